@@ -1,0 +1,1 @@
+"""Drives and buses: everything below slider setpoints."""

@@ -1,0 +1,70 @@
+"""What a configuration file says of the bus and the drives: sections [can] and [drives]."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NodeId = Annotated[int, Meta(ge=1, le=127)]
+
+
+class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
+    """How the simulated drives behave; used only with interface = "simulated"."""
+
+    time_constant: Annotated[float, Meta(ge=0.0)] = 0.004
+    """First-order lag of the servo behind its setpoint [s]."""
+    max_velocity: Positive = 2.0
+    """What the slider can do at most [m/s]."""
+    max_acceleration: Positive = 100.0
+    """What the slider can do at most [m/s²]."""
+    missed_syncs: Annotated[int, Meta(ge=1)] = 3
+    """So many SYNCs missed in a row make a drive stop by itself."""
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Slider positions at power-on [m]."""
+
+
+class Can(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [can]: any python-can interface, or "simulated" (three drives inside the process)."""
+
+    interface: str
+    channel: str = ""
+    bitrate: Annotated[int, Meta(gt=0)] = 1_000_000
+    """Bits per second: for the bus load, and for interfaces that set it themselves."""
+    simulated: Simulated = Simulated()
+
+
+class Drive(Struct, frozen=True, forbid_unknown_fields=True):
+    """One drive: section [drives.A], [drives.B] or [drives.C]."""
+
+    node: NodeId
+    counts_per_metre: Positive
+    direction: Literal[1, -1] = 1
+    """-1 where counts fall as the slider position rises."""
+    offset: float = 0.0
+    """Slider position at zero counts [m]."""
+
+
+class Drives(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [drives]: what all three share, and one table for each."""
+
+    protocol: Literal["cia402"]
+    A: Drive
+    B: Drive
+    C: Drive
+    master_node: NodeId = 126
+    """The node id of the service itself, for its heartbeat."""
+    heartbeat: Positive = 0.1
+    """Period of everyone's heartbeat [s]; three missed ones are a loss."""
+    following_error: Positive = 0.005
+    """The drives' own following error window, object 6065h [m]."""
+    quick_stop_deceleration: Positive = 10.0
+    """Object 6085h [m/s²]."""
+    sdo_timeout: Positive = 0.5
+    """How long a drive may take to answer a configuration request [s]."""
+
+    @property
+    def each(self) -> tuple[Drive, Drive, Drive]:
+        """The three drives in the order of the sliders."""
+        return self.A, self.B, self.C

@@ -1,0 +1,88 @@
+"""What the control loop needs of three drives together."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple, Protocol
+
+NAMES = ("A", "B", "C")
+"""The drives are named as the sliders they move."""
+
+Triple = tuple[float, float, float]
+
+
+class PowerState(IntEnum):
+    """States of the CiA 402 power drive system (CiA 402-2, finite state automaton)."""
+
+    NOT_READY_TO_SWITCH_ON = 0
+    SWITCH_ON_DISABLED = 1
+    READY_TO_SWITCH_ON = 2
+    SWITCHED_ON = 3
+    OPERATION_ENABLED = 4
+    QUICK_STOP_ACTIVE = 5
+    FAULT_REACTION_ACTIVE = 6
+    FAULT = 7
+
+    def __str__(self) -> str:
+        return self.name.lower().replace("_", " ")
+
+
+class DriveFault(NamedTuple):
+    """Why a drive must not be moved any more; lasts until it is reset."""
+
+    drive: str
+    """Name of the drive, or "" where the bus itself is at fault."""
+    cause: str
+    """One of emcy, fault, silent, heartbeat, state, frame, setpoint, bus."""
+    code: int
+    """The EMCY or 603Fh error code, 0 where there is none."""
+    message: str
+    """One line for people, with drive, cause and code in it."""
+
+
+class Feedback(NamedTuple):
+    """What the three drives last said, as of the newest SYNC."""
+
+    position: Triple
+    """Measured slider positions [m]."""
+    state: tuple[PowerState, PowerState, PowerState]
+    fault: DriveFault | None
+    """The first fault since the last reset, else None."""
+
+
+class Drives(Protocol):
+    """Three drives in cyclic synchronous position control.
+
+    `configure` and `close` may block and raise DriveError. All else is for the cycle: it never blocks and never
+    raises; what goes wrong is a fault in the next feedback.
+    """
+
+    bus_load: float
+    """Worst-case share of the bus that the cyclic traffic takes, with stuffing; 1.0 is full."""
+
+    def configure(self, period: float) -> None:
+        """Set the drives up for a cycle of `period` seconds, read every value back, start them without power."""
+
+    def sync(self) -> None:
+        """Send SYNC: the drives take up the setpoints written since the last one and sample their positions."""
+
+    def read(self) -> Feedback:
+        """Take in every frame that has arrived."""
+
+    def write(self, position: Triple, velocity: Triple) -> None:
+        """Send setpoints [m] and velocity feed-forward [m/s], to be taken up at the next SYNC."""
+
+    def enable(self) -> None:
+        """Begin to power up; the following cycles carry it out, the feedback's states tell when it is done."""
+
+    def disable(self) -> None:
+        """Take power off; meant for a robot at standstill."""
+
+    def quick_stop(self) -> None:
+        """Make every drive stop by its own quick-stop ramp, in this cycle."""
+
+    def reset(self) -> None:
+        """Forget the fault and clear the drives' own; never powers them up."""
+
+    def close(self) -> None:
+        """Leave the drives without power and not operational, and let go of the bus."""

@@ -1,0 +1,85 @@
+"""A servo axis: first-order lag behind its setpoint, within what its motor can do."""
+
+from __future__ import annotations
+
+import math
+
+
+class Servo:
+    """One axis in counts and seconds: a position loop with velocity feed-forward and a braking ramp.
+
+    Over a step the setpoint r runs in a straight line from the last target to the new one, the feed-forward w
+    likewise from the last to the new, and the position x obeys
+
+        dx/dt = w + (r - x) / time_constant,
+
+    so that the following error e = r - x obeys de/dt = (dr/dt - w) - e / time_constant: it fades, and only
+    what the feed-forward leaves uncovered feeds it. An exact feed-forward has no lag, none at all lags by
+    dr/dt · time_constant. With time_constant = 0 the servo is ideal: on the target at the end of each step.
+    The velocity that this asks for is then cut to what can still be braked in time, to `max_velocity` and to
+    `max_acceleration`.
+    """
+
+    def __init__(
+        self, position: float, *, time_constant: float, max_velocity: float, max_acceleration: float
+    ) -> None:
+        self.position = position
+        """Measured position [counts]."""
+        self.velocity = 0.0
+        """Measured velocity [counts/s]."""
+        self.setpoint = position
+        """What the last step aimed at [counts]."""
+        self.limited = False
+        """Whether the last step was cut to a limit."""
+        self._feed_forward = 0.0
+        self._time_constant = time_constant
+        self._max_velocity = max_velocity
+        self._max_acceleration = max_acceleration
+
+    @property
+    def following_error(self) -> float:
+        """Setpoint less position [counts]."""
+        return self.setpoint - self.position
+
+    def hold(self) -> None:
+        """Stand still here, by the brake."""
+        self.velocity = self._feed_forward = 0.0
+        self.setpoint = self.position
+        self.limited = False
+
+    def follow(self, target: float, feed_forward: float, step: float) -> None:
+        """Move for `step` seconds towards `target` [counts] with `feed_forward` [counts/s] at its end."""
+        slope = (target - self.setpoint) / step
+        uncovered = slope - 0.5 * (self._feed_forward + feed_forward)
+        gap = self.following_error
+        if self._time_constant > 0.0:
+            settled = uncovered * self._time_constant
+            closing = (gap - settled) * -math.expm1(-step / self._time_constant) / step
+        else:
+            closing = gap / step
+
+        # The fastest approach that max_acceleration can still end on the setpoint, step by step.
+        gain = self._max_acceleration * step
+        brakable = 0.5 * gain * (math.sqrt(1.0 + 8.0 * abs(gap) / (gain * step)) - 1.0)
+        if gap * closing > 0.0:
+            closing = max(-brakable, min(closing, brakable))
+
+        wanted = slope + closing
+        velocity = max(-self._max_velocity, min(wanted, self._max_velocity))
+        velocity = max(self.velocity - gain, min(velocity, self.velocity + gain))
+        self.limited = velocity != wanted
+        self.setpoint, self._feed_forward = target, feed_forward
+        self.velocity = velocity
+        self.position += velocity * step
+
+    def brake(self, deceleration: float, step: float) -> None:
+        """Slow down for `step` seconds with `deceleration` [counts/s²], at most to standstill."""
+        moving = min(step, abs(self.velocity) / deceleration)
+        lost = math.copysign(deceleration * moving, self.velocity)
+        self.position += (self.velocity - 0.5 * lost) * moving
+        self.velocity = self.velocity - lost if moving == step else 0.0
+        self.setpoint, self._feed_forward = self.position, 0.0
+
+    def coast(self, step: float) -> None:
+        """Keep the velocity for `step` seconds, as a drive does that waits for its next setpoint."""
+        self.position += self.velocity * step

@@ -1,0 +1,5 @@
+"""`python -m service` is `trirail`."""
+
+from service.cli import main
+
+main()

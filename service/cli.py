@@ -1,0 +1,223 @@
+"""The command line: `trirail COMMAND`. Errors are one line on standard error; exit 1, or 2 for wrong usage."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import App, CycloptsError, Parameter
+
+from service import __version__, terminal
+from service.config import SIM, load
+from service.errors import TrirailError
+from service.session import DEFAULT_LOCATOR
+
+app = App(
+    name="trirail",
+    help="Drives a 3-PRP planar parallel robot in real time: goals in over Zenoh, setpoints out over CAN.",
+    version=f"trirail {__version__}",
+)
+
+Flag = Parameter(negative="")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Service:
+    """Which service to talk to."""
+
+    robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT")] = "demo"
+    "Name of the robot, as in its configuration."
+    connect: Annotated[str, Parameter(env_var="TRIRAIL_CONNECT")] = DEFAULT_LOCATOR
+    "Zenoh locator of the service or of a router."
+    json: Annotated[bool, Flag] = False
+    "Print one JSON object instead of words."
+
+
+HERE = Service()
+
+
+@app.command
+def run(config: Path = SIM, /, *, record: Path | None = None) -> int:
+    """Run the service in the foreground until SIGTERM or Ctrl-C: then a controlled stop, drives disabled, exit 0.
+
+    Parameters
+    ----------
+    config
+        Configuration file; the simulated robot if absent.
+    record
+        Recording file to write, instead of one named by the time in the configured folder.
+    """
+    from service.supervisor import Supervisor
+
+    settings = load(config)
+    return Supervisor(settings, record, terminal.say).run(lambda ready: terminal.up(settings, ready))
+
+
+@app.command
+def demo(*, stay: Annotated[bool, Flag] = False, record: Path | None = None) -> int:
+    """Start the service on simulated drives, enable it, send it a tour of goals, and report.
+
+    Parameters
+    ----------
+    stay
+        Keep the service and its live view up afterwards, until Ctrl-C.
+    record
+        Recording file to leave.
+    """
+    from service import demo as shown
+
+    return shown.run(stay=stay, record=record)
+
+
+@app.command
+def goto(
+    x: float,
+    y: float,
+    phi: float,
+    /,
+    *,
+    wait: Annotated[bool, Flag] = False,
+    speed: float = 1.0,
+    deg: Annotated[bool, Flag] = False,
+    service: Service = HERE,
+) -> int:
+    """Move the platform to a pose.
+
+    Parameters
+    ----------
+    x
+        Position of the platform's centre [m].
+    y
+        Position of the platform's centre [m].
+    phi
+        Angle of the platform [rad].
+    wait
+        Show the progress; exit 0 only when the robot has arrived.
+    speed
+        Fraction of full speed, up to 1.
+    deg
+        The angle is in degrees.
+    """
+    from service.client import Robot
+
+    angle = math.radians(phi) if deg else phi
+    with Robot(service.robot, service.connect) as robot:
+        goal = robot.move_to(x=x, y=y, phi=angle, speed=speed)
+        if not wait:
+            _print(service, {"id": goal.id, "duration": goal.duration}, f"goal {goal.id}: {goal.duration:.2f} s")
+            return 0
+        result = terminal.follow(robot, goal, f"x {x:g} m, y {y:g} m, φ {math.degrees(angle):g}°", show=not service.json)
+    _print(service, result._asdict(), result.message)
+    return 0 if result.outcome == "done" else 1
+
+
+@app.command
+def enable(*, service: Service = HERE) -> int:
+    """Power the drives up and hold."""
+    return _command("enable", service)
+
+
+@app.command
+def disable(*, service: Service = HERE) -> int:
+    """Stop and take power off the drives."""
+    return _command("disable", service)
+
+
+@app.command
+def stop(*, service: Service = HERE) -> int:
+    """Stop the robot within its limits."""
+    return _command("stop", service)
+
+
+@app.command
+def quick_stop(*, service: Service = HERE) -> int:
+    """Stop every drive as fast as it can; the robot is in fault until a reset."""
+    return _command("quick_stop", service)
+
+
+@app.command
+def reset(*, service: Service = HERE) -> int:
+    """Clear a fault whose cause is gone; the robot stays without power."""
+    return _command("reset", service)
+
+
+@app.command
+def status(*, service: Service = HERE) -> int:
+    """Print the present state."""
+    from service.client import Robot
+
+    with Robot(service.robot, service.connect) as robot:
+        state = robot.state()
+    if service.json:
+        terminal.json(msgspec.to_builtins(state))
+    else:
+        terminal.show(state, service.robot)
+    return 0
+
+
+@app.command
+def watch(*, service: Service = HERE) -> int:
+    """Show the state live until Ctrl-C."""
+    from service.client import Robot
+
+    with Robot(service.robot, service.connect) as robot:
+        if service.json:
+            for state in robot.states():
+                terminal.json(msgspec.to_builtins(state))
+        else:
+            terminal.watch(robot)
+    return 0
+
+
+@app.command
+def events(*, service: Service = HERE) -> int:
+    """Print past events and those to come until Ctrl-C."""
+    from service.client import Robot
+
+    with Robot(service.robot, service.connect) as robot:
+        robot.state()  # so that a missing service is said, not waited for
+        for event in robot.events(history=True):
+            if service.json:
+                terminal.json(msgspec.to_builtins(event))
+            else:
+                terminal.event(event)
+    return 0
+
+
+def _command(name: str, service: Service) -> int:
+    from service.client import Robot
+
+    with Robot(service.robot, service.connect) as robot:
+        reply = robot.command(name)
+    _print(service, msgspec.to_builtins(reply), f"{name}: done, the robot is {reply.mode}")
+    return 0
+
+
+def _print(service: Service, content: object, words: str) -> None:
+    if service.json:
+        terminal.json(content)
+    else:
+        terminal.say(words)
+
+
+def main() -> None:
+    """Run a command and exit as it says."""
+    try:
+        code = app(exit_on_error=False, print_error=False, result_action="return_value")
+    except CycloptsError as error:
+        terminal.complain(f"{str(error).strip()} (trirail --help tells the usage)")
+        code = 2
+    except TrirailError as error:
+        terminal.complain(str(error))
+        code = 1
+    except KeyboardInterrupt:
+        code = 130
+    except BrokenPipeError:  # the reader, head for one, has seen enough
+        sys.stderr.close()
+        code = 0
+    sys.exit(code if isinstance(code, int) else 0)

@@ -1,0 +1,248 @@
+"""A client of the service: goals, commands and states over Zenoh.
+
+    with Robot("demo") as robot:
+        robot.enable()
+        result = robot.move_to(x=0.02, y=-0.01, phi=0.1).wait(timeout=10)
+"""
+
+from __future__ import annotations
+
+import getpass
+import queue
+import re
+import threading
+import time
+import uuid
+from collections.abc import Iterator
+from types import TracebackType
+from typing import NamedTuple, Self, TypeVar
+
+import msgspec
+import zenoh
+from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
+
+from service import session
+from service.errors import RefusedError, ServiceError
+from service.messages import CommandReply, ErrorReply, Event, GoalReply, Info, PoseGoal, State
+
+REPLY_WITHIN = 20.0
+"""How long a command may take to be carried out [s]."""
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+
+class Result(NamedTuple):
+    """How a goal ended."""
+
+    id: str
+    outcome: str
+    message: str
+
+
+class Goal:
+    """A goal that the service has accepted."""
+
+    def __init__(self, goal_id: str, duration: float) -> None:
+        self.id = goal_id
+        self.duration = duration
+        """Expected time from acceptance to arrival [s]."""
+        self._ended = threading.Event()
+        self._result: Result | None = None
+
+    @property
+    def result(self) -> Result | None:
+        """How it ended, None while it has not."""
+        return self._result
+
+    def wait(self, timeout: float | None = None) -> Result:
+        """Wait for its end. Raises TimeoutError if that takes longer than `timeout` seconds."""
+        if not self._ended.wait(timeout) or self._result is None:
+            raise TimeoutError(f"goal {self.id} has not ended within {timeout:g} s")
+        return self._result
+
+    def _end(self, result: Result) -> None:
+        self._result = result
+        self._ended.set()
+
+
+class Robot:
+    """A connection to one robot's service.
+
+    Raises ServiceError where there is no service, RefusedError where it says no.
+    """
+
+    def __init__(self, name: str = "demo", connect: str = session.DEFAULT_LOCATOR, user: str | None = None) -> None:
+        self.name = name
+        self.user = user or _user()
+        self._connect = connect
+        self._session = session.open_client(connect)
+        self._goals: dict[str, Goal] = {}
+        self._goals_lock = threading.Lock()
+        self._results = declare_advanced_subscriber(
+            self._session,
+            self._key("event"),
+            self._on_event,
+            recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the connection; goals under way go on."""
+        self._session.close()
+
+    # ------------------------------------------------------------------ goals and commands
+
+    def move_to(
+        self,
+        *,
+        x: float,
+        y: float,
+        phi: float,
+        speed: float = 1.0,
+        valid_for: float | None = None,
+        id: str | None = None,  # noqa: A002 - the field's name on the wire
+    ) -> Goal:
+        """Send a pose goal [m, rad]; return once it is accepted."""
+        goal_id = id or uuid.uuid4().hex[:12]
+        try:
+            message = PoseGoal(x=x, y=y, phi=phi, speed=speed, valid_for=valid_for, id=goal_id)
+        except ValueError as error:
+            raise RefusedError("malformed", f"not a goal: {error}") from error
+        goal = Goal(goal_id, 0.0)
+        with self._goals_lock:
+            self._goals.setdefault(goal_id, goal)
+        try:
+            reply = self._ask(self._key("goal", self.user), GoalReply, msgspec.json.encode(message))
+        except (RefusedError, ServiceError):
+            with self._goals_lock:
+                self._goals.pop(goal_id, None)
+            raise
+        goal.duration = reply.duration
+        return goal
+
+    def enable(self) -> None:
+        """Power the drives up; return when the robot holds."""
+        self.command("enable")
+
+    def disable(self) -> None:
+        """Stop, then take power off; return when the drives have none."""
+        self.command("disable")
+
+    def stop(self) -> None:
+        """Stop within the limits; return when the robot stands."""
+        self.command("stop")
+
+    def quick_stop(self) -> None:
+        """Stop every drive by its own ramp, as fast as it can; the robot is in fault afterwards."""
+        self.command("quick_stop")
+
+    def reset(self) -> None:
+        """Clear a fault whose cause is gone; the robot is disabled afterwards."""
+        self.command("reset")
+
+    def command(self, name: str) -> CommandReply:
+        """Send a command; return once the service confirms that it has been carried out."""
+        return self._ask(self._key("cmd", self.user, name), CommandReply)
+
+    def info(self) -> Info:
+        """Ask for geometry, limits, rates and versions."""
+        return self._ask(self._key("info"), Info)
+
+    # ------------------------------------------------------------------ what the service tells
+
+    def state(self, timeout: float = 2.0) -> State:
+        """Return the newest state."""
+        for state in self.states(timeout):
+            return state
+        raise ServiceError(self._nobody())
+
+    def states(self, timeout: float | None = None) -> Iterator[State]:
+        """Yield states as they come, the newest where this is too slow; end after `timeout` seconds without one."""
+        decoder = msgspec.json.Decoder(State)
+        with self._session.declare_subscriber(self._key("state"), zenoh.handlers.RingChannel(1)) as subscriber:
+            heard = time.monotonic()
+            while timeout is None or time.monotonic() - heard < timeout:
+                sample = subscriber.try_recv()
+                if sample is None:
+                    time.sleep(0.002)
+                    continue
+                heard = time.monotonic()
+                yield decoder.decode(sample.payload.to_bytes())
+
+    def events(self, history: bool = False, timeout: float | None = None) -> Iterator[Event]:
+        """Yield events in order, with `history` those of the past first; end after `timeout` seconds without one."""
+        received: queue.Queue[Event] = queue.Queue()
+        decoder = msgspec.json.Decoder(Event)
+        subscriber = declare_advanced_subscriber(
+            self._session,
+            self._key("event"),
+            lambda sample: received.put(decoder.decode(sample.payload.to_bytes())),
+            history=HistoryConfig(detect_late_publishers=True) if history else None,
+            recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
+        )
+        with subscriber:
+            while True:
+                try:
+                    yield received.get(timeout=timeout)
+                except queue.Empty:
+                    return
+
+    # ------------------------------------------------------------------ inside
+
+    def _key(self, *parts: str) -> str:
+        return session.key(self.name, *parts)
+
+    def _on_event(self, sample: zenoh.Sample) -> None:
+        event = msgspec.json.decode(sample.payload.to_bytes(), type=Event)
+        if event.id is None or event.outcome is None:
+            return
+        with self._goals_lock:
+            goal = self._goals.pop(event.id, None)
+        if goal is not None:
+            goal._end(Result(event.id, event.outcome, event.message))  # noqa: SLF001 - the goal is this client's
+
+    def _ask(self, key: str, kind: type[T], payload: bytes | None = None) -> T:
+        """Query and decode the one reply. An empty one means that nobody is there, or may not be asked."""
+        for reply in self._session.get(
+            key,
+            payload=payload,
+            encoding=session.JSON if payload else None,
+            timeout=REPLY_WITHIN,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+        ):
+            if reply.ok is not None:
+                return msgspec.json.decode(reply.ok.payload.to_bytes(), type=kind)
+            if reply.err is not None:
+                raise _refusal(reply.err.payload.to_bytes())
+        raise ServiceError(self._nobody())
+
+    def _nobody(self) -> str:
+        return (
+            f"no robot {self.name!r} answers at {self._connect}: is its service running, is the name right "
+            "(--robot), may this user ask it?"
+        )
+
+
+def _refusal(payload: bytes) -> RefusedError | ServiceError:
+    try:
+        error = msgspec.json.decode(payload, type=ErrorReply)
+    except msgspec.DecodeError:
+        return ServiceError(f"no answer from the service: {payload.decode(errors='replace')}")
+    return RefusedError(error.code, error.message, slider=error.slider, value=error.value, limit=error.limit)
+
+
+def _user() -> str:
+    try:
+        name = getpass.getuser()
+    except (KeyError, OSError):
+        return "anonymous"
+    return re.sub(r"[^A-Za-z0-9_-]", "-", name) or "anonymous"

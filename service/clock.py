@@ -1,0 +1,49 @@
+"""Fixed-rate ticks on absolute deadlines of the monotonic clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+
+class Tick(NamedTuple):
+    """One tick, as it came."""
+
+    deadline_ns: int
+    """When it was due."""
+    lateness_ns: int
+    """How much later it came."""
+    missed: int
+    """Ticks skipped since the one before."""
+
+
+def sleep_until(deadline_ns: int) -> None:
+    """Sleep to an absolute time of the monotonic clock."""
+    remaining = deadline_ns - time.monotonic_ns()
+    if remaining > 0:
+        time.sleep(remaining * 1e-9)  # CPython sleeps to an absolute deadline: clock_nanosleep, TIMER_ABSTIME
+
+
+class Ticker:
+    """Ticks every `period_ns`; a tick that is missed is skipped and counted, never caught up in a burst."""
+
+    def __init__(
+        self,
+        period_ns: int,
+        now: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[int], None] = sleep_until,
+    ) -> None:
+        self._period_ns = period_ns
+        self._now = now
+        self._sleep = sleep
+        self._deadline_ns = now()
+
+    def wait(self) -> Tick:
+        """Sleep until the next deadline that is not over yet by a whole period."""
+        self._deadline_ns += self._period_ns
+        self._sleep(self._deadline_ns)
+        lateness_ns = self._now() - self._deadline_ns
+        missed = max(0, lateness_ns // self._period_ns)
+        self._deadline_ns += missed * self._period_ns
+        return Tick(self._deadline_ns, lateness_ns - missed * self._period_ns, missed)

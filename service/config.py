@@ -1,0 +1,272 @@
+"""The configuration file: typed, strict, refused with file, key, value and what is allowed."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, get_args
+
+import msgspec
+from msgspec import Meta, Struct
+
+from drivers.config import Can, Drives, Positive
+from service.errors import ConfigError
+from service.geometry import Geometry, Leg, singular_angles
+
+_PACKAGED = Path(__file__).parent / "configs"
+SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[1] / "configs") / "sim.toml"
+"""The configuration that needs nothing: no hardware, no rights, no other program."""
+
+Triple = tuple[float, float, float]
+PositiveTriple = tuple[Positive, Positive, Positive]
+Range = tuple[float, float]
+Fraction = Annotated[float, Meta(gt=0.0, le=1.0)]
+
+
+class Robot(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [robot]."""
+
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+    """The <robot> of every Zenoh key; letters, digits, - and _."""
+
+
+class LegTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """One leg of a robot as built: [[geometry.leg]], metres and radians, as service.geometry.Leg."""
+
+    anchor: Range
+    rail_angle: float
+    home: float
+    edge_point: Range
+    edge_angle: float
+
+
+class GeometryTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [geometry]: the paper's symmetric robot by `l0`, or three measured legs."""
+
+    l0: Positive | None = None
+    leg: tuple[LegTable, LegTable, LegTable] | None = None
+
+
+class PlatformLimits(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [limits.platform]: for x, y [m] and phi [rad]."""
+
+    velocity: PositiveTriple
+    acceleration: PositiveTriple
+    jerk: PositiveTriple
+    x: Range
+    y: Range
+    phi: Range
+
+
+class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [limits.slider]: the same for all three."""
+
+    position: Range
+    """Travel of lambda_10 [m]."""
+    passive: Range
+    """Travel of lambda_32 along the platform's edges [m]."""
+    velocity: Positive
+    acceleration: Positive
+    jerk: Positive
+    following_error: Positive
+    """Setpoint less measured position beyond which everything stops [m]."""
+
+
+class Limits(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [limits]."""
+
+    platform: PlatformLimits
+    slider: SliderLimits
+    singularity_margin: Positive = 0.1
+    """How near phi may come to a singular angle [rad]."""
+
+
+class Loop(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [loop]."""
+
+    rate_hz: Annotated[int, Meta(ge=1, le=4000)]
+    realtime: Literal["off", "prefer", "enforce"] = "prefer"
+    """Whether SCHED_FIFO, locked memory and a pinned processor are done without, wished for, or demanded."""
+    priority: Annotated[int, Meta(ge=1, le=99)] = 80
+    cpu: Annotated[int, Meta(ge=0)] | None = None
+    """The processor to stay on; the last one that the process may use when absent."""
+
+
+class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [zenoh]."""
+
+    listen: Annotated[tuple[str, ...], Meta(min_length=1)] = ("tcp/127.0.0.1:7447",)
+
+
+class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [telemetry]."""
+
+    directory: str = "recordings"
+    """Where recordings go, relative to where the service was started."""
+    state_hz: Annotated[int, Meta(ge=1, le=200)] = 50
+    live_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
+    """Loopback port of the live Rerun server; 0 for none."""
+    capture_can: bool = False
+    """Write every CAN frame of the session beside the recording, in candump's log format."""
+
+
+class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [watchdogs]."""
+
+    enable_timeout: Positive = 2.0
+    """How long the drives may take to power up [s]."""
+    max_overruns: Annotated[int, Meta(ge=1)] = 20
+    """So many missed ticks in a row are a controlled stop."""
+
+
+class Config(Struct, frozen=True, forbid_unknown_fields=True):
+    """A whole configuration file."""
+
+    robot: Robot
+    geometry: GeometryTable
+    limits: Limits
+    loop: Loop
+    can: Can
+    drives: Drives
+    zenoh: Zenoh
+    telemetry: Telemetry
+    watchdogs: Watchdogs
+
+    @property
+    def period(self) -> float:
+        """The loop's period [s]."""
+        return 1.0 / self.loop.rate_hz
+
+
+def load(path: Path) -> Config:
+    """Read a configuration file. Raises ConfigError with the file, the key, the value and what is allowed."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; configs/sim.toml is one to start from") from error
+    try:
+        return parse(text)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def parse(text: str) -> Config:
+    """Read a configuration from TOML. Raises ConfigError."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"not TOML: {error}") from error
+    for key, value in _leaves(raw):
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{key} = {value}: it must be a finite number")
+    try:
+        config = msgspec.convert(raw, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(_explain(str(error), raw)) from error
+    _check(config)
+    return config
+
+
+def geometry(table: GeometryTable) -> Geometry:
+    """Build the robot's geometry from its section. Raises ConfigError."""
+    if (table.l0 is None) == (table.leg is None):
+        raise ConfigError("geometry: give either l0 (the symmetric robot) or three [[geometry.leg]] tables")
+    try:
+        if table.leg is None:
+            return Geometry.symmetric(table.l0 or 0.0)
+        first, second, third = (Leg(**msgspec.structs.asdict(leg)) for leg in table.leg)
+        return Geometry(legs=(first, second, third))
+    except ValueError as error:
+        raise ConfigError(f"geometry: {error}") from error
+
+
+def _leaves(value: object, key: str = "") -> Iterator[tuple[str, object]]:
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _leaves(inner, f"{key}.{name}" if key else name)
+    elif isinstance(value, list):
+        for index, inner in enumerate(value):
+            yield from _leaves(inner, f"{key}[{index}]")
+    else:
+        yield key, value
+
+
+_AT = re.compile(r"^(?P<what>.*?)(?: - at `\$(?P<path>[^`]*)`)?$", re.DOTALL)
+_FIELD = re.compile(r"^Object (?P<how>contains unknown|missing required) field `(?P<name>[^`]*)`")
+
+
+def _explain(error: str, raw: dict[str, Any]) -> str:
+    """Turn msgspec's words into a key, the value found there, and what is allowed."""
+    found = _AT.match(error)
+    what, path = (found["what"], (found["path"] or "").lstrip(".")) if found else (error, "")
+    if field := _FIELD.match(what):
+        key = f"{path}.{field['name']}" if path else field["name"]
+        if field["how"] == "missing required":
+            return f"{key}: missing {'key' if path else 'section'}"
+        allowed = _type_at(path).__struct_fields__
+        close = difflib.get_close_matches(field["name"], allowed, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"allowed are {', '.join(allowed)}"
+        return f"{key}: unknown {'key' if path else 'section'}; {hint}"
+    value: object = raw
+    for part in _parts(path):
+        value = value[int(part) if isinstance(value, list) else part]  # type: ignore[index]
+    if what.startswith("Invalid enum value"):
+        return f"{path} = {value!r}: allowed are {', '.join(map(repr, get_args(_type_at(path))))}"
+    return f"{path} = {value!r}: {what[0].lower()}{what[1:].replace('`', '')}"
+
+
+def _parts(path: str) -> list[str]:
+    return re.findall(r"[^.\[\]]+", path)
+
+
+def _type_at(path: str) -> Any:
+    """The type that the key or table at `path` must have."""
+    kind: Any = Config
+    for part in _parts(path):
+        if part.isdigit():
+            kind = get_args(kind)[0]
+        else:
+            kind = next(field.type for field in msgspec.structs.fields(kind) if field.name == part)
+        if isinstance(kind, UnionType):
+            kind = get_args(kind)[0]
+    return kind
+
+
+def _check(config: Config) -> None:
+    """Refuse what is well-formed but impossible."""
+    robot = geometry(config.geometry)
+    platform, slider = config.limits.platform, config.limits.slider
+    ranges = {
+        "limits.platform.x": platform.x,
+        "limits.platform.y": platform.y,
+        "limits.platform.phi": platform.phi,
+        "limits.slider.position": slider.position,
+        "limits.slider.passive": slider.passive,
+    }
+    for key, (low, high) in ranges.items():
+        if low >= high:
+            raise ConfigError(f"{key} = [{low:g}, {high:g}]: the lower limit must be below the upper one")
+    (low, high), margin = platform.phi, config.limits.singularity_margin
+    for angle in singular_angles(robot):
+        if low - margin < angle < high + margin:
+            raise ConfigError(
+                f"limits.platform.phi = [{low:g}, {high:g}] comes nearer than limits.singularity_margin = {margin:g} "
+                f"to the singular angle {angle:.4f}: keep {'below ' if angle > 0 else 'above '}"
+                f"{angle - math.copysign(margin, angle):.4f}"
+            )
+    nodes = [config.drives.master_node, *(drive.node for drive in config.drives.each)]
+    if len(set(nodes)) < len(nodes):
+        raise ConfigError(
+            f"drives: the node ids of master_node, A, B and C must differ, but are {', '.join(map(str, nodes))}"
+        )
+    # The drives take the period as an integer times a power of ten of a second, object 60C2h.
+    if 1_000_000 % config.loop.rate_hz:
+        raise ConfigError(
+            f"loop.rate_hz = {config.loop.rate_hz}: a cycle must be a whole number of microseconds, "
+            "as with 100, 200, 250, 400, 500, 800, 1000"
+        )

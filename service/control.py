@@ -1,0 +1,430 @@
+"""The robot's control, one cycle at a time, without a clock, a socket or a file.
+
+Each cycle: `observe` what the drives said, `handle` a request if there is one, `advance` the motion and solve the
+sliders, and `write` the setpoints behind the last gate. What happened is left in `answers` and `happenings`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from drivers.interface import NAMES, Drives, Feedback, PowerState
+from service.config import Config, geometry
+from service.errors import RefusedError
+from service.kinematics import forward_into, inverse_into
+from service.limits import Bounds
+from service.messages import Level, Outcome
+from service.modes import DISABLED, Action, Event, Mode, Refusal, State, step
+from service.motion import STILL, MotionState, Plan, Planner, rest
+from service.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest, Request
+
+Triple = tuple[float, float, float]
+
+REMEMBERED_IDS = 10_000
+SETTLE = 0.1
+"""How long the drives may take to leave their fault state after a reset [s]."""
+
+_COMMANDS = {
+    "enable": Event.ENABLE,
+    "disable": Event.DISABLE,
+    "stop": Event.STOP,
+    "quick_stop": Event.QUICK_STOP,
+    "reset": Event.RESET,
+}
+_POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
+
+
+class Happening(NamedTuple):
+    """Something to tell everyone, in the order in which it happened."""
+
+    kind: str
+    level: Level
+    message: str
+    mode: str | None = None
+    id: str | None = None
+    outcome: Outcome | None = None
+    user: str | None = None
+
+
+class Goal(NamedTuple):
+    """The goal that the robot is moving to, or braking from."""
+
+    id: str
+    user: str
+
+
+class _Pending(NamedTuple):
+    """A command that is confirmed once it has been carried out."""
+
+    request: CommandRequest
+    since: int
+
+
+class Control:
+    """Modes, motion, kinematics and limits of one robot over one set of drives."""
+
+    def __init__(self, config: Config, drives: Drives) -> None:
+        robot = geometry(config.geometry)
+        self._drives = drives
+        self._period = config.period
+        self._legs = robot.packed()
+        self._bounds = Bounds(config.limits, config.period)
+        self._planner = Planner(robot, config.limits.platform, self._bounds)
+        self._following_error_limit = config.limits.slider.following_error
+        self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
+        self._settle_cycles = max(3, round(SETTLE / config.period))
+
+        self._motion = np.zeros((3, 3))
+        self._sliders = np.zeros((6, 3))
+        self._pose = np.zeros(3)
+        self._measured = np.zeros(3)
+
+        self.cycle = 0
+        self.state: State = DISABLED
+        self.fault: str | None = None
+        self.goal: Goal | None = None
+        self.feedback = Feedback(STILL, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
+        self.velocity: Triple = STILL
+        self.pose: Triple = STILL
+        self.commanded: MotionState = rest(STILL)
+        self.rows: list[list[float]] = self._sliders.tolist()
+        """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 of the setpoints."""
+        self.following_error: Triple = STILL
+        self._written: deque[Triple] = deque([STILL, STILL], maxlen=2)
+        self._plan: Plan | None = None
+        self._time = 0.0
+        self._entered = 0
+        self._pending: list[_Pending] = []
+        self._ended_ids: dict[str, None] = {}
+        self.answers: list[Answer] = []
+        self.happenings: list[Happening] = []
+
+    # ------------------------------------------------------------------ the cycle, in its order
+
+    def start(self, feedback: Feedback) -> None:
+        """Take the measured sliders for the commanded ones, before the first cycle."""
+        self.feedback = feedback
+        self._written.extend((feedback.position, feedback.position))
+        self._follow_measured()
+
+    def observe(self, feedback: Feedback) -> None:
+        """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
+        self.cycle += 1
+        period = self._period
+        before, now = self.feedback.position, feedback.position
+        self.velocity = (
+            (now[0] - before[0]) / period,
+            (now[1] - before[1]) / period,
+            (now[2] - before[2]) / period,
+        )
+        # A drive reaches at this SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
+        due = self._written[0]
+        self.following_error = (due[0] - now[0], due[1] - now[1], due[2] - now[2])
+        self.feedback = feedback
+        self._measured[:] = now
+        if forward_into(self._legs, self._measured, self._pose, self._pose) == 0:
+            self.pose = tuple(self._pose.tolist())
+        mode = self.state.mode
+        if feedback.fault is not None:
+            self.trip(feedback.fault.message)
+        elif mode is Mode.ENABLING:
+            self._power_up()
+        elif mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
+            for name, error in zip(NAMES, self.following_error, strict=True):
+                if not abs(error) <= self._following_error_limit:
+                    self.trip(
+                        f"slider {name}: following error {error * 1e3:.3f} mm is beyond its limit "
+                        f"{self._following_error_limit * 1e3:g} mm"
+                    )
+                    break
+        if self._pending:
+            self._confirm()
+
+    def handle(self, request: Request, now_ns: int) -> None:
+        """Carry out one request at a time of the monotonic clock, or refuse it."""
+        try:
+            if isinstance(request, GoalRequest):
+                self._take_goal(request, now_ns)
+            elif isinstance(request, CommandRequest):
+                self._take_command(request)
+            else:
+                self._tell("refused", "warning", request.message, user=request.user)
+        except RefusedError as refusal:
+            self._refuse(request, refusal)
+
+    def happen(self, event: Event, reason: str) -> None:
+        """Let something happen that nobody asked for: the gateway is lost, ticks are late, the service ends."""
+        decided = step(self.state, event)
+        if isinstance(decided, Refusal) or decided.state == self.state:
+            return
+        self._tell("service", "warning", reason)
+        if decided.action is Action.BRAKE:
+            self._end_goal("stopped", reason)
+        self._go(event, reason)
+
+    def advance(self) -> None:
+        """Move the commanded state on by one period."""
+        if self._plan is None:
+            return
+        self._time += self._period
+        self.commanded = self._plan.at(self._time)
+        if self._time >= self._plan.duration:
+            self._plan = None
+
+    def solve(self) -> None:
+        """Solve the sliders for the commanded state, by the paper's recursion; pass the last gate, or trip."""
+        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
+            self._follow_measured()
+            return
+        for row, values in enumerate(self.commanded):
+            self._motion[row] = values
+        singular = inverse_into(self._legs, self._motion, self._sliders)
+        if singular:
+            self.trip(f"slider {NAMES[singular - 1]}: no setpoint, the commanded pose is singular or not a number")
+            return
+        rows = self._sliders.tolist()
+        violation = self._bounds.setpoint(rows, self._written[1]) or self._bounds.pose(self.commanded.pose)
+        if violation:
+            self.trip(f"setpoint refused: {violation}")
+            return
+        self.rows = rows
+        if self._plan is None and self.state.mode in (Mode.MOVING, Mode.STOPPING):
+            self._end_goal("done", "arrived")
+            self._go(Event.STANDSTILL, "standstill")
+
+    def write(self) -> None:
+        """Send the setpoints."""
+        position, velocity = self.rows[0], self.rows[1]
+        setpoint = (position[0], position[1], position[2])
+        self._written.append(setpoint)
+        self._drives.write(setpoint, (velocity[0], velocity[1], velocity[2]))
+
+    # ------------------------------------------------------------------ what others ask of it
+
+    @property
+    def powered(self) -> bool:
+        """Whether any drive can still move its slider."""
+        return any(state in _POWERED for state in self.feedback.state)
+
+    @property
+    def progress(self) -> tuple[float, float]:
+        """Share of the running motion's time that is over, and what remains of it [s]."""
+        if self._plan is None:
+            return 0.0, 0.0
+        return self._time / self._plan.duration, self._plan.duration - self._time
+
+    def trip(self, reason: str) -> None:
+        """Stop all three drives in this cycle and latch the reason."""
+        if self.state.mode is Mode.FAULT:
+            return
+        self.fault = reason
+        self._tell("fault", "error", reason)
+        self._end_goal("faulted", reason)
+        self._go(Event.FAULT, reason)
+
+    # ------------------------------------------------------------------ requests
+
+    def _take_goal(self, request: GoalRequest, now_ns: int) -> None:
+        if request.id in self._ended_ids or (self.goal and self.goal.id == request.id):
+            raise RefusedError("duplicate_id", f"goal id {request.id!r} has been used: every goal needs its own")
+        decided = step(self.state, Event.GOAL)
+        if isinstance(decided, Refusal):
+            raise RefusedError(decided.code, self._because(decided))
+        goal = request.goal
+        if goal.valid_for is not None and now_ns - request.received_ns > goal.valid_for * 1e9:
+            raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")
+        plan = self._planner.to_pose(self.commanded, (goal.x, goal.y, goal.phi), goal.speed)
+        self._end_goal("preempted", f"preempted by goal {request.id}")
+        self.goal = Goal(request.id, request.user)
+        self._plan, self._time = plan, 0.0
+        self.answers.append(Accepted(request.ticket, request.id, plan.duration))
+        self._go(Event.GOAL, f"goal {request.id} of {request.user}")
+
+    def _take_command(self, request: CommandRequest) -> None:
+        event = _COMMANDS[request.name]
+        decided = step(self.state, event)
+        if isinstance(decided, Refusal):
+            raise RefusedError(decided.code, self._because(decided))
+        if decided.action is Action.POWER_UP:
+            self._check_start()
+        if decided.action is Action.CLEAR and self.powered:
+            raise RefusedError("stopping", "the drives are still stopping: send reset again when they stand")
+        reason = f"{request.name} by {request.user}"
+        if decided.action is Action.BRAKE:
+            self._end_goal("stopped", reason)
+        if event is Event.QUICK_STOP:
+            self.trip(reason)
+        else:
+            self._go(event, reason)
+        self._pending.append(_Pending(request, self.cycle))
+
+    def _because(self, refusal: Refusal) -> str:
+        return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
+
+    def _refuse(self, request: Request, refusal: RefusedError) -> None:
+        if isinstance(request, RefusedRequest):
+            return
+        self.answers.append(
+            Refused(request.ticket, refusal.code, str(refusal), refusal.slider, refusal.value, refusal.limit)
+        )
+        if isinstance(request, GoalRequest):
+            if refusal.code == "duplicate_id":  # that id has its ending, or will have it
+                self._tell("refused", "warning", str(refusal), user=request.user)
+                return
+            outcome: Outcome = "expired" if refusal.code == "expired" else "rejected"
+            self._remember(request.id)
+            self._tell(
+                "goal",
+                "warning",
+                f"goal {request.id} {outcome}: {refusal}",
+                id=request.id,
+                outcome=outcome,
+                user=request.user,
+            )
+        else:
+            self._tell("refused", "warning", f"{request.name} refused: {refusal}", user=request.user)
+
+    def _check_start(self) -> None:
+        """Refuse to enable where the robot stands outside what it may do."""
+        position = self.feedback.position
+        self._measured[:] = position
+        unreachable = forward_into(self._legs, self._measured, self._pose, self._pose)
+        self._motion[:] = 0.0
+        self._motion[0] = self._pose
+        if unreachable or inverse_into(self._legs, self._motion, self._sliders):
+            raise RefusedError("singular", "the measured sliders belong to no pose: move them by hand, then enable")
+        violation = self._bounds.pose(self._pose.tolist()) or self._bounds.setpoint(self._sliders.tolist(), position)
+        if violation:
+            raise RefusedError(
+                "out_of_workspace",
+                f"the robot stands outside its limits: {violation}; move it inside by hand, then enable",
+                value=violation.value,
+                limit=violation.limit,
+            )
+
+    def _confirm(self) -> None:
+        """Answer the commands that have been carried out or cannot be any more."""
+        still = []
+        for pending in self._pending:
+            verdict = self._verdict(pending)
+            request = pending.request
+            if verdict is None:
+                still.append(pending)
+            elif verdict == "":
+                self.answers.append(Confirmed(request.ticket, request.name, self.state.mode))
+            else:
+                self.answers.append(Refused(request.ticket, "failed", f"{request.name} failed: {verdict}"))
+        self._pending = still
+
+    def _verdict(self, pending: _Pending) -> str | None:
+        """Return "" when the command is carried out, None while it is not, else why it never will be."""
+        mode = self.state.mode
+        match pending.request.name:
+            case "enable":
+                if mode is Mode.ENABLING:
+                    return None
+                return "" if mode not in (Mode.FAULT, Mode.DISABLED) else self.fault or "disabled while powering up"
+            case "disable":
+                return None if mode is Mode.STOPPING or self.powered else ""
+            case "stop":
+                return None if mode is Mode.STOPPING else ""
+            case "reset":
+                if mode is Mode.FAULT:
+                    return f"the cause is still there: {self.fault}"
+                return None if self.cycle - pending.since < self._settle_cycles else ""
+            case _:
+                return None if self.powered else ""
+
+    # ------------------------------------------------------------------ from state to state
+
+    def _go(self, event: Event, reason: str) -> None:
+        """Step the modes and carry out the action."""
+        decided = step(self.state, event)
+        if isinstance(decided, Refusal):
+            return
+        match decided.action:
+            case Action.POWER_UP:
+                self._drives.enable()
+            case Action.POWER_DOWN:
+                self._drives.disable()
+            case Action.QUICK_STOP:
+                self._drives.quick_stop()
+            case Action.CLEAR:
+                self._drives.reset()
+                self.fault = None
+            case Action.BRAKE:
+                try:
+                    self._plan, self._time = self._planner.brake(self.commanded), 0.0
+                except RefusedError as error:
+                    self.trip(f"no controlled stop: {error}")
+                    return
+        before, self.state = self.state.mode, decided.state
+        if self.state.mode is not before:
+            self._entered = self.cycle
+            self._tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
+        if self.state.mode in (Mode.DISABLED, Mode.FAULT):
+            self._plan = None
+
+    def _power_up(self) -> None:
+        """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""
+        if all(state is PowerState.OPERATION_ENABLED for state in self.feedback.state):
+            self._measured[:] = self.rows[0]
+            if forward_into(self._legs, self._measured, self._pose, self._pose):
+                self.trip("the measured sliders belong to no pose")
+                return
+            self.commanded = rest(self._pose.tolist())
+            self._go(Event.POWERED, "all drives are enabled")
+        elif self.cycle - self._entered > self._enable_cycles:
+            waiting = [
+                f"drive {name} is {state}"
+                for name, state in zip(NAMES, self.feedback.state, strict=True)
+                if state is not PowerState.OPERATION_ENABLED
+            ]
+            seconds = self._enable_cycles * self._period
+            self.trip(f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected")
+
+    def _follow_measured(self) -> None:
+        """Make the setpoint of every drive without power the position that it measures: nothing moves on enable."""
+        before, now = self.rows[0], self.feedback.position
+        held = self.state.mode is Mode.ENABLING
+        position = [
+            last if held and state is PowerState.OPERATION_ENABLED else measured
+            for last, measured, state in zip(before, now, self.feedback.state, strict=True)
+        ]
+        self.commanded = rest(self.pose)
+        self._motion[:] = 0.0
+        self._motion[0] = self.pose
+        if inverse_into(self._legs, self._motion, self._sliders) == 0:
+            self.rows = self._sliders.tolist()
+        self.rows[0] = position
+        self.rows[1] = self.rows[2] = [0.0, 0.0, 0.0]
+
+    def _end_goal(self, outcome: Outcome, reason: str) -> None:
+        """End the running goal, once."""
+        if self.goal is None:
+            return
+        goal, self.goal = self.goal, None
+        self._remember(goal.id)
+        level: Level = "error" if outcome == "faulted" else "info"
+        self._tell("goal", level, f"goal {goal.id} {outcome}: {reason}", id=goal.id, outcome=outcome, user=goal.user)
+
+    def _remember(self, goal_id: str) -> None:
+        self._ended_ids[goal_id] = None
+        if len(self._ended_ids) > REMEMBERED_IDS:
+            del self._ended_ids[next(iter(self._ended_ids))]
+
+    def _tell(
+        self,
+        kind: str,
+        level: Level,
+        message: str,
+        *,
+        mode: str | None = None,
+        id: str | None = None,  # noqa: A002 - the field's name on the wire
+        outcome: Outcome | None = None,
+        user: str | None = None,
+    ) -> None:
+        self.happenings.append(Happening(kind, level, message, mode, id, outcome, user))

@@ -1,0 +1,172 @@
+"""`trirail demo`: the whole service on simulated drives, driven by a client from outside as a user would."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from service.client import Result, Robot
+from service.config import SIM, load
+from service.errors import RefusedError, ServiceError
+from service.messages import State
+from service.terminal import out, percentiles
+
+START_WITHIN = 120.0
+GOAL_WITHIN = 15.0
+
+
+class Leg(NamedTuple):
+    """One goal of the tour: a name, x, y [m], phi [rad] and the speed."""
+
+    name: str
+    x: float
+    y: float
+    phi: float
+    speed: float = 1.0
+
+
+CENTRE = (0.0, 0.0, 0.0)
+TOUR = (
+    Leg("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.4),
+    Leg("back to the centre", *CENTRE),
+    Leg("paper: 50 mm along x", 0.05, 0.0, 0.0, 0.4),
+    Leg("back to the centre", *CENTRE),
+    Leg("paper: 50 mm along y", 0.0, 0.05, 0.0, 0.4),
+    Leg("back to the centre", *CENTRE),
+    Leg("tour: right, turned left", 0.06, 0.02, 0.35),
+    Leg("tour: top", 0.0, 0.07, -0.4),
+    Leg("tour: left, turned right", -0.06, 0.02, -0.7),
+    Leg("tour: bottom left", -0.04, -0.05, 0.2),
+    Leg("tour: bottom right, slowly", 0.04, -0.05, -0.2, 0.5),
+    Leg("tour: home", *CENTRE),
+)
+
+
+class _Row(NamedTuple):
+    leg: Leg
+    result: Result
+    seconds: float
+
+
+def run(*, stay: bool, record: Path | None) -> int:
+    """Run the demo; return 0 if every goal ended `done` and the service ended well."""
+    config = load(SIM)
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    recording = record or Path(config.telemetry.directory) / f"demo-{stamp}.rrd"
+    locator = config.zenoh.listen[0]
+    out.print(f"[bold]trirail demo[/]: starting the service on {SIM.name}, simulated drives at {config.loop.rate_hz} Hz")
+    with _service(recording) as service:
+        with _connect(config.robot.name, locator, service) as robot:
+            robot.enable()
+            rows = list(_tour(robot))
+            state = robot.state()
+            if stay and all(row.result.outcome == "done" for row in rows):
+                _report(rows, state, recording)
+                _stay(config.telemetry.live_port)
+            robot.disable()
+        service.send_signal(signal.SIGTERM)
+        code = service.wait(timeout=20)
+    if not stay:
+        _report(rows, state, recording)
+    if code:
+        out.print(f"[bold red]the service ended with exit code {code}[/]")
+    return 0 if code == 0 and all(row.result.outcome == "done" for row in rows) else 1
+
+
+@contextlib.contextmanager
+def _service(recording: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Run the service in a process of its own; show what it said if this fails."""
+    with tempfile.TemporaryFile() as log:
+        command = [sys.executable, "-m", "service", "run", str(SIM), "--record", str(recording)]
+        service = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+        try:
+            yield service
+        except BaseException:
+            service.send_signal(signal.SIGTERM)
+            service.wait(timeout=20)
+            log.seek(0)
+            sys.stderr.write(log.read().decode())
+            raise
+
+
+def _connect(name: str, locator: str, service: subprocess.Popen[bytes]) -> Robot:
+    """Connect once the service is up. The first start of all compiles the kinematics."""
+    deadline = time.monotonic() + START_WITHIN
+    with out.status("waiting for the service (its very first start compiles the kinematics, half a minute)"):
+        while time.monotonic() < deadline:
+            if service.poll() is not None:
+                raise ServiceError("the service could not start: see above")
+            with contextlib.suppress(ServiceError):
+                robot = Robot(name, locator, user="demo")
+                try:
+                    robot.state(timeout=1.0)
+                except ServiceError:
+                    robot.close()
+                else:
+                    return robot
+            time.sleep(0.1)
+    raise ServiceError(f"the service was not up within {START_WITHIN:g} s")
+
+
+def _tour(robot: Robot) -> Iterator[_Row]:
+    columns = TextColumn("{task.description:28}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}")
+    with Progress(*columns, console=out) as progress:
+        task = progress.add_task("the tour", total=len(TOUR), note="")
+        for leg in TOUR:
+            began = time.monotonic()
+            try:
+                goal = robot.move_to(x=leg.x, y=leg.y, phi=leg.phi, speed=leg.speed)
+            except RefusedError as error:
+                result = Result("", "rejected", str(error))
+            else:
+                for state in robot.states(2.0):
+                    x, y, phi = state.pose
+                    pose = f"x {x * 1e3:6.1f} mm  y {y * 1e3:6.1f} mm  φ {math.degrees(phi):6.1f}°"
+                    progress.update(task, description=leg.name, note=pose)
+                    if goal.result or time.monotonic() - began > GOAL_WITHIN:
+                        break
+                result = goal.result or Result(goal.id, "unknown", f"no end within {GOAL_WITHIN:g} s")
+            progress.advance(task)
+            seconds = time.monotonic() - began
+            colour = "green" if result.outcome == "done" else "red"
+            progress.console.print(
+                f"  [{colour}]{result.outcome:9}[/] {leg.name:28} {seconds:5.2f} s"
+                + ("" if result.outcome == "done" else f"  {escape(result.message)}")
+            )
+            yield _Row(leg, result, seconds)
+
+
+def _report(rows: list[_Row], state: State, recording: Path) -> None:
+    done = sum(row.result.outcome == "done" for row in rows)
+    loop = state.loop
+    error = max(state.sliders.following_error_max)
+    out.print()
+    out.print(f"[bold]goals[/]            {done} of {len(rows)} done")
+    out.print(f"[bold]following error[/]  {error * 1e6:.0f} µm at most")
+    out.print(f"[bold]loop[/]             {loop.cycles} cycles at {loop.rate_hz} Hz, {loop.overruns} missed")
+    out.print(f"[bold]lateness[/]         {percentiles(loop.lateness_us)}")
+    out.print(f"[bold]cycle time[/]       {percentiles(loop.cycle_us)}")
+    for lack in loop.lacking:
+        out.print(f"[bold yellow]without[/]          {escape(lack)}", soft_wrap=True)
+    out.print(f"[bold]recording[/]        {recording}", soft_wrap=True)
+    out.print(f"[bold]look at it[/]       .venv/bin/rerun {recording}", soft_wrap=True)
+
+
+def _stay(live_port: int) -> None:
+    out.print()
+    out.print("The service stays up, enabled. In another terminal: trirail goto 0.03 0.02 0.2 --wait")
+    out.print(f"Live view: .venv/bin/rerun --connect rerun+http://127.0.0.1:{live_port}/proxy", soft_wrap=True)
+    out.print("Ctrl-C ends it.")
+    with contextlib.suppress(KeyboardInterrupt):
+        signal.pause()

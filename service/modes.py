@@ -1,0 +1,166 @@
+"""The modes of the service as a pure state machine: what each event does in each mode."""
+
+from __future__ import annotations
+
+from enum import Enum, StrEnum, auto
+from typing import NamedTuple
+
+
+class Mode(StrEnum):
+    """What the robot is doing."""
+
+    DISABLED = "disabled"
+    ENABLING = "enabling"
+    HOLDING = "holding"
+    MOVING = "moving"
+    STOPPING = "stopping"
+    FAULT = "fault"
+
+
+MODES = tuple(Mode)
+"""In the order in which records number them."""
+
+
+class Event(Enum):
+    """What can happen: requests, what the motion and the drives report, and what goes wrong."""
+
+    ENABLE = auto()
+    DISABLE = auto()
+    GOAL = auto()
+    STOP = auto()
+    QUICK_STOP = auto()
+    RESET = auto()
+    POWERED = auto()  # all drives reached operation enabled
+    STANDSTILL = auto()  # the commanded motion has ended
+    FAULT = auto()  # a drive, the bus or a setpoint is bad
+    GATEWAY_LOST = auto()
+    LATE = auto()  # too many ticks missed in a row
+    SHUTDOWN = auto()
+
+
+class Action(Enum):
+    """What the loop does on the way from one state to the next, in the same cycle."""
+
+    NOTHING = auto()
+    POWER_UP = auto()
+    POWER_DOWN = auto()
+    START = auto()
+    BRAKE = auto()
+    QUICK_STOP = auto()
+    CLEAR = auto()
+
+
+class State(NamedTuple):
+    """A mode, and whether the drives are to be disabled once the robot stands."""
+
+    mode: Mode
+    disable_after: bool = False
+
+
+class Step(NamedTuple):
+    """The next state, and what to do on the way."""
+
+    state: State
+    action: Action = Action.NOTHING
+
+
+class Refusal(NamedTuple):
+    """The event makes no sense in this mode: the state stays."""
+
+    code: str
+    message: str
+
+
+DISABLED = State(Mode.DISABLED)
+ENABLING = State(Mode.ENABLING)
+HOLDING = State(Mode.HOLDING)
+MOVING = State(Mode.MOVING)
+STOPPING = State(Mode.STOPPING)
+STOPPING_TO_DISABLE = State(Mode.STOPPING, disable_after=True)
+FAULT = State(Mode.FAULT)
+
+STATES = (DISABLED, ENABLING, HOLDING, MOVING, STOPPING, STOPPING_TO_DISABLE, FAULT)
+
+_NO_FAULT = Refusal("no_fault", "there is no fault to reset")
+_DISABLED = Refusal("not_enabled", "the robot is disabled: send enable first")
+_ENABLING = Refusal("not_enabled", "the drives are still powering up: send the goal when the mode is holding")
+_STOPPING = Refusal("stopping", "the robot is stopping: send it again when the mode is holding")
+_DISABLING = Refusal("stopping", "the robot is stopping to be disabled: send enable when the mode is disabled")
+_FAULT = Refusal("fault", "the robot is in fault: remove the cause, then send reset and enable")
+
+_POWER_OFF = Step(DISABLED, Action.POWER_DOWN)
+_TRIP = Step(FAULT, Action.QUICK_STOP)
+
+_TABLE: dict[State, dict[Event, Step | Refusal]] = {
+    DISABLED: {
+        Event.ENABLE: Step(ENABLING, Action.POWER_UP),
+        Event.GOAL: _DISABLED,
+        Event.RESET: _NO_FAULT,
+        Event.QUICK_STOP: _TRIP,
+        Event.FAULT: _TRIP,
+    },
+    ENABLING: {
+        Event.DISABLE: _POWER_OFF,
+        Event.GOAL: _ENABLING,
+        Event.STOP: _POWER_OFF,
+        Event.RESET: _NO_FAULT,
+        Event.POWERED: Step(HOLDING),
+        Event.GATEWAY_LOST: _POWER_OFF,
+        Event.LATE: _POWER_OFF,
+        Event.SHUTDOWN: _POWER_OFF,
+        Event.QUICK_STOP: _TRIP,
+        Event.FAULT: _TRIP,
+    },
+    HOLDING: {
+        Event.DISABLE: _POWER_OFF,
+        Event.GOAL: Step(MOVING, Action.START),
+        Event.RESET: _NO_FAULT,
+        Event.SHUTDOWN: _POWER_OFF,
+        Event.QUICK_STOP: _TRIP,
+        Event.FAULT: _TRIP,
+    },
+    MOVING: {
+        Event.DISABLE: Step(STOPPING_TO_DISABLE, Action.BRAKE),
+        Event.GOAL: Step(MOVING, Action.START),
+        Event.STOP: Step(STOPPING, Action.BRAKE),
+        Event.RESET: _NO_FAULT,
+        Event.STANDSTILL: Step(HOLDING),
+        Event.GATEWAY_LOST: Step(STOPPING, Action.BRAKE),
+        Event.LATE: Step(STOPPING, Action.BRAKE),
+        Event.SHUTDOWN: Step(STOPPING_TO_DISABLE, Action.BRAKE),
+        Event.QUICK_STOP: _TRIP,
+        Event.FAULT: _TRIP,
+    },
+    STOPPING: {
+        Event.DISABLE: Step(STOPPING_TO_DISABLE),
+        Event.GOAL: _STOPPING,
+        Event.RESET: _NO_FAULT,
+        Event.STANDSTILL: Step(HOLDING),
+        Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),
+        Event.QUICK_STOP: _TRIP,
+        Event.FAULT: _TRIP,
+    },
+    STOPPING_TO_DISABLE: {
+        Event.ENABLE: _DISABLING,
+        Event.GOAL: _DISABLING,
+        Event.RESET: _NO_FAULT,
+        Event.STANDSTILL: _POWER_OFF,
+        Event.QUICK_STOP: _TRIP,
+        Event.FAULT: _TRIP,
+    },
+    FAULT: {
+        Event.ENABLE: _FAULT,
+        Event.GOAL: _FAULT,
+        Event.RESET: Step(DISABLED, Action.CLEAR),
+    },
+}
+
+
+def step(state: State, event: Event) -> Step | Refusal:
+    """Decide what `event` does in `state`; what is not in the table changes nothing.
+
+    What is already so is confirmed, not refused: enabling an enabled robot, stopping one that stands. The first
+    fault is the one that stays: neither a second one nor anything but a reset leads out of it, and a reset never
+    leads further than to disabled.
+    """
+    return _TABLE[state].get(event, Step(state))

@@ -1,0 +1,68 @@
+"""What each of the service's child processes begins with: `python -m service.process NAME RUNTIME READY [SOCKETS…]`.
+
+Its order comes on standard input; READY is a descriptor on which the process says, once, that it is up.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from service import packets
+from service.config import Config
+from service.errors import TrirailError
+from service.realtime import die_with_parent
+
+
+class Order(msgspec.Struct, frozen=True):
+    """What a child process is told to do."""
+
+    config: Config
+    record: str | None
+    """Recording file to write, None for one named by the time."""
+
+
+def _main(name: str, runtime: Path, ready: Callable[[object], None], sockets: list[int]) -> int:
+    order = msgspec.json.decode(sys.stdin.buffer.read(), type=Order)
+    config = order.config
+    # Each process imports what it needs and no more: the loop must not load Zenoh or Rerun.
+    if name == "loop":
+        from service import loop
+
+        gateway, recorder = (packets.Port(socket.socket(fileno=number)) for number in sockets)
+        return loop.main(config, gateway, recorder, ready)
+    link = packets.connect(runtime / name)
+    if name == "gateway":
+        from service import gateway as gate
+
+        return gate.main(config, link, ready)
+    from service import recording
+
+    return recording.main(config, order.record, link, ready)
+
+
+def main() -> int:
+    """Run one child process; return its exit code."""
+    name, runtime, descriptor, *sockets = sys.argv[1:]
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends it to all; the supervisor alone acts on it
+    die_with_parent(signal.SIGTERM)
+
+    def ready(content: object) -> None:
+        # The descriptor stays open: its end is how the supervisor learns of this process's end.
+        os.write(int(descriptor), msgspec.json.encode(content))
+
+    try:
+        return _main(name, Path(runtime), ready, [int(number) for number in sockets])
+    except TrirailError as error:
+        print(f"trirail: {error}", file=sys.stderr, flush=True)  # noqa: T201 - a process says why it ends
+        return os.EX_CONFIG
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,46 @@
+"""The recorder's process: takes what the loop sends and gives it to the recorder."""
+
+from __future__ import annotations
+
+import select
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+from service.config import Config
+from service.packets import Closed, Happened, Kind, Link, Welcome, decode_answer
+from service.recorder import Recorder
+
+
+def main(config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> int:
+    """Record until the loop has gone or the process is told to end."""
+    recorder = Recorder(config, Path(config.telemetry.directory))
+    ending = False
+
+    def end(_signal: int, _frame: object) -> None:
+        nonlocal ending
+        ending = True
+
+    signal.signal(signal.SIGTERM, end)
+    poll = select.poll()
+    poll.register(link.fileno(), select.POLLIN)
+    try:
+        while not ending:
+            poll.poll(500)
+            while (packet := link.receive()) is not None:
+                content = packet[1:]
+                if packet[0] == Kind.RECORDS:
+                    recorder.records(content)
+                elif packet[0] == Kind.FRAMES:
+                    recorder.frames(content)
+                else:
+                    said = decode_answer(content)
+                    if isinstance(said, Happened):
+                        recorder.event(said.event)
+                    elif isinstance(said, Welcome):
+                        ready({"recording": str(recorder.path), "live": recorder.live_url})
+    except Closed:
+        pass
+    finally:
+        recorder.close()
+    return 0

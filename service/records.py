@@ -1,0 +1,49 @@
+"""One record a cycle: what the loop commanded, what the drives answered, and how long it took.
+
+Records have a fixed binary layout, are packed by the loop, travel in batches, and are read as numpy arrays.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PARTS = ("sync", "read", "mode", "motion", "kinematics", "write", "record")
+"""The parts of a cycle that are timed, in their order."""
+
+FIELDS: tuple[tuple[str, str, int], ...] = (
+    ("cycle", "q", 1),  # SYNCs sent since the start; times the period, the nominal time
+    ("deadline_ns", "q", 1),  # when this cycle was due, monotonic clock
+    ("lateness_ns", "q", 1),  # how much later it began
+    ("parts_ns", "i", len(PARTS)),  # time spent in each part; "record" is that of the cycle before
+    ("overruns", "q", 1),  # ticks missed since the start
+    ("mode", "B", 1),  # index into service.modes.MODES
+    ("drive_state", "B", 3),  # drivers.interface.PowerState of A, B, C
+    ("pose", "d", 3),  # measured: forward kinematics of the measured sliders; x, y [m], phi [rad]
+    ("commanded_pose", "d", 3),
+    ("commanded_pose_velocity", "d", 3),
+    ("commanded_pose_acceleration", "d", 3),
+    ("position", "d", 3),  # measured sliders: lambda_10 of A, B, C [m]
+    ("velocity", "d", 3),  # measured sliders [m/s]
+    ("commanded_position", "d", 3),  # setpoints written in this cycle [m]
+    ("commanded_velocity", "d", 3),  # v_10 [m/s]
+    ("commanded_acceleration", "d", 3),  # gamma_10 [m/s²]
+    ("passive_position", "d", 3),  # commanded lambda_32 [m]
+    ("following_error", "d", 3),  # setpoint due at this SYNC less measured position [m]
+    ("progress", "d", 1),  # of the running goal, 0 to 1
+    ("remaining", "d", 1),  # of the running goal [s]
+)
+
+DTYPE: np.dtype[Any] = np.dtype(
+    [(name, "<" + {"q": "i8", "i": "i4", "B": "u1", "d": "f8"}[code], (n,) if n > 1 else ()) for name, code, n in FIELDS]
+)
+LAYOUT = struct.Struct("<" + "".join(f"{n}{code}" for _, code, n in FIELDS))
+"""The same layout as DTYPE, for packing one record: as many values as the fields have, in their order."""
+
+
+def unpack(batch: bytes | memoryview) -> NDArray[np.void]:
+    """View a batch of packed records as an array with the fields of DTYPE, shape (n,)."""
+    return np.frombuffer(batch, DTYPE)

@@ -1,0 +1,217 @@
+"""`trirail run`: starts the three processes, watches them, restarts those that may be, and ends them in order."""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from service import packets
+from service.config import Config
+from service.errors import ServiceError
+from service.process import Order
+
+CHILDREN = ("loop", "gateway", "recorder")
+START_WITHIN = 120.0
+"""How long the processes may take to come up; the very first start compiles the kinematics [s]."""
+END_WITHIN = 6.0
+"""How long they may take to end before they are killed [s]."""
+RESTARTS = 5
+"""So many restarts of one process within a minute are tried."""
+
+
+class _Child:
+    """A child process, and a pipe on which it says that it is ready and whose end is its end."""
+
+    def __init__(self, name: str, order: bytes, runtime: Path, sockets: list[int]) -> None:
+        self.name = name
+        self.ready_with: dict[str, Any] | None = None
+        self.pipe, write = os.pipe()
+        arguments = [name, str(runtime), str(write), *map(str, sockets)]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "service.process", *arguments],
+            stdin=subprocess.PIPE,
+            pass_fds=[write, *sockets],
+        )
+        os.close(write)
+        if self.process.stdin is not None:
+            self.process.stdin.write(order)
+            self.process.stdin.close()
+
+    def listen(self) -> bool:
+        """Read what the child says; False once it has ended."""
+        content = os.read(self.pipe, 65_536)
+        if content:
+            self.ready_with = msgspec.json.decode(content)
+        return bool(content)
+
+    def wait(self, deadline: float) -> bool:
+        """Wait for its end until a time of the monotonic clock."""
+        try:
+            self.process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    @property
+    def how(self) -> str:
+        """How it ended, for people."""
+        code = self.process.returncode
+        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+class Supervisor:
+    """Runs the service in the foreground."""
+
+    def __init__(self, config: Config, record: Path | None, say: Callable[[str], None]) -> None:
+        self._order = msgspec.json.encode(Order(config, str(record) if record else None))
+        self._say = say
+        self._children: dict[str, _Child] = {}
+        self._selector = selectors.DefaultSelector()
+        self._restarts: dict[str, list[float]] = {name: [] for name in CHILDREN}
+        self._ending = False
+        self._failed = False
+
+    def run(self, up: Callable[[dict[str, dict[str, Any]]], None]) -> int:
+        """Run until a signal or a process that must not be missing ends it; return the exit code.
+
+        `up` is called once with what each process said when it was ready.
+        """
+        parent = os.environ.get("XDG_RUNTIME_DIR")
+        with tempfile.TemporaryDirectory(prefix="trirail-", dir=parent) as folder, _Signals() as signals:
+            self._runtime = Path(folder)
+            self._listening = [packets.listen(self._runtime / name) for name in CHILDREN[1:]]
+            self._selector.register(signals.reader, selectors.EVENT_READ, None)
+            try:
+                for name in CHILDREN:
+                    self._start(name)
+                self._watch(up, signals)
+            finally:
+                self._end()
+                for listening in self._listening:
+                    listening.close()
+        return 1 if self._failed else 0
+
+    def _start(self, name: str) -> None:
+        sockets = [listening.fileno() for listening in self._listening] if name == "loop" else []
+        child = _Child(name, self._order, self._runtime, sockets)
+        self._children[name] = child
+        self._selector.register(child.pipe, selectors.EVENT_READ, child)
+
+    def _watch(self, up: Callable[[dict[str, dict[str, Any]]], None], signals: _Signals) -> None:
+        deadline = time.monotonic() + START_WITHIN
+        is_up = False
+        while not self._ending:
+            for key, _ in self._selector.select(1.0):
+                child: _Child | None = key.data
+                if child is None:
+                    self._say(f"{signals.take().name}: stopping the robot and disabling the drives")
+                    self._ending = True
+                elif not child.listen():
+                    self._on_end(child)
+            if is_up or self._ending:
+                continue
+            ready = {name: child.ready_with for name, child in self._children.items() if child.ready_with is not None}
+            if len(ready) == len(CHILDREN):
+                is_up = True
+                up(ready)
+                notify("READY=1")
+            elif time.monotonic() > deadline:
+                missing = ", ".join(name for name in CHILDREN if name not in ready)
+                raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")
+
+    def _on_end(self, child: _Child) -> None:
+        """Decide what the end of a process means."""
+        self._forget(child)
+        child.process.wait()
+        said_why = child.process.returncode == os.EX_CONFIG
+        name, restarts = child.name, self._restarts[child.name]
+        if name == "loop":
+            self._fail(
+                "" if said_why else f"the loop is dead ({child.how}): the drives stop by their own watchdogs; ending"
+            )
+            return
+        if child.ready_with is None and not restarts:
+            self._fail("" if said_why else f"the {name} could not start ({child.how})")
+            return
+        now = time.monotonic()
+        restarts[:] = [moment for moment in restarts if now - moment < 60.0] + [now]
+        if len(restarts) > RESTARTS:
+            self._fail(f"the {name} keeps dying ({child.how}): ending the service")
+            return
+        consequence = "the loop stops the robot and holds" if name == "gateway" else "the robot is not affected"
+        self._say(f"the {name} has died ({child.how}): {consequence}; starting it again")
+        self._start(name)
+
+    def _fail(self, reason: str) -> None:
+        self._failed = self._ending = True
+        if reason:
+            self._say(reason)
+
+    def _forget(self, child: _Child) -> None:
+        self._selector.unregister(child.pipe)
+        os.close(child.pipe)
+        del self._children[child.name]
+
+    def _end(self) -> None:
+        """End the loop first, so that the others can tell of it; then those."""
+        notify("STOPPING=1")
+        if loop := self._children.get("loop"):
+            loop.process.send_signal(signal.SIGTERM)
+            loop.wait(time.monotonic() + END_WITHIN)
+        # The others end by themselves once the loop has gone and what it said is published and on disk.
+        by_itself = time.monotonic() + END_WITHIN
+        asked = by_itself + END_WITHIN
+        for child in list(self._children.values()):
+            if not child.wait(by_itself):
+                child.process.send_signal(signal.SIGTERM)
+        for child in list(self._children.values()):
+            if not child.wait(asked):
+                self._say(f"the {child.name} does not end: killing it")
+                child.process.kill()
+                child.process.wait()
+            self._failed = self._failed or child.process.returncode != 0
+            self._forget(child)
+
+
+class _Signals:
+    """SIGTERM and SIGINT as something to select on."""
+
+    def __enter__(self) -> _Signals:
+        self.reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        self._before = {
+            number: signal.signal(number, lambda _signal, _frame: None)
+            for number in (signal.SIGTERM, signal.SIGINT)
+        }
+        self._wakeup = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        return self
+
+    def take(self) -> signal.Signals:
+        return signal.Signals(self.reader.recv(1)[0])
+
+    def __exit__(self, *_: object) -> None:
+        signal.set_wakeup_fd(self._wakeup)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self.reader.close()
+        self._writer.close()
+
+
+def notify(state: str) -> None:
+    """Tell systemd, where it asked for it: sd_notify(3)."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if address:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            sender.connect("\0" + address[1:] if address.startswith("@") else address)
+            sender.send(state.encode())

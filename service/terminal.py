@@ -1,0 +1,130 @@
+"""What the commands print for people, and for programs with --json."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+from typing import Any
+
+import msgspec
+from rich.console import Console
+from rich.live import Live
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.table import Table
+
+from service.client import Goal, Result, Robot
+from service.config import Config
+from service.errors import ServiceError
+from service.messages import Event, Percentiles, State
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+COLOURS = {
+    "disabled": "dim",
+    "enabling": "cyan",
+    "holding": "green",
+    "moving": "bold green",
+    "stopping": "yellow",
+    "fault": "bold red",
+}
+LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}
+SILENT = 3.0
+"""A service from which nothing is heard for so long is taken for gone [s]."""
+
+
+def say(words: str) -> None:
+    """Print a line."""
+    out.print(escape(words), soft_wrap=True)
+
+
+def complain(words: str) -> None:
+    """Print an error as one line on standard error."""
+    err.print(f"trirail: {escape(' '.join(words.split()))}", soft_wrap=True)
+
+
+def json(content: object) -> None:
+    """Print one JSON object on a line of its own, at once."""
+    sys.stdout.write(msgspec.json.encode(content).decode() + "\n")
+    sys.stdout.flush()
+
+
+def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
+    """Say that the service is up, where it is, and what it lacks."""
+    loop, recorder = ready["loop"], ready["recorder"]
+    out.print(f"[bold green]up[/]  robot [bold]{config.robot.name}[/] at {config.loop.rate_hz} Hz")
+    out.print(f"    goals      {', '.join(config.zenoh.listen)}  (trirail enable, trirail goto 0.02 0 0.1 --wait)")
+    if recorder["live"]:
+        out.print(f"    live view  rerun --connect {recorder['live']}", soft_wrap=True)
+    out.print(f"    recording  {recorder['recording']}", soft_wrap=True)
+    out.print(f"    bus load   {loop['bus_load']:.0%}")
+    if loop["bus_load"] > 0.8:
+        out.print("    [yellow]warning[/]: above 80 % there is little left for repeated frames; lower loop.rate_hz")
+    for lack in loop["lacking"]:
+        out.print(f"    [yellow]without[/] {escape(lack)}", soft_wrap=True)
+
+
+def follow(robot: Robot, goal: Goal, title: str, *, show: bool = True) -> Result:
+    """Wait for a goal's end and show its progress."""
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}")
+    with Progress(*columns, console=out, transient=True, disable=not show) as progress:
+        task = progress.add_task(title, total=1.0, left="")
+        for state in robot.states(SILENT):
+            if goal.result is not None:
+                return goal.result
+            if state.goal is not None and state.goal.id == goal.id:
+                progress.update(task, completed=state.goal.progress, left=f"{state.goal.remaining:.1f} s left")
+    if goal.result is not None:
+        return goal.result
+    raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
+
+
+def show(state: State, robot: str) -> None:
+    """Print a state."""
+    out.print(_table(state, robot))
+
+
+def watch(robot: Robot) -> None:
+    """Show the state live until Ctrl-C or the service goes silent."""
+    with Live(console=out, refresh_per_second=10, transient=False) as live, contextlib.suppress(KeyboardInterrupt):
+        for state in robot.states(SILENT):
+            live.update(_table(state, robot.name))
+        raise ServiceError("the service has gone silent")
+
+
+def event(happened: Event) -> None:
+    """Print an event on a line."""
+    level = f"[{LEVELS[happened.level]}]{happened.level:7}[/]"
+    out.print(f"{happened.seq:5}  {happened.t:9.3f} s  {level}  {escape(happened.message)}", soft_wrap=True)
+
+
+def _table(state: State, robot: str) -> Table:
+    x, y, phi = state.pose
+    grid = Table.grid(padding=(0, 2))
+    grid.add_row("robot", f"[bold]{robot}[/]  [{COLOURS.get(state.mode, '')}]{state.mode}[/]  t {state.t:.2f} s")
+    for fault in state.faults:
+        grid.add_row("fault", f"[bold red]{escape(fault)}[/]")
+    grid.add_row("pose", f"x {x * 1e3:9.3f} mm   y {y * 1e3:9.3f} mm   φ {math.degrees(phi):9.4f}°")
+    if state.goal:
+        grid.add_row("goal", f"{state.goal.id}  {state.goal.progress:4.0%}  {state.goal.remaining:.1f} s left")
+    sliders = state.sliders
+    for index, name in enumerate("ABC"):
+        grid.add_row(
+            f"slider {name}",
+            f"{sliders.position[index] * 1e3:9.3f} mm {sliders.velocity[index] * 1e3:9.2f} mm/s   "
+            f"following error {sliders.following_error[index] * 1e6:7.1f} µm   {sliders.status[index]}",
+        )
+    loop = state.loop
+    grid.add_row("loop", f"{loop.rate_hz} Hz, {loop.cycles} cycles, {loop.overruns} missed, bus {loop.bus_load:.0%}")
+    grid.add_row("lateness", percentiles(loop.lateness_us))
+    grid.add_row("cycle", percentiles(loop.cycle_us))
+    for lack in loop.lacking:
+        grid.add_row("[yellow]without[/]", escape(lack))
+    return grid
+
+
+def percentiles(values: Percentiles) -> str:
+    """Write percentiles on a line."""
+    return f"p50 {values.p50:.0f}  p99 {values.p99:.0f}  p99.9 {values.p999:.0f}  max {values.max:.0f} µs"

@@ -1,0 +1,107 @@
+"""Frames: the worst-case arithmetic, and the CiA 402 state machine as tables."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers import frames
+from drivers.interface import PowerState
+
+P = PowerState
+
+
+@pytest.mark.parametrize(("n", "bits"), [(0, 55), (1, 65), (2, 75), (4, 95), (6, 115), (8, 135)])
+def test_worst_case_frame_length(n: int, bits: int) -> None:
+    assert frames.frame_bits(n) == bits
+
+
+@given(n=st.integers(0, 8), pattern=st.integers(0, 2**98 - 1))
+def test_no_content_makes_a_frame_longer_than_the_worst_case(n: int, pattern: int) -> None:
+    open_to_stuffing = 34 + 8 * n
+    bits = [pattern >> i & 1 for i in range(open_to_stuffing)]
+    assert open_to_stuffing + _stuff_bits(bits) + 13 <= frames.frame_bits(n)
+
+
+def _stuff_bits(bits: list[int]) -> int:
+    """Stuff bits a transmitter inserts: after five equal ones, itself counted in the next run."""
+    stuffed, last, run = 0, None, 0
+    for bit in bits:
+        run = run + 1 if bit == last else 1
+        last = bit
+        if run == 5:
+            stuffed += 1
+            last, run = 1 - bit, 1
+    return stuffed
+
+
+def test_worst_case_is_reached() -> None:
+    bits = [0] * 5 + [i // 4 % 2 ^ 1 for i in range(34 + 64 - 5)]
+    assert 34 + 64 + _stuff_bits(bits) + 13 == frames.frame_bits(8)
+
+
+def test_a_kilohertz_fills_three_quarters_of_a_megabit() -> None:
+    assert frames.CYCLE_BITS == 745
+    assert frames.bus_load(1000, 1_000_000, 0.1) == pytest.approx(0.75, abs=0.001)
+
+
+@given(bitrate=st.sampled_from([125_000, 250_000, 500_000, 1_000_000]), heartbeat=st.floats(0.05, 1.0))
+def test_the_highest_rate_fills_the_bus(bitrate: int, heartbeat: float) -> None:
+    assert frames.bus_load(frames.highest_rate(bitrate, heartbeat), bitrate, heartbeat) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("statusword", "state"),
+    [
+        (0x0000, P.NOT_READY_TO_SWITCH_ON),
+        (0x0250, P.SWITCH_ON_DISABLED),
+        (0x0270, P.SWITCH_ON_DISABLED),
+        (0x0231, P.READY_TO_SWITCH_ON),
+        (0x0233, P.SWITCHED_ON),
+        (0x1637, P.OPERATION_ENABLED),
+        (0x0217, P.QUICK_STOP_ACTIVE),
+        (0x021F, P.FAULT_REACTION_ACTIVE),
+        (0x023F, P.FAULT_REACTION_ACTIVE),
+        (0x0218, P.FAULT),
+        (0x0238, P.FAULT),
+        (0x0211, None),  # ready to switch on, but with the quick stop bit low: no state has that
+        (0x0022, None),
+    ],
+)
+def test_statusword(statusword: int, state: PowerState | None) -> None:
+    assert frames.power_state(statusword) is state
+
+
+@given(statusword=st.integers(0, 0xFFFF))
+def test_only_seven_bits_make_the_state(statusword: int) -> None:
+    assert frames.power_state(statusword) is frames.power_state(statusword & 0x6F)
+
+
+@pytest.mark.parametrize(
+    ("state", "word"),
+    [
+        (P.NOT_READY_TO_SWITCH_ON, 0x00),
+        (P.SWITCH_ON_DISABLED, 0x06),
+        (P.READY_TO_SWITCH_ON, 0x07),
+        (P.SWITCHED_ON, 0x0F),
+        (P.OPERATION_ENABLED, 0x0F),
+        (P.QUICK_STOP_ACTIVE, 0x02),
+        (P.FAULT_REACTION_ACTIVE, 0x00),
+        (P.FAULT, 0x00),
+    ],
+)
+def test_controlwords_towards_operation(state: PowerState, word: int) -> None:
+    assert frames.controlword(state, P.OPERATION_ENABLED) == word
+
+
+@pytest.mark.parametrize("state", list(PowerState))
+def test_stopping_asks_the_same_of_every_state(state: PowerState) -> None:
+    assert frames.controlword(state, P.QUICK_STOP_ACTIVE) == 0x02
+    assert frames.controlword(state, P.SWITCH_ON_DISABLED) == 0x00
+
+
+@pytest.mark.parametrize("state", list(PowerState))
+@pytest.mark.parametrize("wanted", [P.OPERATION_ENABLED, P.QUICK_STOP_ACTIVE, P.SWITCH_ON_DISABLED])
+def test_no_transition_resets_a_fault(state: PowerState, wanted: frames.Wanted) -> None:
+    assert not frames.controlword(state, wanted) & frames.FAULT_RESET

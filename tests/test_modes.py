@@ -1,0 +1,161 @@
+"""Every state × event, against the statement of what each event does."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.modes import (
+    DISABLED,
+    ENABLING,
+    FAULT,
+    HOLDING,
+    MOVING,
+    STATES,
+    STOPPING,
+    STOPPING_TO_DISABLE,
+    Action,
+    Event,
+    Mode,
+    Refusal,
+    State,
+    Step,
+    step,
+)
+
+REFUSED = None
+
+# One row a state, one column an event: the next state (None: refused) and the action where there is one.
+E = Event
+TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
+    DISABLED: {
+        E.ENABLE: (ENABLING, Action.POWER_UP),
+        E.DISABLE: (DISABLED, Action.NOTHING),
+        E.GOAL: REFUSED,
+        E.STOP: (DISABLED, Action.NOTHING),
+        E.QUICK_STOP: (FAULT, Action.QUICK_STOP),
+        E.RESET: REFUSED,
+        E.POWERED: (DISABLED, Action.NOTHING),
+        E.STANDSTILL: (DISABLED, Action.NOTHING),
+        E.FAULT: (FAULT, Action.QUICK_STOP),
+        E.GATEWAY_LOST: (DISABLED, Action.NOTHING),
+        E.LATE: (DISABLED, Action.NOTHING),
+        E.SHUTDOWN: (DISABLED, Action.NOTHING),
+    },
+    ENABLING: {
+        E.ENABLE: (ENABLING, Action.NOTHING),
+        E.DISABLE: (DISABLED, Action.POWER_DOWN),
+        E.GOAL: REFUSED,
+        E.STOP: (DISABLED, Action.POWER_DOWN),
+        E.QUICK_STOP: (FAULT, Action.QUICK_STOP),
+        E.RESET: REFUSED,
+        E.POWERED: (HOLDING, Action.NOTHING),
+        E.STANDSTILL: (ENABLING, Action.NOTHING),
+        E.FAULT: (FAULT, Action.QUICK_STOP),
+        E.GATEWAY_LOST: (DISABLED, Action.POWER_DOWN),
+        E.LATE: (DISABLED, Action.POWER_DOWN),
+        E.SHUTDOWN: (DISABLED, Action.POWER_DOWN),
+    },
+    HOLDING: {
+        E.ENABLE: (HOLDING, Action.NOTHING),
+        E.DISABLE: (DISABLED, Action.POWER_DOWN),
+        E.GOAL: (MOVING, Action.START),
+        E.STOP: (HOLDING, Action.NOTHING),
+        E.QUICK_STOP: (FAULT, Action.QUICK_STOP),
+        E.RESET: REFUSED,
+        E.POWERED: (HOLDING, Action.NOTHING),
+        E.STANDSTILL: (HOLDING, Action.NOTHING),
+        E.FAULT: (FAULT, Action.QUICK_STOP),
+        E.GATEWAY_LOST: (HOLDING, Action.NOTHING),
+        E.LATE: (HOLDING, Action.NOTHING),
+        E.SHUTDOWN: (DISABLED, Action.POWER_DOWN),
+    },
+    MOVING: {
+        E.ENABLE: (MOVING, Action.NOTHING),
+        E.DISABLE: (STOPPING_TO_DISABLE, Action.BRAKE),
+        E.GOAL: (MOVING, Action.START),
+        E.STOP: (STOPPING, Action.BRAKE),
+        E.QUICK_STOP: (FAULT, Action.QUICK_STOP),
+        E.RESET: REFUSED,
+        E.POWERED: (MOVING, Action.NOTHING),
+        E.STANDSTILL: (HOLDING, Action.NOTHING),
+        E.FAULT: (FAULT, Action.QUICK_STOP),
+        E.GATEWAY_LOST: (STOPPING, Action.BRAKE),
+        E.LATE: (STOPPING, Action.BRAKE),
+        E.SHUTDOWN: (STOPPING_TO_DISABLE, Action.BRAKE),
+    },
+    STOPPING: {
+        E.ENABLE: (STOPPING, Action.NOTHING),
+        E.DISABLE: (STOPPING_TO_DISABLE, Action.NOTHING),
+        E.GOAL: REFUSED,
+        E.STOP: (STOPPING, Action.NOTHING),
+        E.QUICK_STOP: (FAULT, Action.QUICK_STOP),
+        E.RESET: REFUSED,
+        E.POWERED: (STOPPING, Action.NOTHING),
+        E.STANDSTILL: (HOLDING, Action.NOTHING),
+        E.FAULT: (FAULT, Action.QUICK_STOP),
+        E.GATEWAY_LOST: (STOPPING, Action.NOTHING),
+        E.LATE: (STOPPING, Action.NOTHING),
+        E.SHUTDOWN: (STOPPING_TO_DISABLE, Action.NOTHING),
+    },
+    STOPPING_TO_DISABLE: {
+        E.ENABLE: REFUSED,
+        E.DISABLE: (STOPPING_TO_DISABLE, Action.NOTHING),
+        E.GOAL: REFUSED,
+        E.STOP: (STOPPING_TO_DISABLE, Action.NOTHING),
+        E.QUICK_STOP: (FAULT, Action.QUICK_STOP),
+        E.RESET: REFUSED,
+        E.POWERED: (STOPPING_TO_DISABLE, Action.NOTHING),
+        E.STANDSTILL: (DISABLED, Action.POWER_DOWN),
+        E.FAULT: (FAULT, Action.QUICK_STOP),
+        E.GATEWAY_LOST: (STOPPING_TO_DISABLE, Action.NOTHING),
+        E.LATE: (STOPPING_TO_DISABLE, Action.NOTHING),
+        E.SHUTDOWN: (STOPPING_TO_DISABLE, Action.NOTHING),
+    },
+    FAULT: {
+        E.ENABLE: REFUSED,
+        E.DISABLE: (FAULT, Action.NOTHING),
+        E.GOAL: REFUSED,
+        E.STOP: (FAULT, Action.NOTHING),
+        E.QUICK_STOP: (FAULT, Action.NOTHING),
+        E.RESET: (DISABLED, Action.CLEAR),
+        E.POWERED: (FAULT, Action.NOTHING),
+        E.STANDSTILL: (FAULT, Action.NOTHING),
+        E.FAULT: (FAULT, Action.NOTHING),
+        E.GATEWAY_LOST: (FAULT, Action.NOTHING),
+        E.LATE: (FAULT, Action.NOTHING),
+        E.SHUTDOWN: (FAULT, Action.NOTHING),
+    },
+}
+
+
+def test_the_table_names_every_state_and_event() -> None:
+    assert set(TABLE) == set(STATES)
+    assert all(set(row) == set(Event) for row in TABLE.values())
+
+
+@pytest.mark.parametrize("event", Event)
+@pytest.mark.parametrize("state", STATES)
+def test_step(state: State, event: Event) -> None:
+    decided = step(state, event)
+    wanted = TABLE[state][event]
+    if wanted is None:
+        assert isinstance(decided, Refusal)
+        assert decided.code
+        assert decided.message
+    else:
+        assert decided == Step(*wanted)
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_a_fault_stops_from_everywhere_and_only_reset_leads_out(state: State) -> None:
+    assert step(state, Event.FAULT) in (Step(FAULT, Action.QUICK_STOP), Step(FAULT))
+    leaving = {event for event in Event if not isinstance(out := step(FAULT, event), Refusal) and out.state != FAULT}
+    assert leaving == {Event.RESET}
+
+
+def test_only_enable_powers_up() -> None:
+    for state in STATES:
+        for event in Event:
+            decided = step(state, event)
+            if isinstance(decided, Step) and decided.action is Action.POWER_UP:
+                assert (state.mode, event) == (Mode.DISABLED, Event.ENABLE)
