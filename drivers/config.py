@@ -15,6 +15,8 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
 
     time_constant: Annotated[float, Meta(ge=0.0)] = 0.004
     """First-order lag of the servo behind its setpoint [s]."""
+    feed_forward_gain: Annotated[float, Meta(ge=0.0)] = 1.0
+    """Share of the velocity feed-forward that the servo makes use of; what it leaves is made up with a lag."""
     max_velocity: Positive = 2.0
     """What the slider can do at most [m/s]."""
     max_acceleration: Positive = 100.0

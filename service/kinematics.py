@@ -8,8 +8,7 @@ Arrays hold one pose, shape (3,), or N of them, shape (N, 3).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,8 +33,7 @@ __all__ = ["Motion", "forward", "forward_into", "inverse", "inverse_into", "jaco
 HOME = np.zeros(3)
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """Motion of the joints of legs A, B, C: each field (3,) or (N, 3), in m, m/s or m/s²."""
 
     position: Array  # lambda_10, the sliders

@@ -123,7 +123,7 @@ class _Recent:
         values = self._values if self._full else self._values[: self._next]
         if not len(values):
             return _NONE
-        p50, p99, p999, most = np.percentile(values, (50.0, 99.0, 99.9, 100.0)) / 1000.0
+        p50, p99, p999, most = (np.percentile(values, (50.0, 99.0, 99.9, 100.0)) / 1000.0).tolist()
         return Percentiles(round(p50, 1), round(p99, 1), round(p999, 1), round(most, 1))
 
 

@@ -22,6 +22,7 @@ from service.errors import ServiceError
 from service.process import Order
 
 CHILDREN = ("loop", "gateway", "recorder")
+PORTS = ("gateway", "recorder")
 START_WITHIN = 120.0
 """How long the processes may take to come up; the very first start compiles the kinematics [s]."""
 END_WITHIN = 6.0
@@ -90,7 +91,7 @@ class Supervisor:
         parent = os.environ.get("XDG_RUNTIME_DIR")
         with tempfile.TemporaryDirectory(prefix="trirail-", dir=parent) as folder, _Signals() as signals:
             self._runtime = Path(folder)
-            self._listening = [packets.listen(self._runtime / name) for name in CHILDREN[1:]]
+            self._listening = [packets.listen(self._runtime / name) for name in PORTS]
             self._selector.register(signals.reader, selectors.EVENT_READ, None)
             try:
                 for name in CHILDREN:

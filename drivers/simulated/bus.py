@@ -78,6 +78,7 @@ def simulated_bus(
         servo = Servo(
             round(drive.direction * (start - drive.offset) * drive.counts_per_metre),
             time_constant=simulated.time_constant,
+            feed_forward_gain=simulated.feed_forward_gain,
             max_velocity=simulated.max_velocity * drive.counts_per_metre,
             max_acceleration=simulated.max_acceleration * drive.counts_per_metre,
         )

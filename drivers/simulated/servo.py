@@ -15,13 +15,19 @@ class Servo:
 
     so that the following error e = r - x obeys de/dt = (dr/dt - w) - e / time_constant: it fades, and only
     what the feed-forward leaves uncovered feeds it. An exact feed-forward has no lag, none at all lags by
-    dr/dt · time_constant. With time_constant = 0 the servo is ideal: on the target at the end of each step.
+    dr/dt · time_constant; `feed_forward_gain` is the share of it that this servo makes use of. With time_constant = 0 the servo is ideal: on the target at the end of each step.
     The velocity that this asks for is then cut to what can still be braked in time, to `max_velocity` and to
     `max_acceleration`.
     """
 
     def __init__(
-        self, position: float, *, time_constant: float, max_velocity: float, max_acceleration: float
+        self,
+        position: float,
+        *,
+        time_constant: float,
+        max_velocity: float,
+        max_acceleration: float,
+        feed_forward_gain: float = 1.0,
     ) -> None:
         self.position = position
         """Measured position [counts]."""
@@ -32,6 +38,7 @@ class Servo:
         self.limited = False
         """Whether the last step was cut to a limit."""
         self._feed_forward = 0.0
+        self._feed_forward_gain = feed_forward_gain
         self._time_constant = time_constant
         self._max_velocity = max_velocity
         self._max_acceleration = max_acceleration
@@ -49,6 +56,7 @@ class Servo:
 
     def follow(self, target: float, feed_forward: float, step: float) -> None:
         """Move for `step` seconds towards `target` [counts] with `feed_forward` [counts/s] at its end."""
+        feed_forward *= self._feed_forward_gain
         slope = (target - self.setpoint) / step
         uncovered = slope - 0.5 * (self._feed_forward + feed_forward)
         gap = self.following_error
