@@ -6,6 +6,7 @@ sliders, and `write` the setpoints behind the last gate. What happened is left i
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from typing import NamedTuple
 
@@ -109,6 +110,11 @@ class Control:
         self.feedback = feedback
         self._written.extend((feedback.position, feedback.position))
         self._follow_measured()
+        # What runs for the first time is slow: plan and check a motion now, not in a cycle.
+        nearby = rest([value + 1e-3 for value in self.pose])
+        with contextlib.suppress(RefusedError):
+            self._planner.to_pose(nearby, self.pose)
+            self._planner.brake(nearby)
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
