@@ -26,9 +26,7 @@ IFF_UP = 0x1
 """Flag of a network interface that is up (linux/if.h)."""
 
 
-def open_bus(
-    section: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic
-) -> can.BusABC:
+def open_bus(section: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic) -> can.BusABC:
     """The bus that section [can] names; BusError with the remedy if there is none.
 
     `drives` and `clock` make the simulated drives, where the bus is "simulated".

@@ -38,7 +38,7 @@ class CapturedBus(can.BusABC):
         self._bus = bus
         self._capture = capture
         self.channel_info = f"{bus.channel_info}, captured"
-        super().__init__(channel=None)
+        super().__init__(channel=self.channel_info)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send and note a frame."""

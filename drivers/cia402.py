@@ -187,9 +187,7 @@ class Cia402:
         for axis in self._axes:
             self._send(frames.message(frames.RPDO1 + axis.node, off))
             # PDOs are heard in NMT operational only, SDOs in pre-operational too: two bytes for object 6040h.
-            self._send(
-                frames.message(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00")
-            )
+            self._send(frames.message(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00"))
         for axis in self._axes:
             self._send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
         with contextlib.suppress(can.CanError, OSError):

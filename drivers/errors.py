@@ -27,7 +27,5 @@ class ConfigurationRefused(DriveError):
     """A drive did not take a value: what was read back differs from what was written."""
 
     def __init__(self, drive: str, name: str, index: int, subindex: int, wanted: object, found: object) -> None:
-        super().__init__(
-            f"drive {drive}: object {index:04X}:{subindex:02X} ({name}): wanted {wanted}, found {found}"
-        )
+        super().__init__(f"drive {drive}: object {index:04X}:{subindex:02X} ({name}): wanted {wanted}, found {found}")
         self.drive = drive

@@ -59,7 +59,5 @@ def unsigned(name: str, scale: Scale, key: str, value: float) -> int:
     """
     counts = abs(scale.counts_per_metre) * value
     if not 0.5 < counts < UINT32_MAX - 0.5:
-        raise DriveError(
-            f"drive {name}: {key} {value:g} is {counts:g} counts, and a drive takes 1 to {UINT32_MAX - 1}"
-        )
+        raise DriveError(f"drive {name}: {key} {value:g} is {counts:g} counts, and a drive takes 1 to {UINT32_MAX - 1}")
     return round(counts)

@@ -31,9 +31,7 @@ NO_SUCH_OBJECT = (0x0602_0000, 0x0609_0011)
 class Client(SdoClient):
     """An SDO client that reads the bus itself while it waits, where canopen would have a thread do it."""
 
-    def __init__(
-        self, bus: can.BusABC, node: int, objects: ObjectDictionary, timeout: float, clock: Clock
-    ) -> None:
+    def __init__(self, bus: can.BusABC, node: int, objects: ObjectDictionary, timeout: float, clock: Clock) -> None:
         super().__init__(frames.SDO_REQUEST + node, frames.SDO_ANSWER + node, objects)  # type: ignore[no-untyped-call]
         self.network = canopen.Network(bus)
         self.bus = bus
@@ -81,9 +79,7 @@ class Remote:
             name = self._variable(index, subindex).qualname
             # PDO parameters are bit fields, and read as the standard writes them.
             form = "{:08X}h" if 0x1400 <= index < 0x1C00 else "{}"
-            raise ConfigurationRefused(
-                self.name, name, index, subindex, form.format(wanted), form.format(found)
-            )
+            raise ConfigurationRefused(self.name, name, index, subindex, form.format(wanted), form.format(found))
 
     def invalidate(self, index: int) -> None:
         """Switch off the PDO whose communication parameters are at `index`, if the drive has it at all."""

@@ -91,9 +91,7 @@ def _send(bus: can.BusABC, message: can.Message) -> None:
 def _check_nodes(drives: Drives) -> None:
     nodes = [drive.node for drive in drives.each] + [drives.master_node]
     if len(set(nodes)) < len(nodes):
-        raise DriveError(
-            f"node ids of drives A, B, C and the master must differ, but are {', '.join(map(str, nodes))}"
-        )
+        raise DriveError(f"node ids of drives A, B, C and the master must differ, but are {', '.join(map(str, nodes))}")
 
 
 def _check_is_idle_servo(remote: Remote) -> None:
@@ -107,9 +105,7 @@ def _check_is_idle_servo(remote: Remote) -> None:
     remote.write(0x6040, 0, frames.DISABLE_VOLTAGE)
     statusword = remote.read(0x6041)
     if frames.power_state(statusword) in POWERED:
-        raise DriveError(
-            f"drive {remote.name}: keeps its power on when told off (statusword {statusword:04X})"
-        )
+        raise DriveError(f"drive {remote.name}: keeps its power on when told off (statusword {statusword:04X})")
 
 
 def _settings(name: str, drive: Drive, drives: Drives, scale: Scale, period: float) -> list[Setting]:
@@ -150,9 +146,7 @@ def _settings(name: str, drive: Drive, drives: Drives, scale: Scale, period: flo
     ]
 
 
-def _pdo(
-    index: int, identifier: int, parameters: tuple[Setting, ...], objects: tuple[int, ...]
-) -> list[Setting]:
+def _pdo(index: int, identifier: int, parameters: tuple[Setting, ...], objects: tuple[int, ...]) -> list[Setting]:
     """The order CiA 301 wants for a mapping: invalid, cleared, mapped, counted, valid again."""
     mapping = index + 0x200
     return [

@@ -89,9 +89,7 @@ class UnixBus(can.BusABC):
     def _listen(self) -> socket.socket:
         with contextlib.suppress(OSError):
             _connect(self._path).close()
-            raise BusError(
-                f"{self.channel_info}: somebody listens there already; stop it or take another path"
-            )
+            raise BusError(f"{self.channel_info}: somebody listens there already; stop it or take another path")
         if self._path.is_socket():
             self._path.unlink()  # left behind by one that died
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
@@ -156,6 +154,4 @@ def _connect(path: Path) -> socket.socket:
 def _remedy(path: Path, listen: bool) -> str:
     if listen:
         return f"unix {path}: cannot listen there; is the folder writable, the path under 108 bytes?"
-    return (
-        f"unix {path}: nobody listens there; start tools/virtual_drives.py --interface unix --channel {path}"
-    )
+    return f"unix {path}: nobody listens there; start tools/virtual_drives.py --interface unix --channel {path}"

@@ -111,7 +111,9 @@ def goto(
         if not wait:
             _print(service, {"id": goal.id, "duration": goal.duration}, f"goal {goal.id}: {goal.duration:.2f} s")
             return 0
-        result = terminal.follow(robot, goal, f"x {x:g} m, y {y:g} m, φ {math.degrees(angle):g}°", show=not service.json)
+        result = terminal.follow(
+            robot, goal, f"x {x:g} m, y {y:g} m, φ {math.degrees(angle):g}°", show=not service.json
+        )
     _print(service, result._asdict(), result.message)
     return 0 if result.outcome == "done" else 1
 

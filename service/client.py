@@ -1,8 +1,8 @@
 """A client of the service: goals, commands and states over Zenoh.
 
-    with Robot("demo") as robot:
-        robot.enable()
-        result = robot.move_to(x=0.02, y=-0.01, phi=0.1).wait(timeout=10)
+with Robot("demo") as robot:
+    robot.enable()
+    result = robot.move_to(x=0.02, y=-0.01, phi=0.1).wait(timeout=10)
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Robot:
 
     def close(self) -> None:
         """End the connection; goals under way go on."""
-        self._session.close()
+        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
 
     # ------------------------------------------------------------------ goals and commands
 
@@ -206,7 +206,7 @@ class Robot:
         with self._goals_lock:
             goal = self._goals.pop(event.id, None)
         if goal is not None:
-            goal._end(Result(event.id, event.outcome, event.message))  # noqa: SLF001 - the goal is this client's
+            goal._end(Result(event.id, event.outcome, event.message))
 
     def _ask(self, key: str, kind: type[T], payload: bytes | None = None) -> T:
         """Query and decode the one reply. An empty one means that nobody is there, or may not be asked."""

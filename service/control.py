@@ -20,7 +20,16 @@ from service.limits import Bounds
 from service.messages import Level, Outcome
 from service.modes import DISABLED, Action, Event, Mode, Refusal, State, step
 from service.motion import STILL, MotionState, Plan, Planner, rest
-from service.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest, Request
+from service.packets import (
+    Accepted,
+    Answer,
+    CommandRequest,
+    Confirmed,
+    GoalRequest,
+    Refused,
+    RefusedRequest,
+    Request,
+)
 
 Triple = tuple[float, float, float]
 
@@ -132,7 +141,8 @@ class Control:
         self.feedback = feedback
         self._measured[:] = now
         if forward_into(self._legs, self._measured, self._pose, self._pose) == 0:
-            self.pose = tuple(self._pose.tolist())
+            x, y, phi = self._pose.tolist()
+            self.pose = (x, y, phi)
         mode = self.state.mode
         if feedback.fault is not None:
             self.trip(feedback.fault.message)

@@ -65,7 +65,9 @@ def run(*, stay: bool, record: Path | None) -> int:
     stamp = time.strftime("%Y%m%d-%H%M%S")
     recording = record or Path(config.telemetry.directory) / f"demo-{stamp}.rrd"
     locator = config.zenoh.listen[0]
-    out.print(f"[bold]trirail demo[/]: starting the service on {SIM.name}, simulated drives at {config.loop.rate_hz} Hz")
+    out.print(
+        f"[bold]trirail demo[/]: starting the service on {SIM.name}, simulated drives at {config.loop.rate_hz} Hz"
+    )
     with _service(recording) as service:
         with _connect(config.robot.name, locator, service) as robot:
             robot.enable()
@@ -120,7 +122,12 @@ def _connect(name: str, locator: str, service: subprocess.Popen[bytes]) -> Robot
 
 
 def _tour(robot: Robot) -> Iterator[_Row]:
-    columns = TextColumn("{task.description:28}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}")
+    columns = (
+        TextColumn("{task.description:28}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
     with Progress(*columns, console=out) as progress:
         task = progress.add_task("the tour", total=len(TOUR), note="")
         for leg in TOUR:

@@ -21,9 +21,7 @@ class KinematicsError(TrirailError, ValueError):
     `leg` is "A", "B", "C" or "" where no single leg is at fault; `value` and `limit` are in metres or radians.
     """
 
-    def __init__(
-        self, message: str, *, leg: str = "", value: float | None = None, limit: float | None = None
-    ) -> None:
+    def __init__(self, message: str, *, leg: str = "", value: float | None = None, limit: float | None = None) -> None:
         super().__init__(message)
         self.leg = leg
         self.value = value

@@ -44,9 +44,7 @@ class Motion(NamedTuple):
     passive_acceleration: Array  # gamma_32
 
 
-def inverse(
-    geometry: Geometry, pose: ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0
-) -> Motion:
+def inverse(geometry: Geometry, pose: ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0) -> Motion:
     """Return the motion of all joints for a motion of the platform, by (9) to (19).
 
     `velocity` and `acceleration` are the time derivatives of the pose, of its shape, or (3,) for all rows.
@@ -138,9 +136,7 @@ def _refuse_pose(geometry: Geometry, motion: Array, leg: int, place: str) -> NoR
     for name, row in zip(("pose", "velocity", "acceleration"), motion, strict=False):
         for axis, value in zip(("x", "y", "phi"), row, strict=True):
             if not math.isfinite(value):
-                raise KinematicsError(
-                    f"{place}{name} {axis} is {value}: it must be finite", value=float(value)
-                )
+                raise KinematicsError(f"{place}{name} {axis} is {value}: it must be finite", value=float(value))
     _refuse_angle(geometry, leg, float(motion[0, 2]), place)
 
 

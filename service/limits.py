@@ -29,7 +29,9 @@ class Violation(NamedTuple):
 
     def __str__(self) -> str:
         subject = f"slider {self.what}" if self.what in LEGS else f"platform {self.what}"
-        return f"{subject}: {self.quantity} {self.value:.6g} {self.unit} is beyond its limit {self.limit:.6g} {self.unit}"
+        return (
+            f"{subject}: {self.quantity} {self.value:.6g} {self.unit} is beyond its limit {self.limit:.6g} {self.unit}"
+        )
 
 
 class Bounds:
@@ -44,9 +46,7 @@ class Bounds:
             ("acceleration", "m/s²", -slider.acceleration * ROUNDING, slider.acceleration * ROUNDING),
             ("passive position", "m", *slider.passive),
         )
-        self._pose = tuple(
-            zip(COORDINATES, ("m", "m", "rad"), (platform.x, platform.y, platform.phi), strict=True)
-        )
+        self._pose = tuple(zip(COORDINATES, ("m", "m", "rad"), (platform.x, platform.y, platform.phi), strict=True))
         self._step = slider.velocity * ROUNDING * period
         self._low = np.array([platform.x[0], platform.y[0], platform.phi[0]])
         self._high = np.array([platform.x[1], platform.y[1], platform.phi[1]])

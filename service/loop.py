@@ -20,7 +20,7 @@ from service.messages import Event
 from service.modes import MODES, Mode
 from service.modes import Event as Mishap
 from service.packets import Happened, Kind, Port, Situation, Welcome, message
-from service.records import LAYOUT, PARTS
+from service.records import LAYOUT
 
 BATCHES_PER_SECOND = 50
 UNSENT_EVENTS = 4096
@@ -95,7 +95,14 @@ class Loop:
         solved = now()
         control.write()
         written = now()
-        parts = (synced - began, read - synced, decided - read, moved - decided, solved - moved, written - solved)
+        parts = (
+            synced - began,
+            read - synced,
+            decided - read,
+            moved - decided,
+            solved - moved,
+            written - solved,
+        )
         self._record(tick, parts)
         self._record_ns = now() - written
 

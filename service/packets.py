@@ -115,7 +115,7 @@ def message(content: Request | Answer) -> bytes:
     return bytes((Kind.MESSAGE,)) + encode(content)
 
 
-class Closed(Exception):  # noqa: N818 - an end, not an error
+class Closed(Exception):
     """The other side has gone."""
 
 

@@ -48,7 +48,11 @@ def _stay_awake(_: Loop) -> None:
 
 _MEASURES: tuple[tuple[str, Callable[[Loop], None], str], ...] = (
     ("SCHED_FIFO", _fifo, "run as root, or allow it: systemd LimitRTPRIO=99, or rtprio in limits.conf"),
-    ("locked memory", _lock_memory, "run as root, or allow it: systemd LimitMEMLOCK=infinity, or memlock in limits.conf"),
+    (
+        "locked memory",
+        _lock_memory,
+        "run as root, or allow it: systemd LimitMEMLOCK=infinity, or memlock in limits.conf",
+    ),
     ("pinned processor", _pin, "name a processor that this process may use in loop.cpu"),
 )
 

@@ -38,7 +38,10 @@ FIELDS: tuple[tuple[str, str, int], ...] = (
 )
 
 DTYPE: np.dtype[Any] = np.dtype(
-    [(name, "<" + {"q": "i8", "i": "i4", "B": "u1", "d": "f8"}[code], (n,) if n > 1 else ()) for name, code, n in FIELDS]
+    [
+        (name, "<" + {"q": "i8", "i": "i4", "B": "u1", "d": "f8"}[code], (n,) if n > 1 else ())
+        for name, code, n in FIELDS
+    ]
 )
 LAYOUT = struct.Struct("<" + "".join(f"{n}{code}" for _, code, n in FIELDS))
 """The same layout as DTYPE, for packing one record: as many values as the fields have, in their order."""

@@ -202,9 +202,7 @@ def _unit_velocity(link: Link, centre: Vector) -> Vector:
 
 
 @compiled()
-def joint_motion(
-    leg: Array, variables: Vector, velocity: Vector, acceleration: Vector
-) -> tuple[Vector, Vector]:
+def joint_motion(leg: Array, variables: Vector, velocity: Vector, acceleration: Vector) -> tuple[Vector, Vector]:
     """Return rates and accelerations of a leg's three joints from the motion of its platform: (15) and (19).
 
     Three joints are what it takes to follow any planar motion. The unknowns of (15) and of (19) have the same

@@ -192,8 +192,7 @@ class _Signals:
         self.reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         self._before = {
-            number: signal.signal(number, lambda _signal, _frame: None)
-            for number in (signal.SIGTERM, signal.SIGINT)
+            number: signal.signal(number, lambda _signal, _frame: None) for number in (signal.SIGTERM, signal.SIGINT)
         }
         self._wakeup = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
         return self

@@ -68,7 +68,12 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
 
 def follow(robot: Robot, goal: Goal, title: str, *, show: bool = True) -> Result:
     """Wait for a goal's end and show its progress."""
-    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}")
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[left]}"),
+    )
     with Progress(*columns, console=out, transient=True, disable=not show) as progress:
         task = progress.add_task(title, total=1.0, left="")
         for state in robot.states(SILENT):
@@ -88,7 +93,10 @@ def show(state: State, robot: str) -> None:
 
 def watch(robot: Robot) -> None:
     """Show the state live until Ctrl-C or the service goes silent."""
-    with Live(console=out, refresh_per_second=10, transient=False) as live, contextlib.suppress(KeyboardInterrupt):
+    with (
+        Live(console=out, refresh_per_second=10, transient=False) as live,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
         for state in robot.states(SILENT):
             live.update(_table(state, robot.name))
         raise ServiceError("the service has gone silent")

@@ -96,9 +96,7 @@ def test_home_must_be_regular() -> None:
 @pytest.mark.parametrize("l0", [0.05, 0.3, 2.0])
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (0.04, -0.03)])
 def test_singular_angles_of_the_symmetric_robot(l0: float, centre: tuple[float, float]) -> None:
-    assert_allclose(
-        singular_angles(Geometry.symmetric(l0), centre), [-2 * math.pi / 3, math.pi / 3], atol=1e-12
-    )
+    assert_allclose(singular_angles(Geometry.symmetric(l0), centre), [-2 * math.pi / 3, math.pi / 3], atol=1e-12)
 
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (0.05, 0.02)])

@@ -141,9 +141,7 @@ def test_jacobians_are_the_papers(pose: tuple[float, float, float]) -> None:
 
 @given(symmetric_poses, st.tuples(*[st.floats(-1.0, 1.0)] * 6))
 @settings(deadline=None)
-def test_connectivity_conditions_are_the_papers(
-    pose: tuple[float, float, float], rates: tuple[float, ...]
-) -> None:
+def test_connectivity_conditions_are_the_papers(pose: tuple[float, float, float], rates: tuple[float, ...]) -> None:
     """(15) and (19) for each leg, in the paper's matrices and with its misprints corrected."""
     theta_1 = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     u3 = np.array([0.0, 0.0, 1.0])
@@ -240,12 +238,8 @@ def test_loops_are_closed(geometry: Geometry, pose: Array) -> None:
         along_rail = leg.home + motion.position[i]
         psi = phi + leg.edge_angle
         px, py = leg.edge_point
-        left_x = (
-            leg.anchor[0] + along_rail * math.cos(leg.rail_angle) + motion.passive_position[i] * math.cos(psi)
-        )
-        left_y = (
-            leg.anchor[1] + along_rail * math.sin(leg.rail_angle) + motion.passive_position[i] * math.sin(psi)
-        )
+        left_x = leg.anchor[0] + along_rail * math.cos(leg.rail_angle) + motion.passive_position[i] * math.cos(psi)
+        left_y = leg.anchor[1] + along_rail * math.sin(leg.rail_angle) + motion.passive_position[i] * math.sin(psi)
         assert_allclose(left_x, x + px * math.cos(phi) - py * math.sin(phi), atol=1e-12)
         assert_allclose(left_y, y + px * math.sin(phi) + py * math.cos(phi), atol=1e-12)
 
@@ -294,9 +288,7 @@ def test_the_other_branch_is_a_solution_too(geometry: Geometry, pose: Array, ang
 
 @given(robots, poses, st.tuples(*[unit] * 3))
 @settings(max_examples=200, deadline=None)
-def test_jacobians_relate_the_velocities(
-    geometry: Geometry, pose: Array, velocity: tuple[float, float, float]
-) -> None:
+def test_jacobians_relate_the_velocities(geometry: Geometry, pose: Array, velocity: tuple[float, float, float]) -> None:
     """(16)."""
     assume(regular(geometry, pose))
     j1, j2 = jacobians(geometry, pose)
@@ -306,9 +298,7 @@ def test_jacobians_relate_the_velocities(
 
 @given(robots, poses, st.lists(st.floats(-0.2, 0.2), min_size=9, max_size=9))
 @settings(max_examples=150, deadline=None)
-def test_velocities_and_accelerations_are_derivatives(
-    geometry: Geometry, middle: Array, swing: list[float]
-) -> None:
+def test_velocities_and_accelerations_are_derivatives(geometry: Geometry, middle: Array, swing: list[float]) -> None:
     """Along a random smooth motion of the platform, against differences of the positions."""
     a, b, c = np.array(swing).reshape(3, 3)
 
@@ -420,10 +410,7 @@ def test_an_edge_along_its_rail_is_singular(phi: float) -> None:
         assert refused.value.limit == pytest.approx(phi, abs=1e-9)
         with pytest.raises(KinematicsError, match="row 2: leg A"):
             call(PAPER, [(0.0, 0.0, 0.0), (0.0, 0.0, 0.1), (0.01, 0.0, phi)])
-    assert (
-        inverse_into(PAPER.packed(), np.array([[0.01, 0.0, phi], [0.0] * 3, [0.0] * 3]), np.empty((6, 3)))
-        == 1
-    )
+    assert inverse_into(PAPER.packed(), np.array([[0.01, 0.0, phi], [0.0] * 3, [0.0] * 3]), np.empty((6, 3))) == 1
 
 
 def test_the_singular_leg_is_named() -> None:
@@ -443,9 +430,7 @@ def test_sliders_can_leave_the_loops_open() -> None:
     )
     geometry = Geometry(legs=(a, b, c))
     sliders = np.full(3, -0.25)
-    with pytest.raises(
-        KinematicsError, match=r"no pose closes the loops, which reach 0.129904 of the"
-    ) as refused:
+    with pytest.raises(KinematicsError, match=r"no pose closes the loops, which reach 0.129904 of the") as refused:
         forward(geometry, sliders)
     assert refused.value.value == pytest.approx(3 * math.sqrt(3) / 2 * 0.05)
     assert refused.value.limit == pytest.approx(3 * math.sqrt(3) / 2 * 0.3 * math.sin(1.9))

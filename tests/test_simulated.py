@@ -56,11 +56,7 @@ class Rig:
 
     def sdo(self, *request: int) -> bytes:
         """One frame to the SDO server, padded to eight bytes, and its answer."""
-        answers = [
-            data
-            for can_id, data in self.send(0x600 + NODE, bytes(request).ljust(8, b"\0"))
-            if can_id == 0x585
-        ]
+        answers = [data for can_id, data in self.send(0x600 + NODE, bytes(request).ljust(8, b"\0")) if can_id == 0x585]
         assert len(answers) == 1
         assert len(answers[0]) == 8
         return answers[0]
@@ -68,9 +64,7 @@ class Rig:
     def read(self, index: int, subindex: int = 0) -> int:
         answer = self.sdo(0x40, *pack("<HB", index, subindex))
         assert answer[0] & 0xE3 == 0x43, f"{index:04X}:{subindex:02X} {answer.hex()}"
-        return int.from_bytes(
-            answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=index in (0x6064, 0x606C)
-        )
+        return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=index in (0x6064, 0x606C))
 
     def refused(self, index: int, subindex: int = 0) -> int:
         """The abort code of an upload."""
@@ -267,9 +261,7 @@ def test_every_object_of_the_eds_answers_as_its_access_says(rig: Rig) -> None:
         (0x1400, 2, b"\xf5", 0x06090030),
     ],
 )
-def test_download_is_refused_with_its_abort_code(
-    rig: Rig, index: int, subindex: int, data: bytes, code: int
-) -> None:
+def test_download_is_refused_with_its_abort_code(rig: Rig, index: int, subindex: int, data: bytes, code: int) -> None:
     assert rig.write_refused(index, subindex, data) == code
 
 

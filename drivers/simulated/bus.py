@@ -46,9 +46,7 @@ class SimulatedBus(can.BusABC):
 
     def _deliver(self, others: Sequence[SimulatedDrive], can_id: int, data: bytes) -> None:
         """Bring a drive's frame to the user and the other drives."""
-        self._arrived.append(
-            can.Message(timestamp=time.time(), arbitration_id=can_id, is_extended_id=False, data=data)
-        )
+        self._arrived.append(can.Message(timestamp=time.time(), arbitration_id=can_id, is_extended_id=False, data=data))
         now = self._clock()
         for drive in others:
             drive.receive(can_id, data, now)
@@ -68,9 +66,7 @@ class SimulatedBus(can.BusABC):
         return self._arrived.popleft(), False
 
 
-def simulated_bus(
-    can: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic
-) -> SimulatedBus:
+def simulated_bus(can: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic) -> SimulatedBus:
     """The three drives of a configuration on a bus of their own, at rest where `can.simulated.start` says."""
     simulated = can.simulated
     devices = []

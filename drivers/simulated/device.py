@@ -184,9 +184,7 @@ class Device:
         operational = self.nmt is Nmt.OPERATIONAL
         rpdos = [pdo for pdo in self._rpdos if operational and pdo.valid]
         tpdos = [pdo for pdo in self._tpdos if operational and pdo.valid]
-        handlers: dict[int, Callable[[bytes], None]] = {
-            pdo.can_id: partial(self._receive_pdo, pdo) for pdo in rpdos
-        }
+        handlers: dict[int, Callable[[bytes], None]] = {pdo.can_id: partial(self._receive_pdo, pdo) for pdo in rpdos}
         handlers[0x000] = self._nmt_command
         node, milliseconds = divmod(self._consumer.value, 1 << 16)
         if node and milliseconds:

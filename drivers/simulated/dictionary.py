@@ -26,7 +26,7 @@ WRONG_STATE = 0x08000022
 NO_DATA = 0x08000024
 
 
-class SdoAbort(Exception):  # noqa: N818 - the standard's word
+class SdoAbort(Exception):
     """A request is refused, with an abort code of CiA 301 (SDO abort transfer)."""
 
     def __init__(self, code: int) -> None:

@@ -37,9 +37,7 @@ _MOST_BYTES = 8
 class Pdo(ABC):
     """What both directions share: communication parameter, mapping, and the rules for changing them."""
 
-    def __init__(
-        self, objects: Dictionary, communication: int, mapping: int, changed: Callable[[], None]
-    ) -> None:
+    def __init__(self, objects: Dictionary, communication: int, mapping: int, changed: Callable[[], None]) -> None:
         self.number = communication % 0x200 + 1
         self._objects = objects
         self._mapping = mapping
@@ -165,9 +163,7 @@ class ReceivePdo(Pdo):
 class TransmitPdo(Pdo):
     """A TPDO: sent on every n-th SYNC, on a SYNC after a change (type 0), or on a change (254, 255)."""
 
-    def __init__(
-        self, objects: Dictionary, communication: int, mapping: int, changed: Callable[[], None]
-    ) -> None:
+    def __init__(self, objects: Dictionary, communication: int, mapping: int, changed: Callable[[], None]) -> None:
         super().__init__(objects, communication, mapping, changed)
         self._inhibit = objects[communication, 3]
         self._event_timer = objects[communication, 5]
