@@ -1,4 +1,4 @@
-"""The gateway's process: Zenoh on one side, the loop on the other. It checks, translates and numbers; it decides nothing."""
+"""The gateway's process: Zenoh on one side, the loop on the other. It checks and translates; it decides nothing."""
 
 from __future__ import annotations
 

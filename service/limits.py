@@ -1,4 +1,4 @@
-"""What may never be exceeded: one table of bounds for paths before they start and for every setpoint before it is sent."""
+"""What may never be exceeded: bounds for paths before they start and for every setpoint before it is sent."""
 
 from __future__ import annotations
 

@@ -71,15 +71,18 @@ def test_wrong_ones_are_refused_in_one_line(right: str, wrong: str, said: str) -
 
 def test_the_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
-    with pytest.raises(ConfigError, match="robot.toml: No such file"):
+    with pytest.raises(ConfigError, match=r"robot\.toml: No such file"):
         load(path)
     path.write_text("[robot]\nname = 3\n")
-    with pytest.raises(ConfigError, match="robot.toml: "):
+    with pytest.raises(ConfigError, match=r"robot\.toml: "):
         load(path)
 
 
 def test_a_robot_as_built() -> None:
-    leg = "[[geometry.leg]]\nanchor = [{x}, {y}]\nrail_angle = {r}\nhome = 0.17\nedge_point = [0.0, 0.0]\nedge_angle = {e}\n"
+    leg = (
+        "[[geometry.leg]]\nanchor = [{x}, {y}]\nrail_angle = {r}\n"
+        "home = 0.17\nedge_point = [0.0, 0.0]\nedge_angle = {e}\n"
+    )
     legs = "".join(
         leg.format(x=x, y=y, r=r, e=r - 1.05)
         for x, y, r in ((0.0, -0.3, 1.05), (0.26, 0.15, 3.14), (-0.26, 0.15, -1.05))

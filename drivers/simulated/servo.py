@@ -15,9 +15,9 @@ class Servo:
 
     so that the following error e = r - x obeys de/dt = (dr/dt - w) - e / time_constant: it fades, and only
     what the feed-forward leaves uncovered feeds it. An exact feed-forward has no lag, none at all lags by
-    dr/dt · time_constant; `feed_forward_gain` is the share of it that this servo makes use of. With time_constant = 0 the servo is ideal: on the target at the end of each step.
-    The velocity that this asks for is then cut to what can still be braked in time, to `max_velocity` and to
-    `max_acceleration`.
+    dr/dt · time_constant; `feed_forward_gain` is the share of it that this servo makes use of. With
+    time_constant = 0 the servo is ideal: on the target at the end of each step. The velocity that this asks
+    for is then cut to what can still be braked in time, to `max_velocity` and to `max_acceleration`.
     """
 
     def __init__(
