@@ -91,6 +91,12 @@ class Gateway:
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.DATA_HIGH,
         )
+        self._records = opened.declare_publisher(
+            self._key("records"),
+            encoding=session.BINARY,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_LOW,
+        )
         self._event = declare_advanced_publisher(
             opened,
             self._key("event"),
@@ -227,7 +233,8 @@ class Gateway:
                 self._answer(ticket, ErrorReply(code, text, slider, value, limit))
 
     def _publish(self, batch: memoryview) -> None:
-        """Take in a batch of records; publish the newest state when it is time."""
+        """Take in a batch of records and pass it on; publish the newest state when it is time."""
+        self._records.put(bytes(batch))
         self._states.records(unpack(batch))
         now = time.monotonic()
         if now >= self._state_due:

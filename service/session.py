@@ -12,7 +12,7 @@ import zenoh
 from service.errors import ServiceError
 
 DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
-JSON, MSGPACK = "application/json", "application/msgpack"
+JSON, MSGPACK, BINARY = "application/json", "application/msgpack", "application/octet-stream"
 TRANSPORT_LIMIT = 1 << 16
 """A goal or command larger than this is thrown away by the transport, before anything is answered [bytes]."""
 

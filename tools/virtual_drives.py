@@ -9,18 +9,17 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-import tomllib
 from pathlib import Path
 from types import FrameType
 
 import can
-import msgspec
 
-from drivers.config import Can, Drives
-from drivers.errors import BusError
+from drivers.config import Drives
 from drivers.interface import NAMES
 from drivers.simulated import SimulatedBus, simulated_bus
 from drivers.unixbus import UnixBus
+from service.config import load
+from service.errors import TrirailError
 
 _POLL = 0.001
 """How long to wait for a frame before the drives' own timers are looked at [s]."""
@@ -61,21 +60,19 @@ def main() -> int:
     arguments.add_argument("--interface", required=True, help='"unix" (listens), or a python-can interface')
     arguments.add_argument("--channel", required=True, help="path of the socket, or the interface's channel")
     options = arguments.parse_args()
-    document = tomllib.loads(options.config.read_text())
-    section = msgspec.convert(document["can"], Can)
-    drives = msgspec.convert(document["drives"], Drives)
 
     signal.signal(signal.SIGINT, _interrupt)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
+        config = load(options.config)
         with (
-            open_bus(options.interface, options.channel, section.bitrate) as wire,
-            simulated_bus(section, drives) as bus,
+            open_bus(options.interface, options.channel, config.can.bitrate) as wire,
+            simulated_bus(config.can, config.drives) as bus,
         ):
-            bridge(wire, bus, Report(drives, bus))
+            bridge(wire, bus, Report(config.drives, bus))
     except KeyboardInterrupt:
         pass
-    except (BusError, can.CanError) as error:
+    except (TrirailError, can.CanError) as error:
         print(f"virtual_drives: {error}", file=sys.stderr)
         return 1
     return 0

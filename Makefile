@@ -1,0 +1,31 @@
+# Two commands set everything up on a fresh machine: `make demo` and `make test`.
+
+PYTHON ?= python3
+VENV := .venv
+READY := $(VENV)/.ready
+
+.PHONY: demo test bench clean
+
+demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
+	$(VENV)/bin/trirail demo $(ARGS)
+
+test: $(READY)  ## everything that decides: lint, format, types, import contracts, tests
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports
+	$(VENV)/bin/pytest
+
+bench: $(READY)  ## the loop and the kinematics, measured
+	$(VENV)/bin/python tools/bench.py loop
+	$(VENV)/bin/python tools/bench.py kinematics
+
+$(READY): pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "trirail needs Python 3.11 or newer: make PYTHON=python3.12 …")'
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/python -m pip install --quiet --upgrade "pip>=25.1"
+	$(VENV)/bin/python -m pip install --quiet --editable . --group dev
+	touch $(READY)
+
+clean:  ## remove what the commands above made
+	rm -rf $(VENV) .mypy_cache .ruff_cache .import_linter_cache .hypothesis

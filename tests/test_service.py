@@ -1,0 +1,417 @@
+"""Whole services in their own processes, as a user runs them: from outside, through Zenoh, signals and files."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import selectors
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import zenoh
+from can import CanutilsLogReader
+
+from drivers import frames
+from service.client import Robot
+from service.config import SIM
+from service.errors import RefusedError, ServiceError
+from service.messages import GoalReply, State
+from service.session import open_client
+
+pytestmark = pytest.mark.slow
+
+UP_WITHIN = 100.0
+END_WITHIN = 20.0
+
+
+class Service:
+    """A service in its own process, on sockets and in a folder of its own."""
+
+    def __init__(self, folder: Path, **changes: str) -> None:
+        self.folder = folder
+        self.locator = f"unixsock-stream/{folder}/zenoh"
+        text = SIM.read_text()
+        for before, after in {
+            'listen = ["tcp/127.0.0.1:7447"]': f'listen = ["{self.locator}"]',
+            "live_port = 9876": "live_port = 0\ncapture_can = true",
+            'directory = "recordings"': f'directory = "{folder}/recordings"',
+            **changes,
+        }.items():
+            assert before in text, before
+            text = text.replace(before, after, 1)
+        path = folder / "robot.toml"
+        path.write_text(text)
+        self.log = folder / "service.log"
+        self.process = run(path, stdout=self.log.open("wb"), stderr=subprocess.STDOUT)
+
+    def wait_up(self) -> None:
+        """Wait until it says that it is up."""
+        deadline = time.monotonic() + UP_WITHIN
+        while "up  robot" not in self.log.read_text():
+            if self.process.poll() is not None or time.monotonic() > deadline:
+                raise AssertionError(self.log.read_text())
+            wait_readable(self.process, 0.1)
+
+    def child(self, name: str) -> int:
+        """Process id of one of its children."""
+        for entry in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split():
+            if Path(f"/proc/{entry}/cmdline").read_bytes().split(b"\0")[3] == name.encode():
+                return int(entry)
+        raise AssertionError(f"no {name} among the children")
+
+    def end(self, number: int = signal.SIGTERM) -> int:
+        """Send a signal and wait for the exit code."""
+        self.process.send_signal(number)
+        return self.process.wait(END_WITHIN)
+
+    def robot(self) -> Robot:
+        return Robot("demo", self.locator, user="ann")
+
+    def frames(self) -> list[tuple[int, bytes]]:
+        """Every frame of the session, once it is over: identifier and data, in order."""
+        (log,) = (self.folder / "recordings").glob("*.log")
+        return [(frame.arbitration_id, bytes(frame.data)) for frame in CanutilsLogReader(log)]
+
+
+def run(*arguments: object, **options: Any) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-m", "service", "run", *map(str, arguments)], **options)
+
+
+def trirail(*arguments: object, locator: str = "") -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    environment = os.environ | ({"TRIRAIL_CONNECT": locator} if locator else {})
+    command = [sys.executable, "-m", "service", *map(str, arguments)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+
+
+def wait_readable(process: subprocess.Popen[bytes], seconds: float) -> None:
+    """Wait for a process to end, for so long at most."""
+    pidfd = os.pidfd_open(process.pid)
+    with selectors.DefaultSelector() as selector:
+        selector.register(pidfd, selectors.EVENT_READ)
+        selector.select(seconds)
+    os.close(pidfd)
+
+
+def until(robot: Robot, condition: Callable[[State], bool]) -> State:
+    """Return the first state for which something holds."""
+    deadline = time.monotonic() + 20.0
+    for state in robot.states(timeout=10.0):
+        if condition(state):
+            return state
+        assert time.monotonic() < deadline, state
+    raise AssertionError("the service has gone silent")
+
+
+def in_motion(robot: Robot) -> None:
+    robot.enable()
+    robot.move_to(x=0.1, y=0.02, phi=0.3, speed=0.2, id="long")
+    until(robot, lambda state: state.goal is not None and state.goal.progress > 0.3)
+
+
+def positions(sent: list[tuple[int, bytes]], node: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Setpoints that a drive was sent [m]."""
+    counts = [frames.SETPOINT.unpack(data)[0] for identifier, data in sent if identifier == frames.RPDO2 + node]
+    return np.array(counts) / 1e7
+
+
+def assert_stopped_smoothly(sent: list[tuple[int, bytes]]) -> None:
+    """The setpoints on the bus end at standstill, and their differences never jump."""
+    for node in (1, 2, 3):
+        acceleration = np.diff(positions(sent, node), 2) / 1e-3**2
+        assert np.abs(acceleration).max() < 15.0 + 0.4  # the limit, and the rounding of three counts
+        assert np.ptp(positions(sent, node)[-5:]) <= 2e-7
+
+
+def controlwords(sent: list[tuple[int, bytes]], node: int) -> list[int]:
+    return [int.from_bytes(data[:2], "little") for identifier, data in sent if identifier == frames.RPDO1 + node]
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Service]:
+    started = Service(tmp_path)
+    started.wait_up()
+    yield started
+    if started.process.poll() is None:
+        started.end()
+
+
+# ---------------------------------------------------------------------- the way it is meant to be used
+
+
+def test_a_session(service: Service) -> None:
+    with service.robot() as robot:
+        info = robot.info()
+        assert info.robot == "demo"
+        assert [leg["name"] for leg in info.geometry] == ["A", "B", "C"]
+        assert robot.state().mode == "disabled"
+        with pytest.raises(RefusedError, match="send enable first"):
+            robot.move_to(x=0.0, y=0.0, phi=0.1)
+        robot.enable()
+        goal = robot.move_to(x=0.02, y=-0.01, phi=0.1, id="g1")
+        assert goal.wait(timeout=10.0).outcome == "done"
+        state = until(robot, lambda state: state.mode == "holding")
+        assert state.pose == pytest.approx((0.02, -0.01, 0.1), abs=1e-5)
+        first = robot.move_to(x=0.1, y=0.0, phi=0.0, speed=0.3)
+        second = robot.move_to(x=0.0, y=0.0, phi=0.0)
+        assert first.wait(timeout=10.0).outcome == "preempted"
+        assert second.wait(timeout=10.0).outcome == "done"
+        robot.disable()
+        assert robot.state().sliders.status == ("switch on disabled",) * 3
+        events = list(robot.events(history=True, timeout=1.0))
+        assert [event.seq for event in events] == list(range(1, len(events) + 1))
+        outcomes = [event.outcome for event in events if event.kind == "goal"]
+        assert outcomes == ["rejected", "done", "preempted", "done"]
+    assert service.end() == 0
+    sent = service.frames()
+    assert {identifier for identifier, _ in sent} <= {
+        frames.NMT,
+        frames.SYNC,
+        frames.HEARTBEAT + 126,
+        *(base + node for base in (0x180, 0x200, 0x280, 0x300, 0x580, 0x600, 0x700) for node in (1, 2, 3)),
+    }
+    for node in (1, 2, 3):
+        words = controlwords(sent, node)
+        assert [words.index(word) for word in (0x06, 0x07, 0x0F)] == sorted(words.index(w) for w in (0x06, 0x07, 0x0F))
+        assert words[-1] & 0b1111 != 0b1111
+    assert_stopped_smoothly(sent)
+
+
+def test_the_commands(service: Service) -> None:
+    def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+        return trirail(*arguments, locator=service.locator)
+
+    assert json.loads(call("enable", "--json").stdout) == {"command": "enable", "mode": "holding", "ok": True}
+    done = call("goto", 0.01, -0.02, 5, "--deg", "--wait")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "done" in done.stdout
+    state = json.loads(call("status", "--json").stdout)
+    assert state["pose"] == pytest.approx([0.01, -0.02, np.radians(5)], abs=1e-5)
+    assert "holding" in call("status").stdout
+    out = call("goto", 0.5, 0, 0)
+    assert out.returncode == 1
+    assert "platform x: position 0.5 m is beyond its limit 0.15 m" in out.stderr
+    assert call("reset").returncode == 1
+    assert call("goto", "nan", 0, 0).returncode == 1
+    assert call("goto", 1, 2).returncode == 2
+    assert call("quick-stop").returncode == 0
+    failed = call("enable")
+    assert failed.returncode == 1
+    assert "fault: quick_stop by" in failed.stderr
+    assert call("reset").returncode == 0
+    assert call("disable").returncode == 0
+    for answer in (out, failed):
+        assert len(answer.stderr.splitlines()) == 1
+    assert service.end(signal.SIGINT) == 0
+
+
+@pytest.mark.parametrize(
+    ("payload", "code", "said"),
+    [
+        (b"{", "malformed", "not a goal"),
+        (b'{"kind": "pose", "x": 1, "y": 2}', "malformed", "missing required field phi"),
+        (b'{"kind": "pose", "x": 0, "y": 0, "phi": 0, "z": 0}', "malformed", "unknown field z"),
+        (b'{"kind": "pose", "x": 0, "y": 0, "phi": NaN}', "malformed", "not a goal"),
+        (b'{"kind": "pose", "x": 0, "y": 0, "phi": 1e999}', "malformed", "not a goal"),
+        (b'{"kind": "pose", "x": 0, "y": 0, "phi": 0, "speed": 2}', "malformed", "<= 1.0"),
+        (b'{"kind": "dance", "x": 0, "y": 0, "phi": 0}', "malformed", "dance"),
+        (b'{"kind": "pose", "x": 0, "y": "0", "phi": 0}', "malformed", "got str"),
+        (b"\xff\xfe", "malformed", "not a goal"),
+        (b"", "malformed", "not a goal"),
+        (b" " * 5000, "too_large", "at most 4096"),
+    ],
+)
+def test_bad_goals(shared: tuple[Service, Robot, zenoh.Session], payload: bytes, code: str, said: str) -> None:
+    _, robot, session = shared
+    before = robot.state().commanded.position
+    (reply,) = session.get("trirail/demo/goal/eve", payload=payload)
+    assert reply.err is not None
+    error = json.loads(reply.err.payload.to_bytes())
+    assert error["code"] == code
+    assert said in error["message"]
+    state = robot.state()
+    assert state.mode == "holding"
+    assert state.commanded.position == pytest.approx(before, abs=1e-12)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Service, Robot, zenoh.Session]]:
+    """One enabled service for the tests that ask it for nothing but a no."""
+    service = Service(tmp_path_factory.mktemp("shared"))
+    service.wait_up()
+    with service.robot() as robot, open_client(service.locator) as session:
+        robot.enable()
+        yield service, robot, session
+    assert service.end() == 0
+
+
+def test_bad_commands(shared: tuple[Service, Robot, zenoh.Session]) -> None:
+    _, robot, session = shared
+    (reply,) = session.get("trirail/demo/cmd/eve/dance")
+    assert reply.err is not None
+    assert "no such command; there are enable" in reply.err.payload.to_string()
+    (reply,) = session.get("trirail/demo/cmd/*/stop")
+    assert reply.err is not None
+    assert "name one robot and one user" in reply.err.payload.to_string()
+    assert robot.state().mode == "holding"
+
+
+def test_other_ways_to_send_a_goal(shared: tuple[Service, Robot, zenoh.Session]) -> None:
+    _, robot, session = shared
+    session.put("trirail/demo/goal/ann", b'{"kind": "pose", "x": 0.01, "y": 0, "phi": 0}')
+    until(robot, lambda state: state.mode == "holding" and abs(state.pose[0] - 0.01) < 1e-5)
+    packed = msgspec.msgpack.encode({"kind": "pose", "x": 0.0, "y": 0.0, "phi": 0.0, "id": "packed"})
+    (reply,) = session.get("trirail/demo/goal/ann", payload=packed, encoding="application/msgpack")
+    assert reply.ok is not None
+    assert msgspec.msgpack.decode(reply.ok.payload.to_bytes(), type=GoalReply).id == "packed"
+    until(robot, lambda state: state.mode == "holding" and abs(state.pose[0]) < 1e-5)
+
+
+def test_the_service_is_seen_alive(shared: tuple[Service, Robot, zenoh.Session]) -> None:
+    _, _, session = shared
+    assert [reply.ok is not None for reply in session.liveliness().get("trirail/demo/alive")] == [True]
+
+
+# ---------------------------------------------------------------------- ends, asked for and not
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_in_motion_is_a_controlled_stop(service: Service, number: int) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        assert service.end(number) == 0
+    sent = service.frames()
+    assert_stopped_smoothly(sent)
+    for node in (1, 2, 3):
+        assert controlwords(sent, node)[-1] & 0b10 == 0  # disable voltage
+        assert positions(sent, node)[-1] != positions(sent, node)[0]
+    assert "Traceback" not in service.log.read_text()
+
+
+def again(service: Service) -> Robot:
+    """Connect to a service whose gateway is being started again."""
+    deadline = time.monotonic() + END_WITHIN
+    while True:
+        with contextlib.suppress(ServiceError):
+            robot = service.robot()
+            robot.state()
+            return robot
+        assert time.monotonic() < deadline
+
+
+def test_a_killed_gateway_is_a_controlled_stop(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        os.kill(service.child("gateway"), signal.SIGKILL)
+    with again(service) as robot:
+        assert robot.state().mode in ("stopping", "holding")
+        state = until(robot, lambda state: state.mode == "holding")
+        assert 0.01 < state.pose[0] < 0.09
+        outcomes = [(event.id, event.outcome) for event in robot.events(history=True, timeout=1.0) if event.outcome]
+        assert ("long", "stopped") in outcomes
+        assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
+    assert service.end() == 0
+    assert_stopped_smoothly(service.frames())
+    assert "the gateway has died (killed by SIGKILL)" in service.log.read_text()
+
+
+def test_a_killed_recorder_does_not_matter(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        os.kill(service.child("recorder"), signal.SIGKILL)
+        state = until(robot, lambda state: state.mode == "holding")
+        assert state.pose[0] == pytest.approx(0.1, abs=1e-5)
+    assert service.end() == 0
+    assert "the recorder has died (killed by SIGKILL)" in service.log.read_text()
+    assert len(list((service.folder / "recordings").glob("*.rrd"))) == 2
+
+
+def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> None:
+    bus = f"{tmp_path}/bus"
+    root = Path(__file__).parents[1]
+    config = tmp_path / "drives.toml"
+    config.write_text(SIM.read_text().replace("rate_hz = 1000", "rate_hz = 100").replace("= 50  ", "= 10  "))
+    command = [sys.executable, str(root / "tools" / "virtual_drives.py"), str(config)]
+    drives = subprocess.Popen([*command, "--interface", "unix", "--channel", bus], stdout=subprocess.PIPE)
+    assert drives.stdout is not None
+    try:
+        while not Path(bus).exists():
+            assert drives.poll() is None
+            wait_readable(drives, 0.05)
+        service = Service(
+            tmp_path,
+            **{'interface = "simulated"': f'interface = "unix"\nchannel = "{bus}"', "rate_hz = 1000": "rate_hz = 100"},
+        )
+        service.wait_up()
+        with service.robot() as robot:
+            in_motion(robot)
+            os.kill(service.child("loop"), signal.SIGKILL)
+        assert service.process.wait(END_WITHIN) == 1
+        assert "the loop is dead (killed by SIGKILL): the drives stop by their own watchdogs" in service.log.read_text()
+        stopped: dict[str, str] = {}
+        while len(stopped) < 3:
+            line = drives.stdout.readline().decode()
+            assert line
+            if found := re.match(r"([ABC]) fault, ", line):
+                stopped[found[1]] = line
+    finally:
+        drives.terminate()
+        drives.wait(END_WITHIN)
+        drives.stdout.close()
+
+
+# ---------------------------------------------------------------------- what cannot start
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("rate_hz = 1000", "rate_hx = 1000", "loop.rate_hx: unknown key; did you mean rate_hz?"),
+        ('interface = "simulated"', 'interface = "socketcan"\nchannel = "can7"', ("AF_CAN", "can7")),
+        ('interface = "simulated"', 'interface = "vcan"', 'can.interface "vcan" is unknown'),
+        ("bitrate = 1_000_000", "bitrate = 500_000", "takes 150% of the bus at 500000 bit/s"),
+        ('listen = ["tcp/127.0.0.1:7447"]', 'listen = ["tcp/127.0.0.1:{port}"]', "cannot listen on tcp/127.0.0.1"),
+        ("live_port = 9876", "live_port = {port}", "telemetry.live_port"),
+    ],
+)
+def test_a_start_that_fails_says_why_in_one_line(
+    tmp_path: Path, before: str, after: str, said: str | tuple[str, ...]
+) -> None:
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        text = SIM.read_text().replace('"tcp/127.0.0.1:7447"', f'"unixsock-stream/{tmp_path}/z"')
+        text = text.replace("live_port = 9876", "live_port = 0") if "live_port" not in before else text
+        if "listen" in before:
+            before = before.replace('"tcp/127.0.0.1:7447"', f'"unixsock-stream/{tmp_path}/z"')
+        path = tmp_path / "robot.toml"
+        path.write_text(text.replace(before, after.format(port=port), 1))
+        failed = trirail("run", path, "--record", tmp_path / "r.rrd")
+    assert failed.returncode == 1
+    assert len(failed.stderr.splitlines()) == 1, failed.stderr
+    assert any(part in failed.stderr for part in ([said] if isinstance(said, str) else said))
+
+
+def test_nobody_there(tmp_path: Path) -> None:
+    failed = trirail("status", locator=f"unixsock-stream/{tmp_path}/none")
+    assert failed.returncode == 1
+    assert failed.stderr.startswith("trirail: no service at unixsock-stream/")
+    assert "trirail run configs/sim.toml" in failed.stderr
+
+
+def test_the_demo(tmp_path: Path) -> None:
+    shown = trirail("demo", "--record", tmp_path / "demo.rrd")
+    assert shown.returncode == 0, shown.stderr + shown.stdout
+    assert "12 of 12 done" in shown.stdout
+    assert (tmp_path / "demo.rrd").stat().st_size > 100_000

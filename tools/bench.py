@@ -1,0 +1,25 @@
+"""Measurements: `python tools/bench.py loop` and `python tools/bench.py kinematics`, with --json for programs."""
+
+from __future__ import annotations
+
+import bench_kinematics
+import bench_loop
+from cyclopts import App
+
+app = App(help="Speed, as ratios within one run: the machines this runs on are not alike.")
+
+
+@app.command
+def loop(*, seconds: float = 30.0, json: bool = False) -> None:
+    """Run the whole service on simulated drives and time its loop, beside cyclictest where that is installed."""
+    bench_loop.main(seconds, json)
+
+
+@app.command
+def kinematics(*, json: bool = False) -> None:
+    """Time the recursion against a straightforward numpy port of the paper's matrices."""
+    bench_kinematics.main(json)
+
+
+if __name__ == "__main__":
+    app()
