@@ -12,6 +12,8 @@ FRAME = struct.Struct("<dHB8s")
 """A captured frame: seconds since 1970, identifier, length, data."""
 CHUNK = 1024
 """Frames handed over at a time."""
+KEPT = 100_000
+"""Frames kept for somebody who does not take them; those after are dropped."""
 
 
 class Capture:
@@ -22,7 +24,8 @@ class Capture:
 
     def note(self, frame: can.Message) -> None:
         """Note a frame, now."""
-        self._frames += FRAME.pack(time.time(), frame.arbitration_id, frame.dlc, bytes(frame.data))
+        if len(self._frames) < KEPT * FRAME.size:
+            self._frames += FRAME.pack(time.time(), frame.arbitration_id, frame.dlc, bytes(frame.data))
 
     def take(self) -> Iterator[bytes]:
         """Hand over what has been noted, in chunks of at most CHUNK frames."""

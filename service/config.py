@@ -120,7 +120,7 @@ class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):
 
     enable_timeout: Positive = 2.0
     """How long the drives may take to power up [s]."""
-    max_overruns: Annotated[int, Meta(ge=1)] = 20
+    max_overruns: Annotated[int, Meta(ge=1)] = 10
     """So many missed ticks in a row are a controlled stop."""
 
 

@@ -38,11 +38,11 @@ class Leg(NamedTuple):
 
 CENTRE = (0.0, 0.0, 0.0)
 TOUR = (
-    Leg("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.4),
+    Leg("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.18),
     Leg("back to the centre", *CENTRE),
-    Leg("paper: 50 mm along x", 0.05, 0.0, 0.0, 0.4),
+    Leg("paper: 50 mm along x", 0.05, 0.0, 0.0, 0.13),
     Leg("back to the centre", *CENTRE),
-    Leg("paper: 50 mm along y", 0.0, 0.05, 0.0, 0.4),
+    Leg("paper: 50 mm along y", 0.0, 0.05, 0.0, 0.13),
     Leg("back to the centre", *CENTRE),
     Leg("tour: right, turned left", 0.06, 0.02, 0.35),
     Leg("tour: top", 0.0, 0.07, -0.4),

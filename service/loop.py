@@ -172,7 +172,7 @@ class Loop:
             self._batched = 0
             self._gateway.send(batch)
             self._recorder.send(batch)
-        if self._capture is not None:
+        if self._capture is not None and self._recorder.connected:
             for frames in self._capture.take():
                 self._recorder.send(bytes((Kind.FRAMES,)) + frames)
         for port in (self._gateway, self._recorder):

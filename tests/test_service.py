@@ -52,7 +52,8 @@ class Service:
         path = folder / "robot.toml"
         path.write_text(text)
         self.log = folder / "service.log"
-        self.process = run(path, stdout=self.log.open("wb"), stderr=subprocess.STDOUT)
+        with self.log.open("wb") as log:
+            self.process = run(path, stdout=log, stderr=subprocess.STDOUT)
 
     def wait_up(self) -> None:
         """Wait until it says that it is up."""
@@ -130,7 +131,7 @@ def assert_stopped_smoothly(sent: list[tuple[int, bytes]]) -> None:
     for node in (1, 2, 3):
         acceleration = np.diff(positions(sent, node), 2) / 1e-3**2
         assert np.abs(acceleration).max() < 15.0 + 0.4  # the limit, and the rounding of three counts
-        assert np.ptp(positions(sent, node)[-5:]) <= 2e-7
+        assert np.ptp(positions(sent, node)[-5:]) < 2e-6  # without power the setpoint is what is measured
 
 
 def controlwords(sent: list[tuple[int, bytes]], node: int) -> list[int]:
@@ -340,7 +341,9 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> N
     bus = f"{tmp_path}/bus"
     root = Path(__file__).parents[1]
     config = tmp_path / "drives.toml"
-    config.write_text(SIM.read_text().replace("rate_hz = 1000", "rate_hz = 100").replace("= 50  ", "= 10  "))
+    config.write_text(
+        SIM.read_text().replace("rate_hz = 1000", "rate_hz = 100").replace("missed_syncs = 150", "missed_syncs = 10")
+    )
     command = [sys.executable, str(root / "tools" / "virtual_drives.py"), str(config)]
     drives = subprocess.Popen([*command, "--interface", "unix", "--channel", bus], stdout=subprocess.PIPE)
     assert drives.stdout is not None
