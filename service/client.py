@@ -7,11 +7,11 @@ with Robot("demo") as robot:
 
 from __future__ import annotations
 
+import contextlib
 import getpass
 import queue
 import re
 import threading
-import time
 import uuid
 from collections.abc import Iterator
 from types import TracebackType
@@ -165,34 +165,27 @@ class Robot:
 
     def states(self, timeout: float | None = None) -> Iterator[State]:
         """Yield states as they come, the newest where this is too slow; end after `timeout` seconds without one."""
-        decoder = msgspec.json.Decoder(State)
-        with self._session.declare_subscriber(self._key("state"), zenoh.handlers.RingChannel(1)) as subscriber:
-            heard = time.monotonic()
-            while timeout is None or time.monotonic() - heard < timeout:
-                sample = subscriber.try_recv()
-                if sample is None:
-                    time.sleep(0.002)
-                    continue
-                heard = time.monotonic()
-                yield decoder.decode(sample.payload.to_bytes())
+        received: queue.Queue[bytes] = queue.Queue(maxsize=1)
+
+        def keep_newest(sample: zenoh.Sample) -> None:
+            with contextlib.suppress(queue.Empty):
+                received.get_nowait()
+            received.put_nowait(sample.payload.to_bytes())
+
+        with self._session.declare_subscriber(self._key("state"), keep_newest):
+            yield from _decoded(received, State, timeout)
 
     def events(self, history: bool = False, timeout: float | None = None) -> Iterator[Event]:
         """Yield events in order, with `history` those of the past first; end after `timeout` seconds without one."""
-        received: queue.Queue[Event] = queue.Queue()
-        decoder = msgspec.json.Decoder(Event)
-        subscriber = declare_advanced_subscriber(
+        received: queue.Queue[bytes] = queue.Queue()
+        with declare_advanced_subscriber(
             self._session,
             self._key("event"),
-            lambda sample: received.put(decoder.decode(sample.payload.to_bytes())),
+            lambda sample: received.put(sample.payload.to_bytes()),
             history=HistoryConfig(detect_late_publishers=True) if history else None,
             recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
-        )
-        with subscriber:
-            while True:
-                try:
-                    yield received.get(timeout=timeout)
-                except queue.Empty:
-                    return
+        ):
+            yield from _decoded(received, Event, timeout)
 
     # ------------------------------------------------------------------ inside
 
@@ -230,6 +223,15 @@ class Robot:
             f"no robot {self.name!r} answers at {self._connect}: is its service running, is the name right "
             "(--robot), may this user ask it?"
         )
+
+
+def _decoded(received: queue.Queue[bytes], kind: type[T], timeout: float | None) -> Iterator[T]:
+    while True:
+        try:
+            payload = received.get(timeout=timeout)
+        except queue.Empty:
+            return
+        yield msgspec.json.decode(payload, type=kind)
 
 
 def _refusal(payload: bytes) -> RefusedError | ServiceError:

@@ -20,17 +20,16 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, declare_advanced_publish
 
 from service import __version__, session
 from service.config import Config, geometry
+from service.links import Closed, Link
 from service.messages import MAX_MESSAGE, CommandReply, ErrorReply, GoalReply, Info, PoseGoal
 from service.packets import (
     Accepted,
     Answer,
-    Closed,
     CommandRequest,
     Confirmed,
     GoalRequest,
     Happened,
     Kind,
-    Link,
     Refused,
     RefusedRequest,
     Request,

@@ -16,10 +16,11 @@ from service.clock import Tick, Ticker
 from service.config import Config
 from service.control import Control
 from service.kinematics import warm_up
+from service.links import Port
 from service.messages import Event
 from service.modes import MODES, Mode
 from service.modes import Event as Mishap
-from service.packets import Happened, Kind, Port, Situation, Welcome, message
+from service.packets import Happened, Kind, Situation, Welcome, message
 from service.records import LAYOUT
 
 BATCHES_PER_SECOND = 50

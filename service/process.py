@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from service import packets
+from service import links
 from service.config import Config
 from service.errors import TrirailError
 from service.realtime import die_with_parent
@@ -35,9 +35,9 @@ def _main(name: str, runtime: Path, ready: Callable[[object], None], sockets: li
     if name == "loop":
         from service import loop
 
-        gateway, recorder = (packets.Port(socket.socket(fileno=number)) for number in sockets)
+        gateway, recorder = (links.Port(socket.socket(fileno=number)) for number in sockets)
         return loop.main(config, gateway, recorder, ready)
-    link = packets.connect(runtime / name)
+    link = links.connect(runtime / name)
     if name == "gateway":
         from service import gateway as gate
 

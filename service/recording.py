@@ -8,7 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from service.config import Config
-from service.packets import Closed, Happened, Kind, Link, Welcome, decode_answer
+from service.links import Closed, Link
+from service.packets import Happened, Kind, Welcome, decode_answer
 from service.recorder import Recorder
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from service import packets
+from service import links
 from service.config import Config
 from service.errors import ServiceError
 from service.process import Order
@@ -91,7 +91,7 @@ class Supervisor:
         parent = os.environ.get("XDG_RUNTIME_DIR")
         with tempfile.TemporaryDirectory(prefix="trirail-", dir=parent) as folder, _Signals() as signals:
             self._runtime = Path(folder)
-            self._listening = [packets.listen(self._runtime / name) for name in PORTS]
+            self._listening = [links.listen(self._runtime / name) for name in PORTS]
             self._selector.register(signals.reader, selectors.EVENT_READ, None)
             try:
                 for name in CHILDREN:

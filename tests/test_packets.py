@@ -1,88 +1,25 @@
-"""Packets over real socket pairs: whole, in order, bounded, and never waited for."""
+"""What goes between the processes survives the way."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from service import packets
-from service.messages import PoseGoal
-from service.packets import Closed, CommandRequest, GoalRequest, Kind, Port, RefusedRequest, Request
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "port"
-
-
-@pytest.fixture
-def port(path: Path) -> Iterator[Port]:
-    port = Port(packets.listen(path))
-    yield port
-    port.close()
-
-
-def test_packets_stay_whole_and_in_order(port: Port, path: Path) -> None:
-    link = packets.connect(path)
-    assert not port.connected
-    assert port.accept()
-    assert not port.accept()
-    for i in range(100):
-        assert port.send(bytes([i]) * (i + 1))
-    assert [link.receive() for _ in range(100)] == [bytes([i]) * (i + 1) for i in range(100)]
-    assert link.receive() is None
-    assert link.send(b"back")
-    assert port.receive() == b"back"
-    assert port.receive() is None
-    link.close()
-
-
-def test_a_peer_that_does_not_read_costs_a_counted_drop(port: Port, path: Path) -> None:
-    link = packets.connect(path)
-    port.accept()
-    sent = 0
-    while port.send(bytes(60_000)):
-        sent += 1
-        assert sent < 10_000
-    assert sent
-    assert port.dropped == 1
-    assert port.connected
-    assert link.receive() == bytes(60_000)
-    link.close()
-
-
-def test_a_lost_peer_is_told_once_and_can_come_back(port: Port, path: Path) -> None:
-    link = packets.connect(path)
-    port.accept()
-    assert not port.take_lost()
-    link.close()
-    assert port.receive() is None
-    assert port.take_lost()
-    assert not port.take_lost()
-    assert not port.send(b"x")
-    again = packets.connect(path)
-    assert port.accept()
-    assert port.send(b"welcome back")
-    assert again.receive() == b"welcome back"
-    again.close()
-    assert not port.send(b"x")  # a peer that is lost in sending is lost too
-    assert port.take_lost()
-
-
-def test_the_peer_sees_the_end(port: Port, path: Path) -> None:
-    link = packets.connect(path)
-    port.accept()
-    port.close()
-    with pytest.raises(Closed):
-        link.receive()
-    link.close()
-
-
-def test_nobody_listens(path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        packets.connect(path)
+from service.messages import Event, PoseGoal
+from service.packets import (
+    Accepted,
+    Answer,
+    CommandRequest,
+    Confirmed,
+    GoalRequest,
+    Happened,
+    Kind,
+    Refused,
+    RefusedRequest,
+    Request,
+    Situation,
+    Welcome,
+)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +30,24 @@ def test_nobody_listens(path: Path) -> None:
         RefusedRequest("ann", "no"),
     ],
 )
-def test_messages_survive_the_way(request_: Request) -> None:
+def test_requests(request_: Request) -> None:
     packet = packets.message(request_)
     assert packet[0] == Kind.MESSAGE
     assert packets.decode_request(packet[1:]) == request_
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        Accepted(1, "g", 0.5),
+        Confirmed(2, "stop", "holding"),
+        Refused(3, "out_of_workspace", "no", "A", 0.4, 0.3),
+        Happened(Event(1, 0.5, 500, 1.0, "goal", "info", "goal g done", id="g", outcome="done")),
+        Situation("g", None),
+        Welcome(("SCHED_FIFO: no",), 0.75, 1.0),
+    ],
+)
+def test_answers(answer: Answer) -> None:
+    packet = packets.message(answer)
+    assert packet[0] == Kind.MESSAGE
+    assert packets.decode_answer(packet[1:]) == answer

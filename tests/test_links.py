@@ -1,0 +1,84 @@
+"""Packets over real socket pairs: whole, in order, bounded, and never waited for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service import links
+from service.links import Closed, Port
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "port"
+
+
+@pytest.fixture
+def port(path: Path) -> Iterator[Port]:
+    port = Port(links.listen(path))
+    yield port
+    port.close()
+
+
+def test_packets_stay_whole_and_in_order(port: Port, path: Path) -> None:
+    link = links.connect(path)
+    assert not port.connected
+    assert port.accept()
+    assert not port.accept()
+    for i in range(100):
+        assert port.send(bytes([i]) * (i + 1))
+    assert [link.receive() for _ in range(100)] == [bytes([i]) * (i + 1) for i in range(100)]
+    assert link.receive() is None
+    assert link.send(b"back")
+    assert port.receive() == b"back"
+    assert port.receive() is None
+    link.close()
+
+
+def test_a_peer_that_does_not_read_costs_a_counted_drop(port: Port, path: Path) -> None:
+    link = links.connect(path)
+    port.accept()
+    sent = 0
+    while port.send(bytes(60_000)):
+        sent += 1
+        assert sent < 10_000
+    assert sent
+    assert port.dropped == 1
+    assert port.connected
+    assert link.receive() == bytes(60_000)
+    link.close()
+
+
+def test_a_lost_peer_is_told_once_and_can_come_back(port: Port, path: Path) -> None:
+    link = links.connect(path)
+    port.accept()
+    assert not port.take_lost()
+    link.close()
+    assert port.receive() is None
+    assert port.take_lost()
+    assert not port.take_lost()
+    assert not port.send(b"x")
+    again = links.connect(path)
+    assert port.accept()
+    assert port.send(b"welcome back")
+    assert again.receive() == b"welcome back"
+    again.close()
+    assert not port.send(b"x")  # a peer that is lost in sending is lost too
+    assert port.take_lost()
+
+
+def test_the_peer_sees_the_end(port: Port, path: Path) -> None:
+    link = links.connect(path)
+    port.accept()
+    port.close()
+    with pytest.raises(Closed):
+        link.receive()
+    link.close()
+
+
+def test_nobody_listens(path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        links.connect(path)
