@@ -15,7 +15,8 @@ from service.recorder import Recorder
 
 def main(config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> int:
     """Record until the loop has gone or the process is told to end."""
-    recorder = Recorder(config, Path(config.telemetry.directory))
+    path = Path(record) if record else None
+    recorder = Recorder(config, Path(config.telemetry.directory), path=path)
     ending = False
 
     def end(_signal: int, _frame: object) -> None:

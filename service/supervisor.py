@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import structs
 
 from service import links
 from service.config import Config
@@ -75,7 +76,8 @@ class Supervisor:
     """Runs the service in the foreground."""
 
     def __init__(self, config: Config, record: Path | None, say: Callable[[str], None]) -> None:
-        self._order = msgspec.json.encode(Order(config, str(record) if record else None))
+        self._orders = dict.fromkeys(CHILDREN, Order(config, None))
+        self._orders["recorder"] = Order(config, str(record) if record else None)
         self._say = say
         self._children: dict[str, _Child] = {}
         self._selector = selectors.DefaultSelector()
@@ -105,7 +107,7 @@ class Supervisor:
 
     def _start(self, name: str) -> None:
         sockets = [listening.fileno() for listening in self._listening] if name == "loop" else []
-        child = _Child(name, self._order, self._runtime, sockets)
+        child = _Child(name, msgspec.json.encode(self._orders[name]), self._runtime, sockets)
         self._children[name] = child
         self._selector.register(child.pipe, selectors.EVENT_READ, child)
 
@@ -152,6 +154,7 @@ class Supervisor:
             return
         consequence = "the loop stops the robot and holds" if name == "gateway" else "the robot is not affected"
         self._say(f"the {name} has died ({child.how}): {consequence}; starting it again")
+        self._orders[name] = structs.replace(self._orders[name], record=None)  # never over the first recording
         self._start(name)
 
     def _fail(self, reason: str) -> None:
