@@ -105,7 +105,7 @@ def _service(recording: Path) -> Iterator[subprocess.Popen[bytes]]:
 def _connect(name: str, locator: str, service: subprocess.Popen[bytes]) -> Robot:
     """Connect once the service is up. The first start of all compiles the kinematics."""
     deadline = time.monotonic() + START_WITHIN
-    with out.status("waiting for the service (its very first start compiles the kinematics, half a minute)"):
+    with out.status("waiting for the service (its very first start compiles the kinematics, some seconds)"):
         while time.monotonic() < deadline:
             if service.poll() is not None:
                 raise ServiceError("the service could not start: see above")

@@ -1,0 +1,124 @@
+"""Where a recording goes: a file that gets everything, and a live view that may be slow, frozen or absent.
+
+Rerun's sinks do not report their failures: they stop taking data, and then block for ever whoever sends more.
+Here each is kept from that, and what it does not get is counted.
+"""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import threading
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import rerun as rr
+from rerun.chunk import Chunk
+
+from service.errors import ServiceError
+
+HOST = "127.0.0.1"
+LIVE_MEMORY = "256MiB"
+"""History that the live server keeps for viewers that connect late."""
+BACKLOG = 20
+"""Batches that may wait for the live view: 2 s."""
+RESERVE = 64 << 20
+"""Free space left on the disk [bytes]: a file sink that once met a full disk never recovers."""
+PATIENCE = 2.0
+"""How long to wait for the disk, or for a thread to end [s]."""
+
+
+class Archive:
+    """A recording file; every batch is handed to the operating system before the next."""
+
+    def __init__(self, stream: rr.RecordingStream, path: Path) -> None:
+        self.lost = 0
+        """Batches that are not in the file."""
+        self._stream = stream
+        self._directory = path.parent
+        self._stuck = False
+
+    def write(self, chunks: list[Chunk]) -> bool:
+        """Write a batch; return whether it was written. Waits for the disk, but not for long."""
+        written = self._has_room() and (not self._stuck or self._flushed(0.01))
+        if written:
+            self._stream.send_chunks(chunks)
+            written = self._flushed(PATIENCE)
+        self.lost += not written
+        return written
+
+    def close(self) -> None:
+        """Complete the file, unless the disk is stuck."""
+        if self._flushed(PATIENCE):
+            self._stream.disconnect()
+
+    def _has_room(self) -> bool:
+        try:
+            return shutil.disk_usage(self._directory).free > RESERVE
+        except OSError:
+            return False
+
+    def _flushed(self, within: float) -> bool:
+        try:
+            self._stream.flush(timeout_sec=within)
+        except RuntimeError:  # the only sign of a failing disk: what was sent is not written in time
+            self._stuck = True
+        else:
+            self._stuck = False
+        return not self._stuck
+
+
+class Relay:
+    """Hands batches on in a thread of its own, and skips to the newest when the receiver falls behind."""
+
+    def __init__(self, deliver: Callable[[list[Chunk]], None], finish: Callable[[], None]) -> None:
+        self.skipped = 0
+        """Batches that were not handed on."""
+        self._deliver = deliver
+        self._finish = finish
+        self._waiting: deque[list[Chunk]] = deque()
+        self._changed = threading.Condition()
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="live", daemon=True)
+        self._thread.start()
+
+    def send(self, chunks: list[Chunk]) -> None:
+        """Take a batch; never blocks."""
+        with self._changed:
+            if len(self._waiting) == BACKLOG:
+                self.skipped += BACKLOG
+                self._waiting.clear()
+            self._waiting.append(chunks)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Hand on what waits, unless the receiver is stuck."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join(PATIENCE)
+
+    def _run(self) -> None:
+        while (chunks := self._next()) is not None:
+            self._deliver(chunks)
+        self._finish()
+
+    def _next(self) -> list[Chunk] | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._closing)
+            return self._waiting.popleft() if self._waiting else None
+
+
+def live_server(port: int) -> rr.GrpcServerSink:
+    """Return a server for viewers on this machine. ServiceError if the port is taken."""
+    with socket.socket() as probe:  # the sink would only log it, and discard all that it is sent
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            raise ServiceError(
+                f"live view: cannot listen on {HOST}:{port}: {error.strerror}; "
+                "set telemetry.live_port to a free port, or to 0 for no live view"
+            ) from error
+    return rr.GrpcServerSink(HOST, port, server_memory_limit=LIVE_MEMORY)
