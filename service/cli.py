@@ -12,7 +12,6 @@ import msgspec
 from cyclopts import App, CycloptsError, Parameter
 
 from service import __version__, terminal
-from service.config import SIM, load
 from service.errors import TrirailError
 from service.session import DEFAULT_LOCATOR
 
@@ -42,7 +41,7 @@ HERE = Service()
 
 
 @app.command
-def run(config: Path = SIM, /, *, record: Path | None = None) -> int:
+def run(config: Path | None = None, /, *, record: Path | None = None) -> int:
     """Run the service in the foreground until SIGTERM or Ctrl-C: then a controlled stop, drives disabled, exit 0.
 
     Parameters
@@ -52,9 +51,10 @@ def run(config: Path = SIM, /, *, record: Path | None = None) -> int:
     record
         Recording file to write, instead of one named by the time in the configured folder.
     """
+    from service.config import SIM, load
     from service.supervisor import Supervisor
 
-    settings = load(config)
+    settings = load(config or SIM)
     return Supervisor(settings, record, terminal.say).run(lambda ready: terminal.up(settings, ready))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from rich.console import Console
@@ -15,9 +15,11 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
 from service.client import Goal, Result, Robot
-from service.config import Config
 from service.errors import ServiceError
 from service.messages import Event, Percentiles, State
+
+if TYPE_CHECKING:
+    from service.config import Config
 
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)

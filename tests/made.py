@@ -59,8 +59,8 @@ def records(
 
 def _tour(t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return pose, velocity and acceleration, (N, 3): a three-petalled flower, turning to and fro."""
-    size, turn = 0.055, 0.30
-    w = 2.0 * math.pi / 9.0
+    size, turn = 0.055, 0.25
+    w = 2.0 * math.pi / 5.0
     terms = [  # of each coordinate: amplitude, angular frequency, phase
         [(size, 2.0 * w, 0.0), (size * 0.6, 4.0 * w, 0.0)],
         [(size, 2.0 * w, -math.pi / 2.0), (size * 0.6, 4.0 * w, math.pi / 2.0)],
