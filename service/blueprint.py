@@ -34,7 +34,10 @@ def layout(settings: Config, bounds: Points) -> rrb.Blueprint:
             rrb.TextLogView(
                 name="Events",
                 origin="/events",
-                columns=rrb.TextLogColumns(timeline_columns=[], text_log_columns=["LogLevel", "Body"]),
+                columns=rrb.TextLogColumns(
+                    timeline_columns=[rrb.encodings.TimelineColumn("t", visible=False)],
+                    text_log_columns=["LogLevel", "Body"],
+                ),
             ),
             row_shares=[2, 3],
         ),

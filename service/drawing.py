@@ -30,7 +30,7 @@ def still(parts: Mechanism) -> Iterator[tuple[str, rr.AsComponents]]:
         rr.Points2D(
             parts.anchors,
             radii=rr.Radius.ui_points(6.0),
-            colors=[palette.FRAME],
+            colors=[palette.ANCHORS],
             labels=[f"{leg}₀" for leg in LEGS],
             show_labels=True,
             draw_order=13,
@@ -63,7 +63,7 @@ def still(parts: Mechanism) -> Iterator[tuple[str, rr.AsComponents]]:
     yield (  # each slider, and in it the pin that the platform turns on
         "/robot/sliders",
         rr.Points2D.from_fields(
-            radii=[*[rr.Radius.ui_points(8.5)] * 3, *[rr.Radius.ui_points(3.0)] * 3],
+            radii=[-8.5] * 3 + [-3.0] * 3,  # negative: points of the screen, not metres
             colors=[*palette.SLIDERS, *[palette.PIN] * 3],
             draw_order=32,
         ),
@@ -99,7 +99,6 @@ def _lines(lines: list[Points], colours: Sequence[Colour], radius: float, *, ord
 def _placed(pose: Points) -> rr.ComponentColumnList:
     """Return the transforms from the platform's frame to the base frame for poses (N, 3)."""
     x, y, phi = pose.T
-    zero, one = np.zeros(len(pose)), np.ones(len(pose))
-    c, s = np.cos(phi), np.sin(phi)
-    rotation = np.stack([c, s, zero, -s, c, zero, zero, zero, one], axis=1)  # column by column
-    return rr.Transform3D.columns(translation=np.stack([x, y, zero], axis=1), mat3x3=rotation)
+    zero = np.zeros(len(pose))
+    turned = np.stack([zero, zero, np.sin(phi / 2.0), np.cos(phi / 2.0)], axis=1)
+    return rr.Transform3D.columns(translation=np.stack([x, y, zero], axis=1), quaternion=turned)

@@ -15,6 +15,7 @@ COMMANDED: Colour = (250, 176, 64, 90)
 PIN: Colour = (20, 21, 24)
 CENTRE: Colour = (76, 208, 224)
 FRAME: Colour = (74, 80, 92)
+ANCHORS: Colour = (122, 130, 144)
 ARMS: Colour = (92, 98, 110)
 
 X: Colour = CENTRE

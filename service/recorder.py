@@ -55,6 +55,7 @@ class Recorder:
         self._wall_offset_ns = started_ns - monotonic_ns()
         self._scene = Scene(config, self._wall_offset_ns)
         self._rate_hz = config.loop.rate_hz
+        self._newest = np.zeros(1, DTYPE)[0]
         self._reported = (0, 0)
         self._next_report = 0.0
 
@@ -114,6 +115,7 @@ class Recorder:
         """Write what is left and complete the file; waits a few seconds at most for a stuck disk or viewer."""
         for batches in self._batches:
             batches.flush()
+        self._report()
         self._archive.close()
         if self._frames:
             self._frames.close()
@@ -132,13 +134,19 @@ class Recorder:
 
     def _record(self, records: NDArray[np.void]) -> None:
         self._archive.write(self._scene.complete(records) + self._scene.drawn(records))
-        newest = records[-1]
-        t = float(newest["cycle"]) / self._rate_hz
+        self._newest = records[-1]
+        if float(self._newest["cycle"]) / self._rate_hz >= self._next_report:
+            self._report()
+
+    def _report(self) -> None:
+        """Say in the log what is missing, if it is more than was last said."""
         missing = (self.lost, self.skipped)
-        if missing != self._reported and t >= self._next_report:
-            self._reported, self._next_report = missing, t + REPORT_EVERY
-            wall = float(newest["deadline_ns"] + self._wall_offset_ns) * 1e-9
-            self._remark(remark(t, wall, "warning", MISSING.format(*missing)))
+        if missing == self._reported:
+            return
+        t = float(self._newest["cycle"]) / self._rate_hz
+        wall = float(self._newest["deadline_ns"] + self._wall_offset_ns) * 1e-9
+        self._reported, self._next_report = missing, t + REPORT_EVERY
+        self._remark(remark(t, wall, "warning", MISSING.format(*missing)))
 
     def _remark(self, line: Chunk) -> None:
         self._archive.write([line])

@@ -6,17 +6,21 @@ Needs no display, only a Vulkan driver; on Debian, mesa-vulkan-drivers.
 from __future__ import annotations
 
 import argparse
+import io
 import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+from PIL import Image
 from rerun.experimental import ViewerClient
 
 TIMEOUT = 60.0
 SETTLE = 2.0
 """For the views to take in what has been loaded [s]."""
+TITLE_BAR = 36
+"""Height of the strip that the viewer keeps for the window's buttons [pixels]; there is nothing in it."""
 
 
 def main() -> int:
@@ -29,16 +33,19 @@ def main() -> int:
     arguments = parser.parse_args()
     if not arguments.recording.is_file():
         parser.error(f"{arguments.recording} is not a file")
+    width, height = (int(number) for number in arguments.size.split("x"))
     port = _free_port()
     command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen"]
-    command += ["--window-size", arguments.size, "--port", str(port), str(arguments.recording)]
+    command += ["--window-size", f"{width}x{height + TITLE_BAR}", "--port", str(port), str(arguments.recording)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as viewer:
         try:
             client = _connect(viewer, f"rerun+http://127.0.0.1:{port}/proxy")
+            client.run_command("ui.toggle_top_panel")
             if arguments.at is not None:
                 client.set_time("t", duration=arguments.at)
             time.sleep(SETTLE)
-            arguments.picture.write_bytes(client.take_screenshot())
+            picture = Image.open(io.BytesIO(client.take_screenshot()))
+            picture.crop((0, TITLE_BAR, width, TITLE_BAR + height)).save(arguments.picture)
         finally:
             viewer.terminate()
     return 0

@@ -1,0 +1,259 @@
+"""The recorder: what is in the file, what happens when disk, port or viewer fail."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import threading
+from collections import namedtuple
+from pathlib import Path
+from typing import Any
+
+import can
+import made
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rerun.chunk import Chunk, RrdReader
+
+from drivers.capture import FRAME
+from service.config import SIM, Config, load
+from service.errors import ServiceError
+from service.messages import Event
+from service.recorder import Recorder
+from service.records import DTYPE
+from service.sinks import BACKLOG, Archive, Relay
+
+WALL_NS = 1_795_245_300_000_000_000
+
+
+def configured(**telemetry: Any) -> Config:
+    config = load(SIM)
+    return msgspec.structs.replace(config, telemetry=msgspec.structs.replace(config.telemetry, **telemetry))
+
+
+def recorder(directory: Path, config: Config | None = None, **more: Any) -> Recorder:
+    settled = {"live": False, "wall_ns": lambda: WALL_NS, "monotonic_ns": lambda: made.MONOTONIC_NS}
+    return Recorder(config or configured(), directory, **{**settled, **more})
+
+
+def feed(to: Recorder, records: NDArray[np.void], size: int = 50) -> None:
+    for start in range(0, len(records), size):
+        to.records(records[start : start + size].tobytes())
+
+
+def chunks(path: Path, entity: str) -> list[Chunk]:
+    return [chunk for chunk in RrdReader(path).stream() if chunk.entity_path == entity]
+
+
+def read(path: Path) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+    """Return the records in a file, and their nominal times [ns]."""
+    batches = [chunk.to_record_batch() for chunk in chunks(path, "/record")]
+    records = np.zeros(sum(batch.num_rows for batch in batches), DTYPE)
+    for name in DTYPE.names or ():
+        columns = [batch.column("fields").flatten().field(name) for batch in batches]
+        flat = [column.flatten() if records[name].ndim > 1 else column for column in columns]
+        records[name] = np.concatenate([column.to_numpy() for column in flat]).reshape(records[name].shape)
+    t = np.concatenate([batch.column("t").to_numpy().astype(np.int64) for batch in batches])
+    order = np.argsort(t)
+    return records[order], t[order]
+
+
+def lines(path: Path) -> list[tuple[str, str]]:
+    """Return level and text of a file's log."""
+    return [
+        (level[0], text[0])
+        for chunk in chunks(path, "/events")
+        for level, text in zip(
+            chunk.to_record_batch().column("TextLog:level").to_pylist(),
+            chunk.to_record_batch().column("TextLog:text").to_pylist(),
+            strict=True,
+        )
+    ]
+
+
+def test_the_file_holds_every_record_in_exact_steps(tmp_path: Path) -> None:
+    sent = made.records(1.234)
+    recording = recorder(tmp_path / "new" / "folder")
+    feed(recording, sent, 37)
+    recording.close()
+    records, t = read(recording.path)
+    assert records.tobytes() == sent.tobytes()
+    assert np.all(np.diff(t) == 1_000_000)
+    assert recording.lost == 0
+
+
+def test_the_file_holds_blueprint_drawing_and_curves(tmp_path: Path) -> None:
+    recording = recorder(tmp_path)
+    feed(recording, made.records(0.3))
+    recording.close()
+    reader = RrdReader(recording.path)
+    (store,) = reader.recordings()
+    assert store.application_id == "trirail"
+    assert len(reader.blueprints()) == 1
+    still = {chunk.entity_path for chunk in reader.stream() if chunk.is_static}
+    moving = {chunk.entity_path for chunk in reader.stream() if not chunk.is_static}
+    assert {"/robot/rails", "/robot/platform/outline", "/sliders/velocity", "/mode"} <= still
+    assert {"/robot/platform", "/robot/sliders", "/sliders/velocity", "/mode", "/record"} <= moving
+
+
+def test_events_are_lines_of_the_log(tmp_path: Path) -> None:
+    recording = recorder(tmp_path)
+    recording.event(Event(1, 0.5, 500, WALL_NS * 1e-9, "mode", "info", "enabled by ann", mode="holding"))
+    recording.event(Event(2, 0.6, 600, WALL_NS * 1e-9, "fault", "error", "drive B: silent"))
+    recording.close()
+    assert lines(recording.path) == [("INFO", "enabled by ann"), ("ERROR", "drive B: silent")]
+
+
+def test_files_are_named_by_the_wall_clock_and_never_overwritten(tmp_path: Path) -> None:
+    first, second = recorder(tmp_path), recorder(tmp_path)
+    first.close()
+    second.close()
+    assert first.path.name.startswith("demo-2026112")
+    assert second.path.name == f"{first.path.stem}-2.rrd"
+
+
+def test_a_file_asked_for_by_name_is_written_anew(tmp_path: Path) -> None:
+    path = tmp_path / "mine.rrd"
+    path.write_text("old")
+    recording = recorder(tmp_path / "elsewhere", path=path)
+    feed(recording, made.records(0.1))
+    recording.close()
+    assert recording.path == path
+    assert len(read(path)[0]) == 100
+    assert not (tmp_path / "elsewhere").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(ServiceError, match=r"cannot write a recording to .*file/x: .*telemetry\.directory"):
+        recorder(blocked / "x")
+
+
+def test_a_live_port_in_use_is_refused(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ServiceError, match=rf"127\.0\.0\.1:{port}: .*telemetry\.live_port"):
+            recorder(tmp_path, configured(live_port=port), live=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_live_view_is_served_on_loopback_beside_the_file(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    recording = recorder(tmp_path, configured(live_port=port), live=True)
+    try:
+        assert recording.live_url == f"rerun+http://127.0.0.1:{port}/proxy"
+        socket.create_connection(("127.0.0.1", port), timeout=5.0).close()
+        feed(recording, made.records(0.4))
+    finally:
+        recording.close()
+    assert len(read(recording.path)[0]) == 400
+    assert (recording.lost, recording.skipped) == (0, 0)
+
+
+def test_without_a_live_port_there_is_no_live_view(tmp_path: Path) -> None:
+    recording = recorder(tmp_path, configured(live_port=0), live=True)
+    recording.close()
+    assert recording.live_url == ""
+
+
+def test_a_full_disk_is_counted_and_said_and_recording_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = namedtuple("usage", "free")
+    recording = recorder(tmp_path)
+    sent = made.records(1.0)
+    feed(recording, sent[:400])
+    with monkeypatch.context() as full:
+        full.setattr(shutil, "disk_usage", lambda _: usage(free=0))
+        feed(recording, sent[400:600])
+    feed(recording, sent[600:])
+    recording.close()
+    records, _ = read(recording.path)
+    assert np.array_equal(records["cycle"], [*range(400), *range(600, 1000)])
+    assert recording.lost == 2  # the batch, and the remark that it is missing
+    assert lines(recording.path) == [
+        (
+            "WARN",
+            "missing so far: 2 batches in the file (disk full or failing), 0 in the live view (viewer too slow)",
+        )
+    ]
+
+
+def test_a_stuck_disk_is_left_alone_until_it_answers() -> None:
+    stream = _Stream()
+    archive = Archive(stream, Path("/tmp/x.rrd"))  # type: ignore[arg-type]
+    assert archive.write([])
+    stream.stuck = True
+    assert not archive.write([])
+    assert not archive.write([])
+    assert stream.sent == 2  # Rerun's sink would block for ever if it were sent more
+    archive.close()
+    assert not stream.closed
+    stream.stuck = False
+    assert archive.write([])
+    assert archive.lost == 2
+    archive.close()
+    assert stream.closed
+
+
+class _Stream:
+    """A recording stream whose disk can be stuck."""
+
+    def __init__(self) -> None:
+        self.sent = 0
+        self.stuck = False
+        self.closed = False
+
+    def send_chunks(self, chunks: list[Chunk]) -> None:
+        self.sent += 1
+
+    def flush(self, *, timeout_sec: float) -> None:
+        if self.stuck:
+            raise RuntimeError("flush timed out")
+
+    def disconnect(self) -> None:
+        self.closed = True
+
+
+def test_a_slow_viewer_is_skipped_to_the_newest() -> None:
+    began, go_on, finished = threading.Event(), threading.Event(), threading.Event()
+    delivered: list[Any] = []
+
+    def deliver(batch: Any) -> None:
+        began.set()
+        assert go_on.wait(10.0)
+        delivered.append(batch)
+
+    relay = Relay(deliver, finished.set)
+    batches: list[Any] = [[number] for number in range(2 * BACKLOG + 5)]
+    relay.send(batches[0])
+    assert began.wait(10.0)
+    for batch in batches[1:]:
+        relay.send(batch)
+    go_on.set()
+    relay.close()
+    assert finished.is_set()
+    assert relay.skipped == 2 * BACKLOG
+    assert delivered == [batches[0], *batches[2 * BACKLOG + 1 :]]
+
+
+def test_captured_frames_are_a_log_that_python_can_reads(tmp_path: Path) -> None:
+    recording = recorder(tmp_path, configured(capture_can=True))
+    recording.frames(FRAME.pack(1_795_245_300.25, 0x201, 6, bytes([1, 2, 3, 4, 5, 255, 0, 0])))
+    recording.frames(FRAME.pack(1_795_245_300.5, 0x080, 0, bytes(8)))
+    recording.close()
+    with can.CanutilsLogReader(recording.path.with_suffix(".log")) as log:
+        first, second = log
+    assert (first.arbitration_id, bytes(first.data)) == (0x201, bytes([1, 2, 3, 4, 5, 255]))
+    assert first.timestamp == pytest.approx(1_795_245_300.25)
+    assert first.channel == "simulated"
+    assert (second.arbitration_id, second.dlc) == (0x080, 0)
+
+
+def test_frames_are_not_kept_unless_asked_for(tmp_path: Path) -> None:
+    recording = recorder(tmp_path)
+    recording.frames(FRAME.pack(1.0, 0x201, 0, bytes(8)))
+    recording.close()
+    assert [path.suffix for path in tmp_path.iterdir()] == [".rrd"]

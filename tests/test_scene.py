@@ -1,0 +1,181 @@
+"""What is drawn, read back from the columns that Rerun is given."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import made
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rerun.chunk import Chunk
+
+from service.config import SIM, LegTable, load
+from service.geometry import Geometry, Leg
+from service.mechanism import Mechanism, sliders
+from service.modes import MODES, Mode
+from service.records import DTYPE
+from service.scene import Scene, remark
+
+CONFIG = load(SIM)
+WALL_OFFSET_NS = 1_700_000_000_000_000_000
+GENERAL = Geometry(
+    legs=(
+        Leg((0.01, -0.29), 1.02, 0.17, (0.088, -0.152), 0.03),
+        Leg((0.27, 0.14), 3.17, 0.175, (0.083, 0.152), 2.06),
+        Leg((-0.25, 0.16), -1.08, 0.172, (-0.171, 0.002), 4.21),
+    )
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene(CONFIG, WALL_OFFSET_NS)
+
+
+def by_entity(chunks: list[Chunk]) -> dict[str, Chunk]:
+    found = {chunk.entity_path: chunk for chunk in chunks}
+    assert len(found) == len(chunks)
+    return found
+
+
+def values(chunk: Chunk, component: str) -> NDArray[Any]:
+    """Return a component's values, (rows, …)."""
+    return np.array(chunk.to_record_batch().column(component).to_pylist())
+
+
+def test_every_field_of_every_record_is_kept_as_it_was(scene: Scene) -> None:
+    records = made.records(0.2)
+    (chunk,) = scene.complete(records)
+    batch = chunk.to_record_batch()
+    fields = batch.column("fields").flatten()
+    for name in DTYPE.names or ():
+        column = fields.field(name)
+        flat = column.flatten() if records[name].ndim > 1 else column
+        assert np.array_equal(flat.to_numpy().reshape(records[name].shape), records[name]), name
+    steps = np.diff(batch.column("t").to_numpy()).astype(int)
+    assert np.all(steps == 1_000_000)
+    wall = batch.column("wall").to_numpy().astype(int)
+    assert np.array_equal(wall, records["deadline_ns"] + WALL_OFFSET_NS)
+
+
+@pytest.mark.parametrize("geometry", [Geometry.symmetric(0.3), GENERAL], ids=["symmetric", "general"])
+def test_sliders_are_drawn_on_their_rail_and_on_their_edge(geometry: Geometry) -> None:
+    records = made.records(5.0, geometry)
+    records["pose"], records["position"] = records["commanded_pose"], records["commanded_position"]
+    parts = Mechanism.of(geometry, CONFIG.limits.slider)
+    config = _with_geometry(geometry)
+    drawn = by_entity(Scene(config, 0).drawn(records))
+
+    points = values(drawn["/robot/sliders"], "Points2D:positions")
+    centre = values(drawn["/robot/platform"], "Transform3D:translation")[:, 0, :2]
+    _, _, z, w = values(drawn["/robot/platform"], "Transform3D:quaternion")[:, 0].T
+    assert len(points) == 250
+    c, s = w * w - z * z, 2.0 * w * z
+    turned = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
+    corners = centre[:, None] + np.einsum("nij,kj->nki", turned, parts.outline[0])
+    for k in range(3):
+        at = points[:, k]
+        assert np.array_equal(at, points[:, 3 + k])  # its pin
+        assert np.abs(_beside(at, *np.broadcast_to(parts.rails[k][:, None], (2, *at.shape)))).max() < 1e-6
+        edges = [np.abs(_beside(at, corners[:, j], corners[:, j + 1])).max() for j in range(3)]
+        assert min(edges) < 1e-6
+        assert sorted(edges)[1] > 1e-2
+
+
+def test_the_symmetric_robot_is_two_equal_triangles() -> None:
+    parts = Mechanism.of(Geometry.symmetric(0.3), CONFIG.limits.slider)
+    (outline,) = parts.outline
+    sides = np.linalg.norm(np.diff(outline, axis=0), axis=1)
+    assert sides == pytest.approx([math.sqrt(3.0) * 0.3] * 3)
+    assert np.array_equal(outline[0], outline[3])
+    assert outline[:3].mean(axis=0) == pytest.approx([0.0, 0.0])
+    for low, high in zip(parts.travel, parts.rails, strict=True):
+        assert np.linalg.norm(low[1] - low[0]) == pytest.approx(0.51)
+        assert np.linalg.norm(high[0] - low[0]) == pytest.approx(np.linalg.norm(high[1] - low[1]))
+
+
+def test_a_platform_with_parallel_edges_is_drawn_as_its_edges() -> None:
+    legs = GENERAL.legs
+    parallel = Geometry(legs=(legs[0], legs[1], Leg((-0.25, 0.16), -1.08, 0.172, (-0.171, 0.002), 0.03)))
+    parts = Mechanism.of(parallel, CONFIG.limits.slider)
+    assert [len(edge) for edge in parts.outline] == [2, 2, 2]
+    assert [len(arm) for arm in parts.arms] == [2, 2, 2]
+
+
+def test_sliders_follow_their_rails() -> None:
+    at = sliders(Geometry.symmetric(0.3), np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
+    assert at[1, 0] - at[0, 0] == pytest.approx([0.05, 0.1 * math.sqrt(3.0) / 2.0])
+    assert np.array_equal(at[1, 1:], at[0, 1:])
+
+
+def test_curves_are_in_the_units_of_people(scene: Scene) -> None:
+    records = made.records(0.5)
+    drawn = by_entity(scene.drawn(records))
+    newest = records[9::10]
+    slider = CONFIG.limits.slider
+    position = values(drawn["/sliders/position"], "Scalars:scalars")
+    assert position[:, :3] == pytest.approx(newest["position"] * 1e3)
+    assert np.all(position[:, 3:] == [slider.position[0] * 1e3, slider.position[1] * 1e3])
+    phi = values(drawn["/pose/phi"], "Scalars:scalars")
+    assert phi[:, 0] == pytest.approx(np.degrees(newest["pose"][:, 2]))
+    t = drawn["/pose/phi"].to_record_batch().column("t").to_numpy().astype(int)
+    assert np.array_equal(t, newest["cycle"] * 1_000_000)
+
+
+def test_no_spike_is_lost_to_thinning(scene: Scene) -> None:
+    records = made.records(0.5)
+    records["following_error"][123] = [-2e-3, 1e-3, 0.0]
+    records["lateness_ns"][271] = 5_000_000
+    drawn = by_entity(scene.drawn(records))
+    error = values(drawn["/sliders/following_error"], "Scalars:scalars")
+    assert error[12, :2] == pytest.approx([-2000.0, 1000.0])
+    timing = values(drawn["/loop/timing"], "Scalars:scalars")
+    assert timing[27, 1:] == pytest.approx([5000.0, 1000.0])  # with the budget
+
+
+def test_a_gap_in_the_cycles_is_a_gap_in_time(scene: Scene) -> None:
+    records = np.concatenate([made.records(0.1)[:33], made.records(0.1)[58:]])
+    t = by_entity(scene.drawn(records))["/pose/phi"].to_record_batch().column("t").to_numpy().astype(int)
+    assert np.array_equal(t // 1_000_000, [9, 19, 29, 32, 59, 69, 79, 89, 99])
+
+
+def test_modes_are_said_when_they_change_and_at_the_start_of_a_batch(scene: Scene) -> None:
+    records = made.records(0.1)
+    records["mode"][40:] = MODES.index(Mode.STOPPING)
+    mode = by_entity(scene.drawn(records))["/mode"]
+    assert values(mode, "StateChange:state").tolist() == [["moving"], ["stopping"]]
+    t = mode.to_record_batch().column("t").to_numpy().astype(int)
+    assert np.array_equal(t, [0, 40_000_000])
+
+
+def test_a_remark_has_its_time_and_level() -> None:
+    line = remark(1.25, 1_700_000_000.5, "warning", "a word")
+    batch = line.to_record_batch()
+    assert batch.column("TextLog:text").to_pylist() == [["a word"]]
+    assert batch.column("TextLog:level").to_pylist() == [["WARN"]]
+    assert batch.column("t").to_numpy().astype(int).tolist() == [1_250_000_000]
+    assert batch.column("wall").to_numpy().astype(int).tolist() == [1_700_000_000_500_000_000]
+
+
+def test_what_is_still_is_there_once(scene: Scene) -> None:
+    paths = [path for path, _ in scene.still()]
+    assert len(set(paths)) == len(paths)
+    assert {"/robot", "/robot/rails", "/robot/platform/outline", "/sliders/position", "/mode"} <= set(paths)
+
+
+def _with_geometry(geometry: Geometry) -> Any:
+    import msgspec
+
+    legs = tuple(LegTable(**{name: getattr(leg, name) for name in Leg.__slots__}) for leg in geometry.legs)
+    table = msgspec.structs.replace(CONFIG.geometry, l0=None, leg=legs)
+    return msgspec.structs.replace(CONFIG, geometry=table)
+
+
+def _beside(points: NDArray[Any], start: NDArray[Any], end: NDArray[Any]) -> NDArray[Any]:
+    """Return how far points lie from the lines through `start` and `end`, all (N, 2)."""
+    along = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
+    off = points - start
+    distance: NDArray[Any] = along[:, 0] * off[:, 1] - along[:, 1] * off[:, 0]
+    return distance
