@@ -42,7 +42,7 @@ def main() -> int:
             client = _connect(viewer, f"rerun+http://127.0.0.1:{port}/proxy")
             client.run_command("ui.toggle_top_panel")
             if arguments.at is not None:
-                client.set_time("t", duration=arguments.at)
+                client.set_time("t", duration=arguments.at, play_state="paused")
             time.sleep(SETTLE)
             picture = Image.open(io.BytesIO(client.take_screenshot()))
             picture.crop((0, TITLE_BAR, width, TITLE_BAR + height)).save(arguments.picture)
