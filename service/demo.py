@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -18,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from service.client import Result, Robot
 from service.config import SIM, load
-from service.errors import RefusedError, ServiceError
+from service.errors import RefusedError, ServiceError, TrirailError
 from service.messages import State
 from service.terminal import out, percentiles
 
@@ -69,7 +71,7 @@ def run(*, stay: bool, record: Path | None) -> int:
         f"[bold]trirail demo[/]: starting the service on {SIM.name}, simulated drives at {config.loop.rate_hz} Hz"
     )
     with _service(recording) as service:
-        with _connect(config.robot.name, locator, service) as robot:
+        with Robot(config.robot.name, locator, user="demo") as robot:
             robot.enable()
             rows = list(_tour(robot))
             state = robot.state()
@@ -88,36 +90,45 @@ def run(*, stay: bool, record: Path | None) -> int:
 
 @contextlib.contextmanager
 def _service(recording: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the service in a process of its own; show what it said if this fails."""
-    with tempfile.TemporaryFile() as log:
-        command = [sys.executable, "-m", "service", "run", str(SIM), "--record", str(recording)]
-        service = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+    """Run the service in a process of its own; end it in any case, and show what it said if something fails.
+
+    It is up when it says so, as to systemd. Asking on its port instead could find another service, and move that.
+    """
+    with (
+        tempfile.TemporaryFile() as log,
+        tempfile.TemporaryDirectory() as folder,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready,
+    ):
+        ready.bind(f"{folder}/ready")
+        ready.settimeout(0.1)
+        service = subprocess.Popen(
+            [sys.executable, "-m", "service", "run", str(SIM), "--record", str(recording)],
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            env=os.environ | {"NOTIFY_SOCKET": ready.getsockname()},
+        )
         try:
+            with out.status("starting the service (the very first time compiles the kinematics, some seconds)"):
+                _wait(service, ready)
             yield service
-        except BaseException:
-            service.send_signal(signal.SIGTERM)
-            service.wait(timeout=20)
+        except TrirailError:
             log.seek(0)
             sys.stderr.write(log.read().decode())
             raise
+        finally:
+            service.send_signal(signal.SIGTERM)
+            service.wait(timeout=20)
 
 
-def _connect(name: str, locator: str, service: subprocess.Popen[bytes]) -> Robot:
-    """Connect once the service is up. The first start of all compiles the kinematics."""
+def _wait(service: subprocess.Popen[bytes], ready: socket.socket) -> None:
     deadline = time.monotonic() + START_WITHIN
-    with out.status("waiting for the service (its very first start compiles the kinematics, some seconds)"):
-        while time.monotonic() < deadline:
-            if service.poll() is not None:
-                raise ServiceError("the service could not start: see above")
-            with contextlib.suppress(ServiceError):
-                robot = Robot(name, locator, user="demo")
-                try:
-                    robot.state(timeout=1.0)
-                except ServiceError:
-                    robot.close()
-                else:
-                    return robot
-            time.sleep(0.1)
+    while time.monotonic() < deadline:
+        with contextlib.suppress(TimeoutError):
+            if ready.recv(1024) == b"READY=1":
+                return
+        if service.poll() is not None:
+            raise ServiceError("the service could not start, see above")
     raise ServiceError(f"the service was not up within {START_WITHIN:g} s")
 
 

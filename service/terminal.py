@@ -57,7 +57,7 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
     """Say that the service is up, where it is, and what it lacks."""
     loop, recorder = ready["loop"], ready["recorder"]
     out.print(f"[bold green]up[/]  robot [bold]{config.robot.name}[/] at {config.loop.rate_hz} Hz")
-    out.print(f"    goals      {', '.join(config.zenoh.listen)}  (trirail enable, trirail goto 0.02 0 0.1 --wait)")
+    out.print(f"    goals      {', '.join(config.zenoh.listen)}", soft_wrap=True)
     if recorder["live"]:
         out.print(f"    live view  rerun --connect {recorder['live']}", soft_wrap=True)
     out.print(f"    recording  {recorder['recording']}", soft_wrap=True)
@@ -123,8 +123,8 @@ def _table(state: State, robot: str) -> Table:
     for index, name in enumerate("ABC"):
         grid.add_row(
             f"slider {name}",
-            f"{sliders.position[index] * 1e3:9.3f} mm {sliders.velocity[index] * 1e3:9.2f} mm/s   "
-            f"following error {sliders.following_error[index] * 1e6:7.1f} µm   {sliders.status[index]}",
+            f"{sliders.position[index] * 1e3:9.3f} mm {sliders.velocity[index] * 1e3:8.2f} mm/s "
+            f"{sliders.following_error[index] * 1e6:7.1f} µm error  {sliders.status[index]}",
         )
     loop = state.loop
     grid.add_row("loop", f"{loop.rate_hz} Hz, {loop.cycles} cycles, {loop.overruns} missed, bus {loop.bus_load:.0%}")
