@@ -1,8 +1,9 @@
-"""Arrays as Rerun's columns, for many entities at once: a fraction of the cost of a call for each."""
+"""Arrays as Rerun's columns, of many entities in one go: a fraction of the cost of Rerun's call for each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -10,9 +11,15 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from service.records import DTYPE
-
 SECOND = 1_000_000_000  # [ns]
+
+
+class Column(NamedTuple):
+    """Values of one component of one entity: a list for every time."""
+
+    path: str
+    kind: rr.ComponentDescriptor
+    values: pa.ListArray
 
 
 class Timelines:
@@ -25,8 +32,7 @@ class Timelines:
     def of(self, records: NDArray[np.void]) -> list[rr.TimeColumn]:
         """Return the times of records. Steps of `t` are exact if the period is a whole number of nanoseconds."""
         t = records["cycle"] * SECOND // self._rate_hz
-        wall = records["deadline_ns"] + self._wall_offset_ns
-        return _times(t, wall)
+        return _times(t, records["deadline_ns"] + self._wall_offset_ns)
 
 
 def moment(t: float, wall: float) -> list[rr.TimeColumn]:
@@ -34,30 +40,45 @@ def moment(t: float, wall: float) -> list[rr.TimeColumn]:
     return _times(np.array([round(t * SECOND)]), np.array([round(wall * SECOND)]))
 
 
-def scalars(times: list[rr.TimeColumn], curves: Mapping[str, NDArray[np.float64]]) -> list[Chunk]:
-    """Return the values of curves, by entity: (N, lines) for N times."""
-    kind = rr.Scalars.descriptor_scalars()
-    metadata = {"rerun:archetype": kind.archetype, "rerun:component_type": kind.component_type}
-    fields, arrays = _indexes(times)
-    for path, values in curves.items():
-        array = _lists(pa.array(np.ascontiguousarray(values).ravel()), len(values))
-        arrays.append(array)
-        fields.append(
-            pa.field(
-                f"{path}:{kind.component}",
-                array.type,
-                metadata={"rerun:entity_path": path, "rerun:component": kind.component, **metadata},
-            )
-        )
-    return _chunks(fields, arrays, times)
+def chunks(times: list[rr.TimeColumn], columns: Iterable[Column]) -> list[Chunk]:
+    """Return columns that share their times as chunks: one for each entity."""
+    arrays = [time.as_arrow_array() for time in times]
+    fields = [pa.field(time.timeline_name(), array.type) for time, array in zip(times, arrays, strict=True)]
+    for path, kind, values in columns:
+        metadata = {"rerun:entity_path": path, "rerun:component": kind.component}
+        if kind.archetype and kind.component_type:
+            metadata |= {"rerun:archetype": kind.archetype, "rerun:component_type": kind.component_type}
+        arrays.append(values)
+        fields.append(pa.field(f"{path}:{kind.component}", values.type, metadata=metadata))
+    batch = pa.record_batch(arrays, schema=pa.schema(fields))
+    return Chunk.from_record_batch(batch, index=[time.timeline_name() for time in times])
 
 
-def structs(times: list[rr.TimeColumn], path: str, records: NDArray[np.void]) -> list[Chunk]:
-    """Return records with every field as it is: one struct for each, component `fields` of the entity."""
-    fields, arrays = _indexes(times)
-    names = DTYPE.names or ()
-    array = _lists(pa.StructArray.from_arrays([_field(records[name]) for name in names], names), len(records))
-    return _chunks([*fields, pa.field(f"{path}:fields", array.type)], [*arrays, array], times)
+def scalars(values: NDArray[np.float64]) -> pa.ListArray:
+    """Return (N, k) as N rows of k numbers."""
+    return _lists(pa.array(_flat(values)), values.shape[1])
+
+
+def vectors(values: NDArray[np.float64]) -> pa.ListArray:
+    """Return (N, k, d) as N rows of k vectors in single precision."""
+    return _lists(_vectors(values), values.shape[1])
+
+
+def strips(values: NDArray[np.float64]) -> pa.ListArray:
+    """Return (N, k, d) as N rows of one line each, through k points in single precision."""
+    points = _vectors(values)
+    kind = pa.list_(pa.field("item", points.type, nullable=False))
+    return _lists(_lists(points, values.shape[1]).cast(kind), 1)
+
+
+def structs(records: NDArray[np.void]) -> pa.ListArray:
+    """Return records as rows of one struct each, with the same fields."""
+    names = records.dtype.names or ()
+    fields = []
+    for values in (records[name] for name in names):
+        flat = pa.array(_flat(values))
+        fields.append(flat if values.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1]))
+    return _lists(pa.StructArray.from_arrays(fields, names), 1)
 
 
 def _times(t: NDArray[np.int64], wall: NDArray[np.int64]) -> list[rr.TimeColumn]:
@@ -67,21 +88,14 @@ def _times(t: NDArray[np.int64], wall: NDArray[np.int64]) -> list[rr.TimeColumn]
     ]
 
 
-def _indexes(times: list[rr.TimeColumn]) -> tuple[list[pa.Field], list[pa.Array]]:
-    arrays = [time.as_arrow_array() for time in times]
-    return [pa.field(time.timeline_name(), array.type) for time, array in zip(times, arrays, strict=True)], arrays
+def _vectors(values: NDArray[np.float64]) -> pa.FixedSizeListArray:
+    kind = pa.list_(pa.field("item", pa.float32(), nullable=False), values.shape[-1])
+    return pa.FixedSizeListArray.from_arrays(pa.array(_flat(values.astype(np.float32))), type=kind)
 
 
-def _field(values: NDArray[np.generic]) -> pa.Array:
-    flat = pa.array(np.ascontiguousarray(values).ravel())
-    return flat if values.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+def _lists(items: pa.Array, length: int) -> pa.ListArray:
+    return pa.ListArray.from_arrays(np.arange(0, len(items) + 1, length, dtype=np.int32), items)
 
 
-def _lists(flat: pa.Array, rows: int) -> pa.ListArray:
-    """Return the values in lists of the same length, as many as there are rows."""
-    return pa.ListArray.from_arrays(np.linspace(0, len(flat), rows + 1).astype(np.int32), flat)
-
-
-def _chunks(fields: list[pa.Field], arrays: list[pa.Array], times: list[rr.TimeColumn]) -> list[Chunk]:
-    batch = pa.record_batch(arrays, schema=pa.schema(fields))
-    return Chunk.from_record_batch(batch, index=[time.timeline_name() for time in times])
+def _flat(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    return np.ascontiguousarray(values).ravel()

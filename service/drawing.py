@@ -7,15 +7,19 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from rerun.chunk import Chunk
 
-from service import mechanism, palette
+from service import columns, mechanism, palette
+from service.columns import Column
 from service.geometry import LEGS, Geometry
 from service.mechanism import Mechanism, Points
 from service.palette import Colour
 
 ORIGIN = 0.02
 """Arms of the cross at the base frame's origin, as a share of the robot's size."""
+POSITIONS = rr.Points2D.descriptor_positions()
+STRIPS = rr.LineStrips2D.descriptor_strips()
+TRANSLATION = rr.Transform3D.descriptor_translation()
+QUATERNION = rr.Transform3D.descriptor_quaternion()
 _CROSS = (np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]]))
 
 
@@ -70,25 +74,15 @@ def still(parts: Mechanism) -> Iterator[tuple[str, rr.AsComponents]]:
     )
 
 
-def moving(
-    geometry: Geometry, times: Sequence[rr.TimeColumn], before: NDArray[np.void], records: NDArray[np.void]
-) -> list[Chunk]:
-    """Return where the moving parts are in `records`, and the trace of the centre from `before` to there.
-
-    Both have shape (N,), as have the times.
-    """
+def moving(geometry: Geometry, before: NDArray[np.void], records: NDArray[np.void]) -> list[Column]:
+    """Return where the moving parts are in `records`, (N,), and the trace of the centre there from `before`."""
     sliders = mechanism.sliders(geometry, records["position"])
-    sliders_and_pins = np.concatenate([sliders, sliders], axis=1)
     steps = np.stack([before["pose"][:, :2], records["pose"][:, :2]], axis=1)
     return [
-        Chunk.from_columns("/robot/platform", times, _placed(records["pose"])),
-        Chunk.from_columns("/robot/commanded", times, _placed(records["commanded_pose"])),
-        Chunk.from_columns(
-            "/robot/sliders",
-            times,
-            rr.Points2D.columns(positions=sliders_and_pins.reshape(-1, 2)).partition(np.full(len(sliders), 6)),
-        ),
-        Chunk.from_columns("/robot/trace", times, rr.LineStrips2D.columns(strips=steps)),
+        *_placed("/robot/platform", records["pose"]),
+        *_placed("/robot/commanded", records["commanded_pose"]),
+        Column("/robot/sliders", POSITIONS, columns.vectors(np.concatenate([sliders, sliders], axis=1))),
+        Column("/robot/trace", STRIPS, columns.strips(steps)),
     ]
 
 
@@ -96,9 +90,12 @@ def _lines(lines: list[Points], colours: Sequence[Colour], radius: float, *, ord
     return rr.LineStrips2D(lines, colors=colours, radii=rr.Radius.ui_points(radius), draw_order=order)
 
 
-def _placed(pose: Points) -> rr.ComponentColumnList:
+def _placed(path: str, pose: Points) -> list[Column]:
     """Return the transforms from the platform's frame to the base frame for poses (N, 3)."""
-    x, y, phi = pose.T
-    zero = np.zeros(len(pose))
-    turned = np.stack([zero, zero, np.sin(phi / 2.0), np.cos(phi / 2.0)], axis=1)
-    return rr.Transform3D.columns(translation=np.stack([x, y, zero], axis=1), quaternion=turned)
+    translation, quaternion = np.zeros((len(pose), 1, 3)), np.zeros((len(pose), 1, 4))
+    translation[:, 0, :2] = pose[:, :2]
+    quaternion[:, 0, 2], quaternion[:, 0, 3] = np.sin(pose[:, 2] / 2.0), np.cos(pose[:, 2] / 2.0)
+    return [
+        Column(path, TRANSLATION, columns.vectors(translation)),
+        Column(path, QUATERNION, columns.vectors(quaternion)),
+    ]

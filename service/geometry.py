@@ -108,8 +108,8 @@ def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)
         # det J2 is smooth between two singular angles of J1. Zeros crowd at the ends, so the samples do too.
         phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, 257)[1:-1])
         negative = _det_j2(geometry, centre, phi) < 0.0
-        changes = np.flatnonzero(negative[1:] != negative[:-1])
-        found.extend(_bisect(geometry, centre, phi[k], phi[k + 1]) for k in changes)
+        changes = np.flatnonzero(negative[1:] != negative[:-1]).tolist()
+        found.extend(_bisect(geometry, centre, float(phi[k]), float(phi[k + 1])) for k in changes)
     return tuple(sorted(_wrapped(phi) for phi in found))
 
 

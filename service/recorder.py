@@ -25,10 +25,12 @@ from service.scene import Scene, remark
 from service.sinks import Archive, Relay, live_server
 
 APPLICATION = "trirail"
-ARCHIVED_HZ = 5
-"""Batches a second to the file: fewer are smaller, and the newest is lost with a killed process."""
+RECORDED_HZ = 5
+"""Batches of whole records a second to the file: a killed process loses the newest one."""
+DRAWN_HZ = 1
+"""Batches of what is drawn a second to the file: fewer are smaller, and can be drawn again from the records."""
 SHOWN_HZ = 10
-"""Batches a second to the live view: its picture moves as often."""
+"""Batches of what is drawn a second to the live view: its picture moves as often."""
 REPORT_EVERY = 10.0
 """How often the log may say that something is missing [s]."""
 MISSING = "missing so far: {} batches in the file (disk full or failing), {} in the live view (viewer too slow)"
@@ -75,16 +77,17 @@ class Recorder:
         layout = blueprint.layout(config, self._scene.bounds)
         open_stream = partial(self._open, str(uuid.uuid4()), name, layout)
         self._archive = Archive(open_stream(rr.FileSink(self.path)), self.path)
-        self._batches = [Batches(self._rate_hz // ARCHIVED_HZ, self._record)]
+        self._batches = [
+            Batches(self._rate_hz // RECORDED_HZ, self._record),
+            Batches(self._rate_hz // DRAWN_HZ, lambda records: self._draw(records, self._archive)),
+        ]
         self._live: Relay | None = None
         self.live_url = ""
         """Where viewers connect; empty without a live view."""
         if server:
             stream = open_stream(server)
             self._live = relay = Relay(stream.send_chunks, stream.disconnect)
-            self._batches.append(
-                Batches(self._rate_hz // SHOWN_HZ, lambda records: relay.send(self._scene.drawn(records)))
-            )
+            self._batches.append(Batches(self._rate_hz // SHOWN_HZ, lambda records: self._draw(records, relay)))
             self.live_url = server.uri
 
     @property
@@ -133,10 +136,13 @@ class Recorder:
         return stream
 
     def _record(self, records: NDArray[np.void]) -> None:
-        self._archive.write(self._scene.complete(records) + self._scene.drawn(records))
+        self._archive.send(self._scene.complete(records))
         self._newest = records[-1]
         if float(self._newest["cycle"]) / self._rate_hz >= self._next_report:
             self._report()
+
+    def _draw(self, records: NDArray[np.void], sink: Archive | Relay) -> None:
+        sink.send(self._scene.drawn(records))
 
     def _report(self) -> None:
         """Say in the log what is missing, if it is more than was last said."""
@@ -149,7 +155,7 @@ class Recorder:
         self._remark(remark(t, wall, "warning", MISSING.format(*missing)))
 
     def _remark(self, line: Chunk) -> None:
-        self._archive.write([line])
+        self._archive.send([line])
         if self._live:
             self._live.send([line])
 

@@ -11,11 +11,13 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from service import columns, config, drawing, palette
+from service.columns import Column
 from service.config import Config
 from service.geometry import LEGS
 from service.mechanism import Mechanism
@@ -23,11 +25,12 @@ from service.messages import Level
 from service.modes import MODES
 from service.palette import Colour
 
-CURVES_HZ = 100
-"""Samples a second of every curve."""
-MOTION_HZ = 50
-"""Positions a second of the mechanism's moving parts."""
+DRAWN_HZ = 100
+"""Samples a second of what is drawn."""
 
+FIELDS = rr.ComponentDescriptor("fields")
+SCALARS = rr.Scalars.descriptor_scalars()
+STATE = rr.StateChange.descriptor_state()
 LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
 
@@ -77,23 +80,22 @@ class Scene:
 
     def complete(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return records as they are."""
-        return columns.structs(self._timelines.of(records), "/record", records)
+        return columns.chunks(self._timelines.of(records), [Column("/record", FIELDS, columns.structs(records))])
 
     def drawn(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return records as people see them: one at least, in order."""
-        of, rate_hz, cycles = self._timelines.of, self._rate_hz, records["cycle"]
-        starts, ends = _groups(cycles, rate_hz // CURVES_HZ)
-        curves = _curves(records, starts, ends)
-        for path, lines in self._plots.items():
-            limits = np.broadcast_to(lines.limits, (len(ends), len(lines.limits)))
-            curves[path] = np.hstack([curves[path], limits])
-        chunks = columns.scalars(of(records[ends]), curves)
-        starts, ends = _groups(cycles, rate_hz // MOTION_HZ)
-        chunks += drawing.moving(self._geometry, of(records[ends]), records[starts], records[ends])
+        starts, ends = _groups(records["cycle"], self._rate_hz // DRAWN_HZ)
+        newest = records[ends]
+        parts = drawing.moving(self._geometry, records[starts], newest)
+        for path, values in _curves(records, newest, starts).items():
+            parts.append(Column(path, SCALARS, columns.scalars(_beside(values, self._plots[path].limits))))
+        return columns.chunks(self._timelines.of(newest), parts) + self._modes(records)
+
+    def _modes(self, records: NDArray[np.void]) -> list[Chunk]:
+        """Return the mode at the first record and wherever it changes."""
         entered = records[np.diff(records["mode"], prepend=len(MODES)) != 0]
-        states = [MODES[mode] for mode in entered["mode"]]
-        chunks.append(Chunk.from_columns("/mode", of(entered), rr.StateChange.columns(state=states)))
-        return chunks
+        modes = pa.array([[MODES[mode]] for mode in entered["mode"]])
+        return columns.chunks(self._timelines.of(entered), [Column("/mode", STATE, modes)])
 
 
 def remark(t: float, wall: float, level: Level, message: str) -> Chunk:
@@ -109,10 +111,9 @@ def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDA
 
 
 def _curves(
-    records: NDArray[np.void], starts: NDArray[np.intp], ends: NDArray[np.intp]
+    records: NDArray[np.void], newest: NDArray[np.void], starts: NDArray[np.intp]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the curves' values, (N, lines), for N groups of rows."""
-    newest = records[ends]
+    """Return the values of curves, (N, lines), for N groups of records that begin at `starts`."""
     error = records["following_error"]
     highest, lowest = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
     timing = np.stack([records["parts_ns"].sum(axis=1), records["lateness_ns"]], axis=1)
@@ -125,6 +126,15 @@ def _curves(
         "/pose/phi": np.degrees(newest["pose"][:, 2:]),  # [°]
         "/loop/timing": np.maximum.reduceat(timing, starts) * 1e-3,  # [µs]
     }
+
+
+def _beside(values: NDArray[np.float64], constants: tuple[float, ...]) -> NDArray[np.float64]:
+    """Return values (N, k) with columns of constants to their right."""
+    rows, lines = values.shape
+    table = np.empty((rows, lines + len(constants)))
+    table[:, :lines] = values
+    table[:, lines:] = constants
+    return table
 
 
 def _plots(settings: Config) -> dict[str, Lines]:

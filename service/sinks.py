@@ -39,14 +39,13 @@ class Archive:
         self._directory = path.parent
         self._stuck = False
 
-    def write(self, chunks: list[Chunk]) -> bool:
-        """Write a batch; return whether it was written. Waits for the disk, but not for long."""
+    def send(self, chunks: list[Chunk]) -> None:
+        """Write a batch, or count it as lost. Waits for the disk, but not for long."""
         written = self._has_room() and (not self._stuck or self._flushed(0.01))
         if written:
             self._stream.send_chunks(chunks)
             written = self._flushed(PATIENCE)
         self.lost += not written
-        return written
 
     def close(self) -> None:
         """Complete the file, unless the disk is stuck."""

@@ -71,7 +71,7 @@ def test_sliders_are_drawn_on_their_rail_and_on_their_edge(geometry: Geometry) -
     points = values(drawn["/robot/sliders"], "Points2D:positions")
     centre = values(drawn["/robot/platform"], "Transform3D:translation")[:, 0, :2]
     _, _, z, w = values(drawn["/robot/platform"], "Transform3D:quaternion")[:, 0].T
-    assert len(points) == 250
+    assert len(points) == 500
     c, s = w * w - z * z, 2.0 * w * z
     turned = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
     corners = centre[:, None] + np.einsum("nij,kj->nki", turned, parts.outline[0])
