@@ -1,39 +1,32 @@
 """The robot's control, one cycle at a time, without a clock, a socket or a file.
 
 Each cycle: `observe` what the drives said, `handle` a request if there is one, `advance` the motion and solve the
-sliders, and `write` the setpoints behind the last gate. What happened is left in `answers` and `happenings`.
+sliders, and `write` the setpoints behind the last gate. What is to be said of it waits at the `desk`.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections import deque
-from typing import NamedTuple
 
 import numpy as np
 
 from drivers.interface import NAMES, Drives, Feedback, PowerState
 from service.config import Config, geometry
+from service.desk import Desk
 from service.errors import RefusedError
 from service.kinematics import forward_into, inverse_into
 from service.limits import Bounds
-from service.messages import Level, Outcome
 from service.modes import DISABLED, Action, Event, Mode, Refusal, State, step
 from service.motion import STILL, MotionState, Plan, Planner, rest
 from service.packets import (
-    Accepted,
-    Answer,
     CommandRequest,
-    Confirmed,
     GoalRequest,
-    Refused,
-    RefusedRequest,
     Request,
 )
 
 Triple = tuple[float, float, float]
 
-REMEMBERED_IDS = 10_000
 SETTLE = 0.1
 """How long the drives may take to leave their fault state after a reset [s]."""
 
@@ -45,32 +38,6 @@ _COMMANDS = {
     "reset": Event.RESET,
 }
 _POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
-
-
-class Happening(NamedTuple):
-    """Something to tell everyone, in the order in which it happened."""
-
-    kind: str
-    level: Level
-    message: str
-    mode: str | None = None
-    id: str | None = None
-    outcome: Outcome | None = None
-    user: str | None = None
-
-
-class Goal(NamedTuple):
-    """The goal that the robot is moving to, or braking from."""
-
-    id: str
-    user: str
-
-
-class _Pending(NamedTuple):
-    """A command that is confirmed once it has been carried out."""
-
-    request: CommandRequest
-    since: int
 
 
 class Control:
@@ -95,7 +62,7 @@ class Control:
         self.cycle = 0
         self.state: State = DISABLED
         self.fault: str | None = None
-        self.goal: Goal | None = None
+        self.desk = Desk()
         self.feedback = Feedback(STILL, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
         self.velocity: Triple = STILL
         self.pose: Triple = STILL
@@ -107,10 +74,6 @@ class Control:
         self._plan: Plan | None = None
         self._time = 0.0
         self._entered = 0
-        self._pending: list[_Pending] = []
-        self._ended_ids: dict[str, None] = {}
-        self.answers: list[Answer] = []
-        self.happenings: list[Happening] = []
 
     # ------------------------------------------------------------------ the cycle, in its order
 
@@ -156,8 +119,7 @@ class Control:
                         f"{self._following_error_limit * 1e3:g} mm"
                     )
                     break
-        if self._pending:
-            self._confirm()
+        self.desk.settle(self._verdict, self.state.mode)
 
     def handle(self, request: Request, now_ns: int) -> None:
         """Carry out one request at a time of the monotonic clock, or refuse it."""
@@ -167,18 +129,18 @@ class Control:
             elif isinstance(request, CommandRequest):
                 self._take_command(request)
             else:
-                self._tell("refused", "warning", request.message, user=request.user)
+                self.desk.tell("refused", "warning", request.message, user=request.user)
         except RefusedError as refusal:
-            self._refuse(request, refusal)
+            self.desk.refuse(request, refusal)
 
     def happen(self, event: Event, reason: str) -> None:
         """Let something happen that nobody asked for: the gateway is lost, ticks are late, the service ends."""
         decided = step(self.state, event)
         if isinstance(decided, Refusal) or decided.state == self.state:
             return
-        self._tell("service", "warning", reason)
+        self.desk.tell("service", "warning", reason)
         if decided.action is Action.BRAKE:
-            self._end_goal("stopped", reason)
+            self.desk.end("stopped", reason)
         self._go(event, reason)
 
     def advance(self) -> None:
@@ -208,7 +170,7 @@ class Control:
             return
         self.rows = rows
         if self._plan is None and self.state.mode in (Mode.MOVING, Mode.STOPPING):
-            self._end_goal("done", "arrived")
+            self.desk.end("done", "arrived")
             self._go(Event.STANDSTILL, "standstill")
 
     def write(self) -> None:
@@ -237,15 +199,14 @@ class Control:
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason
-        self._tell("fault", "error", reason)
-        self._end_goal("faulted", reason)
+        self.desk.tell("fault", "error", reason)
+        self.desk.end("faulted", reason)
         self._go(Event.FAULT, reason)
 
     # ------------------------------------------------------------------ requests
 
     def _take_goal(self, request: GoalRequest, now_ns: int) -> None:
-        if request.id in self._ended_ids or (self.goal and self.goal.id == request.id):
-            raise RefusedError("duplicate_id", f"goal id {request.id!r} has been used: every goal needs its own")
+        self.desk.check_id(request.id)
         decided = step(self.state, Event.GOAL)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
@@ -253,10 +214,8 @@ class Control:
         if goal.valid_for is not None and now_ns - request.received_ns > goal.valid_for * 1e9:
             raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")
         plan = self._planner.to_pose(self.commanded, (goal.x, goal.y, goal.phi), goal.speed)
-        self._end_goal("preempted", f"preempted by goal {request.id}")
-        self.goal = Goal(request.id, request.user)
         self._plan, self._time = plan, 0.0
-        self.answers.append(Accepted(request.ticket, request.id, plan.duration))
+        self.desk.begin(request, plan.duration)
         self._go(Event.GOAL, f"goal {request.id} of {request.user}")
 
     def _take_command(self, request: CommandRequest) -> None:
@@ -270,38 +229,15 @@ class Control:
             raise RefusedError("stopping", "the drives are still stopping: send reset again when they stand")
         reason = f"{request.name} by {request.user}"
         if decided.action is Action.BRAKE:
-            self._end_goal("stopped", reason)
+            self.desk.end("stopped", reason)
         if event is Event.QUICK_STOP:
             self.trip(reason)
         else:
             self._go(event, reason)
-        self._pending.append(_Pending(request, self.cycle))
+        self.desk.undertake(request, self.cycle)
 
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
-
-    def _refuse(self, request: Request, refusal: RefusedError) -> None:
-        if isinstance(request, RefusedRequest):
-            return
-        self.answers.append(
-            Refused(request.ticket, refusal.code, str(refusal), refusal.slider, refusal.value, refusal.limit)
-        )
-        if isinstance(request, GoalRequest):
-            if refusal.code == "duplicate_id":  # that id has its ending, or will have it
-                self._tell("refused", "warning", str(refusal), user=request.user)
-                return
-            outcome: Outcome = "expired" if refusal.code == "expired" else "rejected"
-            self._remember(request.id)
-            self._tell(
-                "goal",
-                "warning",
-                f"goal {request.id} {outcome}: {refusal}",
-                id=request.id,
-                outcome=outcome,
-                user=request.user,
-            )
-        else:
-            self._tell("refused", "warning", f"{request.name} refused: {refusal}", user=request.user)
 
     def _check_start(self) -> None:
         """Refuse to enable where the robot stands outside what it may do."""
@@ -321,24 +257,10 @@ class Control:
                 limit=violation.limit,
             )
 
-    def _confirm(self) -> None:
-        """Answer the commands that have been carried out or cannot be any more."""
-        still = []
-        for pending in self._pending:
-            verdict = self._verdict(pending)
-            request = pending.request
-            if verdict is None:
-                still.append(pending)
-            elif verdict == "":
-                self.answers.append(Confirmed(request.ticket, request.name, self.state.mode))
-            else:
-                self.answers.append(Refused(request.ticket, "failed", f"{request.name} failed: {verdict}"))
-        self._pending = still
-
-    def _verdict(self, pending: _Pending) -> str | None:
+    def _verdict(self, name: str, since: int) -> str | None:
         """Return "" when the command is carried out, None while it is not, else why it never will be."""
         mode = self.state.mode
-        match pending.request.name:
+        match name:
             case "enable":
                 if mode is Mode.ENABLING:
                     return None
@@ -350,7 +272,7 @@ class Control:
             case "reset":
                 if mode is Mode.FAULT:
                     return f"the cause is still there: {self.fault}"
-                return None if self.cycle - pending.since < self._settle_cycles else ""
+                return None if self.cycle - since < self._settle_cycles else ""
             case _:
                 return None if self.powered else ""
 
@@ -380,7 +302,7 @@ class Control:
         before, self.state = self.state.mode, decided.state
         if self.state.mode is not before:
             self._entered = self.cycle
-            self._tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
+            self.desk.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
         if self.state.mode in (Mode.DISABLED, Mode.FAULT):
             self._plan = None
 
@@ -417,30 +339,3 @@ class Control:
             self.rows = self._sliders.tolist()
         self.rows[0] = position
         self.rows[1] = self.rows[2] = [0.0, 0.0, 0.0]
-
-    def _end_goal(self, outcome: Outcome, reason: str) -> None:
-        """End the running goal, once."""
-        if self.goal is None:
-            return
-        goal, self.goal = self.goal, None
-        self._remember(goal.id)
-        level: Level = "error" if outcome == "faulted" else "info"
-        self._tell("goal", level, f"goal {goal.id} {outcome}: {reason}", id=goal.id, outcome=outcome, user=goal.user)
-
-    def _remember(self, goal_id: str) -> None:
-        self._ended_ids[goal_id] = None
-        if len(self._ended_ids) > REMEMBERED_IDS:
-            del self._ended_ids[next(iter(self._ended_ids))]
-
-    def _tell(
-        self,
-        kind: str,
-        level: Level,
-        message: str,
-        *,
-        mode: str | None = None,
-        id: str | None = None,  # noqa: A002 - the field's name on the wire
-        outcome: Outcome | None = None,
-        user: str | None = None,
-    ) -> None:
-        self.happenings.append(Happening(kind, level, message, mode, id, outcome, user))

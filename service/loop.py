@@ -163,7 +163,7 @@ class Loop:
         self._batched += 1
         if self._batched == self._batch_size:
             self._flush()
-        if control.answers or control.happenings:
+        if control.desk.answers or control.desk.happenings:
             self._speak()
 
     def _flush(self) -> None:
@@ -184,23 +184,23 @@ class Loop:
 
     def _speak(self) -> None:
         """Answer requests and number what has happened."""
-        control = self.control
-        for happening in control.happenings:
+        control, desk = self.control, self.control.desk
+        for happening in desk.happenings:
             self._events += 1
             t = control.cycle * self._period
             event = Event(self._events, t, control.cycle, time.time(), **happening._asdict())
             packet = message(Happened(event))
             self._unsent.append(packet)
             self._recorder.send(packet)
-        control.happenings.clear()
-        situation = message(Situation(control.goal.id if control.goal else None, control.fault))
+        desk.happenings.clear()
+        situation = message(Situation(desk.goal.id if desk.goal else None, control.fault))
         if situation != self._situation:
             self._situation = situation
             self._gateway.send(situation)
         self._send_events()
-        for answer in control.answers:
+        for answer in desk.answers:
             self._gateway.send(message(answer))
-        control.answers.clear()
+        desk.answers.clear()
 
     def _send_events(self) -> None:
         while self._unsent and self._gateway.send(self._unsent[0]):

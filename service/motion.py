@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from ruckig import ControlInterface, InputParameter, Result, Ruckig, Synchronization, Trajectory
+from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
 
 from service.config import PlatformLimits
 from service.errors import KinematicsError, RefusedError
@@ -22,6 +23,10 @@ HEADROOM = 0.98
 """A path that was too fast is slowed to this share of the limit, for what lies between the samples."""
 ATTEMPTS = 4
 """How often a path may be slowed before it is refused."""
+
+JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
+"""Ruckig finds no solution just where one kind of profile gives way to another, as for a distance of 2 a³ / j²
+from rest to rest: there a hair less jerk has one."""
 
 
 class MotionState(NamedTuple):
@@ -120,10 +125,13 @@ class Planner:
 
     def _solve(self, request: InputParameter) -> Plan:
         trajectory = Trajectory(3)
-        result = self._ruckig.calculate(request, trajectory)
-        if result not in (Result.Working, Result.Finished):
-            raise RefusedError("no_plan", f"no motion leads there from the present one: Ruckig says {result.name}")
-        return Plan(trajectory)
+        jerk = request.max_jerk
+        for share in JERK_SHARES:
+            request.max_jerk = [share * limit for limit in jerk]
+            with contextlib.suppress(RuckigError):
+                if self._ruckig.calculate(request, trajectory) in (Result.Working, Result.Finished):
+                    return Plan(trajectory)
+        raise RefusedError("no_plan", "no motion leads there from the present one: send the goal again when it holds")
 
     def _excess(self, plan: Plan) -> float:
         """How many times too fast the plan is for a slider. Raises RefusedError if it leaves the workspace."""

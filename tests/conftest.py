@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from drivers.cia402 import Cia402
 from drivers.simulated import SimulatedDrive, simulated_bus
 from service.config import SIM, Config, load
-from service.control import Control, Happening
+from service.control import Control
+from service.desk import Happening
 from service.messages import PoseGoal
 from service.modes import Mode
 from service.packets import Answer, CommandRequest, GoalRequest, Request
@@ -73,10 +74,11 @@ class Rig:
         control.solve()
         control.write()
         self.rows.append(control.rows)
-        self.answers += control.answers
-        self.happenings += control.happenings
-        control.answers.clear()
-        control.happenings.clear()
+        desk = control.desk
+        self.answers += desk.answers
+        self.happenings += desk.happenings
+        desk.answers.clear()
+        desk.happenings.clear()
 
     def cycles(self, number: int) -> None:
         for _ in range(number):

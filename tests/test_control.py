@@ -108,6 +108,16 @@ def test_from_rest_the_path_is_straight(rig: Rig) -> None:
     assert np.max(np.ptp(share, axis=1)) < 1e-9
 
 
+@pytest.mark.parametrize("distance", [0.01, 0.01000000000000001])
+def test_a_distance_at_which_ruckig_changes_its_profile(rig: Rig, distance: float) -> None:
+    rig.enable()
+    rig.goal("g1", distance, 0.0, 0.0)  # 2 a³ / j² with the configured limits
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    rig.goal("g2", 0.0, 0.0, 0.0)
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    assert rig.outcomes() == [("g1", "done"), ("g2", "done")]
+
+
 def test_speed_is_a_share_of_the_time(rig: Rig) -> None:
     rig.enable()
     full = rig.goal("g1", 0.05, 0.0, 0.0)
@@ -165,7 +175,7 @@ def test_a_goal_too_late_has_expired(rig: Rig) -> None:
     rig.cycle(GoalRequest(99, "ann", "g1", goal, round((rig.now - 0.6) * 1e9)))
     assert refusal(rig.answers[-1]).code == "expired"
     assert rig.outcomes() == [("g1", "expired")]
-    assert rig.control.goal is None
+    assert rig.control.desk.goal is None
 
 
 def test_an_id_is_used_once(rig: Rig) -> None:
