@@ -1,0 +1,158 @@
+"""Identifies the geometry of a robot as built from measured poses, and writes its [geometry] section.
+
+python tools/calibrate.py poses.csv --config robot.toml --output geometry.toml
+
+The file has the columns x, y, phi, A, B, C: where an outside instrument saw the platform, and what the sliders
+read there, in metres and radians. service.calibration has the mathematics. The report goes to standard error.
+Needs trirail[analysis].
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from service import config
+from service.algebra import Array
+from service.calibration import PARAMETERS, Calibration, CalibrationError, identify
+from service.errors import TrirailError
+from service.geometry import LEGS, Geometry, singular_angles
+
+COLUMNS = ("x", "y", "phi", *LEGS)
+COORDINATES = (("x", "µm", 1e6), ("y", "µm", 1e6), ("phi", "mrad", 1e3))
+HELD = """\
+No pose tells where along its rail an anchor lies, which home makes up for, nor where along its edge an edge
+point, which is only the zero of lambda_32: along rail and edge both stay as in the starting geometry."""
+
+
+def read(path: Path, *, degrees: bool = False) -> tuple[Array, Array, list[int]]:
+    """Return poses (N, 3) and sliders (N, 3) in m and rad, and the lines on which they stand.
+
+    Raises CalibrationError with the line of what is wrong.
+    """
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            names = [name.strip() for name in next(reader, [])]
+            if sorted(names) != sorted(COLUMNS):
+                raise CalibrationError(f"line 1: the columns are {', '.join(names)}; wanted are {', '.join(COLUMNS)}")
+            for fields in reader:
+                if fields:
+                    rows.append(_numbers(names, fields, reader.line_num))
+                    lines.append(reader.line_num)
+    except OSError as error:
+        raise CalibrationError(str(error.strerror)) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise CalibrationError(f"not a CSV file: {error}") from error
+    data = np.array(rows).reshape(-1, len(COLUMNS))
+    if degrees:
+        data[:, 2] = np.radians(data[:, 2])
+    return data[:, :3], data[:, 3:], lines
+
+
+def _numbers(names: Sequence[str], fields: Sequence[str], line: int) -> list[float]:
+    """Return the fields of a row in the order of COLUMNS."""
+    if len(fields) != len(names):
+        raise CalibrationError(f"line {line}: {len(fields)} fields; wanted are {len(names)}")
+    given = dict(zip(names, fields, strict=True))
+    values = []
+    for name in COLUMNS:
+        try:
+            value = float(given[name])
+        except ValueError as error:
+            raise CalibrationError(f"line {line}: {name} is {given[name]!r}: it must be a number") from error
+        if not math.isfinite(value):
+            raise CalibrationError(f"line {line}: {name} is {value}: it must be finite")
+        values.append(value)
+    return values
+
+
+def section(geometry: Geometry) -> str:
+    """Return the [geometry] section of a configuration, exact to the last digit."""
+    lines = ["[geometry]"]
+    for name, leg in zip(LEGS, geometry.legs, strict=True):
+        lines += ["", f"[[geometry.leg]]  # {name}"]
+        for key, value in asdict(leg).items():
+            lines.append(f"{key} = {np.asarray(value).tolist()}")
+    return "\n".join(lines) + "\n"
+
+
+def describe(found: Calibration, lines: Sequence[int]) -> str:
+    """Return the report for people."""
+    said = [f"{len(lines)} poses; the residuals are {found.misfit:.2f} times the stated noise", ""]
+    said.append(f"{'residual':<36}{'rms':>10}{'greatest':>12}")
+    for (name, unit, scale), column in zip(COORDINATES, np.abs(found.residuals.T), strict=True):
+        rms, worst = math.sqrt(np.mean(column**2)), int(np.argmax(column))
+        said.append(f"{f'{name} [{unit}]':<36}{rms * scale:>10.3f}{column[worst] * scale:>12.3f}  line {lines[worst]}")
+
+    said += ["", f"{'correction':<36}{'change':>10}{'std. error':>12}"]
+    for leg, changes, errors in zip(LEGS, found.corrections, found.standard_errors, strict=True):
+        for name, change, error in zip(PARAMETERS, changes, errors, strict=True):
+            unit = "mrad" if name.endswith("angle") else "mm"
+            known = f"{error * 1e3:.4f}" if math.isfinite(error) else "open"
+            said.append(f"{f'{leg} {name} [{unit}]':<36}{change * 1e3:>10.4f}{known:>12}")
+
+    said += ["", HELD]
+    for leg, names, combinations in found.open:
+        what = "one combination of them stays" if combinations == 1 else f"{combinations} combinations of them stay"
+        said.append(f"Leg {leg}: these poses cannot separate {', '.join(names)}: {what} as in the starting geometry.")
+    if found.open:
+        said.append("Poses that differ more, in phi above all, would.")
+
+    angles = singular_angles(found.geometry)
+    low, high = max(phi for phi in angles if phi < 0.0), min(phi for phi in angles if phi > 0.0)
+    said += ["", f"With G at (0, 0) singular at phi = {low:.4f} and {high:.4f} rad: see limits.platform.phi."]
+    return "\n".join(said)
+
+
+def calibrate(options: argparse.Namespace) -> None:
+    """Read, identify, report, write. Raises TrirailError."""
+    start = config.geometry(config.load(options.config).geometry)
+    try:
+        poses, sliders, lines = read(options.poses, degrees=options.deg)
+    except CalibrationError as error:
+        raise CalibrationError(f"{options.poses}: {error}") from error
+    try:
+        found = identify(start, poses, sliders, position_noise=options.position_noise, angle_noise=options.angle_noise)
+    except CalibrationError as error:
+        if error.row is None:
+            raise
+        raise CalibrationError(f"{options.poses}: line {lines[error.row]}: {error}") from error
+    print(describe(found, lines), file=sys.stderr)
+    if options.output is None:
+        print(section(found.geometry), end="")
+        return
+    try:
+        options.output.write_text(section(found.geometry), encoding="utf-8")
+    except OSError as error:
+        raise CalibrationError(f"cannot write {options.output}: {error.strerror}") from error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Calibrate; return the exit code."""
+    parser = argparse.ArgumentParser(description="Identifies the geometry of a robot as built from measured poses.")
+    parser.add_argument("poses", type=Path, help=f"CSV file with the columns {', '.join(COLUMNS)} [m, rad]")
+    parser.add_argument("--config", type=Path, default=config.SIM, help="its geometry is where to start (%(default)s)")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="where to write the section; else standard output")
+    parser.add_argument("--deg", action="store_true", help="phi is in degrees")
+    parser.add_argument("--position-noise", type=float, default=20e-6, metavar="M", help="of x and y [m] (%(default)s)")
+    parser.add_argument("--angle-noise", type=float, default=1e-4, metavar="RAD", help="of phi [rad] (%(default)s)")
+    try:
+        calibrate(parser.parse_args(arguments))
+    except TrirailError as error:
+        print(f"calibrate: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
