@@ -44,7 +44,7 @@ def _main(name: str, runtime: Path, ready: Callable[[object], None], sockets: li
         return gate.main(config, link, ready)
     from service import recording
 
-    return recording.main(config, order.record, link, ready)
+    recording.main(config, order.record, link, ready)
 
 
 def main() -> int:

@@ -22,14 +22,14 @@ from service.errors import ServiceError
 from service.messages import Event
 from service.records import DTYPE, unpack
 from service.scene import Scene, remark
-from service.sinks import Archive, Relay, live_server
+from service.sinks import Archive, Relay, live_relay, live_server
 
 APPLICATION = "trirail"
-RECORDED_HZ = 5
+RECORDS_HZ = 5
 """Batches of whole records a second to the file: a killed process loses the newest one."""
-DRAWN_HZ = 1
-"""Batches of what is drawn a second to the file: fewer are smaller, and can be drawn again from the records."""
-SHOWN_HZ = 10
+DRAWING_HZ = 1
+"""Batches of what is drawn a second to the file: fewer are smaller, and records are enough to draw it again."""
+LIVE_HZ = 5
 """Batches of what is drawn a second to the live view: its picture moves as often."""
 REPORT_EVERY = 10.0
 """How often the log may say that something is missing [s]."""
@@ -78,16 +78,15 @@ class Recorder:
         open_stream = partial(self._open, str(uuid.uuid4()), name, layout)
         self._archive = Archive(open_stream(rr.FileSink(self.path)), self.path)
         self._batches = [
-            Batches(self._rate_hz // RECORDED_HZ, self._record),
-            Batches(self._rate_hz // DRAWN_HZ, lambda records: self._draw(records, self._archive)),
+            Batches(self._rate_hz // RECORDS_HZ, self._record),
+            Batches(self._rate_hz // DRAWING_HZ, lambda records: self._draw(records, self._archive)),
         ]
         self._live: Relay | None = None
         self.live_url = ""
         """Where viewers connect; empty without a live view."""
         if server:
-            stream = open_stream(server)
-            self._live = relay = Relay(stream.send_chunks, stream.disconnect)
-            self._batches.append(Batches(self._rate_hz // SHOWN_HZ, lambda records: self._draw(records, relay)))
+            self._live = relay = live_relay(open_stream(server))
+            self._batches.append(Batches(self._rate_hz // LIVE_HZ, lambda records: self._draw(records, relay)))
             self.live_url = server.uri
 
     @property

@@ -121,3 +121,13 @@ def live_server(port: int) -> rr.GrpcServerSink:
                 "set telemetry.live_port to a free port, or to 0 for no live view"
             ) from error
     return rr.GrpcServerSink(HOST, port, server_memory_limit=LIVE_MEMORY)
+
+
+def live_relay(stream: rr.RecordingStream) -> Relay:
+    """Return a relay to the viewers of a stream."""
+
+    def deliver(chunks: list[Chunk]) -> None:
+        stream.send_chunks(chunks)
+        stream.flush()  # a slow viewer is waited for here, before Rerun's own queues fill the memory
+
+    return Relay(deliver, stream.disconnect)

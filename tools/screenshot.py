@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -37,7 +39,9 @@ def main() -> int:
     port = _free_port()
     command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen"]
     command += ["--window-size", f"{width}x{height + TITLE_BAR}", "--port", str(port), str(arguments.recording)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as viewer:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    ) as viewer:
         try:
             client = _connect(viewer, f"rerun+http://127.0.0.1:{port}/proxy")
             client.run_command("ui.toggle_top_panel")
@@ -47,7 +51,7 @@ def main() -> int:
             picture = Image.open(io.BytesIO(client.take_screenshot()))
             picture.crop((0, TITLE_BAR, width, TITLE_BAR + height)).save(arguments.picture)
         finally:
-            viewer.terminate()
+            os.killpg(viewer.pid, signal.SIGTERM)  # `python -m rerun` does not pass the signal on to the viewer
     return 0
 
 
