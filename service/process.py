@@ -44,7 +44,7 @@ def _main(name: str, runtime: Path, ready: Callable[[object], None], sockets: li
         return gate.main(config, link, ready)
     from service import recording
 
-    recording.main(config, order.record, link, ready)
+    return recording.main(config, order.record, link, ready)
 
 
 def main() -> int:
@@ -65,4 +65,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    sys.stderr.flush()
+    # Everything is closed by now. Rerun's file sink, when a disk has failed it, would keep the interpreter from ending.
+    os._exit(code)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import select
 import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
 
 from service.config import Config
 from service.links import Closed, Link
@@ -16,8 +13,8 @@ from service.packets import Happened, Kind, Welcome, decode_answer
 from service.recorder import Recorder
 
 
-def main(config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> NoReturn:
-    """Record until the loop has gone or the process is told to end; then end the process."""
+def main(config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> int:
+    """Record until the loop has gone or the process is told to end."""
     path = Path(record) if record else None
     recorder = Recorder(config, Path(config.telemetry.directory), path=path)
     ending = False
@@ -48,6 +45,4 @@ def main(config: Config, record: str | None, link: Link, ready: Callable[[object
         pass
     finally:
         recorder.close()
-    # Rerun's file sink, when a disk has failed it, keeps the interpreter from ever ending by itself.
-    sys.stderr.flush()
-    os._exit(0)
+    return 0
