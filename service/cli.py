@@ -6,14 +6,17 @@ import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 from cyclopts import App, CycloptsError, Parameter
 
-from service import __version__, terminal
+from service import __version__, offline, terminal
 from service.errors import TrirailError
 from service.session import DEFAULT_LOCATOR
+
+if TYPE_CHECKING:
+    from service.client import Goal, Robot
 
 app = App(
     name="trirail",
@@ -21,7 +24,7 @@ app = App(
     version=f"trirail {__version__}",
 )
 
-Flag = Parameter(negative="")
+Flag = offline.Flag
 
 
 @Parameter(name="*")
@@ -108,14 +111,110 @@ def goto(
     angle = math.radians(phi) if deg else phi
     with Robot(service.robot, service.connect) as robot:
         goal = robot.move_to(x=x, y=y, phi=angle, speed=speed)
-        if not wait:
-            _print(service, {"id": goal.id, "duration": goal.duration}, f"goal {goal.id}: {goal.duration:.2f} s")
-            return 0
-        result = terminal.follow(
-            robot, goal, f"x {x:g} m, y {y:g} m, φ {math.degrees(angle):g}°", show=not service.json
-        )
-    _print(service, result._asdict(), result.message)
-    return 0 if result.outcome == "done" else 1
+        return _follow(service, robot, goal, wait, f"x {x:g} m, y {y:g} m, φ {math.degrees(angle):g}°")
+
+
+@app.command
+def sliders(
+    a: float,
+    b: float,
+    c: float,
+    /,
+    *,
+    wait: Annotated[bool, Flag] = False,
+    speed: float = 1.0,
+    service: Service = HERE,
+) -> int:
+    """Move the sliders to positions [m]; also the way out of a pose that goto refuses.
+
+    Parameters
+    ----------
+    wait
+        Show the progress; exit 0 only when the robot has arrived.
+    speed
+        Fraction of full speed, up to 1.
+    """
+    from service.client import Robot
+
+    with Robot(service.robot, service.connect) as robot:
+        goal = robot.move_sliders(a, b, c, speed=speed)
+        return _follow(service, robot, goal, wait, f"A {a:g} m, B {b:g} m, C {c:g} m")
+
+
+@app.command
+def jog(vx: float, vy: float, w: float, /, *, seconds: float | None = None, service: Service = HERE) -> int:
+    """Move at a velocity [m/s, rad/s] while the command lasts: until Ctrl-C, or for some seconds.
+
+    Parameters
+    ----------
+    seconds
+        How long.
+    """
+    from service.client import Robot
+
+    with Robot(service.robot, service.connect) as robot:
+        try:
+            with robot.jog(x=vx, y=vy, phi=w) as jogging:
+                terminal.jogging(robot, jogging, seconds, show=not service.json)
+        except KeyboardInterrupt:
+            pass
+        if jogging.error is not None:
+            raise jogging.error
+        result = jogging.result
+    _print(service, result._asdict() if result else {}, result.message if result else "the jog has no known end")
+    return 0 if result and result.outcome == "done" else 1
+
+
+@app.command
+def follow(
+    file: Path,
+    /,
+    *,
+    stretch: Annotated[bool, Flag] = False,
+    wait: Annotated[bool, Flag] = False,
+    service: Service = HERE,
+) -> int:
+    """Follow a timed trajectory from where the robot stands.
+
+    Parameters
+    ----------
+    file
+        CSV with columns t, x, y, phi (and vx, vy, w, and ax, ay, e), or JSON with a list of points.
+    stretch
+        Slow down what is too fast, instead of refusing it.
+    wait
+        Show the progress; exit 0 only when the robot has arrived.
+    """
+    from service.client import Robot
+    from service.trajectory import read
+
+    points = read(file)
+    with Robot(service.robot, service.connect) as robot:
+        goal = robot.follow(points, stretch=stretch)
+        return _follow(service, robot, goal, wait, f"{file.name}: {len(points)} points")
+
+
+@app.command
+def pause(*, service: Service = HERE) -> int:
+    """Stop on the path and keep the goal."""
+    return _command("pause", service)
+
+
+@app.command
+def resume(*, service: Service = HERE) -> int:
+    """Go on with a paused goal."""
+    return _command("resume", service)
+
+
+@app.command
+def override(percent: float, /, *, service: Service = HERE) -> int:
+    """Let motions run at a share of full speed, 0 to 200 %, never beyond the limits."""
+    from service.client import Robot
+
+    with Robot(service.robot, service.connect) as robot:
+        robot.override(percent)
+    _print(service, {"override": percent}, f"override: {percent:g} %")
+    return 0
 
 
 @app.command
@@ -191,6 +290,11 @@ def events(*, service: Service = HERE) -> int:
     return 0
 
 
+app.command(offline.ik)
+app.command(offline.fk)
+app.command(offline.workspace)
+
+
 def _command(name: str, service: Service) -> int:
     from service.client import Robot
 
@@ -198,6 +302,16 @@ def _command(name: str, service: Service) -> int:
         reply = robot.command(name)
     _print(service, msgspec.to_builtins(reply), f"{name}: done, the robot is {reply.mode}")
     return 0
+
+
+def _follow(service: Service, robot: Robot, goal: Goal, wait: bool, title: str) -> int:
+    """Say that a goal is accepted, or follow it to its end."""
+    if not wait:
+        _print(service, {"id": goal.id, "duration": goal.duration}, f"goal {goal.id}: {goal.duration:.2f} s")
+        return 0
+    result = terminal.follow(robot, goal, title, show=not service.json)
+    _print(service, result._asdict(), result.message)
+    return 0 if result.outcome == "done" else 1
 
 
 def _print(service: Service, content: object, words: str) -> None:

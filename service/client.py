@@ -13,7 +13,7 @@ import queue
 import re
 import threading
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import NamedTuple, Self, TypeVar
 
@@ -22,8 +22,22 @@ import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from service import session
-from service.errors import RefusedError, ServiceError
-from service.messages import CommandReply, ErrorReply, Event, GoalReply, Info, PoseGoal, State
+from service.errors import RefusedError, ServiceError, TrirailError
+from service.messages import (
+    CommandReply,
+    ErrorReply,
+    Event,
+    GoalReply,
+    Info,
+    Override,
+    PoseGoal,
+    SlidersGoal,
+    State,
+    TrajectoryGoal,
+    TrajectoryPoint,
+    VelocityGoal,
+)
+from service.messages import Goal as _Message
 
 REPLY_WITHIN = 20.0
 """How long a command may take to be carried out [s]."""
@@ -63,6 +77,49 @@ class Goal:
     def _end(self, result: Result) -> None:
         self._result = result
         self._ended.set()
+
+
+class Jog:
+    """A velocity that is kept alive while the context lasts; `result` tells afterwards how it ended."""
+
+    def __init__(self, robot: Robot, velocity: tuple[float, float, float], timeout: float) -> None:
+        self._robot = robot
+        self._velocity = velocity
+        self._timeout = timeout
+        self._id = uuid.uuid4().hex[:12]
+        self._over = threading.Event()
+        self._renewing = threading.Thread(target=self._renew, name="jog", daemon=True)
+        self._goal: Goal | None = None
+        self.error: Exception | None = None
+        """Why it could not be renewed any more."""
+
+    @property
+    def result(self) -> Result | None:
+        """How it ended, None while it has not."""
+        return self._goal.result if self._goal else None
+
+    def __enter__(self) -> Self:
+        self._goal = self._send()
+        self._renewing.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._renewing.join()
+        if self._goal is not None and self.error is None:
+            self._goal.wait(self._timeout + 10.0)
+
+    def _send(self) -> Goal:
+        x, y, phi = self._velocity
+        return self._robot.send(lambda name: VelocityGoal(x, y, phi, timeout=self._timeout, id=name), self._id)
+
+    def _renew(self) -> None:
+        while not self._over.wait(self._timeout / 3.0):
+            try:
+                self._send()
+            except TrirailError as error:
+                self.error = error
+                return
 
 
 class Robot:
@@ -110,14 +167,49 @@ class Robot:
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> Goal:
         """Send a pose goal [m, rad]; return once it is accepted."""
+        return self.send(lambda name: PoseGoal(x=x, y=y, phi=phi, speed=speed, valid_for=valid_for, id=name), id)
+
+    def move_sliders(
+        self,
+        a: float,
+        b: float,
+        c: float,
+        *,
+        speed: float = 1.0,
+        valid_for: float | None = None,
+        id: str | None = None,  # noqa: A002 - the field's name on the wire
+    ) -> Goal:
+        """Send a goal for the sliders A, B, C [m]; return once it is accepted."""
+        return self.send(lambda name: SlidersGoal((a, b, c), speed=speed, valid_for=valid_for, id=name), id)
+
+    def follow(
+        self,
+        points: Sequence[TrajectoryPoint],
+        *,
+        stretch: bool = False,
+        id: str | None = None,  # noqa: A002 - the field's name on the wire
+    ) -> Goal:
+        """Send a timed trajectory that begins where the robot stands; return once it is accepted."""
+        return self.send(lambda name: TrajectoryGoal(tuple(points), stretch=stretch, id=name), id)
+
+    def jog(self, *, x: float = 0.0, y: float = 0.0, phi: float = 0.0, timeout: float = 0.2) -> Jog:
+        """Move at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
+
+        with robot.jog(x=0.01):
+            wait_for_the_key_to_be_released()
+        """
+        return Jog(self, (x, y, phi), timeout)
+
+    def send(self, make: Callable[[str], _Message], id: str | None = None) -> Goal:  # noqa: A002
+        """Send the goal that `make` makes for an id; return once it is accepted."""
         goal_id = id or uuid.uuid4().hex[:12]
         try:
-            message = PoseGoal(x=x, y=y, phi=phi, speed=speed, valid_for=valid_for, id=goal_id)
+            message = make(goal_id)
         except ValueError as error:
             raise RefusedError("malformed", f"not a goal: {error}") from error
         goal = Goal(goal_id, 0.0)
         with self._goals_lock:
-            self._goals.setdefault(goal_id, goal)
+            goal = self._goals.setdefault(goal_id, goal)
         try:
             reply = self._ask(self._key("goal", self.user), GoalReply, msgspec.json.encode(message))
         except (RefusedError, ServiceError):
@@ -147,9 +239,21 @@ class Robot:
         """Clear a fault whose cause is gone; the robot is disabled afterwards."""
         self.command("reset")
 
-    def command(self, name: str) -> CommandReply:
+    def pause(self) -> None:
+        """Stop on the path; return when the robot stands. The goal is kept for resume."""
+        self.command("pause")
+
+    def resume(self) -> None:
+        """Go on with a paused goal."""
+        self.command("resume")
+
+    def override(self, percent: float) -> None:
+        """Let this motion and those to come run at a share of full speed, 0 to 200 %, within the limits."""
+        self.command("override", msgspec.json.encode(Override(percent)))
+
+    def command(self, name: str, content: bytes | None = None) -> CommandReply:
         """Send a command; return once the service confirms that it has been carried out."""
-        return self._ask(self._key("cmd", self.user, name), CommandReply)
+        return self._ask(self._key("cmd", self.user, name), CommandReply, content)
 
     def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""

@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from service.algebra import Array, Vector, add, cross, dot, scale, subtract
 from service.compiled import compiled
 from service.geometry import PARALLEL
@@ -19,8 +21,10 @@ __all__ = [
     "ROUNDING",
     "forward_batch",
     "forward_into",
+    "forward_motion",
     "inverse_batch",
     "inverse_into",
+    "inverse_motion",
     "jacobians_batch",
     "loop_equation",
 ]
@@ -57,7 +61,8 @@ def _close(leg: Array, pose: Vector) -> ClosedLeg:
 
 
 @compiled()
-def _inverse(legs: Array, motion: Array, out: Array) -> int:
+def inverse_motion(legs: Array, motion: Array, out: Array) -> int:
+    """Do inverse_into, from compiled code."""
     pose = motion[0, 0], motion[0, 1], motion[0, 2]
     velocity = motion[1, 0], motion[1, 1], motion[1, 2]
     acceleration = motion[2, 0], motion[2, 1], motion[2, 2]
@@ -81,14 +86,14 @@ def inverse_into(legs: Array, motion: Array, out: Array) -> int:
     leg, gets the rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32. Returns 0, or 1 + i if leg i is
     singular or a number is not finite; then `out` means nothing.
     """
-    return _inverse(legs, motion, out)
+    return inverse_motion(legs, motion, out)
 
 
 @compiled(f"i8({LEGS}, f8[:, :, ::1], f8[:, :, ::1])")
 def inverse_batch(legs: Array, motion: Array, out: Array) -> int:
     """Do inverse_into for `motion` (3, N, 3) and `out` (6, N, 3); the codes of row k begin after 3 k."""
     for k in range(motion.shape[1]):
-        code = _inverse(legs, motion[:, k], out[:, k])
+        code = inverse_motion(legs, motion[:, k], out[:, k])
         if code != 0:
             return 3 * k + code
     return 0
@@ -215,4 +220,43 @@ def forward_batch(legs: Array, sliders: Array, near: Array, poses: Array) -> int
         code = _forward(legs, sliders[k], near[k], poses[k])
         if code != 0:
             return 5 * k + code
+    return 0
+
+
+@compiled()
+def _solve(rows: tuple[Vector, Vector, Vector], right: Vector) -> Vector:
+    """Solve three linear equations by Cramer's rule."""
+    a, b, c = rows
+    by_a, by_b, by_c = cross(b, c), cross(c, a), cross(a, b)
+    det = dot(a, by_a)
+    total = add(add(scale(right[0], by_a), scale(right[1], by_b)), scale(right[2], by_c))
+    return scale(1.0 / det, total)
+
+
+@compiled()
+def forward_motion(legs: Array, sliders: Array, near: Array, motion: Array) -> int:
+    """Write the platform's pose, velocity and acceleration (3, 3) for those of the sliders, (3, 3).
+
+    From (16): J2 times the platform's velocity is J1 times the sliders'. Their accelerations are linear in the
+    platform's, with the same matrices: what they are without it is subtracted. Codes of forward_into.
+    """
+    code = _forward(legs, sliders[0], near, motion[0])
+    if code != 0:
+        return code
+    pose = motion[0, 0], motion[0, 1], motion[0, 2]
+    a, b, c = _close(legs[0], pose), _close(legs[1], pose), _close(legs[2], pose)
+    j2 = _beta(a), _beta(b), _beta(c)
+    rates = a.delta * sliders[1, 0], b.delta * sliders[1, 1], c.delta * sliders[1, 2]
+    motion[1, 0], motion[1, 1], motion[1, 2] = _solve(j2, rates)
+    motion[2, 0] = motion[2, 1] = motion[2, 2] = 0.0
+    without = np.empty((6, 3))
+    code = inverse_motion(legs, motion, without)
+    if code != 0:
+        return code
+    left = (
+        a.delta * (sliders[2, 0] - without[2, 0]),
+        b.delta * (sliders[2, 1] - without[2, 1]),
+        c.delta * (sliders[2, 2] - without[2, 2]),
+    )
+    motion[2, 0], motion[2, 1], motion[2, 2] = _solve(j2, left)
     return 0

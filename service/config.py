@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import math
 import re
 import tomllib
@@ -252,7 +253,9 @@ def _check(config: Config) -> None:
         if low >= high:
             raise ConfigError(f"{key} = [{low:g}, {high:g}]: the lower limit must be below the upper one")
     (low, high), margin = platform.phi, config.limits.singularity_margin
-    for angle in singular_angles(robot):
+    # On a robot as built the singular angles move with the centre: linearly in x and y, so the corners bound them.
+    centres = [(0.0, 0.0), *itertools.product(platform.x, platform.y)]
+    for angle in {angle for centre in centres for angle in singular_angles(robot, centre)}:
         if low - margin < angle < high + margin:
             raise ConfigError(
                 f"limits.platform.phi = [{low:g}, {high:g}] comes nearer than limits.singularity_margin = {margin:g} "

@@ -17,13 +17,12 @@ from service.desk import Desk
 from service.errors import RefusedError
 from service.kinematics import forward_into, inverse_into
 from service.limits import Bounds
-from service.modes import DISABLED, Action, Event, Mode, Refusal, State, step
-from service.motion import STILL, MotionState, Plan, Planner, rest
-from service.packets import (
-    CommandRequest,
-    GoalRequest,
-    Request,
-)
+from service.messages import Goal, Outcome, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
+from service.modes import DISABLED, HOLDING, MOVING, Action, Event, Mode, Refusal, State, step
+from service.motion import STILL, MotionState, Run, rest
+from service.packets import CommandRequest, GoalRequest, Request
+from service.paths import Path
+from service.planning import Planner, Point
 
 Triple = tuple[float, float, float]
 
@@ -36,7 +35,13 @@ _COMMANDS = {
     "stop": Event.STOP,
     "quick_stop": Event.QUICK_STOP,
     "reset": Event.RESET,
+    "pause": Event.PAUSE,
+    "resume": Event.RESUME,
 }
+_OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.FAULT: "faulted"}
+"""How a goal ends on an event after which it is not under way; else it is stopped."""
+SLOWEST = 0.05
+"""Where the time along a path runs slower than this, a new goal is planned from a standstill."""
 _POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 
 
@@ -49,7 +54,7 @@ class Control:
         self._period = config.period
         self._legs = robot.packed()
         self._bounds = Bounds(config.limits, config.period)
-        self._planner = Planner(robot, config.limits.platform, self._bounds)
+        self._planner = Planner(robot, config.limits, self._bounds, config.period)
         self._following_error_limit = config.limits.slider.following_error
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._settle_cycles = max(3, round(SETTLE / config.period))
@@ -71,8 +76,10 @@ class Control:
         """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 of the setpoints."""
         self.following_error: Triple = STILL
         self._written: deque[Triple] = deque([STILL, STILL], maxlen=2)
-        self._plan: Plan | None = None
-        self._time = 0.0
+        self.override = 1.0
+        """The rate at which motions are to run."""
+        self._runs: deque[Run] = deque()
+        """The motion under way, and the one to follow at its end."""
         self._entered = 0
 
     # ------------------------------------------------------------------ the cycle, in its order
@@ -85,8 +92,14 @@ class Control:
         # What runs for the first time is slow: plan and check a motion now, not in a cycle.
         nearby = rest([value + 1e-3 for value in self.pose])
         with contextlib.suppress(RefusedError):
-            self._planner.to_pose(nearby, self.pose)
-            self._planner.brake(nearby)
+            for in_sliders in (False, True):
+                path = (
+                    self._planner.to_sliders(nearby, feedback.position)
+                    if in_sliders
+                    else self._planner.to_pose(nearby, self.pose)
+                )
+                run = self._planner.begin(path, 1.0, nearby.pose)
+                self._planner.change_rate(run, 0.0, run.state(0.0, nearby.pose).pose)
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
@@ -139,18 +152,17 @@ class Control:
         if isinstance(decided, Refusal) or decided.state == self.state:
             return
         self.desk.tell("service", "warning", reason)
-        if decided.action is Action.BRAKE:
-            self.desk.end("stopped", reason)
         self._go(event, reason)
 
     def advance(self) -> None:
         """Move the commanded state on by one period."""
-        if self._plan is None:
+        if not self._runs:
             return
-        self._time += self._period
-        self.commanded = self._plan.at(self._time)
-        if self._time >= self._plan.duration:
-            self._plan = None
+        run = self._runs[0]
+        self.commanded = run.state(self._period, self.commanded.pose)
+        run.time += self._period
+        if run.stands and len(self._runs) > 1:
+            self._runs.popleft()
 
     def solve(self) -> None:
         """Solve the sliders for the commanded state, by the paper's recursion; pass the last gate, or trip."""
@@ -169,9 +181,8 @@ class Control:
             self.trip(f"setpoint refused: {violation}")
             return
         self.rows = rows
-        if self._plan is None and self.state.mode in (Mode.MOVING, Mode.STOPPING):
-            self.desk.end("done", "arrived")
-            self._go(Event.STANDSTILL, "standstill")
+        if self.state.mode in (Mode.MOVING, Mode.STOPPING) and self._runs[0].stands:
+            self._stand(self._runs[0])
 
     def write(self) -> None:
         """Send the setpoints."""
@@ -190,9 +201,10 @@ class Control:
     @property
     def progress(self) -> tuple[float, float]:
         """Share of the running motion's time that is over, and what remains of it [s]."""
-        if self._plan is None:
+        if not self._runs:
             return 0.0, 0.0
-        return self._time / self._plan.duration, self._plan.duration - self._time
+        *stops, run = self._runs
+        return run.progress, run.remaining + sum(stop.ends - stop.time for stop in stops)
 
     def trip(self, reason: str) -> None:
         """Stop all three drives in this cycle and latch the reason."""
@@ -200,25 +212,64 @@ class Control:
             return
         self.fault = reason
         self.desk.tell("fault", "error", reason)
-        self.desk.end("faulted", reason)
         self._go(Event.FAULT, reason)
 
     # ------------------------------------------------------------------ requests
 
     def _take_goal(self, request: GoalRequest, now_ns: int) -> None:
-        self.desk.check_id(request.id)
+        self.desk.check_id(request)
         decided = step(self.state, Event.GOAL)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
         goal = request.goal
         if goal.valid_for is not None and now_ns - request.received_ns > goal.valid_for * 1e9:
             raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")
-        plan = self._planner.to_pose(self.commanded, (goal.x, goal.y, goal.phi), goal.speed)
-        self._plan, self._time = plan, 0.0
-        self.desk.begin(request, plan.duration)
+        runs = self._runs_to(goal)
+        self._runs = runs
+        self.desk.begin(request, sum(run.ends - run.time for run in runs))
         self._go(Event.GOAL, f"goal {request.id} of {request.user}")
 
+    def _runs_to(self, goal: Goal) -> deque[Run]:
+        """Plan a goal from the commanded motion: at once, or where that is too fast, after a stop on the old path."""
+        planner, rate, start = self._planner, self.override, self.commanded
+        if start.at_rest:
+            return deque([planner.begin(self._path(goal, start), rate, start.pose)])
+        now = self._runs[0].at.rate
+        if now >= SLOWEST:
+            try:
+                # The new path's time goes on at the rate of the old one's: in it, the motion is that much slower.
+                velocity = [value / now for value in start.velocity]
+                acceleration = [value / now**2 for value in start.acceleration]
+                path = self._path(goal, MotionState(start.pose, velocity, acceleration))
+                run = planner.begin(path, now, start.pose)
+                if run.target == now:
+                    planner.change_rate(run, rate, start.pose)
+                    return deque([run])
+            except RefusedError as error:
+                if error.code not in ("too_fast", "no_plan"):
+                    raise
+        run = self._runs[0].copy()
+        planner.change_rate(run, 0.0, start.pose)
+        end = run.state(run.ends - run.time, start.pose)
+        path = self._path(goal, rest(end.pose))
+        return deque([run, planner.begin(path, rate, end.pose)])
+
+    def _path(self, goal: Goal, start: MotionState) -> Path:
+        match goal:
+            case PoseGoal():
+                return self._planner.to_pose(start, (goal.x, goal.y, goal.phi), goal.speed)
+            case SlidersGoal():
+                return self._planner.to_sliders(start, goal.position, goal.speed)
+            case VelocityGoal():
+                return self._planner.jog(start, (goal.x, goal.y, goal.phi), goal.timeout)
+            case TrajectoryGoal():
+                points = [Point(p.t, (p.x, p.y, p.phi), p.velocity, p.acceleration) for p in goal.points]
+                return self._planner.follow(start, points, goal.stretch)
+
     def _take_command(self, request: CommandRequest) -> None:
+        if request.name == "override":
+            self._take_override(request)
+            return
         event = _COMMANDS[request.name]
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
@@ -228,12 +279,18 @@ class Control:
         if decided.action is Action.CLEAR and self.powered:
             raise RefusedError("stopping", "the drives are still stopping: send reset again when they stand")
         reason = f"{request.name} by {request.user}"
-        if decided.action is Action.BRAKE:
-            self.desk.end("stopped", reason)
         if event is Event.QUICK_STOP:
             self.trip(reason)
         else:
             self._go(event, reason)
+        self.desk.undertake(request, self.cycle)
+
+    def _take_override(self, request: CommandRequest) -> None:
+        """Let this motion and those to come run at another rate."""
+        self.override = request.value if request.value is not None else 1.0
+        if self.state.mode is Mode.MOVING:
+            self._run_at(self.override)
+        self.desk.tell("service", "info", f"override {self.override:.0%} by {request.user}", user=request.user)
         self.desk.undertake(request, self.cycle)
 
     def _because(self, refusal: Refusal) -> str:
@@ -267,8 +324,10 @@ class Control:
                 return "" if mode not in (Mode.FAULT, Mode.DISABLED) else self.fault or "disabled while powering up"
             case "disable":
                 return None if mode is Mode.STOPPING or self.powered else ""
-            case "stop":
+            case "stop" | "pause":
                 return None if mode is Mode.STOPPING else ""
+            case "resume" | "override":
+                return ""
             case "reset":
                 if mode is Mode.FAULT:
                     return f"the cause is still there: {self.fault}"
@@ -293,18 +352,39 @@ class Control:
             case Action.CLEAR:
                 self._drives.reset()
                 self.fault = None
-            case Action.BRAKE:
-                try:
-                    self._plan, self._time = self._planner.brake(self.commanded), 0.0
-                except RefusedError as error:
-                    self.trip(f"no controlled stop: {error}")
-                    return
-        before, self.state = self.state.mode, decided.state
-        if self.state.mode is not before:
+            case Action.BRAKE if decided.state.paused or len(self._runs) == 1:
+                self._run_at(0.0)
+            case Action.BRAKE:  # it is stopping already, for a goal that is not to follow any more
+                self._runs.pop()
+            case Action.RESUME:
+                self._run_at(self.override)
+        before, self.state = self.state, decided.state
+        if self.state.mode is not before.mode:
             self._entered = self.cycle
+        if not self.state.has_goal:
+            outcome = _OUTCOMES.get(event, "stopped")
+            self.desk.end(outcome, "arrived" if outcome == "done" else reason)
+        if self.state.mode is not before.mode:
             self.desk.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
-        if self.state.mode in (Mode.DISABLED, Mode.FAULT):
-            self._plan = None
+        if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
+            self._runs.clear()
+
+    def _run_at(self, rate: float) -> None:
+        """Change the rate of the goal's motion; where that follows a stop on the old path, the stop stays as it is."""
+        run = self._runs[-1]
+        if len(self._runs) == 1:
+            self._planner.change_rate(run, rate, self.commanded.pose)
+        else:
+            start = run.state(0.0, self.commanded.pose).pose
+            self._runs[-1] = self._planner.begin(run.path, rate, start)
+
+    def _stand(self, run: Run) -> None:
+        """The motion has ended where it should, or its law has brought it to a standstill on the way."""
+        if self.state.mode is Mode.MOVING and not run.arrived:
+            return  # the override is zero
+        if run.arrived and self.state.paused:
+            self.state = MOVING  # it arrived all the same: nothing is left to resume
+        self._go(Event.STANDSTILL, "standstill")
 
     def _power_up(self) -> None:
         """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from service.errors import RefusedError
-from service.messages import Level, Outcome
+from service.messages import Level, Outcome, VelocityGoal
 from service.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest, Request
 
 REMEMBERED_IDS = 10_000
@@ -30,6 +30,7 @@ class Goal(NamedTuple):
 
     id: str
     user: str
+    is_jog: bool
 
 
 class Desk:
@@ -44,16 +45,21 @@ class Desk:
 
     # ------------------------------------------------------------------ goals
 
-    def check_id(self, goal_id: str) -> None:
-        """Raise RefusedError if the id has been used."""
-        if goal_id in self._ended or (self.goal and self.goal.id == goal_id):
+    def check_id(self, request: GoalRequest) -> None:
+        """Raise RefusedError if the id has been used; a jog's own velocities share one."""
+        goal_id = request.id
+        running = self.goal is not None and self.goal.id == goal_id
+        fresh = running and self.goal is not None and self.goal.is_jog and isinstance(request.goal, VelocityGoal)
+        if goal_id in self._ended or (running and not fresh):
             raise RefusedError("duplicate_id", f"goal id {goal_id!r} has been used: every goal needs its own")
 
     def begin(self, request: GoalRequest, duration: float) -> None:
-        """Accept a goal; the one before is preempted."""
-        self.end("preempted", f"preempted by goal {request.id}")
-        self.goal = Goal(request.id, request.user)
+        """Accept a goal; the one before is preempted, unless this is the same one afresh."""
         self.answers.append(Accepted(request.ticket, request.id, duration))
+        if self.goal is not None and self.goal.id == request.id:
+            return
+        self.end("preempted", f"preempted by goal {request.id}")
+        self.goal = Goal(request.id, request.user, isinstance(request.goal, VelocityGoal))
 
     def end(self, outcome: Outcome, reason: str) -> None:
         """End the running goal, if there is one."""

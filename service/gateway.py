@@ -21,7 +21,7 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, declare_advanced_publish
 from service import __version__, session
 from service.config import Config, geometry
 from service.links import Closed, Link
-from service.messages import MAX_MESSAGE, CommandReply, ErrorReply, GoalReply, Info, PoseGoal
+from service.messages import MAX_MESSAGE, CommandReply, ErrorReply, Goal, GoalReply, Info, Override
 from service.packets import (
     Accepted,
     Answer,
@@ -41,7 +41,7 @@ from service.packets import (
 from service.records import unpack
 from service.state import StateMaker
 
-COMMANDS = ("enable", "disable", "stop", "quick_stop", "reset")
+COMMANDS = ("enable", "disable", "stop", "quick_stop", "reset", "pause", "resume", "override")
 WAITING = 256
 """Requests that may wait for the gateway; beyond that the oldest get no answer."""
 EVENTS_KEPT = 1000
@@ -76,7 +76,7 @@ class Gateway:
         self._states = StateMaker(config)
         self._state_every = 1.0 / config.telemetry.state_hz
         self._state_due = 0.0
-        self._goals = msgspec.json.Decoder(PoseGoal), msgspec.msgpack.Decoder(PoseGoal)
+        self._goals = msgspec.json.Decoder(Goal), msgspec.msgpack.Decoder(Goal)
         self._incoming: deque[Incoming] = deque(maxlen=WAITING)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._waiting: dict[int, _Waiting] = {}
@@ -194,6 +194,14 @@ class Gateway:
         if name not in COMMANDS:
             problem = f"{name}: no such command; there are {', '.join(COMMANDS)}"
             self._refuse(incoming, user, ErrorReply("unknown_command", problem))
+        elif name == "override":
+            try:
+                share = msgspec.json.decode(incoming.payload, type=Override).percent / 100.0
+            except (msgspec.DecodeError, UnicodeDecodeError) as error:
+                problem = f'override takes {{"percent": 0 to 200}}: {_plain(error)}'
+                self._refuse(incoming, user, ErrorReply("malformed", problem))
+                return
+            self._forward(incoming, lambda ticket: CommandRequest(ticket, user, name, share))
         elif incoming.payload not in (b"", b"{}", b"null"):
             self._refuse(incoming, user, ErrorReply("malformed", f"{name} takes no content"))
         else:

@@ -51,7 +51,7 @@ class Loop:
         self._max_overruns = config.watchdogs.max_overruns
         self._epoch = time.time()
         self._welcome = message(Welcome(lacking, drives.bus_load, self._epoch))
-        self._situation = message(Situation(None, None))
+        self._situation = message(Situation(None, 1.0, None))
 
         self.control = Control(config, drives)
         self.ending = False
@@ -86,13 +86,17 @@ class Loop:
         read = now()
         control.observe(feedback)
         self._watch(tick)
-        request = self._gateway.receive()
-        if request is not None:
-            control.handle(packets.decode_request(memoryview(request)[1:]), tick.deadline_ns + tick.lateness_ns)
-        decided = now()
-        control.advance()
-        moved = now()
-        control.solve()
+        decided = moved = now()
+        try:
+            request = self._gateway.receive()
+            if request is not None:
+                control.handle(packets.decode_request(memoryview(request)[1:]), tick.deadline_ns + tick.lateness_ns)
+            decided = now()
+            control.advance()
+            moved = now()
+            control.solve()
+        except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
+            control.trip(f"internal error, please report it: {error!r}")
         solved = now()
         control.write()
         written = now()
@@ -193,7 +197,7 @@ class Loop:
             self._unsent.append(packet)
             self._recorder.send(packet)
         desk.happenings.clear()
-        situation = message(Situation(desk.goal.id if desk.goal else None, control.fault))
+        situation = message(Situation(desk.goal.id if desk.goal else None, control.override, control.fault))
         if situation != self._situation:
             self._situation = situation
             self._gateway.send(situation)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 
-MAX_MESSAGE = 4096
+MAX_MESSAGE = 49_152
 """A goal or command longer than this is refused before it is decoded [bytes]."""
 
 Identifier = Annotated[str, Meta(min_length=1, max_length=64)]
@@ -30,10 +31,81 @@ class PoseGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
     """The goal expires unless it starts within so many seconds."""
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "phi", "speed", "valid_for"):
-            value = getattr(self, name)
-            if value is not None and not math.isfinite(value):
-                raise ValueError(f"{name} is {value}: it must be a finite number")
+        _check_finite(self)
+
+
+class SlidersGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="sliders"):
+    """Move the sliders to positions, straight in slider space where the start allows."""
+
+    position: Triple
+    id: Identifier | None = None
+    speed: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
+    valid_for: Annotated[float, Meta(gt=0.0)] | None = None
+
+    def __post_init__(self) -> None:
+        _check_finite(self)
+
+
+class VelocityGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="velocity"):
+    """Jog: move at a velocity [m/s, rad/s] until `timeout` passes without a fresh one of the same id."""
+
+    x: float
+    y: float
+    phi: float
+    id: Identifier | None = None
+    timeout: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
+    valid_for: Annotated[float, Meta(gt=0.0)] | None = None
+
+    def __post_init__(self) -> None:
+        _check_finite(self)
+
+
+class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the platform is at a time [s]: x, y [m], phi [rad]; how fast and how accelerated, where given."""
+
+    t: float
+    x: float
+    y: float
+    phi: float
+    velocity: Triple | None = None
+    acceleration: Triple | None = None
+
+    def __post_init__(self) -> None:
+        _check_finite(self)
+
+
+class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="trajectory"):
+    """Follow timed points, quintic between them, from where the robot stands."""
+
+    points: Annotated[tuple[TrajectoryPoint, ...], Meta(min_length=2, max_length=400)]
+    id: Identifier | None = None
+    stretch: bool = False
+    """Slow a trajectory that is too fast for a slider, instead of refusing it."""
+    valid_for: Annotated[float, Meta(gt=0.0)] | None = None
+
+    def __post_init__(self) -> None:
+        _check_finite(self)
+        for before, after in itertools.pairwise(self.points):
+            if not before.t < after.t:
+                raise ValueError(f"points: t = {after.t} follows t = {before.t}: times must rise")
+
+
+Goal = PoseGoal | SlidersGoal | VelocityGoal | TrajectoryGoal
+
+
+class Override(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content of the command override: the share of full speed at which motions run."""
+
+    percent: Annotated[float, Meta(ge=0.0, le=200.0)]
+
+
+def _check_finite(message: Struct) -> None:
+    """Refuse numbers that are not finite: msgpack can carry them."""
+    for name in message.__struct_fields__:
+        value = getattr(message, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not math.isfinite(number):
+                raise ValueError(f"{name} is {number}: it must be a finite number")
 
 
 class GoalReply(Struct, frozen=True):

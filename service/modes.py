@@ -30,6 +30,8 @@ class Event(Enum):
     STOP = auto()
     QUICK_STOP = auto()
     RESET = auto()
+    PAUSE = auto()
+    RESUME = auto()
     POWERED = auto()  # all drives reached operation enabled
     STANDSTILL = auto()  # the commanded motion has ended
     FAULT = auto()  # a drive, the bus or a setpoint is bad
@@ -46,15 +48,22 @@ class Action(Enum):
     POWER_DOWN = auto()
     START = auto()
     BRAKE = auto()
+    RESUME = auto()
     QUICK_STOP = auto()
     CLEAR = auto()
 
 
 class State(NamedTuple):
-    """A mode, and whether the drives are to be disabled once the robot stands."""
+    """A mode, and what is to come once the robot stands: its drives disabled, or the same goal again."""
 
     mode: Mode
     disable_after: bool = False
+    paused: bool = False
+
+    @property
+    def has_goal(self) -> bool:
+        """Whether a goal can be under way."""
+        return self.mode is Mode.MOVING or self.paused
 
 
 class Step(NamedTuple):
@@ -77,9 +86,11 @@ HOLDING = State(Mode.HOLDING)
 MOVING = State(Mode.MOVING)
 STOPPING = State(Mode.STOPPING)
 STOPPING_TO_DISABLE = State(Mode.STOPPING, disable_after=True)
+PAUSING = State(Mode.STOPPING, paused=True)
+PAUSED = State(Mode.HOLDING, paused=True)
 FAULT = State(Mode.FAULT)
 
-STATES = (DISABLED, ENABLING, HOLDING, MOVING, STOPPING, STOPPING_TO_DISABLE, FAULT)
+STATES = (DISABLED, ENABLING, HOLDING, MOVING, STOPPING, STOPPING_TO_DISABLE, PAUSING, PAUSED, FAULT)
 
 _NO_FAULT = Refusal("no_fault", "there is no fault to reset")
 _DISABLED = Refusal("not_enabled", "the robot is disabled: send enable first")
@@ -88,6 +99,9 @@ _STOPPING = Refusal("stopping", "the robot is stopping: send it again when the m
 _DISABLING = Refusal("stopping", "the robot is stopping to be disabled: send enable when the mode is disabled")
 _FAULT = Refusal("fault", "the robot is in fault: remove the cause, then send reset and enable")
 
+_NO_GOAL = Refusal("no_goal", "there is no goal under way")
+_NOT_PAUSED = Refusal("not_paused", "there is no paused goal to resume")
+
 _POWER_OFF = Step(DISABLED, Action.POWER_DOWN)
 _TRIP = Step(FAULT, Action.QUICK_STOP)
 
@@ -95,6 +109,8 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
     DISABLED: {
         Event.ENABLE: Step(ENABLING, Action.POWER_UP),
         Event.GOAL: _DISABLED,
+        Event.PAUSE: _NO_GOAL,
+        Event.RESUME: _NOT_PAUSED,
         Event.RESET: _NO_FAULT,
         Event.QUICK_STOP: _TRIP,
         Event.FAULT: _TRIP,
@@ -102,6 +118,8 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
     ENABLING: {
         Event.DISABLE: _POWER_OFF,
         Event.GOAL: _ENABLING,
+        Event.PAUSE: _NO_GOAL,
+        Event.RESUME: _NOT_PAUSED,
         Event.STOP: _POWER_OFF,
         Event.RESET: _NO_FAULT,
         Event.POWERED: Step(HOLDING),
@@ -114,6 +132,8 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
     HOLDING: {
         Event.DISABLE: _POWER_OFF,
         Event.GOAL: Step(MOVING, Action.START),
+        Event.PAUSE: _NO_GOAL,
+        Event.RESUME: _NOT_PAUSED,
         Event.RESET: _NO_FAULT,
         Event.SHUTDOWN: _POWER_OFF,
         Event.QUICK_STOP: _TRIP,
@@ -123,6 +143,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.DISABLE: Step(STOPPING_TO_DISABLE, Action.BRAKE),
         Event.GOAL: Step(MOVING, Action.START),
         Event.STOP: Step(STOPPING, Action.BRAKE),
+        Event.PAUSE: Step(PAUSING, Action.BRAKE),
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: Step(HOLDING),
         Event.GATEWAY_LOST: Step(STOPPING, Action.BRAKE),
@@ -134,6 +155,8 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
     STOPPING: {
         Event.DISABLE: Step(STOPPING_TO_DISABLE),
         Event.GOAL: _STOPPING,
+        Event.PAUSE: _NO_GOAL,
+        Event.RESUME: _NOT_PAUSED,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: Step(HOLDING),
         Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),
@@ -143,14 +166,42 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
     STOPPING_TO_DISABLE: {
         Event.ENABLE: _DISABLING,
         Event.GOAL: _DISABLING,
+        Event.PAUSE: _NO_GOAL,
+        Event.RESUME: _NOT_PAUSED,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: _POWER_OFF,
+        Event.QUICK_STOP: _TRIP,
+        Event.FAULT: _TRIP,
+    },
+    PAUSING: {
+        Event.DISABLE: Step(STOPPING_TO_DISABLE),
+        Event.GOAL: Step(MOVING, Action.START),
+        Event.STOP: Step(STOPPING),
+        Event.RESUME: Step(MOVING, Action.RESUME),
+        Event.RESET: _NO_FAULT,
+        Event.STANDSTILL: Step(PAUSED),
+        Event.GATEWAY_LOST: Step(STOPPING),
+        Event.LATE: Step(STOPPING),
+        Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),
+        Event.QUICK_STOP: _TRIP,
+        Event.FAULT: _TRIP,
+    },
+    PAUSED: {
+        Event.DISABLE: _POWER_OFF,
+        Event.GOAL: Step(MOVING, Action.START),
+        Event.STOP: Step(HOLDING),
+        Event.RESUME: Step(MOVING, Action.RESUME),
+        Event.RESET: _NO_FAULT,
+        Event.GATEWAY_LOST: Step(HOLDING),
+        Event.SHUTDOWN: _POWER_OFF,
         Event.QUICK_STOP: _TRIP,
         Event.FAULT: _TRIP,
     },
     FAULT: {
         Event.ENABLE: _FAULT,
         Event.GOAL: _FAULT,
+        Event.PAUSE: _FAULT,
+        Event.RESUME: _FAULT,
         Event.RESET: Step(DISABLED, Action.CLEAR),
     },
 }

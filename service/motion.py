@@ -1,32 +1,19 @@
-"""Plans of the platform's motion: jerk-limited, from any state of motion, checked before they start."""
+"""The platform's motion under way: a path, the law by which its time runs, and the state they are at."""
 
 from __future__ import annotations
 
-import contextlib
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
+from ruckig import Trajectory
 
-from service.config import PlatformLimits
-from service.errors import KinematicsError, RefusedError
-from service.geometry import Geometry
-from service.kinematics import inverse
-from service.limits import LEGS, Bounds
+from service.algebra import Array
+from service.paths import FOR_EVER, Path, advance, value
 
-SAMPLES = 64
-"""Poses at which a path is checked before it is accepted."""
-HEADROOM = 0.98
-"""A path that was too fast is slowed to this share of the limit, for what lies between the samples."""
-ATTEMPTS = 4
-"""How often a path may be slowed before it is refused."""
-
-JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
-"""Ruckig finds no solution just where one kind of profile gives way to another, as for a distance of 2 a³ / j²
-from rest to rest: there a hair less jerk has one."""
+STILL = (0.0, 0.0, 0.0)
+SAME_TIME = 1e-9
+"""Knots closer than this are one [s]."""
 
 
 class MotionState(NamedTuple):
@@ -42,115 +29,145 @@ class MotionState(NamedTuple):
         return not any(self.velocity) and not any(self.acceleration)
 
 
-STILL = (0.0, 0.0, 0.0)
-
-
 def rest(pose: Sequence[float]) -> MotionState:
     """Stand at a pose."""
     return MotionState(tuple(pose), STILL, STILL)
 
 
-class Plan:
-    """A motion in time: where the platform is told to be, from 0 to `duration` seconds and after."""
+class Rate(NamedTuple):
+    """Where a law is: time along the path [s], its rate, and the rate's change [1/s]."""
 
-    def __init__(self, trajectory: Trajectory) -> None:
-        self._trajectory = trajectory
-        self.duration: float = trajectory.duration
-
-    def at(self, time: float) -> MotionState:
-        """Evaluate at a time [s]; after the end the platform stands."""
-        if time >= self.duration:
-            return rest(self._trajectory.at_time(self.duration)[0])
-        return MotionState(*self._trajectory.at_time(time))
+    s: float
+    rate: float
+    change: float
 
 
-class Planner:
-    """Makes plans within the platform's limits and the sliders' bounds."""
+class Run:
+    """A path and its law, advanced by one period a cycle."""
 
-    def __init__(self, geometry: Geometry, limits: PlatformLimits, bounds: Bounds) -> None:
-        self._geometry = geometry
-        self._limits = limits
-        self._bounds = bounds
-        self._ruckig = Ruckig(3)
+    def __init__(self, legs: Array, path: Path, law: Path, target: float) -> None:
+        self.path = path
+        self.law = law
+        self.target = target
+        """The rate that the law leads to."""
+        self.time = 0.0
+        """Time since the law began [s]."""
+        self._legs = legs
+        self._near = np.zeros(3)
+        self._out = np.zeros((3, 3))
+        self._law_out = np.zeros((3, 1))
 
-    def to_pose(self, start: MotionState, target: Sequence[float], speed: float = 1.0) -> Plan:
-        """Plan from any state of motion to rest at a pose; at `speed` 0.5 the same path takes twice as long.
+    @property
+    def at(self) -> Rate:
+        """Where the law is."""
+        value(self.law.knots, self.law.pieces, self.time, self._law_out)
+        s, rate, change = self._law_out[:, 0].tolist()
+        return Rate(s, rate, change)
 
-        The whole path is checked: one that leaves the workspace is refused, one that is too fast for a slider is
-        slowed. Raises RefusedError with slider or coordinate, value and limit.
-        """
-        if violation := self._bounds.pose(target):
-            raise RefusedError(
-                "out_of_workspace",
-                f"the goal is out of the workspace: {violation}",
-                value=violation.value,
-                limit=violation.limit,
-            )
-        for _ in range(ATTEMPTS):
-            plan = self._plan(start, target, speed)
-            excess = self._excess(plan)
-            if excess <= 1.0:
-                return plan
-            speed *= HEADROOM / excess
-        raise RefusedError(
-            "too_fast",
-            "from its present motion the robot cannot take this path within its sliders' limits; "
-            "send the goal again when it holds",
-        )
+    @property
+    def arrived(self) -> bool:
+        """Whether the end of the path has been reached."""
+        return self.at.s >= self.path.duration
 
-    def brake(self, start: MotionState) -> Plan:
-        """Plan from any state of motion to rest, along the present direction where that is straight."""
-        request = self._request(start, 1.0)
-        request.control_interface = ControlInterface.Velocity
-        request.target_velocity = STILL
-        request.target_acceleration = STILL
-        return self._solve(request)
+    @property
+    def stands(self) -> bool:
+        """Whether the law has brought the motion to a standstill, at the end of the path or before."""
+        at = self.at
+        return at.s >= self.path.duration or (self.target == 0.0 and at.rate == at.change == 0.0)
 
-    def _plan(self, start: MotionState, target: Sequence[float], speed: float) -> Plan:
-        request = self._request(start, speed)
-        request.target_position = list(target)
-        return self._solve(request)
+    @property
+    def remaining(self) -> float:
+        """Time to the end of the path [s]; of one that is stopped before, at full speed."""
+        return max(0.0, self.ends - self.time if self.target else self.path.duration - self.at.s)
 
-    def _request(self, start: MotionState, speed: float) -> InputParameter:
-        request = InputParameter(3)
-        request.current_position = list(start.pose)
-        request.current_velocity = list(start.velocity)
-        request.current_acceleration = list(start.acceleration)
-        # The same path k times slower has k times the velocity, k² the acceleration and k³ the jerk.
-        request.max_velocity = [speed * limit for limit in self._limits.velocity]
-        request.max_acceleration = [speed**2 * limit for limit in self._limits.acceleration]
-        request.max_jerk = [speed**3 * limit for limit in self._limits.jerk]
-        request.synchronization = Synchronization.Phase
-        return request
+    @property
+    def ends(self) -> float:
+        """When it stands, in time of its law [s]."""
+        return min(end_of(self.path, self.law, self.target), FOR_EVER if self.target else float(self.law.knots[-2]))
 
-    def _solve(self, request: InputParameter) -> Plan:
-        trajectory = Trajectory(3)
-        jerk = request.max_jerk
-        for share in JERK_SHARES:
-            request.max_jerk = [share * limit for limit in jerk]
-            with contextlib.suppress(RuckigError):
-                if self._ruckig.calculate(request, trajectory) in (Result.Working, Result.Finished):
-                    return Plan(trajectory)
-        raise RefusedError("no_plan", "no motion leads there from the present one: send the goal again when it holds")
+    def copy(self) -> Run:
+        """Return the same motion, to be changed by itself."""
+        other = Run(self._legs, self.path, self.law, self.target)
+        other.time = self.time
+        return other
 
-    def _excess(self, plan: Plan) -> float:
-        """How many times too fast the plan is for a slider. Raises RefusedError if it leaves the workspace."""
-        times = np.linspace(0.0, plan.duration, SAMPLES)
-        states: NDArray[np.float64] = np.array([plan.at(time) for time in times.tolist()])
-        pose = states[:, 0]
-        try:
-            motion = inverse(self._geometry, pose, states[:, 1], states[:, 2])
-        except KinematicsError as error:
-            raise RefusedError("out_of_workspace", f"the path leads out of the workspace: {error}") from error
-        if found := self._bounds.path(pose, motion.position, motion.passive_position):
-            row, violation = found
-            raise RefusedError(
-                "out_of_workspace",
-                f"the path leads out of the workspace after {row / (SAMPLES - 1):.0%} of its time: {violation}",
-                slider=violation.what if violation.what in LEGS else None,
-                value=violation.value,
-                limit=violation.limit,
-            )
-        velocity = np.abs(motion.velocity).max() / self._bounds.velocity
-        acceleration = np.abs(motion.acceleration).max() / self._bounds.acceleration
-        return max(float(velocity), math.sqrt(float(acceleration)))
+    @property
+    def progress(self) -> float:
+        """Share of the path's time that is over."""
+        return min(1.0, self.at.s / self.path.duration) if self.path.duration > 0.0 else 1.0
+
+    def change_law(self, law: Path, target: float) -> None:
+        """Go on from here by another law."""
+        self.law, self.target, self.time = law, target, 0.0
+
+    def state(self, ahead: float, near: Sequence[float]) -> MotionState:
+        """Evaluate so much later than now [s]; a pose that cannot be is not a number."""
+        self._near[:] = near
+        code = advance(self._legs, *self.path, *self.law[:2], self.time + ahead, self._near, self._out)
+        if code:
+            self._out[:] = np.nan
+        return MotionState(*self._out.tolist())
+
+
+def end_of(path: Path, law: Path, target: float) -> float:
+    """Return when a law reaches the end of a path [s]; infinite if it stops before."""
+    last = law.pieces[-1, 0]
+    begins, s, rate = float(law.knots[-2]), float(last[0]), float(last[1])
+    if s >= path.duration:
+        return _crossing(law, path.duration)
+    return begins + (path.duration - s) / rate if rate > 0.0 and target > 0.0 else np.inf
+
+
+def _crossing(law: Path, s: float) -> float:
+    """Return when a law passes a time along the path, by halving."""
+    low, high, out = 0.0, float(law.knots[-2]), np.zeros((3, 1))
+    for _ in range(40):
+        middle = (low + high) / 2.0
+        value(law.knots, law.pieces, middle, out)
+        low, high = (middle, high) if out[0, 0] < s else (low, middle)
+    return high
+
+
+def from_ruckig(trajectory: Trajectory, in_sliders: bool = False) -> Path:
+    """Take a Ruckig trajectory over as a path: between its switching times everything is a cubic."""
+    duration: float = trajectory.duration
+    times = {0.0, duration}
+    for profile in trajectory.profiles[0]:
+        time = 0.0
+        for span in (*profile.brake.t, *profile.t):
+            time += span
+            times.add(time)
+    knots = [0.0]
+    for time in sorted(times):
+        if time - knots[-1] > SAME_TIME and time <= duration:
+            knots.append(time)
+    if len(knots) == 1:
+        knots.append(max(duration, SAME_TIME))
+    states = np.array([trajectory.at_time(time) for time in knots[:-1]] + [trajectory.at_time(knots[-1])])
+    degrees = states.shape[2]
+    pieces = np.zeros((len(knots) - 1, degrees, 6))
+    pieces[:, :, 0] = states[:-1, 0]
+    pieces[:, :, 1] = states[:-1, 1]
+    pieces[:, :, 2] = states[:-1, 2] / 2.0
+    pieces[:, :, 3] = np.diff(states[:, 2], axis=0) / np.diff(knots)[:, None] / 6.0
+    return Path(np.array(knots), pieces, in_sliders)
+
+
+def law_from_ruckig(trajectory: Trajectory, target: float) -> Path:
+    """Take a one-dimensional Ruckig trajectory over as a law: after it the rate stays what it is."""
+    ramp = from_ruckig(trajectory)
+    last = np.zeros((1, 1, 6))
+    last[0, 0, :2] = trajectory.at_time(trajectory.duration)[0][0], target
+    return Path(np.append(ramp.knots, ramp.knots[-1] + FOR_EVER), np.concatenate([ramp.pieces, last]))
+
+
+def joined(paths: Sequence[Path]) -> Path:
+    """Return one path after the other."""
+    ends = np.cumsum([path.duration for path in paths])
+    knots = [paths[0].knots, *(path.knots[1:] + end for path, end in zip(paths[1:], ends, strict=False))]
+    return Path(np.concatenate(knots), np.concatenate([path.pieces for path in paths]), paths[0].in_sliders)
+
+
+def stretched(path: Path, factor: float) -> Path:
+    """Return the same path, `factor` times slower."""
+    return Path(path.knots * factor, path.pieces / factor ** np.arange(6.0), path.in_sliders)

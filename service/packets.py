@@ -7,7 +7,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct, msgpack
 
-from service.messages import Event, PoseGoal
+from service.messages import Event, Goal
 
 
 class Kind(IntEnum):
@@ -24,7 +24,7 @@ class GoalRequest(Struct, frozen=True, tag=True):
     ticket: int
     user: str
     id: str
-    goal: PoseGoal
+    goal: Goal
     received_ns: int
 
 
@@ -34,6 +34,7 @@ class CommandRequest(Struct, frozen=True, tag=True):
     ticket: int
     user: str
     name: str
+    value: float | None = None
 
 
 class RefusedRequest(Struct, frozen=True, tag=True):
@@ -89,6 +90,7 @@ class Situation(Struct, frozen=True, tag=True):
     """Loop to both: what records do not say and the state needs; sent when it changes."""
 
     goal: str | None
+    override: float
     fault: Annotated[str, Meta(max_length=512)] | None
 
 

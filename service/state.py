@@ -34,7 +34,7 @@ class StateMaker:
         self._velocity = self._acceleration = np.zeros(3)
         self._error_max = np.zeros(3)
         self._welcome = Welcome((), 0.0, 0.0)
-        self._situation = Situation(None, None)
+        self._situation = Situation(None, 1.0, None)
 
     def update(self, news: Situation | Welcome) -> None:
         """Take in what the loop says beside its records."""
@@ -90,7 +90,7 @@ class StateMaker:
                 status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
             ),
             goal=GoalState(goal, float(row["progress"]), float(row["remaining"])) if goal else None,
-            override=1.0,
+            override=self._situation.override,
             lease=None,
             faults=(self._situation.fault,) if self._situation.fault else (),
             loop=LoopState(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+import time
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -14,7 +15,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
-from service.client import Goal, Result, Robot
+from service.client import Goal, Jog, Result, Robot
 from service.errors import ServiceError
 from service.messages import Event, Percentiles, State
 
@@ -86,6 +87,18 @@ def follow(robot: Robot, goal: Goal, title: str, *, show: bool = True) -> Result
     if goal.result is not None:
         return goal.result
     raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
+
+
+def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
+    """Show where a jog leads, until it ends or its time is over."""
+    ends = math.inf if seconds is None else time.monotonic() + seconds
+    with Live(console=out, refresh_per_second=10, transient=True) as live:
+        for state in robot.states(SILENT):
+            if show:
+                live.update(_table(state, robot.name))
+            if time.monotonic() >= ends or jog.error is not None or jog.result is not None:
+                return
+    raise ServiceError("the service has gone silent")
 
 
 def show(state: State, robot: str) -> None:

@@ -16,7 +16,7 @@ from drivers.simulated import SimulatedDrive, simulated_bus
 from service.config import SIM, Config, load
 from service.control import Control
 from service.desk import Happening
-from service.messages import PoseGoal
+from service.messages import Goal, PoseGoal
 from service.modes import Mode
 from service.packets import Answer, CommandRequest, GoalRequest, Request
 
@@ -92,17 +92,20 @@ class Rig:
             self.cycle()
         raise AssertionError(f"not within {within} cycles; the mode is {self.mode}")
 
-    def command(self, name: str) -> Answer:
+    def command(self, name: str, value: float | None = None) -> Answer:
         """Send a command and run until it is answered."""
         ticket = next(self._tickets)
-        self.cycle(CommandRequest(ticket, "ann", name))
+        self.cycle(CommandRequest(ticket, "ann", name, value))
         self.until(lambda: self._answered(ticket))
         return self.answers[-1]
 
-    def goal(self, id: str, x: float, y: float, phi: float, **more: float) -> Answer:  # noqa: A002
+    def goal(self, id: str, x: float, y: float, phi: float, speed: float = 1.0) -> Answer:  # noqa: A002
+        """Send a pose goal; return its answer."""
+        return self.send(id, PoseGoal(x=x, y=y, phi=phi, speed=speed))
+
+    def send(self, id: str, goal: Goal) -> Answer:  # noqa: A002
         """Send a goal; return its answer."""
         ticket = next(self._tickets)
-        goal = PoseGoal(x=x, y=y, phi=phi, id=id, **more)
         self.cycle(GoalRequest(ticket, "ann", id, goal, round(self.now * 1e9)))
         assert self._answered(ticket)
         return self.answers[-1]
