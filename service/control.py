@@ -243,7 +243,8 @@ class Control:
                 path = self._path(goal, MotionState(start.pose, velocity, acceleration))
                 run = planner.begin(path, now, start.pose)
                 if run.target == now:
-                    planner.change_rate(run, rate, start.pose)
+                    if rate != now:
+                        planner.change_rate(run, rate, start.pose)
                     return deque([run])
             except RefusedError as error:
                 if error.code not in ("too_fast", "no_plan"):

@@ -17,14 +17,14 @@ from service.limits import LEGS, Bounds
 from service.motion import STILL, MotionState, Run, end_of, from_ruckig, joined, law_from_ruckig, stretched
 from service.paths import Path, advance, constant, survey
 
-SAMPLES = 96
+SAMPLES = 48
 """Moments at which a path is looked at, besides its knots."""
 PLANNED = (0.98, 0.98, 0.93)
 """Share of the sliders' limits of velocity, acceleration and jerk that plans make use of: the rest is for what lies
 between the samples, where jerk varies most."""
 ATTEMPTS = 4
 """How often a path may be slowed before it is refused."""
-IN_MOTION = (1.0, 0.7, 0.4)
+IN_MOTION = (1.0, 0.5)
 """Shares of the platform's limits that a plan from motion is tried with."""
 HALVINGS = 5
 """How finely a jog's way to a limit is made use of."""
