@@ -15,14 +15,14 @@ from drivers.interface import NAMES, Drives, Feedback, PowerState
 from service.config import Config, geometry
 from service.desk import Desk
 from service.errors import RefusedError
+from service.goals import plan
 from service.kinematics import forward_into, inverse_into
 from service.limits import Bounds
-from service.messages import Goal, Outcome, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
+from service.messages import Outcome
 from service.modes import DISABLED, HOLDING, MOVING, Action, Event, Mode, Refusal, State, step
 from service.motion import STILL, MotionState, Run, rest
 from service.packets import CommandRequest, GoalRequest, Request
-from service.paths import Path
-from service.planning import Planner, Point
+from service.planning import Planner
 
 Triple = tuple[float, float, float]
 
@@ -40,8 +40,6 @@ _COMMANDS = {
 }
 _OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.FAULT: "faulted"}
 """How a goal ends on an event after which it is not under way; else it is stopped."""
-SLOWEST = 0.05
-"""Where the time along a path runs slower than this, a new goal is planned from a standstill."""
 _POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 
 
@@ -224,48 +222,10 @@ class Control:
         goal = request.goal
         if goal.valid_for is not None and now_ns - request.received_ns > goal.valid_for * 1e9:
             raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")
-        runs = self._runs_to(goal)
-        self._runs = runs
-        self.desk.begin(request, sum(run.ends - run.time for run in runs))
+        under_way = self._runs[0] if self._runs else None
+        self._runs = plan(self._planner, goal, self.commanded, under_way, self.override)
+        self.desk.begin(request, sum(run.ends - run.time for run in self._runs))
         self._go(Event.GOAL, f"goal {request.id} of {request.user}")
-
-    def _runs_to(self, goal: Goal) -> deque[Run]:
-        """Plan a goal from the commanded motion: at once, or where that is too fast, after a stop on the old path."""
-        planner, rate, start = self._planner, self.override, self.commanded
-        if start.at_rest:
-            return deque([planner.begin(self._path(goal, start), rate, start.pose)])
-        now = self._runs[0].at.rate
-        if now >= SLOWEST:
-            try:
-                # The new path's time goes on at the rate of the old one's: in it, the motion is that much slower.
-                velocity = [value / now for value in start.velocity]
-                acceleration = [value / now**2 for value in start.acceleration]
-                path = self._path(goal, MotionState(start.pose, velocity, acceleration))
-                run = planner.begin(path, now, start.pose)
-                if run.target == now:
-                    if rate != now:
-                        planner.change_rate(run, rate, start.pose)
-                    return deque([run])
-            except RefusedError as error:
-                if error.code not in ("too_fast", "no_plan"):
-                    raise
-        run = self._runs[0].copy()
-        planner.change_rate(run, 0.0, start.pose)
-        end = run.state(run.ends - run.time, start.pose)
-        path = self._path(goal, rest(end.pose))
-        return deque([run, planner.begin(path, rate, end.pose)])
-
-    def _path(self, goal: Goal, start: MotionState) -> Path:
-        match goal:
-            case PoseGoal():
-                return self._planner.to_pose(start, (goal.x, goal.y, goal.phi), goal.speed)
-            case SlidersGoal():
-                return self._planner.to_sliders(start, goal.position, goal.speed)
-            case VelocityGoal():
-                return self._planner.jog(start, (goal.x, goal.y, goal.phi), goal.timeout)
-            case TrajectoryGoal():
-                points = [Point(p.t, (p.x, p.y, p.phi), p.velocity, p.acceleration) for p in goal.points]
-                return self._planner.follow(start, points, goal.stretch)
 
     def _take_command(self, request: CommandRequest) -> None:
         if request.name == "override":

@@ -278,6 +278,34 @@ def test_other_ways_to_send_a_goal(shared: tuple[Service, Robot, zenoh.Session])
     until(robot, lambda state: state.mode == "holding" and abs(state.pose[0]) < 1e-5)
 
 
+def test_every_kind_of_goal(shared: tuple[Service, Robot, zenoh.Session], tmp_path: Path) -> None:
+    service, robot, _ = shared
+    assert robot.move_sliders(0.01, 0.0, -0.01).wait(timeout=10.0).outcome == "done"
+    assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
+    with robot.jog(x=0.02) as jog:
+        until(robot, lambda state: state.pose[0] > 0.015)
+    assert jog.error is None
+    assert jog.result is not None
+    assert jog.result.outcome == "done"
+    robot.override(50.0)
+    slow = robot.move_to(x=-0.03, y=0.0, phi=0.0, speed=0.2)
+    until(robot, lambda state: state.goal is not None and state.goal.progress > 0.2)
+    robot.pause()
+    state = robot.state()
+    assert (state.mode, state.override) == ("holding", 0.5)
+    assert state.goal is not None
+    robot.resume()
+    robot.override(100.0)
+    assert slow.wait(timeout=20.0).outcome == "done"
+    path = tmp_path / "path.csv"
+    path.write_text("t,x,y,phi\n0,-0.03,0,0\n0.5,-0.01,0,0.1\n1,0,0,0\n")
+    followed = trirail("follow", path, "--wait", "--json", locator=service.locator)
+    assert json.loads(followed.stdout)["outcome"] == "done"
+    refused = trirail("follow", path, locator=service.locator)
+    assert refused.returncode == 1
+    assert "the trajectory begins at x = -0.03" in refused.stderr
+
+
 def test_the_service_is_seen_alive(shared: tuple[Service, Robot, zenoh.Session]) -> None:
     _, _, session = shared
     assert [reply.ok is not None for reply in session.liveliness().get("trirail/demo/alive")] == [True]
