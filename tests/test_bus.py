@@ -80,6 +80,7 @@ def test_connect_leaves_no_bus_open_where_the_drives_are_impossible(monkeypatch:
 
 def test_any_python_can_interface_opens() -> None:
     opened = bus.open_bus(Can(interface="virtual", channel="test-bus"), DRIVES)
+    assert opened.recv(0) is None
     opened.shutdown()
 
 

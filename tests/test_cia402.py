@@ -528,7 +528,9 @@ class TestFaults:
 
     def test_bus_off(self, enabled: Rig) -> None:
         enabled.bus.inject(0x040, bytes(8), is_error_frame=True)
-        enabled.found("bus", within=1)
+        fault = enabled.found("bus", within=1).fault
+        assert fault is not None
+        assert "bus-off" in fault.message
 
     def test_frames_of_others_are_no_concern(self, enabled: Rig) -> None:
         enabled.bus.inject(frames.TPDO2 + 20, b"\xff")
