@@ -448,6 +448,22 @@ def test_trajectories_that_are_refused(rig: Rig) -> None:
     assert_within_limits(rig)
 
 
+def test_a_trajectory_may_not_jump_into_its_acceleration(rig: Rig) -> None:
+    rig.enable()
+    still = (0.0, 0.0, 0.0)
+    for acceleration, taken in ((0.3, True), (0.5, False)):  # within a millisecond: 300 and 500 m/s³, 400 are allowed
+        points = (
+            TrajectoryPoint(0.0, 0.0, 0.0, 0.0, velocity=still, acceleration=(acceleration, 0.0, 0.0)),
+            TrajectoryPoint(1.0, 0.05, 0.0, 0.0, velocity=still, acceleration=still),
+        )
+        answer = rig.send(f"g{acceleration}", TrajectoryGoal(points))
+        assert isinstance(answer, Accepted) is taken
+        rig.command("stop")
+        rig.goal(f"back{acceleration}", 0.0, 0.0, 0.0)
+        rig.until(lambda: rig.mode is Mode.HOLDING)
+    assert_within_limits(rig)
+
+
 def test_pause_and_resume_stay_on_the_path(rig: Rig) -> None:
     rig.enable()
     rig.goal("g1", 0.08, -0.04, 0.3)

@@ -1,0 +1,107 @@
+"""The loop's shell around the control: overruns, neighbours, and a program that is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import Rig
+
+from service import links
+from service.clock import Tick
+from service.links import Link, Port
+from service.loop import BATCHES_PER_SECOND, Loop
+from service.modes import Mode
+from service.packets import CommandRequest, Happened, Kind, Welcome, decode_answer, message
+from service.records import unpack
+
+
+class Shell:
+    """A loop over the simulated drives, cycled by hand, with a gateway at its port."""
+
+    def __init__(self, rig: Rig, folder: Path) -> None:
+        self.rig = rig
+        self.ports = Port(links.listen(folder / "gateway")), Port(links.listen(folder / "recorder"))
+        self.gateway: Link = links.connect(folder / "gateway")
+        self.loop = Loop(rig.config, rig.driver, *self.ports)
+        self.loop.control.start(rig.control.feedback)
+
+    def cycles(self, number: int, missed: int = 0) -> None:
+        for _ in range(number):
+            self.rig.now += self.rig.config.period
+            self.rig.sent.clear()
+            self.loop.cycle(Tick(round(self.rig.now * 1e9), 0, missed))
+
+    def enabled(self) -> None:
+        self.cycles(self.rig.config.loop.rate_hz // BATCHES_PER_SECOND)  # by then the gateway is accepted
+        self.gateway.send(message(CommandRequest(1, "ann", "enable")))
+        self.cycles(20)
+        assert self.loop.control.state.mode is Mode.HOLDING
+
+    def received(self) -> list[bytes]:
+        packets = []
+        while (packet := self.gateway.receive()) is not None:
+            packets.append(packet)
+        return packets
+
+
+@pytest.fixture
+def shell(rig: Rig, tmp_path: Path) -> Iterator[Shell]:
+    made = Shell(rig, tmp_path)
+    yield made
+    made.gateway.close()
+    for port in made.ports:
+        port.close()
+
+
+def test_every_cycle_has_its_record_and_every_event_its_number(shell: Shell) -> None:
+    shell.enabled()
+    shell.cycles(40)
+    packets = shell.received()
+    cycles = [int(c) for packet in packets if packet[0] == Kind.RECORDS for c in unpack(packet[1:])["cycle"]]
+    assert cycles == list(range(cycles[0], cycles[0] + len(cycles)))
+    said = [decode_answer(packet[1:]) for packet in packets if packet[0] == Kind.MESSAGE]
+    assert isinstance(said[0], Welcome)
+    assert [answer.event.seq for answer in said if isinstance(answer, Happened)] == [1, 2]
+
+
+def test_a_program_that_is_wrong_stops_the_robot_in_that_cycle(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    shell.enabled()
+
+    def wrong() -> None:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(shell.loop.control, "advance", wrong)
+    shell.cycles(1)
+    assert shell.loop.control.state.mode is Mode.FAULT
+    assert "a bug" in (shell.loop.control.fault or "")
+    quick = {frame.arbitration_id - 0x200 for frame in shell.rig.sent if frame.data and frame.data[0] & 0b110 == 0b010}
+    assert {1, 2, 3} <= quick
+
+
+def test_missed_ticks_are_counted(shell: Shell) -> None:
+    shell.enabled()
+    shell.cycles(1, missed=3)
+    shell.cycles(20)
+    rows = [unpack(packet[1:]) for packet in shell.received() if packet[0] == Kind.RECORDS]
+    assert int(rows[-1]["overruns"][-1]) == 3
+
+
+def test_a_lost_gateway_is_noticed(shell: Shell) -> None:
+    shell.enabled()
+    shell.gateway.close()
+    shell.cycles(1)
+    assert not shell.ports[0].connected
+    shell.cycles(5)
+    assert shell.loop.control.state.mode is Mode.HOLDING  # it stood: nothing to stop
+
+
+def test_it_ends_when_the_robot_has_no_power(shell: Shell) -> None:
+    shell.enabled()
+    shell.loop.ending = True
+    shell.cycles(1)
+    assert shell.loop.control.state.mode is Mode.DISABLED
+    assert not shell.loop._over()  # the drives have not said so yet
+    shell.cycles(5)
+    assert shell.loop._over()
