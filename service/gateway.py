@@ -232,8 +232,8 @@ class Gateway:
                 self._event.put(msgspec.json.encode(event))
             case Situation() | Welcome():
                 self._states.update(answer)
-            case Accepted(ticket, goal_id, duration):
-                self._answer(ticket, GoalReply(goal_id, duration))
+            case Accepted(ticket, goal_id, duration, slowed, stops_first, queued):
+                self._answer(ticket, GoalReply(goal_id, duration, slowed, stops_first, queued))
             case Confirmed(ticket, name, mode):
                 self._answer(ticket, CommandReply(name, mode))
             case Refused(ticket, code, text, slider, value, limit):

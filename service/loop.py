@@ -88,7 +88,7 @@ class Loop:
         self._watch(tick)
         decided = moved = now()
         try:
-            request = self._gateway.receive()
+            request = self._gateway.receive() if control.ready else None
             if request is not None:
                 control.handle(packets.decode_request(memoryview(request)[1:]), tick.deadline_ns + tick.lateness_ns)
             decided = now()

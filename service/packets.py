@@ -35,6 +35,9 @@ class CommandRequest(Struct, frozen=True, tag=True):
     user: str
     name: str
     value: float | None = None
+    """The rate, for override."""
+    goal: str | None = None
+    """The one goal that is to be stopped, for stop."""
 
 
 class RefusedRequest(Struct, frozen=True, tag=True):
@@ -50,6 +53,9 @@ class Accepted(Struct, frozen=True, tag=True):
     ticket: int
     id: str
     duration: float
+    slowed: float
+    stops_first: bool
+    queued: bool
 
 
 class Confirmed(Struct, frozen=True, tag=True):

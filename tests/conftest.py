@@ -119,7 +119,7 @@ class Rig:
         """Send a goal; return its answer."""
         ticket = next(self._tickets)
         self.cycle(GoalRequest(ticket, "ann", id, goal, round(self.now * 1e9)))
-        assert self._answered(ticket)
+        self.until(lambda: self._answered(ticket), 50)
         return self.answers[-1]
 
     def _answered(self, ticket: int) -> bool:

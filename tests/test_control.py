@@ -331,7 +331,7 @@ def test_a_following_error(rig: Rig) -> None:
 def test_the_last_gate(rig: Rig, monkeypatch: pytest.MonkeyPatch, commanded: MotionState, said: str) -> None:
     moving(rig)
     sent = rig.setpoints()[-1, 0]
-    monkeypatch.setattr(rig.control._runs[0], "state", lambda *_: commanded)
+    monkeypatch.setattr(rig.control._course.runs[0], "state", lambda *_: commanded)
     rig.cycle()
     assert rig.mode is Mode.FAULT
     assert quick_stops(rig) == {1, 2, 3}
