@@ -255,6 +255,9 @@ class Control:
     def _consider(self, request: GoalRequest) -> None:
         """Begin to plan a goal, or refuse it."""
         self.desk.check_id(request)
+        if request.withdrawn is not None:
+            self.desk.withdraw(request, "stopped", request.withdrawn)
+            return
         decided = step(self.state, Event.GOAL)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
@@ -311,10 +314,10 @@ class Control:
         if decided.action is Action.CLEAR and self.powered:
             raise RefusedError("stopping", "the drives are still stopping: send reset again when they stand")
         reason = f"{request.name} by {request.user}"
-        self._withdraw(event, reason)
         if event is Event.QUICK_STOP:
             self.trip(reason)
         else:
+            self._withdraw(event, reason)
             self._go(event, reason)
         self.desk.undertake(request, self.cycle)
 

@@ -26,6 +26,8 @@ class GoalRequest(Struct, frozen=True, tag=True):
     id: str
     goal: Goal
     received_ns: int
+    withdrawn: str | None = None
+    """Why it must not begin any more, for a goal that waited when the robot was told to stop."""
 
 
 class CommandRequest(Struct, frozen=True, tag=True):

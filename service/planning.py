@@ -25,7 +25,7 @@ from service.steps import Steps
 GENTLEST = 0.3
 """Share of the platform's limits below which no plan from motion is tried."""
 ROOM = 0.97
-"""Share of what would just fit that the second plan from motion makes use of."""
+"""Share of what would just fit that is made use of where rounding must not make it too fast."""
 JOGS = 5
 """How often a jog is tried slower or shorter before it only brakes."""
 JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
@@ -69,7 +69,7 @@ class Planner:
     ) -> None:
         self._legs = geometry.packed()
         self._platform = Kinodynamic(platform.velocity, platform.acceleration, platform.jerk)
-        self._sliders = Kinodynamic(*([limit] * 3 for limit in checker.slider_limits.tolist()))
+        self._sliders = Kinodynamic(*([ROOM * limit] * 3 for limit in checker.slider_limits.tolist()))
         self._travel = slider.position
         self._bounds = bounds
         self._checker = checker

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,35 +50,89 @@ def _quantity(motion: Array, sliders: Array, i: int) -> tuple[float, float]:
     return sliders[3, i - 6], sliders[4, i - 6]
 
 
+class Way(NamedTuple):
+    """A path, the law it is run by, the robot that takes it, and what limits that."""
+
+    legs: Array
+    knots: Array
+    pieces: Array
+    in_sliders: bool
+    law_knots: Array
+    law_pieces: Array
+    box: Array
+
+
 @compiled()
-def _look(
-    legs: Array,
-    knots: Array,
-    pieces: Array,
-    in_sliders: bool,
-    law_knots: Array,
-    law_pieces: Array,
-    time: float,
-    near: Array,
-    box: Array,
-    motion: Array,
-    sliders: Array,
-) -> bool:
+def _look(way: Way, time: float, near: Array, motion: Array, sliders: Array) -> bool:
     """Write platform and sliders at a time of the law; whether they are within reach."""
-    motion_at(knots, pieces, law_knots, law_pieces, time, motion)
-    if in_sliders:
+    motion_at(way.knots, way.pieces, way.law_knots, way.law_pieces, time, motion)
+    if way.in_sliders:
         targets = motion.copy()
-        if forward_motion(legs, targets, near, motion) != 0:
+        if forward_motion(way.legs, targets, near, motion) != 0:
             return False
         near[:] = motion[0]
-    if inverse_motion(legs, motion, sliders) != 0:
+    if inverse_motion(way.legs, motion, sliders) != 0:
         return False
     for i in range(9):
         column = i if i < 3 else 2 + i // 3
         position, _ = _quantity(motion, sliders, i)
-        if not box[0, column] - ROUNDING <= position <= box[1, column] + ROUNDING:
+        if not way.box[0, column] - ROUNDING <= position <= way.box[1, column] + ROUNDING:
             return False
     return True
+
+
+@compiled()
+def _turns(way: Way, last: float, time: float, near: Array, motion: Array, sliders: Array) -> float:
+    """Return when a position that turns near its limit between two looks is beyond it, else not a number.
+
+    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the looks at `last` and at `time`, and have room for one more.
+    """
+    for i in range(9):
+        column = i if i < 3 else 2 + i // 3
+        before, leaving = _quantity(motion[0], sliders[0], i)
+        _, coming = _quantity(motion[1], sliders[1], i)
+        if leaving * coming >= 0.0:
+            continue
+        # It has turned about here, were the acceleration constant.
+        turn = before + leaving * leaving / (leaving - coming) * (time - last) / 2.0
+        if way.box[0, column] + NEAR <= turn <= way.box[1, column] - NEAR:
+            continue
+        low, high = last, time
+        for _ in range(HALVINGS // 3):
+            middle = (low + high) / 2.0
+            if not _look(way, middle, near, motion[2], sliders[2]):
+                return middle
+            _, velocity = _quantity(motion[2], sliders[2], i)
+            if velocity * leaving > 0.0:
+                low = middle
+            else:
+                high = middle
+    return math.nan
+
+
+@compiled()
+def _walk(way: Way, times: Array, step: float, near: Array, worst: Array) -> tuple[float, float]:
+    """Look at a path at ascending times and a step later; return the last time within reach, and one beyond it."""
+    motion, sliders = np.empty((3, 3, 3)), np.empty((3, 6, 3))
+    last = -math.inf
+    for k in range(len(times)):
+        time = times[k]
+        if abs(time - last) < ROUNDING:
+            motion[1], sliders[1] = motion[0], sliders[0]
+        elif not _look(way, time, near, motion[1], sliders[1]):
+            return last, time
+        elif time > last + step and k > 0:
+            beyond = _turns(way, last, time, near, motion, sliders)
+            if not math.isnan(beyond):
+                return last, beyond
+        last = time + step
+        if not _look(way, last, near, motion[0], sliders[0]):
+            return time, last
+        for i in range(3):
+            worst[0] = max(worst[0], abs(sliders[1, 1, i]))
+            worst[1] = max(worst[1], abs(sliders[1, 2, i]))
+            worst[2] = max(worst[2], abs(sliders[0, 2, i] - sliders[1, 2, i]) / step)
+    return last, math.nan
 
 
 @compiled(
@@ -105,59 +160,18 @@ def survey(
     the limits, low and high, of x, y, phi, lambda_10 and lambda_32. Returns when it is first out of reach, else
     not a number; `worst` (3,) means nothing where it is.
     """
+    way = Way(legs, knots, pieces, in_sliders, law_knots, law_pieces, box)
     times = _moments(knots, law_knots, law_pieces, first, until, even, step)
-    motion, sliders, near = np.empty((2, 3, 3)), np.empty((2, 6, 3)), start.copy()
-    last_motion, last_sliders, last = np.empty((3, 3)), np.empty((6, 3)), math.inf
+    near = start.copy()
     worst[:] = 0.0
-    beyond = math.nan
-    for k in range(len(times)):
-        if abs(times[k] - last) < ROUNDING:
-            motion[0], sliders[0] = last_motion, last_sliders
-        elif not _look(
-            legs, knots, pieces, in_sliders, law_knots, law_pieces, times[k], near, box, motion[0], sliders[0]
-        ):
-            beyond = times[k]
-            break
-        for i in range(9):
-            column = i if i < 3 else 2 + i // 3
-            before, leaving = _quantity(last_motion, last_sliders, i)
-            _, coming = _quantity(motion[0], sliders[0], i)
-            if times[k] - last < step or leaving * coming >= 0.0:
-                continue
-            # It has turned in between: about here, were the acceleration constant.
-            turn = before + leaving * leaving / (leaving - coming) * (times[k] - last) / 2.0
-            if box[0, column] + NEAR <= turn <= box[1, column] - NEAR:
-                continue
-            low, high = last, times[k]
-            for _ in range(HALVINGS // 3):
-                middle = (low + high) / 2.0
-                if not _look(
-                    legs, knots, pieces, in_sliders, law_knots, law_pieces, middle, near, box, motion[1], sliders[1]
-                ):
-                    beyond = middle
-                    break
-                _, velocity = _quantity(motion[1], sliders[1], i)
-                if velocity * leaving > 0.0:
-                    low = middle
-                else:
-                    high = middle
-        if not math.isnan(beyond):
-            break
-        last = times[k] + step
-        if not _look(legs, knots, pieces, in_sliders, law_knots, law_pieces, last, near, box, motion[1], sliders[1]):
-            beyond, last = last, times[k]
-            break
-        last_motion[:], last_sliders[:] = motion[1], sliders[1]
-        for i in range(3):
-            worst[0] = max(worst[0], abs(sliders[0, 1, i]))
-            worst[1] = max(worst[1], abs(sliders[0, 2, i]))
-            worst[2] = max(worst[2], abs(sliders[1, 2, i] - sliders[0, 2, i]) / step)
+    inside, beyond = _walk(way, times, step, near, worst)
     if not math.isnan(beyond):
-        low = min(last, beyond)
+        motion, sliders = np.empty((3, 3)), np.empty((6, 3))
+        inside = max(inside, first)
         for _ in range(HALVINGS // 3):
-            middle = (low + beyond) / 2.0
-            if _look(legs, knots, pieces, in_sliders, law_knots, law_pieces, middle, near, box, motion[1], sliders[1]):
-                low = middle
+            middle = (inside + beyond) / 2.0
+            if _look(way, middle, near, motion, sliders):
+                inside = middle
             else:
                 beyond = middle
     return beyond
