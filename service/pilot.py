@@ -64,7 +64,7 @@ class Pilot:
             if _ended(self._change):
                 self._change = None
             return None
-        if self._goal is None:
+        if self._goal is None or self._course.turning:  # what is yet to begin cannot be planned from
             return None
         if self._steps is None:
             self._steps = self._begin(self._goal)
@@ -83,8 +83,6 @@ class Pilot:
         return self._goals.plan(goal, self._course, self.override)
 
     def _append(self, goal: PoseGoal, blend: float) -> Steps[tuple[Run, Extension]]:
-        while self._course.turning:
-            yield
         run = self._course.runs[-1]
         return run, (yield from self._goals.append(goal, run, blend))
 
