@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -134,6 +135,18 @@ def test_wherever_a_file_is_cut_the_records_before_are_read(tmp_path: Path, shar
     assert records.tobytes() == sent[: len(records)].tobytes()
     assert abs(len(records) / len(sent) - share) < 0.2
     assert (tmp_path / "cut.rrd").stat().st_size == round(share * len(content))
+
+
+@pytest.mark.parametrize("close", [True, False])
+def test_a_file_that_ends_with_a_whole_message_is_read_where_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, close: bool
+) -> None:
+    """A recording may be larger than the room for temporary files."""
+    recorder = written(tmp_path / "a.rrd", made.records(0.2), close=close)
+    monkeypatch.setattr(shutil, "copyfile", None)
+    assert len(read(tmp_path / "a.rrd").records) == 200
+    if not close:
+        recorder.close()
 
 
 def test_every_length_of_the_last_message_is_survived(tmp_path: Path) -> None:
