@@ -81,7 +81,7 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     """Cut the motion to a goal out of a recording, in time with equation (5). Raises ServiceError.
 
     Nothing is fitted. The log names the goal and the cycle that set the robot in motion for it. In that cycle the
-    motion advanced by one period for the first time (the order of a cycle: service.loop.Loop.cycle), so its setpoints
+    motion advanced by one period for the first time (service.control.Control.advance), so its setpoints
     are those of t = 1 period, those of the k-th cycle of motion t = k periods, and t = 0 is the standstill before.
     That time ran like this throughout is checked by the progress in each record.
     """
