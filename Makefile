@@ -19,6 +19,7 @@ test: $(READY)  ## everything that decides: lint, format, types, import contract
 bench: $(READY)  ## the loop and the kinematics, measured
 	$(VENV)/bin/python tools/bench.py loop
 	$(VENV)/bin/python tools/bench.py kinematics
+	$(VENV)/bin/python tools/bench.py planning
 
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "trirail needs Python 3.11 or newer: make PYTHON=python3.12 …")'

@@ -150,12 +150,15 @@ class Gateway:
     # ------------------------------------------------------------------ Zenoh to loop
 
     def _declare(self) -> None:
+        # Called as messages arrive, by one thread: else a stop could overtake the goals that were put before it.
+        on_query = zenoh.handlers.Callback(self._on_query, indirect=False)
+        on_sample = zenoh.handlers.Callback(self._on_sample, indirect=False)
         declare = self._session.declare_queryable
         self._declared = [
-            declare(self._key("goal", "*"), self._on_query),
-            declare(self._key("cmd", "*", "*"), self._on_query),
-            declare(self._key("info"), self._on_query),
-            self._session.declare_subscriber(self._key("goal", "*"), self._on_sample),
+            declare(self._key("goal", "*"), on_query),
+            declare(self._key("cmd", "*", "*"), on_query),
+            declare(self._key("info"), on_query),
+            self._session.declare_subscriber(self._key("goal", "*"), on_sample),
             self._session.liveliness().declare_token(self._key("alive")),
         ]
 

@@ -25,7 +25,7 @@ from drivers import frames
 from service.client import Robot
 from service.config import SIM
 from service.errors import RefusedError, ServiceError
-from service.messages import GoalReply, State
+from service.messages import GoalReply, OwnLimits, State
 from service.session import open_client
 
 pytestmark = pytest.mark.slow
@@ -304,6 +304,45 @@ def test_every_kind_of_goal(shared: tuple[Service, Robot, zenoh.Session], tmp_pa
     refused = trirail("follow", path, locator=service.locator)
     assert refused.returncode == 1
     assert "the trajectory begins at x = -0.03" in refused.stderr
+
+
+def test_a_flood_of_goals_ends_one_by_one_and_a_stop_overtakes_it(service: Service) -> None:
+    """Puts, which have no answer: faster than the loop plans them; then a stop. Each has its ending, in order."""
+    ids = [f"f{k}" for k in range(900)]  # as many as late subscribers are told of
+    with service.robot() as robot, open_client(service.locator) as user:
+        robot.enable()
+        for k, name in enumerate(ids):
+            goal = {"kind": "pose", "x": 0.03 * (k % 3 - 1), "y": 0.02 * (k % 2), "phi": 0.1, "id": name}
+            user.put("trirail/demo/goal/bob", json.dumps(goal), encoding="application/json")
+        (reply,) = user.get("trirail/demo/cmd/bob/stop", priority=zenoh.Priority.DATA)
+        assert reply.ok is not None
+        until(robot, lambda state: state.mode == "holding")
+        outcomes = [(event.id, event.outcome) for event in robot.events(history=True, timeout=1.0) if event.outcome]
+    assert [name for name, _ in outcomes] == ids
+    assert {outcome for _, outcome in outcomes[:-1]} <= {"preempted", "stopped"}
+    assert outcomes[-1][1] == "stopped"
+    assert service.end() == 0
+    assert_stopped_smoothly(service.frames())
+
+
+def test_goals_wait_blend_and_are_cancelled(service: Service) -> None:
+    with service.robot() as robot:
+        robot.enable()
+        corner = robot.move_to(x=0.05, y=0.0, phi=0.0, blend=0.01)
+        end = robot.move_to(x=0.05, y=0.05, phi=0.0)
+        assert end.reply.queued
+        assert (corner.wait(10.0).outcome, end.wait(10.0).outcome) == ("done", "done")
+        slow = robot.move_to(x=-0.05, y=0.0, phi=0.0, speed=0.1)
+        slow.cancel()
+        assert slow.wait(1.0).outcome == "stopped"
+        with pytest.raises(RefusedError, match="not under way"):
+            slow.cancel()
+        with pytest.raises(RefusedError, match=r"limits\.velocity of x is 1: the robot's limit is 0\.25"):
+            robot.move_to(x=0.0, y=0.0, phi=0.0, limits=OwnLimits(velocity=(1.0, 0.1, 0.1)))
+    blended = trirail("goto", 0.0, 0.0, 0.0, "--blend", 0.01, locator=service.locator)
+    assert (blended.returncode, blended.stderr) == (0, "")
+    waiting = trirail("goto", 0.02, 0.02, 0.0, "--wait", "--json", locator=service.locator)
+    assert json.loads(waiting.stdout)["outcome"] == "done"
 
 
 def test_the_service_is_seen_alive(shared: tuple[Service, Robot, zenoh.Session]) -> None:

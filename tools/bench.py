@@ -1,9 +1,10 @@
-"""Measurements: `python tools/bench.py loop` and `python tools/bench.py kinematics`, with --json for programs."""
+"""Measurements: `python tools/bench.py loop`, `kinematics` or `planning`, with --json for programs."""
 
 from __future__ import annotations
 
 import bench_kinematics
 import bench_loop
+import bench_planning
 from cyclopts import App
 
 app = App(help="Speed, as ratios within one run: the machines this runs on are not alike.")
@@ -19,6 +20,12 @@ def loop(*, seconds: float = 30.0, json: bool = False) -> None:
 def kinematics(*, json: bool = False) -> None:
     """Time the recursion against a straightforward numpy port of the paper's matrices."""
     bench_kinematics.main(json)
+
+
+@app.command
+def planning(*, json: bool = False) -> None:
+    """Time what a goal costs the loop in a cycle."""
+    bench_planning.main(json)
 
 
 if __name__ == "__main__":
