@@ -86,6 +86,7 @@ def goto(
     *,
     wait: Annotated[bool, Flag] = False,
     speed: float = 1.0,
+    blend: float | None = None,
     deg: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
@@ -103,6 +104,8 @@ def goto(
         Show the progress; exit 0 only when the robot has arrived.
     speed
         Fraction of full speed, up to 1.
+    blend
+        The next goto waits for this one, and begins that near to its end [m], instead of preempting it.
     deg
         The angle is in degrees.
     """
@@ -110,7 +113,7 @@ def goto(
 
     angle = math.radians(phi) if deg else phi
     with Robot(service.robot, service.connect) as robot:
-        goal = robot.move_to(x=x, y=y, phi=angle, speed=speed)
+        goal = robot.move_to(x=x, y=y, phi=angle, speed=speed, blend=blend)
         return _follow(service, robot, goal, wait, f"x {x:g} m, y {y:g} m, φ {math.degrees(angle):g}°")
 
 
@@ -307,7 +310,8 @@ def _command(name: str, service: Service) -> int:
 def _follow(service: Service, robot: Robot, goal: Goal, wait: bool, title: str) -> int:
     """Say that a goal is accepted, or follow it to its end."""
     if not wait:
-        _print(service, {"id": goal.id, "duration": goal.duration}, f"goal {goal.id}: {goal.duration:.2f} s")
+        words = f"goal {goal.id}: {goal.duration:.2f} s{terminal.notes(goal.reply)}"
+        _print(service, msgspec.to_builtins(goal.reply), words)
         return 0
     result = terminal.follow(robot, goal, title, show=not service.json)
     _print(service, result._asdict(), result.message)

@@ -30,9 +30,11 @@ from service.messages import (
     GoalReply,
     Info,
     Override,
+    OwnLimits,
     PoseGoal,
     SlidersGoal,
     State,
+    Stop,
     TrajectoryGoal,
     TrajectoryPoint,
     VelocityGoal,
@@ -56,10 +58,11 @@ class Result(NamedTuple):
 class Goal:
     """A goal that the service has accepted."""
 
-    def __init__(self, goal_id: str, duration: float) -> None:
+    def __init__(self, goal_id: str, robot: Robot) -> None:
         self.id = goal_id
-        self.duration = duration
-        """Expected time from acceptance to arrival [s]."""
+        self.reply = GoalReply(goal_id, 0.0)
+        """What the service said of it."""
+        self._robot = robot
         self._ended = threading.Event()
         self._result: Result | None = None
 
@@ -67,6 +70,18 @@ class Goal:
     def result(self) -> Result | None:
         """How it ended, None while it has not."""
         return self._result
+
+    @property
+    def duration(self) -> float:
+        """Expected time from acceptance to arrival [s]."""
+        return self.reply.duration
+
+    def cancel(self) -> None:
+        """Stop it, if it is under way or waits for another one; return when that is done.
+
+        Other goals go on, but those that wait for this one. Raises RefusedError if it has ended.
+        """
+        self._robot.command("stop", msgspec.json.encode(Stop(self.id)))
 
     def wait(self, timeout: float | None = None) -> Result:
         """Wait for its end. Raises TimeoutError if that takes longer than `timeout` seconds."""
@@ -139,6 +154,7 @@ class Robot:
             self._session,
             self._key("event"),
             self._on_event,
+            history=HistoryConfig(detect_late_publishers=True),  # of a gateway that was started again
             recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
 
@@ -163,11 +179,22 @@ class Robot:
         y: float,
         phi: float,
         speed: float = 1.0,
+        limits: OwnLimits | None = None,
+        blend: float | None = None,
         valid_for: float | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> Goal:
-        """Send a pose goal [m, rad]; return once it is accepted."""
-        return self.send(lambda name: PoseGoal(x=x, y=y, phi=phi, speed=speed, valid_for=valid_for, id=name), id)
+        """Send a pose goal [m, rad]; return once it is accepted.
+
+        With `blend` [m] the next pose goal waits for this one, and begins that near to its end; without it, the next
+        goal preempts this one. `limits` are lower ones than the platform's.
+        """
+        return self.send(
+            lambda name: PoseGoal(
+                x=x, y=y, phi=phi, id=name, speed=speed, valid_for=valid_for, limits=limits, blend=blend
+            ),
+            id,
+        )
 
     def move_sliders(
         self,
@@ -207,7 +234,7 @@ class Robot:
             message = make(goal_id)
         except ValueError as error:
             raise RefusedError("malformed", f"not a goal: {error}") from error
-        goal = Goal(goal_id, 0.0)
+        goal = Goal(goal_id, self)
         with self._goals_lock:
             goal = self._goals.setdefault(goal_id, goal)
         try:
@@ -216,7 +243,7 @@ class Robot:
             with self._goals_lock:
                 self._goals.pop(goal_id, None)
             raise
-        goal.duration = reply.duration
+        goal.reply = reply
         return goal
 
     def enable(self) -> None:
@@ -280,7 +307,7 @@ class Robot:
             yield from _decoded(received, State, timeout)
 
     def events(self, history: bool = False, timeout: float | None = None) -> Iterator[Event]:
-        """Yield events in order, with `history` those of the past first; end after `timeout` seconds without one."""
+        """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
         received: queue.Queue[bytes] = queue.Queue()
         with declare_advanced_subscriber(
             self._session,
@@ -289,7 +316,12 @@ class Robot:
             history=HistoryConfig(detect_late_publishers=True) if history else None,
             recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
         ):
-            yield from _decoded(received, Event, timeout)
+            last = 0, 0.0
+            for event in _decoded(received, Event, timeout):
+                # A gateway that was started again tells the past once more; a service that was, counts from one.
+                if event.seq > last[0] or event.time > last[1]:
+                    last = event.seq, event.time
+                    yield event
 
     # ------------------------------------------------------------------ inside
 

@@ -16,7 +16,7 @@ R = TypeVar("R")
 
 HERE = Path(__file__).parent
 # what is inlined, or fixed as a constant, across files
-SOURCES = ("compiled.py", "algebra.py", "recursion.py", "geometry.py", "closure.py", "paths.py")
+SOURCES = ("compiled.py", "algebra.py", "recursion.py", "geometry.py", "closure.py", "paths.py", "survey.py")
 FINGERPRINT = hashlib.sha256(b"".join((HERE / name).read_bytes() for name in SOURCES)).hexdigest()
 
 

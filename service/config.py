@@ -87,6 +87,13 @@ class Limits(Struct, frozen=True, forbid_unknown_fields=True):
     """How near phi may come to a singular angle [rad]."""
 
 
+class Motion(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [motion]."""
+
+    queue: Annotated[int, Meta(ge=0, le=100)] = 8
+    """How many goals may wait for the one under way, where that has a `blend`."""
+
+
 class Loop(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [loop]."""
 
@@ -137,6 +144,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     zenoh: Zenoh
     telemetry: Telemetry
     watchdogs: Watchdogs
+    motion: Motion = Motion()
 
     @property
     def period(self) -> float:

@@ -7,22 +7,25 @@ sliders, and `write` the setpoints behind the last gate. What is to be said of i
 from __future__ import annotations
 
 import contextlib
+import math
 from collections import deque
 
 import numpy as np
 
 from drivers.interface import NAMES, Drives, Feedback, PowerState
 from service.config import Config, geometry
+from service.course import Course
 from service.desk import Desk
 from service.errors import RefusedError
-from service.goals import plan
+from service.goals import Goals
 from service.kinematics import forward_into, inverse_into
-from service.limits import Bounds
-from service.messages import Outcome
+from service.limits import EDGE, Bounds
+from service.messages import Outcome, PoseGoal, SlidersGoal
 from service.modes import DISABLED, HOLDING, MOVING, Action, Event, Mode, Refusal, State, step
 from service.motion import STILL, MotionState, Run, rest
 from service.packets import CommandRequest, GoalRequest, Request
-from service.planning import Planner
+from service.pilot import Pilot
+from service.steps import finish
 
 Triple = tuple[float, float, float]
 
@@ -40,6 +43,8 @@ _COMMANDS = {
 }
 _OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.FAULT: "faulted"}
 """How a goal ends on an event after which it is not under way; else it is stopped."""
+_GO_ON = (Event.GOAL, Event.STANDSTILL, Event.POWERED, Event.PAUSE, Event.RESUME, Event.ENABLE, Event.RESET)
+"""Events that leave alone what has been sent but not begun."""
 _POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 
@@ -52,8 +57,12 @@ class Control:
         self._drives = drives
         self._period = config.period
         self._legs = robot.packed()
-        self._bounds = Bounds(config.limits, config.period)
-        self._planner = Planner(robot, config.limits, self._bounds, config.period)
+        self._bounds = Bounds(config.limits, config.period, EDGE)
+        self._goals = Goals(robot, config.limits, config.period)
+        self._course = Course(rest(STILL), config.period)
+        self._pilot = Pilot(self._goals, self._course, config.period)
+        self._queue_depth = config.motion.queue
+        self._waiting: deque[GoalRequest] = deque()
         self._step = config.limits.slider.velocity * config.period
         self._following_error_limit = config.limits.slider.following_error
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
@@ -71,18 +80,14 @@ class Control:
         self.feedback = Feedback(STILL, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
         self.velocity: Triple = STILL
         self.pose: Triple = STILL
-        self.commanded: MotionState = rest(STILL)
         self.rows: list[list[float]] = self._sliders.tolist()
         """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 of the setpoints."""
         self.following_error: Triple = STILL
         self._jumps = False, False, False
         """Which sliders were measured where none can be so soon: what they say is not followed."""
         self._written: deque[Triple] = deque([STILL, STILL], maxlen=2)
-        self.override = 1.0
-        """The rate at which motions are to run."""
-        self._runs: deque[Run] = deque()
-        """The motion under way, and the one to follow at its end."""
         self._entered = 0
+        self._now_ns = 0
 
     # ------------------------------------------------------------------ the cycle, in its order
 
@@ -93,16 +98,11 @@ class Control:
         self.rows[0] = list(feedback.position)
         self._follow_measured()
         # What runs for the first time is slow: plan and check a motion now, not in a cycle.
-        nearby = rest([value + 1e-3 for value in self.pose])
-        with contextlib.suppress(RefusedError):
-            for in_sliders in (False, True):
-                path = (
-                    self._planner.to_sliders(nearby, feedback.position)
-                    if in_sliders
-                    else self._planner.to_pose(nearby, self.pose)
-                )
-                run = self._planner.begin(path, 1.0, nearby.pose)
-                self._planner.change_rate(run, 0.0, run.state(0.0, nearby.pose).pose)
+        nearby = Course(rest([value + 1e-3 for value in self.pose]), self._period)
+        for goal in (PoseGoal(*self.pose), SlidersGoal(feedback.position)):
+            with contextlib.suppress(RefusedError):
+                nearby.take(finish(self._goals.plan(goal, nearby, 1.0)).runs)
+                finish(self._goals.laws.change(nearby.runs[0], 0.0, self.pose))
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
@@ -145,10 +145,11 @@ class Control:
         self.desk.settle(self._verdict, self.state.mode)
 
     def handle(self, request: Request, now_ns: int) -> None:
-        """Carry out one request at a time of the monotonic clock, or refuse it."""
+        """Take one request at a time of the monotonic clock: goals wait until those before them are planned."""
         try:
             if isinstance(request, GoalRequest):
-                self._take_goal(request, now_ns)
+                self._now_ns = now_ns
+                self._waiting.append(request)
             elif isinstance(request, CommandRequest):
                 self._take_command(request)
             else:
@@ -158,6 +159,7 @@ class Control:
 
     def happen(self, event: Event, reason: str) -> None:
         """Let something happen that nobody asked for: the gateway is lost, ticks are late, the service ends."""
+        self._withdraw(event, reason)
         decided = step(self.state, event)
         if isinstance(decided, Refusal) or decided.state == self.state:
             return
@@ -165,14 +167,11 @@ class Control:
         self._go(event, reason)
 
     def advance(self) -> None:
-        """Move the commanded state on by one period."""
-        if not self._runs:
-            return
-        run = self._runs[0]
-        self.commanded = run.state(self._period, self.commanded.pose)
-        run.time += self._period
-        if run.stands and len(self._runs) > 1:
-            self._runs.popleft()
+        """Plan one step further, and move the commanded state on by one period."""
+        self._think()
+        for _ in range(self._course.advance()):
+            self.desk.pass_on()
+        self._expire()
 
     def solve(self) -> None:
         """Solve the sliders for the commanded state, by the paper's recursion; pass the last gate, or trip."""
@@ -191,8 +190,9 @@ class Control:
             self.trip(f"setpoint refused: {violation}")
             return
         self.rows = rows
-        if self.state.mode in (Mode.MOVING, Mode.STOPPING) and self._runs[0].stands:
-            self._stand(self._runs[0])
+        course = self._course
+        if self.state.mode in (Mode.MOVING, Mode.STOPPING) and course.runs[0].stands and not course.turning:
+            self._stand(course.runs[0])
 
     def write(self) -> None:
         """Send the setpoints."""
@@ -209,11 +209,27 @@ class Control:
         return any(state in _POWERED for state in self.feedback.state)
 
     @property
+    def ready(self) -> bool:
+        """Whether another request can be taken: no goal waits for another one to be planned."""
+        return not self._waiting
+
+    @property
+    def commanded(self) -> MotionState:
+        """The platform's motion commanded in this cycle."""
+        return self._course.commanded
+
+    @property
+    def override(self) -> float:
+        """The rate at which motions are to run."""
+        return self._pilot.override
+
+    @property
     def progress(self) -> tuple[float, float]:
-        """Share of the running motion's time that is over, and what remains of it [s]."""
-        if not self._runs:
-            return 0.0, 0.0
-        *stops, run = self._runs
+        """Share of the time of the goal under way that is over, and what remains of it [s]."""
+        course = self._course
+        if not course.runs or course.turning:
+            return 0.0, course.remaining
+        *stops, run = course.runs
         return run.progress, run.remaining + sum(stop.ends - stop.time for stop in stops)
 
     def trip(self, reason: str) -> None:
@@ -222,28 +238,86 @@ class Control:
             return
         self.fault = reason
         self.desk.tell("fault", "error", reason)
+        self._withdraw(Event.FAULT, reason)
         self._go(Event.FAULT, reason)
 
     # ------------------------------------------------------------------ requests
 
-    def _take_goal(self, request: GoalRequest, now_ns: int) -> None:
+    def _think(self) -> None:
+        """Begin with the next goal if none is being planned, and take one step."""
+        pilot = self._pilot
+        if not pilot.busy and self._waiting:
+            self._planned = self._waiting.popleft()
+            try:
+                self._consider(self._planned)
+            except RefusedError as refusal:
+                self.desk.refuse(self._planned, refusal)
+        try:
+            taken = pilot.think()
+        except RefusedError as refusal:
+            self.desk.refuse(self._planned, refusal)
+            return
+        if taken is not None:
+            request = self._planned
+            valid = request.goal.valid_for
+            expires = self.cycle + valid / self._period if valid is not None else math.inf
+            self.desk.begin(request, taken, expires)
+            self._go(Event.GOAL, f"goal {request.id} of {request.user}")
+
+    def _consider(self, request: GoalRequest) -> None:
+        """Begin to plan a goal, or refuse it."""
         self.desk.check_id(request)
+        if request.withdrawn is not None:
+            self.desk.withdraw(request, "stopped", request.withdrawn)
+            return
         decided = step(self.state, Event.GOAL)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
         goal = request.goal
-        if goal.valid_for is not None and now_ns - request.received_ns > goal.valid_for * 1e9:
+        if goal.valid_for is not None and self._now_ns - request.received_ns > goal.valid_for * 1e9:
             raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")
-        under_way = self._runs[0] if self._runs else None
-        self._runs = plan(self._planner, goal, self.commanded, under_way, self.override)
-        self.desk.begin(request, sum(run.ends - run.time for run in self._runs))
-        self._go(Event.GOAL, f"goal {request.id} of {request.user}")
+        blend = None
+        if self.state.mode is Mode.MOVING and self.desk.goals and isinstance(goal, PoseGoal):
+            blend = self.desk.goals[-1].blend
+        if blend is not None and len(self.desk.goals) > self._queue_depth:
+            text = f"{self._queue_depth} goals are waiting already (motion.queue): send it when one has ended"
+            raise RefusedError("queue_full", text, value=len(self.desk.goals), limit=self._queue_depth)
+        self._pilot.plan(goal, blend)
+
+    def _withdraw(self, event: Event, reason: str) -> None:
+        """End what has been sent but not begun, where the robot is to stand."""
+        if event in _GO_ON:
+            return
+        outcome: Outcome = "faulted" if event is Event.FAULT else "stopped"
+        requests = [self._planned, *self._waiting] if self._pilot.busy else [*self._waiting]
+        self._pilot.give_up()
+        self._waiting.clear()
+        for request in requests:
+            self.desk.withdraw(request, outcome, reason)
+
+    def _expire(self) -> None:
+        """Let go of waiting goals that can no more begin in time, and of those behind them."""
+        for number, goal in enumerate(self.desk.goals):
+            if number and self.cycle > goal.expires:
+                self._drop(number, goal.id, "expired", "it has not begun in time")
+                return
+
+    def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: str) -> None:
+        """End a goal that waits, and those behind it."""
+        self.desk.end("stopped", f"goal {goal_id} before it {outcome}", but=number + 1)
+        self.desk.end(outcome, reason, but=number)
+        run = self._course.runs[-1]
+        run.drop(number - 1)
+        self._pilot.run_at(self.override)
 
     def _take_command(self, request: CommandRequest) -> None:
         if request.name == "override":
             self._take_override(request)
             return
         event = _COMMANDS[request.name]
+        if request.goal is not None and self._stops_only(request.goal, f"{request.name} by {request.user}"):
+            self.desk.undertake(request, self.cycle)
+            return
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
@@ -255,14 +329,29 @@ class Control:
         if event is Event.QUICK_STOP:
             self.trip(reason)
         else:
+            self._withdraw(event, reason)
             self._go(event, reason)
         self.desk.undertake(request, self.cycle)
 
+    def _stops_only(self, goal_id: str, reason: str) -> bool:
+        """Stop a goal that has not begun; whether that was all. Raises RefusedError if it is not under way at all."""
+        if self.desk.goal is not None and self.desk.goal.id == goal_id:
+            return False
+        for number, goal in enumerate(self.desk.goals):
+            if goal.id == goal_id:
+                self._drop(number, goal_id, "stopped", reason)
+                return True
+        if self._pilot.busy and self._planned.id == goal_id:
+            self._pilot.give_up()
+            self.desk.withdraw(self._planned, "stopped", reason)
+            return True
+        raise RefusedError("no_goal", f"goal {goal_id!r} is not under way: it has ended, or never was")
+
     def _take_override(self, request: CommandRequest) -> None:
         """Let this motion and those to come run at another rate."""
-        self.override = request.value if request.value is not None else 1.0
+        self._pilot.override = request.value if request.value is not None else 1.0
         if self.state.mode is Mode.MOVING:
-            self._run_at(self.override)
+            self._pilot.run_at(self.override)
         self.desk.tell("service", "info", f"override {self.override:.0%} by {request.user}", user=request.user)
         self.desk.undertake(request, self.cycle)
 
@@ -338,12 +427,12 @@ class Control:
             case Action.CLEAR:
                 self._drives.reset()
                 self.fault = None
-            case Action.BRAKE if decided.state.paused or len(self._runs) == 1:
-                self._run_at(0.0)
-            case Action.BRAKE:  # it is stopping already, for a goal that is not to follow any more
-                self._runs.pop()
+            case Action.BRAKE if decided.state.paused:
+                self._pilot.run_at(0.0)
+            case Action.BRAKE:
+                self._brake()
             case Action.RESUME:
-                self._run_at(self.override)
+                self._pilot.run_at(self.override)
         before, self.state = self.state, decided.state
         if self.state.mode is not before.mode:
             self._entered = self.cycle
@@ -353,16 +442,19 @@ class Control:
         if self.state.mode is not before.mode:
             self.desk.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
-            self._runs.clear()
+            self._course.take(deque())
+            self._pilot.stop_thinking()
 
-    def _run_at(self, rate: float) -> None:
-        """Change the rate of the goal's motion; where that follows a stop on the old path, the stop stays as it is."""
-        run = self._runs[-1]
-        if len(self._runs) == 1:
-            self._planner.change_rate(run, rate, self.commanded.pose)
+    def _brake(self) -> None:
+        """Stop on the path of the motion under way; what was to follow it does not."""
+        course = self._course
+        course.keep()
+        course.forget()
+        if len(course.runs) > 1:  # it is stopping already, for a goal that is not to follow any more
+            course.runs.pop()
+            self._pilot.stop_thinking()
         else:
-            start = run.state(0.0, self.commanded.pose).pose
-            self._runs[-1] = self._planner.begin(run.path, rate, start)
+            self._pilot.run_at(0.0)
 
     def _stand(self, run: Run) -> None:
         """The motion has ended where it should, or its law has brought it to a standstill on the way."""
@@ -379,7 +471,7 @@ class Control:
             if forward_into(self._legs, self._measured, self._pose, self._pose):
                 self.trip("the measured sliders belong to no pose")
                 return
-            self.commanded = rest(self._pose.tolist())
+            self._course.commanded = rest(self._pose.tolist())
             self._go(Event.POWERED, "all drives are enabled")
         elif self.cycle - self._entered > self._enable_cycles:
             waiting = [
@@ -404,7 +496,7 @@ class Control:
         ):
             stays = stopped_now or jumps or (held and state is PowerState.OPERATION_ENABLED)
             position.append(last if stays else last + max(-self._step, min(measured - last, self._step)))
-        self.commanded = rest(self.pose)
+        self._course.commanded = rest(self.pose)
         self._motion[:] = 0.0
         self._motion[0] = self.pose
         if inverse_into(self._legs, self._motion, self._sliders) == 0:

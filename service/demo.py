@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import signal
-import socket
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,13 +13,13 @@ from typing import NamedTuple
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from service import spawned
 from service.client import Result, Robot
 from service.config import SIM, load
-from service.errors import RefusedError, ServiceError, TrirailError
+from service.errors import RefusedError
 from service.messages import State
 from service.terminal import out, percentiles
 
-START_WITHIN = 120.0
 GOAL_WITHIN = 15.0
 
 
@@ -70,7 +65,9 @@ def run(*, stay: bool, record: Path | None) -> int:
     out.print(
         f"[bold]trirail demo[/]: starting the service on {SIM.name}, simulated drives at {config.loop.rate_hz} Hz"
     )
-    with _service(recording) as service:
+    with contextlib.ExitStack() as stack:
+        with out.status("starting the service (the very first time compiles the kinematics, some seconds)"):
+            service = stack.enter_context(spawned.service(SIM, recording))
         with Robot(config.robot.name, locator, user="demo") as robot:
             robot.enable()
             rows = list(_tour(robot))
@@ -79,57 +76,12 @@ def run(*, stay: bool, record: Path | None) -> int:
                 _report(rows, state, recording)
                 _stay(config.telemetry.live_port)
             robot.disable()
-        service.send_signal(signal.SIGTERM)
-        code = service.wait(timeout=20)
+        code = spawned.end(service)
     if not stay:
         _report(rows, state, recording)
     if code:
         out.print(f"[bold red]the service ended with exit code {code}[/]")
     return 0 if code == 0 and all(row.result.outcome == "done" for row in rows) else 1
-
-
-@contextlib.contextmanager
-def _service(recording: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the service in a process of its own; end it in any case, and show what it said if something fails.
-
-    It is up when it says so, as to systemd. Asking on its port instead could find another service, and move that.
-    """
-    with (
-        tempfile.TemporaryFile() as log,
-        tempfile.TemporaryDirectory() as folder,
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready,
-    ):
-        ready.bind(f"{folder}/ready")
-        ready.settimeout(0.1)
-        service = subprocess.Popen(
-            [sys.executable, "-m", "service", "run", str(SIM), "--record", str(recording)],
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-            env=os.environ | {"NOTIFY_SOCKET": ready.getsockname()},
-        )
-        try:
-            with out.status("starting the service (the very first time compiles the kinematics, some seconds)"):
-                _wait(service, ready)
-            yield service
-        except TrirailError:
-            log.seek(0)
-            sys.stderr.write(log.read().decode())
-            raise
-        finally:
-            service.send_signal(signal.SIGTERM)
-            service.wait(timeout=20)
-
-
-def _wait(service: subprocess.Popen[bytes], ready: socket.socket) -> None:
-    deadline = time.monotonic() + START_WITHIN
-    while time.monotonic() < deadline:
-        with contextlib.suppress(TimeoutError):
-            if ready.recv(1024) == b"READY=1":
-                return
-        if service.poll() is not None:
-            raise ServiceError("the service could not start, see above")
-    raise ServiceError(f"the service was not up within {START_WITHIN:g} s")
 
 
 def _tour(robot: Robot) -> Iterator[_Row]:

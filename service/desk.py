@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
 from service.errors import RefusedError
-from service.messages import Level, Outcome, VelocityGoal
+from service.messages import Level, Outcome, PoseGoal, VelocityGoal
 from service.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest, Request
+from service.pilot import Taken
 
 REMEMBERED_IDS = 10_000
 """Goals whose ids may not be used again; older ones are forgotten."""
+
+
+_LEVELS: dict[Outcome, Level] = {"faulted": "error", "rejected": "warning", "expired": "warning"}
 
 
 class Happening(NamedTuple):
@@ -26,18 +31,23 @@ class Happening(NamedTuple):
 
 
 class Goal(NamedTuple):
-    """The goal that the robot is moving to."""
+    """A goal that the robot is moving to, or that is to follow it."""
 
     id: str
     user: str
     is_jog: bool
+    blend: float | None
+    """How far from its end the next goal may begin [m]; None where that preempts it."""
+    expires: float
+    """In which cycle it is too late to begin."""
 
 
 class Desk:
-    """Keeps the running goal and the commands under way; what it has to say waits in `answers` and `happenings`."""
+    """Keeps the goals and the commands under way; what it has to say waits in `answers` and `happenings`."""
 
     def __init__(self) -> None:
-        self.goal: Goal | None = None
+        self.goals: deque[Goal] = deque()
+        """The goal that the robot is moving to, and those to follow it."""
         self.answers: list[Answer] = []
         self.happenings: list[Happening] = []
         self._commands: list[tuple[CommandRequest, int]] = []
@@ -45,27 +55,49 @@ class Desk:
 
     # ------------------------------------------------------------------ goals
 
+    @property
+    def goal(self) -> Goal | None:
+        """The goal that the robot is moving to."""
+        return self.goals[0] if self.goals else None
+
     def check_id(self, request: GoalRequest) -> None:
         """Raise RefusedError if the id has been used; a jog's own velocities share one."""
         goal_id = request.id
-        running = self.goal is not None and self.goal.id == goal_id
-        fresh = running and self.goal is not None and self.goal.is_jog and isinstance(request.goal, VelocityGoal)
-        if goal_id in self._ended or (running and not fresh):
+        running = any(goal.id == goal_id for goal in self.goals)
+        if goal_id in self._ended or (running and not self._is_fresh(request)):
             raise RefusedError("duplicate_id", f"goal id {goal_id!r} has been used: every goal needs its own")
 
-    def begin(self, request: GoalRequest, duration: float) -> None:
-        """Accept a goal; the one before is preempted, unless this is the same one afresh."""
-        self.answers.append(Accepted(request.ticket, request.id, duration))
-        if self.goal is not None and self.goal.id == request.id:
+    def begin(self, request: GoalRequest, taken: Taken, expires: float) -> None:
+        """Accept a goal; those before it are preempted, unless it follows them or is the same jog afresh."""
+        self.answers.append(
+            Accepted(request.ticket, request.id, taken.duration, taken.slowed, taken.stops_first, taken.queued)
+        )
+        if self._is_fresh(request):
             return
-        self.end("preempted", f"preempted by goal {request.id}")
-        self.goal = Goal(request.id, request.user, isinstance(request.goal, VelocityGoal))
+        if not taken.queued:
+            self.end("preempted", f"preempted by goal {request.id}")
+        blend = request.goal.blend if isinstance(request.goal, PoseGoal) else None
+        is_jog = isinstance(request.goal, VelocityGoal)
+        self.goals.append(Goal(request.id, request.user, is_jog, blend, expires))
 
-    def end(self, outcome: Outcome, reason: str) -> None:
-        """End the running goal, if there is one."""
-        if self.goal is not None:
-            goal, self.goal = self.goal, None
-            self._ending(goal.id, goal.user, outcome, reason, "error" if outcome == "faulted" else "info")
+    def pass_on(self) -> None:
+        """The first goal is reached, and the one that waited for it has begun."""
+        goal = self.goals.popleft()
+        self._ending(goal.id, goal.user, "done", f"passed on the way to goal {self.goals[0].id}")
+
+    def end(self, outcome: Outcome, reason: str, but: int = 0) -> None:
+        """End the goals, but so many of the first."""
+        kept = [self.goals.popleft() for _ in range(min(but, len(self.goals)))]
+        while self.goals:
+            goal = self.goals.popleft()
+            self._ending(goal.id, goal.user, outcome, reason)
+        self.goals.extend(kept)
+
+    def withdraw(self, request: GoalRequest, outcome: Outcome, reason: str) -> None:
+        """Answer that a goal has ended before it began."""
+        self.answers.append(Refused(request.ticket, outcome, f"goal {request.id} {outcome} before it began: {reason}"))
+        if not self._is_fresh(request):
+            self._ending(request.id, request.user, outcome, reason)
 
     def refuse(self, request: Request, refusal: RefusedError) -> None:
         """Answer that a request is not carried out. A goal that is refused has ended; a used id has its own ending."""
@@ -79,9 +111,18 @@ class Desk:
             self.tell("refused", "warning", text, user=request.user)
         else:
             outcome: Outcome = "expired" if refusal.code == "expired" else "rejected"
-            self._ending(request.id, request.user, outcome, text, "warning")
+            if self._is_fresh(request):
+                self.tell("refused", "warning", text, user=request.user)
+            else:
+                self._ending(request.id, request.user, outcome, text)
 
-    def _ending(self, goal_id: str, user: str, outcome: Outcome, reason: str, level: Level) -> None:
+    def _is_fresh(self, request: GoalRequest) -> bool:
+        """Whether it renews the jog that is under way."""
+        goal = self.goal
+        return goal is not None and goal.id == request.id and goal.is_jog and isinstance(request.goal, VelocityGoal)
+
+    def _ending(self, goal_id: str, user: str, outcome: Outcome, reason: str) -> None:
+        level = _LEVELS.get(outcome, "info")
         self._ended[goal_id] = None
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]

@@ -21,7 +21,7 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, declare_advanced_publish
 from service import __version__, session
 from service.config import Config, geometry
 from service.links import Closed, Link
-from service.messages import MAX_MESSAGE, CommandReply, ErrorReply, Goal, GoalReply, Info, Override
+from service.messages import MAX_MESSAGE, CommandReply, ErrorReply, Goal, GoalReply, Info, Override, Stop
 from service.packets import (
     Accepted,
     Answer,
@@ -42,8 +42,14 @@ from service.records import unpack
 from service.state import StateMaker
 
 COMMANDS = ("enable", "disable", "stop", "quick_stop", "reset", "pause", "resume", "override")
-WAITING = 256
-"""Requests that may wait for the gateway; beyond that the oldest get no answer."""
+UNREAD = 65_536
+"""Messages from Zenoh that may wait to be read; beyond that the oldest get no answer."""
+BACKLOG = 20_000
+"""Goals that may wait for those before them; beyond that they are refused."""
+AHEAD = 2
+"""Goals that the loop has at once, so that it has the next one when it is done with the last. The others wait here:
+a command overtakes them, and what waits when the robot is told to stop does not begin any more."""
+STOPPING = ("stop", "disable", "quick_stop")
 EVENTS_KEPT = 1000
 REPLY_WITHIN = 15.0
 """A command that the loop has not carried out by then is answered with an error [s]."""
@@ -77,7 +83,9 @@ class Gateway:
         self._state_every = 1.0 / config.telemetry.state_hz
         self._state_due = 0.0
         self._goals = msgspec.json.Decoder(Goal), msgspec.msgpack.Decoder(Goal)
-        self._incoming: deque[Incoming] = deque(maxlen=WAITING)
+        self._incoming: deque[Incoming] = deque(maxlen=UNREAD)
+        self._backlog: deque[tuple[Incoming, GoalRequest]] = deque()
+        self._ahead: set[int] = set()
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._waiting: dict[int, _Waiting] = {}
         self._tickets = 0
@@ -128,8 +136,11 @@ class Gateway:
         except Closed:
             return
         finally:
-            for waiting in list(self._waiting.values()):
-                self._reply(waiting.incoming, ErrorReply("ended", "the service has ended"))
+            for incoming in [
+                *(waiting.incoming for waiting in self._waiting.values()),
+                *(goal[0] for goal in self._backlog),
+            ]:
+                self._reply(incoming, ErrorReply("ended", "the service has ended"))
 
     def end(self) -> None:
         """End soon; safe from a signal handler."""
@@ -187,8 +198,24 @@ class Gateway:
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
             self._refuse(incoming, user, ErrorReply("malformed", f"not a goal: {_plain(error)}"))
             return
+        if len(self._backlog) >= BACKLOG:
+            self._refuse(incoming, user, ErrorReply("busy", f"{BACKLOG} goals are waiting already: send fewer"))
+            return
         goal_id = goal.id or uuid.uuid4().hex[:12]
-        self._forward(incoming, lambda ticket: GoalRequest(ticket, user, goal_id, goal, time.monotonic_ns()))
+        self._tickets += 1
+        request = GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns())
+        self._backlog.append((incoming, request))
+        self._send_goals()
+
+    def _send_goals(self) -> None:
+        """Pass on as many goals as the loop is to have."""
+        while self._backlog and len(self._ahead) < AHEAD:
+            incoming, request = self._backlog[0]
+            if not self._link.send(message(request)):
+                return
+            self._backlog.popleft()
+            self._ahead.add(request.ticket)
+            self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
 
     def _command(self, incoming: Incoming, user: str, name: str) -> None:
         if name not in COMMANDS:
@@ -202,10 +229,30 @@ class Gateway:
                 self._refuse(incoming, user, ErrorReply("malformed", problem))
                 return
             self._forward(incoming, lambda ticket: CommandRequest(ticket, user, name, share))
-        elif incoming.payload not in (b"", b"{}", b"null"):
-            self._refuse(incoming, user, ErrorReply("malformed", f"{name} takes no content"))
-        else:
+        elif incoming.payload in (b"", b"{}", b"null"):
             self._forward(incoming, lambda ticket: CommandRequest(ticket, user, name))
+            if name in STOPPING:
+                replace, reason = msgspec.structs.replace, f"{name} by {user}"
+                self._backlog = deque((waiting, replace(goal, withdrawn=reason)) for waiting, goal in self._backlog)
+        elif name == "stop":
+            try:
+                goal = msgspec.json.decode(incoming.payload, type=Stop).goal
+            except (msgspec.DecodeError, UnicodeDecodeError) as error:
+                self._refuse(incoming, user, ErrorReply("malformed", f'stop takes {{"goal": id}}: {_plain(error)}'))
+                return
+            if not self._withdraw(incoming, goal, f"{name} by {user}"):
+                self._forward(incoming, lambda ticket: CommandRequest(ticket, user, name, goal=goal))
+        else:
+            self._refuse(incoming, user, ErrorReply("malformed", f"{name} takes no content"))
+
+    def _withdraw(self, incoming: Incoming, goal_id: str, reason: str) -> bool:
+        """Stop a goal that waits here, before the loop has it; whether there is one."""
+        for number, (waiting, request) in enumerate(self._backlog):
+            if request.id == goal_id:
+                self._backlog[number] = waiting, msgspec.structs.replace(request, withdrawn=reason)
+                self._reply(incoming, CommandReply("stop", self._states.newest().mode))
+                return True
+        return False
 
     def _forward(self, incoming: Incoming, make: Callable[[int], Request]) -> None:
         self._tickets += 1
@@ -232,8 +279,8 @@ class Gateway:
                 self._event.put(msgspec.json.encode(event))
             case Situation() | Welcome():
                 self._states.update(answer)
-            case Accepted(ticket, goal_id, duration):
-                self._answer(ticket, GoalReply(goal_id, duration))
+            case Accepted(ticket, goal_id, duration, slowed, stops_first, queued):
+                self._answer(ticket, GoalReply(goal_id, duration, slowed, stops_first, queued))
             case Confirmed(ticket, name, mode):
                 self._answer(ticket, CommandReply(name, mode))
             case Refused(ticket, code, text, slider, value, limit):
@@ -252,6 +299,9 @@ class Gateway:
         waiting = self._waiting.pop(ticket, None)
         if waiting is not None:
             self._reply(waiting.incoming, content)
+        if ticket in self._ahead:
+            self._ahead.discard(ticket)
+            self._send_goals()
 
     def _give_up_late(self) -> None:
         now = time.monotonic()

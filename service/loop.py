@@ -24,8 +24,8 @@ from service.packets import Happened, Kind, Situation, Welcome, message
 from service.records import LAYOUT
 
 BATCHES_PER_SECOND = 50
-UNSENT_EVENTS = 4096
-"""Events kept for a gateway that is away; beyond that the oldest are lost."""
+EVENTS_KEPT = 1000
+"""Events kept for a gateway that comes anew: the one before may have died with some that it had not published."""
 SHUTDOWN = 3.0
 """How long a controlled stop may take before the drives are left to their own quick stop [s]."""
 
@@ -60,7 +60,8 @@ class Loop:
         self._overruns = 0
         self._late_streak = 0
         self._events = 0
-        self._unsent: deque[bytes] = deque(maxlen=UNSENT_EVENTS)
+        self._kept: deque[bytes] = deque(maxlen=EVENTS_KEPT)
+        self._told = 0
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
         self._batch = bytearray(1 + self._batch_size * LAYOUT.size)
         self._batch[0] = Kind.RECORDS
@@ -88,7 +89,7 @@ class Loop:
         self._watch(tick)
         decided = moved = now()
         try:
-            request = self._gateway.receive()
+            request = self._gateway.receive() if control.ready else None
             if request is not None:
                 control.handle(packets.decode_request(memoryview(request)[1:]), tick.deadline_ns + tick.lateness_ns)
             decided = now()
@@ -184,6 +185,8 @@ class Loop:
             if port.accept():
                 port.send(self._welcome)
                 port.send(self._situation)
+                if port is self._gateway:
+                    self._told = 0
         self._send_events()
 
     def _speak(self) -> None:
@@ -194,7 +197,7 @@ class Loop:
             t = control.cycle * self._period
             event = Event(self._events, t, control.cycle, time.time(), **happening._asdict())
             packet = message(Happened(event))
-            self._unsent.append(packet)
+            self._kept.append(packet)
             self._recorder.send(packet)
         desk.happenings.clear()
         situation = message(Situation(desk.goal.id if desk.goal else None, control.override, control.fault))
@@ -207,8 +210,10 @@ class Loop:
         desk.answers.clear()
 
     def _send_events(self) -> None:
-        while self._unsent and self._gateway.send(self._unsent[0]):
-            self._unsent.popleft()
+        """Tell the gateway of every event that is kept and that it does not know."""
+        self._told = max(self._told, self._events - len(self._kept))
+        while self._told < self._events and self._gateway.send(self._kept[self._told - self._events]):
+            self._told += 1
 
 
 def main(config: Config, gateway: Port, recorder: Port, ready: Callable[[object], None]) -> int:

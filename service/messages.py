@@ -16,6 +16,19 @@ Identifier = Annotated[str, Meta(min_length=1, max_length=64)]
 Level = Literal["info", "warning", "error"]
 Outcome = Literal["done", "rejected", "preempted", "stopped", "expired", "faulted"]
 Triple = tuple[float, float, float]
+Positive = Annotated[float, Meta(gt=0.0)]
+PositiveTriple = tuple[Positive, Positive, Positive]
+
+
+class OwnLimits(Struct, frozen=True, forbid_unknown_fields=True):
+    """A goal's own limits for x, y [m] and phi [rad], in place of the platform's; none may be above them."""
+
+    velocity: PositiveTriple | None = None
+    acceleration: PositiveTriple | None = None
+    jerk: PositiveTriple | None = None
+
+    def __post_init__(self) -> None:
+        _check_finite(self)
 
 
 class PoseGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="pose"):
@@ -29,6 +42,10 @@ class PoseGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
     """Fraction of full speed: 0.5 takes twice as long over the same path."""
     valid_for: Annotated[float, Meta(gt=0.0)] | None = None
     """The goal expires unless it starts within so many seconds."""
+    limits: OwnLimits | None = None
+    blend: Annotated[float, Meta(ge=0.0)] | None = None
+    """The next pose goal waits for this one, and begins when no point of the platform is farther than that from where
+    it is to be [m]; without it, the next goal preempts this one."""
 
     def __post_init__(self) -> None:
         _check_finite(self)
@@ -99,6 +116,12 @@ class Override(Struct, frozen=True, forbid_unknown_fields=True):
     percent: Annotated[float, Meta(ge=0.0, le=200.0)]
 
 
+class Stop(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content, if any, of the command stop: which goal is to be stopped, wherever it is, and no other."""
+
+    goal: Identifier
+
+
 def _check_finite(message: Struct) -> None:
     """Refuse numbers that are not finite: msgpack can carry them."""
     for name in message.__struct_fields__:
@@ -114,6 +137,12 @@ class GoalReply(Struct, frozen=True):
     id: str
     duration: float
     """Expected time from now to arrival [s]."""
+    slowed: float = 1.0
+    """How many times slower it is than was asked for, since a slider could not follow."""
+    stops_first: bool = False
+    """The robot stops on its old path first: from its present motion it could not, or would be later."""
+    queued: bool = False
+    """It begins when the goals before it are reached."""
     accepted: Literal[True] = True
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 from ruckig import Trajectory
 
 from service.algebra import Array
-from service.paths import FOR_EVER, Path, advance, value
+from service.paths import FOR_EVER, Path, advance, reached, value
 
 STILL = (0.0, 0.0, 0.0)
 SAME_TIME = 1e-9
@@ -42,6 +43,15 @@ class Rate(NamedTuple):
     change: float
 
 
+class Seam(NamedTuple):
+    """Where on a path one goal ends and the next one, that waited for it, begins."""
+
+    s: float
+    """Time along the path [s]."""
+    before: Path
+    """The path without the next goal; the same up to the seam."""
+
+
 class Run:
     """A path and its law, advanced by one period a cycle."""
 
@@ -52,6 +62,8 @@ class Run:
         """The rate that the law leads to."""
         self.time = 0.0
         """Time since the law began [s]."""
+        self.seams: deque[Seam] = deque()
+        self._begun = 0.0
         self._legs = legs
         self._near = np.zeros(3)
         self._out = np.zeros((3, 3))
@@ -77,24 +89,51 @@ class Run:
 
     @property
     def remaining(self) -> float:
-        """Time to the end of the path [s]; of one that is stopped before, at full speed."""
-        return max(0.0, self.ends - self.time if self.target else self.path.duration - self.at.s)
+        """Time to the end of the goal under way [s]; of one that is stopped before, at full speed."""
+        s = self.seams[0].s if self.seams else self.path.duration
+        return max(0.0, self.reaches(s) - self.time if self.target else s - self.at.s)
 
     @property
     def ends(self) -> float:
         """When it stands, in time of its law [s]."""
-        return min(end_of(self.path, self.law, self.target), FOR_EVER if self.target else float(self.law.knots[-2]))
+        stops = FOR_EVER if self.target else float(self.law.knots[-2])
+        return min(self.reaches(self.path.duration), stops)
+
+    def reaches(self, s: float) -> float:
+        """When it comes to a time along the path, in time of its law [s]; infinite if it stops before."""
+        return arrival(self.law, self.target, s)
+
+    @property
+    def progress(self) -> float:
+        """Share that is over of the time of the goal under way."""
+        end = self.seams[0].s if self.seams else self.path.duration
+        return max(0.0, min(1.0, (self.at.s - self._begun) / (end - self._begun))) if end > self._begun else 1.0
 
     def copy(self) -> Run:
         """Return the same motion, to be changed by itself."""
         other = Run(self._legs, self.path, self.law, self.target)
-        other.time = self.time
+        other.time, other.seams, other._begun = self.time, self.seams.copy(), self._begun
         return other
 
-    @property
-    def progress(self) -> float:
-        """Share of the path's time that is over."""
-        return min(1.0, self.at.s / self.path.duration) if self.path.duration > 0.0 else 1.0
+    def append(self, s: float, path: Path) -> None:
+        """Go on from a time along the path by another one, that begins with the motion that the run has there."""
+        longer = joined([cut(self.path, s), path])
+        self.seams.append(Seam(s, self.path))
+        self.path = longer
+
+    def drop(self, number: int) -> None:
+        """Leave out the goals behind the seam of that number, counted from zero."""
+        self.path = self.seams[number].before
+        while len(self.seams) > number:
+            self.seams.pop()
+
+    def pass_seams(self) -> int:
+        """Return how many goals have ended since the last time."""
+        s, passed = self.at.s, 0
+        while self.seams and s >= self.seams[0].s:
+            self._begun = self.seams.popleft().s
+            passed += 1
+        return passed
 
     def change_law(self, law: Path, target: float) -> None:
         """Go on from here by another law."""
@@ -109,23 +148,13 @@ class Run:
         return MotionState(*self._out.tolist())
 
 
-def end_of(path: Path, law: Path, target: float) -> float:
-    """Return when a law reaches the end of a path [s]; infinite if it stops before."""
+def arrival(law: Path, target: float, s: float) -> float:
+    """Return when a law that leads to a rate reaches a time along the path [s]; infinite if it stops before."""
     last = law.pieces[-1, 0]
-    begins, s, rate = float(law.knots[-2]), float(last[0]), float(last[1])
-    if s >= path.duration:
-        return _crossing(law, path.duration)
-    return begins + (path.duration - s) / rate if rate > 0.0 and target > 0.0 else np.inf
-
-
-def _crossing(law: Path, s: float) -> float:
-    """Return when a law passes a time along the path, by halving."""
-    low, high, out = 0.0, float(law.knots[-2]), np.zeros((3, 1))
-    for _ in range(40):
-        middle = (low + high) / 2.0
-        value(law.knots, law.pieces, middle, out)
-        low, high = (middle, high) if out[0, 0] < s else (low, middle)
-    return high
+    begins, at, rate = float(law.knots[-2]), float(last[0]), float(last[1])
+    if at >= s:
+        return reached(law.knots, law.pieces, s, begins)
+    return begins + (s - at) / rate if rate > 0.0 and target > 0.0 else np.inf
 
 
 def from_ruckig(trajectory: Trajectory, in_sliders: bool = False) -> Path:
@@ -166,6 +195,14 @@ def joined(paths: Sequence[Path]) -> Path:
     ends = np.cumsum([path.duration for path in paths])
     knots = [paths[0].knots, *(path.knots[1:] + end for path, end in zip(paths[1:], ends, strict=False))]
     return Path(np.concatenate(knots), np.concatenate([path.pieces for path in paths]), paths[0].in_sliders)
+
+
+def cut(path: Path, s: float) -> Path:
+    """Return a path up to a time along it [s]."""
+    if s >= path.duration:
+        return path
+    last = max(1, int(np.searchsorted(path.knots, s - SAME_TIME)))
+    return Path(np.append(path.knots[:last], s), path.pieces[:last], path.in_sliders)
 
 
 def stretched(path: Path, factor: float) -> Path:

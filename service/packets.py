@@ -26,6 +26,8 @@ class GoalRequest(Struct, frozen=True, tag=True):
     id: str
     goal: Goal
     received_ns: int
+    withdrawn: str | None = None
+    """Why it must not begin any more, for a goal that waited when the robot was told to stop."""
 
 
 class CommandRequest(Struct, frozen=True, tag=True):
@@ -35,6 +37,9 @@ class CommandRequest(Struct, frozen=True, tag=True):
     user: str
     name: str
     value: float | None = None
+    """The rate, for override."""
+    goal: str | None = None
+    """The one goal that is to be stopped, for stop."""
 
 
 class RefusedRequest(Struct, frozen=True, tag=True):
@@ -50,6 +55,9 @@ class Accepted(Struct, frozen=True, tag=True):
     ticket: int
     id: str
     duration: float
+    slowed: float
+    stops_first: bool
+    queued: bool
 
 
 class Confirmed(Struct, frozen=True, tag=True):

@@ -1,4 +1,4 @@
-"""Paths in time as piecewise polynomials, the law by which time runs along them, and what both ask of the sliders.
+"""Paths in time as piecewise polynomials, and the law by which time runs along them.
 
 A path has knots (n + 1,) in seconds and pieces (n, d, 6): coefficients of ascending powers of the time since the
 piece's knot, for each of d coordinates. A law is a path of one coordinate: s, the time along the path, as a function
@@ -12,13 +12,17 @@ from typing import NamedTuple
 import numpy as np
 
 from service.algebra import Array
-from service.closure import LEGS, forward_motion, inverse_motion
+from service.closure import LEGS, forward_motion
 from service.compiled import compiled
 
-__all__ = ["Path", "advance", "constant", "survey", "value"]
+__all__ = ["Path", "advance", "constant", "motion_at", "reached", "value", "value_at"]
 
 FOR_EVER = 1e9
 """How long the last piece of a law lasts [s]."""
+HALVINGS = 48
+"""Of an interval, until it is narrower than numbers of its size can tell."""
+ROUNDING = 1e-9
+"""By so much may a position be beyond its limit, or two times be the same [m, rad, s]."""
 
 
 class Path(NamedTuple):
@@ -47,8 +51,8 @@ def _piece(knots: Array, time: float) -> int:
 
 
 @compiled()
-def _value(knots: Array, pieces: Array, time: float, out: Array) -> None:
-    """Write the value and two derivatives, (3, d); before the start and after the end nothing moves."""
+def value_at(knots: Array, pieces: Array, time: float, out: Array) -> None:
+    """Do value, from compiled code; before the start and after the end nothing moves."""
     inside = knots[0] <= time <= knots[-1]
     at = min(max(time, knots[0]), knots[-1])
     k = _piece(knots, at)
@@ -66,20 +70,20 @@ def _value(knots: Array, pieces: Array, time: float, out: Array) -> None:
 @compiled("void(f8[::1], f8[:, :, ::1], f8, f8[:, ::1])")
 def value(knots: Array, pieces: Array, time: float, out: Array) -> None:
     """Write a path's value and first two derivatives at a time [s] into `out` (3, d)."""
-    _value(knots, pieces, time, out)
+    value_at(knots, pieces, time, out)
 
 
 @compiled()
-def _advance(knots: Array, pieces: Array, law_knots: Array, law_pieces: Array, time: float, out: Array) -> float:
+def motion_at(knots: Array, pieces: Array, law_knots: Array, law_pieces: Array, time: float, out: Array) -> None:
+    """Write where a path is, by a law, at a time of the law: value and two derivatives, (3, d)."""
     law = np.empty((3, 1))
-    _value(law_knots, law_pieces, time, law)
+    value_at(law_knots, law_pieces, time, law)
     s: float = law[0, 0]
     rate, change = law[1, 0], law[2, 0]
-    _value(knots, pieces, s, out)
+    value_at(knots, pieces, s, out)
     for i in range(3):
         out[2, i] = out[2, i] * rate * rate + out[1, i] * change
         out[1, i] *= rate
-    return s
 
 
 @compiled(f"i8({LEGS}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], f8, f8[::1], f8[:, ::1])")
@@ -99,57 +103,25 @@ def advance(
     A path in slider space is turned into the platform's motion on the branch of the pose `near`. Returns 0, or a
     code of forward_into.
     """
-    _advance(knots, pieces, law_knots, law_pieces, time, out)
+    motion_at(knots, pieces, law_knots, law_pieces, time, out)
     if in_sliders:
         sliders = out.copy()
         return forward_motion(legs, sliders, near, out)
     return 0
 
 
-@compiled(f"i8({LEGS}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], f8[::1], f8, f8[::1], f8[:, ::1], f8[::1])")
-def survey(
-    legs: Array,
-    knots: Array,
-    pieces: Array,
-    in_sliders: bool,
-    law_knots: Array,
-    law_pieces: Array,
-    times: Array,
-    step: float,
-    start: Array,
-    box: Array,
-    worst: Array,
-) -> int:
-    """Look at a path, run by a law, at so many times; write the sliders' greatest velocity, acceleration and jerk.
-
-    Jerk is the change of acceleration over a `step` [s], as the drives see it. `start` is the pose at the first
-    time. `box` (2, 5) holds the limits, low and high, of x, y, phi, lambda_10 and lambda_32. Returns 0, or 1 + k
-    where the sample k is out of reach; `worst` (3,) then means nothing.
-    """
-    motion, sliders, after, near = np.empty((3, 3)), np.empty((6, 3)), np.empty((6, 3)), start.copy()
-    path = np.empty((3, 3))
-    worst[:] = 0.0
-    for k in range(len(times)):
-        for out, time in ((sliders, times[k]), (after, times[k] + step)):
-            _advance(knots, pieces, law_knots, law_pieces, time, path)
-            if in_sliders:
-                if forward_motion(legs, path, near, motion) != 0:
-                    return 1 + k
-                near[:] = motion[0]
-            else:
-                motion[:] = path
-            if inverse_motion(legs, motion, out) != 0:
-                return 1 + k
-            for i in range(3):
-                if not box[0, i] <= motion[0, i] <= box[1, i]:
-                    return 1 + k
-        for i in range(3):
-            if not (box[0, 3] <= sliders[0, i] <= box[1, 3] and box[0, 4] <= sliders[3, i] <= box[1, 4]):
-                return 1 + k
-            worst[0] = max(worst[0], abs(sliders[1, i]))
-            worst[1] = max(worst[1], abs(sliders[2, i]))
-            worst[2] = max(worst[2], abs(after[2, i] - sliders[2, i]) / step)
-    return 0
+@compiled("f8(f8[::1], f8[:, :, ::1], f8, f8)")
+def reached(law_knots: Array, law_pieces: Array, s: float, last: float) -> float:
+    """Return when a law passes a time along the path [s], by halving: between its start and `last`."""
+    low, high, out = law_knots[0], last, np.empty((3, 1))
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2.0
+        value_at(law_knots, law_pieces, middle, out)
+        if out[0, 0] < s:
+            low = middle
+        else:
+            high = middle
+    return float(high)
 
 
 def constant(rate: float, start: float = 0.0) -> Path:

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from service.client import Goal, Jog, Result, Robot
 from service.errors import ServiceError
-from service.messages import Event, Percentiles, State
+from service.messages import Event, GoalReply, Percentiles, State
 
 if TYPE_CHECKING:
     from service.config import Config
@@ -69,6 +69,18 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
         out.print(f"    [yellow]without[/] {escape(lack)}", soft_wrap=True)
 
 
+def notes(reply: GoalReply) -> str:
+    """Say what is out of the ordinary with an accepted goal; nothing where all is as asked."""
+    said = []
+    if reply.slowed > 1.001:
+        said.append(f"slowed {reply.slowed:.2f} times, since a slider could not follow")
+    if reply.stops_first:
+        said.append("stops on the old path first")
+    if reply.queued:
+        said.append("waits for the goal before it")
+    return f" ({', '.join(said)})" if said else ""
+
+
 def follow(robot: Robot, goal: Goal, title: str, *, show: bool = True) -> Result:
     """Wait for a goal's end and show its progress."""
     columns = (
@@ -78,7 +90,7 @@ def follow(robot: Robot, goal: Goal, title: str, *, show: bool = True) -> Result
         TextColumn("{task.fields[left]}"),
     )
     with Progress(*columns, console=out, transient=True, disable=not show) as progress:
-        task = progress.add_task(title, total=1.0, left="")
+        task = progress.add_task(title + notes(goal.reply), total=1.0, left="")
         for state in robot.states(SILENT):
             if goal.result is not None:
                 return goal.result

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
+from collections import deque
 from collections.abc import Callable, Iterator
 
 import can
@@ -13,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 
+from drivers import frames
 from drivers.cia402 import Cia402
 from drivers.simulated import SimulatedDrive, simulated_bus
 from service.config import SIM, Config, load
@@ -59,6 +62,8 @@ class Rig:
         self.answers: list[Answer] = []
         self.happenings: list[Happening] = []
         self.rows: list[list[list[float]]] = []
+        self.seen: list[list[tuple[int, int]]] = []
+        self._posted: deque[Request] = deque()
         self._tickets = itertools.count(1)
 
     def _note(self, message: can.Message, timeout: float | None = None) -> None:
@@ -73,6 +78,10 @@ class Rig:
     def mode(self) -> Mode:
         return self.control.state.mode
 
+    def holds(self) -> bool:
+        """Whether the robot stands and is ready for a goal."""
+        return self.mode is Mode.HOLDING
+
     def cycle(self, request: Request | None = None) -> None:
         """Run one cycle, with a request or without; `sent` holds its frames afterwards."""
         self.now += self.config.period
@@ -81,11 +90,14 @@ class Rig:
         self.driver.sync()
         control.observe(self.driver.read())
         if request is not None:
-            control.handle(request, round(self.now * 1e9))
+            self._posted.append(request)
+        if control.ready and self._posted:
+            control.handle(self._posted.popleft(), round(self.now * 1e9))
         control.advance()
         control.solve()
         control.write()
         self.rows.append(control.rows)
+        self.seen.append([frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6])
         desk = control.desk
         self.answers += desk.answers
         self.happenings += desk.happenings
@@ -119,8 +131,16 @@ class Rig:
         """Send a goal; return its answer."""
         ticket = next(self._tickets)
         self.cycle(GoalRequest(ticket, "ann", id, goal, round(self.now * 1e9)))
-        assert self._answered(ticket)
+        self.until(lambda: self._answered(ticket), 50)
         return self.answers[-1]
+
+    def post(self, id: str, goal: Goal) -> None:  # noqa: A002
+        """Send a goal in this cycle and do not wait for its answer."""
+        self.cycle(GoalRequest(next(self._tickets), "ann", id, goal, round(self.now * 1e9)))
+
+    def order(self, name: str, value: float | None = None) -> None:
+        """Send a command in this cycle and do not wait for its answer."""
+        self.cycle(CommandRequest(next(self._tickets), "ann", name, value))
 
     def _answered(self, ticket: int) -> bool:
         return bool(self.answers) and getattr(self.answers[-1], "ticket", None) == ticket
@@ -135,6 +155,17 @@ class Rig:
     def setpoints(self) -> NDArray[np.float64]:
         """Rows of all cycles so far: (cycles, 6, 3), lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32."""
         return np.array(self.rows)
+
+    def captured(self) -> NDArray[np.float64]:
+        """Setpoints and velocity offsets [m, m/s] of all cycles so far, as their frames have them: (cycles, 2, 3).
+
+        Not a number where no setpoints were sent.
+        """
+        scale = np.array([drive.counts_per_metre * drive.direction for drive in self.config.drives.each])
+        offset = np.array([drive.offset for drive in self.config.drives.each])
+        nothing = [(math.nan, math.nan)] * 3
+        counts = np.array([sent if len(sent) == 3 else nothing for sent in self.seen])
+        return np.stack([counts[:, :, 0] / scale + offset, counts[:, :, 1] / scale], axis=1)
 
 
 @pytest.fixture

@@ -48,6 +48,21 @@ def assert_within_limits(rig: Rig) -> None:
     assert np.abs(acceleration).max() <= limits.acceleration * 1.001
     assert np.abs(jerk).max() <= limits.jerk * 1.001
     assert np.abs(velocity - rows[1:, 1]).max() <= limits.acceleration * PERIOD  # the feed-forward is the velocity
+    assert_frames_within_limits(rig)
+
+
+def assert_frames_within_limits(rig: Rig) -> None:
+    """Setpoints as captured from the bus: continuous in position, velocity and acceleration, jerk inside its limit."""
+    (position, velocity), limits = rig.captured().transpose(1, 0, 2), rig.config.limits.slider
+    count = 1.0 / min(drive.counts_per_metre for drive in rig.config.drives.each)
+    acceleration = np.diff(velocity, axis=0) / PERIOD
+    jerk = np.diff(acceleration, axis=0) / PERIOD
+    between = (velocity[1:] + velocity[:-1]) / 2.0
+    assert np.isfinite(velocity).sum() >= 0.9 * velocity.size
+    assert np.nanmax(np.abs(np.diff(position, axis=0) / PERIOD - between)) <= limits.jerk * PERIOD**2 + count / PERIOD
+    assert np.nanmax(np.abs(velocity)) <= limits.velocity * 1.001
+    assert np.nanmax(np.abs(acceleration)) <= limits.acceleration * 1.001 + count / PERIOD
+    assert np.nanmax(np.abs(jerk)) <= limits.jerk * 1.001 + 2.0 * count / PERIOD**2
 
 
 # ---------------------------------------------------------------------- enabling
@@ -331,7 +346,7 @@ def test_a_following_error(rig: Rig) -> None:
 def test_the_last_gate(rig: Rig, monkeypatch: pytest.MonkeyPatch, commanded: MotionState, said: str) -> None:
     moving(rig)
     sent = rig.setpoints()[-1, 0]
-    monkeypatch.setattr(rig.control._runs[0], "state", lambda *_: commanded)
+    monkeypatch.setattr(rig.control._course.runs[0], "state", lambda *_: commanded)
     rig.cycle()
     assert rig.mode is Mode.FAULT
     assert quick_stops(rig) == {1, 2, 3}

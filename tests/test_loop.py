@@ -88,6 +88,17 @@ def test_missed_ticks_are_counted(shell: Shell) -> None:
     assert int(rows[-1]["overruns"][-1]) == 3
 
 
+def test_a_gateway_that_comes_anew_is_told_everything(shell: Shell, tmp_path: Path) -> None:
+    shell.enabled()
+    shell.gateway.close()  # with all that it had not read
+    shell.cycles(30)
+    shell.gateway = links.connect(tmp_path / "gateway")
+    shell.cycles(30)
+    said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
+    assert isinstance(said[0], Welcome)
+    assert [answer.event.mode for answer in said if isinstance(answer, Happened)] == ["enabling", "holding"]
+
+
 def test_a_lost_gateway_is_noticed(shell: Shell) -> None:
     shell.enabled()
     shell.gateway.close()

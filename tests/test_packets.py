@@ -39,7 +39,7 @@ def test_requests(request_: Request) -> None:
 @pytest.mark.parametrize(
     "answer",
     [
-        Accepted(1, "g", 0.5),
+        Accepted(1, "g", 0.5, 1.0, False, True),
         Confirmed(2, "stop", "holding"),
         Refused(3, "out_of_workspace", "no", "A", 0.4, 0.3),
         Happened(Event(1, 0.5, 500, 1.0, "goal", "info", "goal g done", id="g", outcome="done")),

@@ -1,0 +1,103 @@
+"""What a motion asks of the sliders, held against their limits: how many times too fast, or where out of reach."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from service.config import Limits
+from service.errors import RefusedError
+from service.geometry import Geometry
+from service.kinematics import inverse_into
+from service.limits import LEGS, Bounds
+from service.motion import STILL
+from service.paths import Path, advance, constant
+from service.steps import Steps
+from service.survey import survey
+
+PLANNED = (0.98, 0.98, 0.93)
+"""Share of the sliders' limits of velocity, acceleration and jerk that plans make use of: the rest is for what lies
+between the moments that are looked at, where jerk varies most."""
+GAP = 0.02
+"""Between moments at which a path is looked at, besides its knots [s]."""
+FEWEST, MOST = 16, 64
+"""Such moments, however short or long the path."""
+KNOTS_A_STEP = 48
+"""Knots of a path that are looked at in one step."""
+LONGEST = 600.0
+"""No path is looked at for longer [s]."""
+
+
+class Look(NamedTuple):
+    """What was found along a path."""
+
+    excess: float
+    """How many times too fast it is for a slider."""
+    beyond: float
+    """When it is out of reach [s]; not a number where it never is."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the robot can do it."""
+        return math.isnan(self.beyond) and self.excess <= 1.0
+
+
+class Checker:
+    """Looks at paths of one robot."""
+
+    def __init__(self, geometry: Geometry, limits: Limits, bounds: Bounds, period: float) -> None:
+        platform, slider = limits.platform, limits.slider
+        self.slider_limits = np.array(PLANNED) * [slider.velocity, slider.acceleration, slider.jerk]
+        """Velocity, acceleration and jerk that plans make use of."""
+        self._legs = geometry.packed()
+        self._bounds = bounds
+        self._period = period
+        self._box = np.array([platform.x, platform.y, platform.phi, slider.position, slider.passive]).T.copy()
+        self._powers = 1.0 / np.arange(1.0, 4.0)
+
+    def look(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Look:
+        """Look at a path under a law from one time of the law to another [s], from near a pose on."""
+        until = max(first, min(until, first + LONGEST))
+        # A path from standstill may begin with an acceleration: the step into it counts, as the one at the end does.
+        if first == 0.0 and law.pieces[0, 0, 0] == 0.0 and not path.pieces[0, :, 1].any():
+            first = -self._period
+        even = min(max(FEWEST, int((until - first) / GAP)), MOST)
+        worst, start = np.zeros(3), np.array(pose, dtype=np.float64)
+        beyond = survey(self._legs, *path, *law[:2], first, until, even, self._period, start, self._box, worst)
+        # The same path k times slower has k times less velocity, k² less acceleration and k³ less jerk.
+        return Look(float(((worst / self.slider_limits) ** self._powers).max()), beyond)
+
+    def whole(self, path: Path, pose: Sequence[float]) -> Steps[float]:
+        """Return how many times too fast a path is. Raises RefusedError where it leaves the workspace."""
+        law, excess = constant(1.0), 0.0
+        ends = [*path.knots[KNOTS_A_STEP : -KNOTS_A_STEP // 2 : KNOTS_A_STEP].tolist(), path.duration]
+        for first, until in zip([0.0, *ends[:-1]], ends, strict=True):
+            if first:
+                yield
+            found = self.look(path, law, first, until, pose)
+            if not math.isnan(found.beyond):
+                raise self.refusal(path, found.beyond, pose)
+            excess = max(excess, found.excess)
+        return excess
+
+    def refusal(self, path: Path, time: float, pose: Sequence[float]) -> RefusedError:
+        """Say what is out of reach at a time along a path, and where on it that is."""
+        where = f"the path leads out of the workspace after {max(0.0, time) / path.duration:.0%} of its time"
+        rows, near, law = np.zeros((6, 3)), np.array(pose, dtype=np.float64), constant(1.0)
+        motion = np.zeros((3, 3))
+        if advance(self._legs, *path, *law[:2], time, near, motion) or inverse_into(self._legs, motion, rows):
+            return RefusedError("singular", f"{where}: the robot is singular there")
+        still = rows[0].tolist(), STILL, STILL, rows[3].tolist()
+        violation = self._bounds.pose(motion[0].tolist()) or self._bounds.setpoint(still, still[0])
+        if violation is None:
+            return RefusedError("out_of_workspace", where)
+        return RefusedError(
+            "out_of_workspace",
+            f"{where}: {violation}",
+            slider=violation.what if violation.what in LEGS else None,
+            value=violation.value,
+            limit=violation.limit,
+        )

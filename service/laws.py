@@ -1,0 +1,76 @@
+"""How time runs along a path: at a rate, and from one rate to another within what the sliders can do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
+
+from service.checks import Checker
+from service.config import PlatformLimits
+from service.geometry import Geometry
+from service.motion import Run, arrival, law_from_ruckig
+from service.paths import Path, constant
+from service.solver import solved
+from service.steps import Steps
+
+SHARES = tuple(0.6**k for k in range(12))
+"""Of the quickest change of rate, tried one after the other before the old law is left to go on."""
+FASTEST = 10.0
+"""No rate is greater."""
+
+
+class Laws:
+    """Makes laws for the paths of one robot."""
+
+    def __init__(self, geometry: Geometry, platform: PlatformLimits, checker: Checker, period: float) -> None:
+        self._legs = geometry.packed()
+        self._checker = checker
+        self._period = period
+        self._ruckig = Ruckig(1)
+        # What of a full-speed motion's rate the platform's limits can take away in a second, and change of that.
+        self._change = min(a / v for a, v in zip(platform.acceleration, platform.velocity, strict=True))
+        self._change_jerk = min(j / v for j, v in zip(platform.jerk, platform.velocity, strict=True))
+
+    def begin(self, path: Path, rate: float, pose: Sequence[float]) -> Steps[Run]:
+        """Start a path at a rate, or as near to it as the sliders' limits allow."""
+        rate = yield from self.possible(path, 0.0, rate, pose)
+        return Run(self._legs, path, constant(rate), rate)
+
+    def change(self, run: Run, rate: float, pose: Sequence[float], shares: Sequence[float] = SHARES) -> Steps[None]:
+        """Let the time along a path run at another rate: as soon as the sliders' limits allow, as fast as they do.
+
+        Where nothing gentler than the old law fits, that goes on: to the end of the path, where it stands too.
+        The run may go on between the steps.
+        """
+        rate = yield from self.possible(run.path, run.at.s, rate, pose)
+        for share in shares:
+            law = self._ramp(run, rate, share)
+            if law is not None:
+                until = min(arrival(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
+                if self._checker.look(run.path, law, 0.0, until, pose).fits:
+                    run.change_law(law, rate)
+                    return
+                yield
+
+    def possible(self, path: Path, s: float, rate: float, pose: Sequence[float]) -> Steps[float]:
+        """Return the rate, or the greatest at which the sliders can take the path from `s` on."""
+        if rate <= 1.0:
+            return rate
+        found = self._checker.look(path, constant(1.0, s), 0.0, path.duration - s, pose)
+        yield
+        return min(rate, 1.0 / found.excess) if math.isnan(found.beyond) and found.excess > 0.0 else rate
+
+    def _ramp(self, run: Run, rate: float, share: float) -> Path | None:
+        """Return the law from the present rate to another, at a share of the quickest change; None without one."""
+        at = run.at
+        request = InputParameter(1)
+        request.control_interface = ControlInterface.Velocity
+        request.current_position, request.current_velocity = [at.s], [at.rate]
+        request.current_acceleration, request.target_velocity = [at.change], [rate]
+        request.max_velocity = [FASTEST]
+        request.max_acceleration = [max(share * self._change, abs(at.change))]
+        request.max_jerk = [share * self._change_jerk]
+        trajectory = Trajectory(1)
+        return law_from_ruckig(trajectory, rate) if solved(self._ruckig, request, trajectory) else None

@@ -1,0 +1,128 @@
+"""Thinks while the robot moves: plans goals and changes of rate in steps, at most one a cycle."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from service.course import Course
+from service.goals import Extension, Goals, Motion
+from service.messages import Goal, PoseGoal
+from service.motion import Run
+from service.steps import Steps
+
+
+class Taken(NamedTuple):
+    """A goal is the robot's now."""
+
+    duration: float
+    """Expected time from now to arrival [s]."""
+    slowed: float
+    stops_first: bool
+    queued: bool
+    """Whether it begins when the one before it is reached."""
+
+
+class Pilot:
+    """Decides how the course goes on."""
+
+    def __init__(self, goals: Goals, course: Course, period: float) -> None:
+        self.override = 1.0
+        """The rate at which motions are to run."""
+        self._goals = goals
+        self._course = course
+        self._period = period
+        self._goal: Goal | None = None
+        self._blend: float | None = None
+        self._steps: Steps[Motion] | Steps[tuple[Run, Extension]] | None = None
+        self._change: Steps[None] | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a goal is being planned."""
+        return self._goal is not None
+
+    def plan(self, goal: Goal, blend: float | None = None) -> None:
+        """Begin to plan a goal: to preempt the motion under way, or to follow it from within `blend` [m] of its end."""
+        self._goal, self._blend, self._steps = goal, blend, None
+
+    def give_up(self) -> None:
+        """Plan the goal no longer."""
+        self._goal = self._steps = None
+
+    def run_at(self, rate: float) -> None:
+        """Let the goal's motion run at another rate, as soon as the sliders allow."""
+        self._change = self._run_at(rate)
+        self._steps = None  # what was planned from the old motion is out of date
+
+    def stop_thinking(self) -> None:
+        """The motion has ended: leave its rate alone."""
+        self._change = None
+
+    def think(self) -> Taken | None:
+        """Take one step; return how a goal is reached once that is decided. Raises RefusedError if it cannot be."""
+        if self._change is not None:
+            if _ended(self._change):
+                self._change = None
+            return None
+        if self._goal is None or self._course.turning:  # what is yet to begin cannot be planned from
+            return None
+        if self._steps is None:
+            self._steps = self._begin(self._goal)
+        try:
+            next(self._steps)
+        except StopIteration as decided:
+            return self._take(decided.value)
+        except Exception:
+            self.give_up()
+            raise
+        return None
+
+    def _begin(self, goal: Goal) -> Steps[Motion] | Steps[tuple[Run, Extension]]:
+        if self._blend is not None and isinstance(goal, PoseGoal) and self._course.runs:
+            return self._append(goal, self._blend)
+        return self._goals.plan(goal, self._course, self.override)
+
+    def _append(self, goal: PoseGoal, blend: float) -> Steps[tuple[Run, Extension]]:
+        run = self._course.runs[-1]
+        return run, (yield from self._goals.append(goal, run, blend))
+
+    def _take(self, decided: Motion | tuple[Run, Extension]) -> Taken | None:
+        """Carry out what has been decided."""
+        course = self._course
+        self._steps = None
+        if isinstance(decided, Motion):
+            self._goal = self._change = None
+            waiting = max(0, decided.turn - course.cycle) * self._period if decided.turn is not None else 0.0
+            course.take(decided.runs, decided.turn)
+            if decided.runs[-1].target != self.override:
+                self._change = self._run_at(self.override)
+            return Taken(waiting + decided.duration, decided.slowed, decided.stops_first, queued=False)
+        run, extension = decided
+        if not course.runs or course.runs[-1] is not run or run.at.s >= extension.s:
+            return None  # the motion that it was to follow has ended: plan it anew
+        self._goal = None
+        run.append(extension.s, extension.path)
+        return Taken(course.remaining, extension.slowed, stops_first=False, queued=True)
+
+    def _run_at(self, rate: float) -> Steps[None]:
+        """Change the rate of the goal's motion; where that follows a stop on the old path, the stop stays as it is."""
+        course = self._course
+        while course.turning:
+            yield
+        if not course.runs:
+            return
+        run = course.runs[-1]
+        if len(course.runs) == 1:
+            yield from self._goals.laws.change(run, rate, course.commanded.pose)
+        else:
+            start = run.state(0.0, course.commanded.pose).pose
+            begun = yield from self._goals.laws.begin(run.path, rate, start)
+            run.change_law(begun.law, begun.target)
+
+
+def _ended(steps: Steps[None]) -> bool:
+    try:
+        next(steps)
+    except StopIteration:
+        return True
+    return False

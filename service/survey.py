@@ -1,0 +1,177 @@
+"""What a path, run by a law, asks of the sliders: looked at along its whole length, compiled."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from service.algebra import Array
+from service.closure import LEGS, forward_motion, inverse_motion
+from service.compiled import compiled
+from service.paths import HALVINGS, ROUNDING, motion_at, reached
+
+__all__ = ["survey"]
+
+NEAR = 1e-3
+"""How near a limit a position may turn without being looked at [m, rad]."""
+
+
+@compiled()
+def _moments(
+    knots: Array, law_knots: Array, law_pieces: Array, first: float, until: float, even: int, step: float
+) -> Array:
+    """Return when to look at a path, ascending: evenly, and over the step before and the one after every knot.
+
+    Jerk is greatest next to a knot, of the path or of the law, and may be so for a short time only. Its mean over
+    a step across a knot lies between the means over the steps that end and begin there.
+    """
+    times = np.empty(even + 2 * (len(knots) + len(law_knots)))
+    for k in range(even):
+        times[k] = first + (until - first) * k / (even - 1)
+    n = even
+    for k in range(len(knots) + len(law_knots)):
+        knot = reached(law_knots, law_pieces, knots[k], until) if k < len(knots) else law_knots[k - len(knots)]
+        for time in (knot - step, knot):
+            if first <= time <= until:
+                times[n] = time
+                n += 1
+    return np.sort(times[:n])
+
+
+@compiled()
+def _quantity(motion: Array, sliders: Array, i: int) -> tuple[float, float]:
+    """Return one of the nine limited positions, x, y, phi, lambda_10 and lambda_32, and its velocity."""
+    if i < 3:
+        return motion[0, i], motion[1, i]
+    if i < 6:
+        return sliders[0, i - 3], sliders[1, i - 3]
+    return sliders[3, i - 6], sliders[4, i - 6]
+
+
+class Way(NamedTuple):
+    """A path, the law it is run by, the robot that takes it, and what limits that."""
+
+    legs: Array
+    knots: Array
+    pieces: Array
+    in_sliders: bool
+    law_knots: Array
+    law_pieces: Array
+    box: Array
+
+
+@compiled()
+def _look(way: Way, time: float, near: Array, motion: Array, sliders: Array) -> bool:
+    """Write platform and sliders at a time of the law; whether they are within reach."""
+    motion_at(way.knots, way.pieces, way.law_knots, way.law_pieces, time, motion)
+    if way.in_sliders:
+        targets = motion.copy()
+        if forward_motion(way.legs, targets, near, motion) != 0:
+            return False
+        near[:] = motion[0]
+    if inverse_motion(way.legs, motion, sliders) != 0:
+        return False
+    for i in range(9):
+        column = i if i < 3 else 2 + i // 3
+        position, _ = _quantity(motion, sliders, i)
+        if not way.box[0, column] - ROUNDING <= position <= way.box[1, column] + ROUNDING:
+            return False
+    return True
+
+
+@compiled()
+def _turns(way: Way, last: float, time: float, near: Array, motion: Array, sliders: Array) -> float:
+    """Return when a position that turns near its limit between two looks is beyond it, else not a number.
+
+    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the looks at `last` and at `time`, and have room for one more.
+    """
+    for i in range(9):
+        column = i if i < 3 else 2 + i // 3
+        before, leaving = _quantity(motion[0], sliders[0], i)
+        _, coming = _quantity(motion[1], sliders[1], i)
+        if leaving * coming >= 0.0:
+            continue
+        # It has turned about here, were the acceleration constant.
+        turn = before + leaving * leaving / (leaving - coming) * (time - last) / 2.0
+        if way.box[0, column] + NEAR <= turn <= way.box[1, column] - NEAR:
+            continue
+        low, high = last, time
+        for _ in range(HALVINGS // 3):
+            middle = (low + high) / 2.0
+            if not _look(way, middle, near, motion[2], sliders[2]):
+                return middle
+            _, velocity = _quantity(motion[2], sliders[2], i)
+            if velocity * leaving > 0.0:
+                low = middle
+            else:
+                high = middle
+    return math.nan
+
+
+@compiled()
+def _walk(way: Way, times: Array, step: float, near: Array, worst: Array) -> tuple[float, float]:
+    """Look at a path at ascending times and a step later; return the last time within reach, and one beyond it."""
+    motion, sliders = np.empty((3, 3, 3)), np.empty((3, 6, 3))
+    last = -math.inf
+    for k in range(len(times)):
+        time = times[k]
+        if abs(time - last) < ROUNDING:
+            motion[1], sliders[1] = motion[0], sliders[0]
+        elif not _look(way, time, near, motion[1], sliders[1]):
+            return last, time
+        elif time > last + step and k > 0:
+            beyond = _turns(way, last, time, near, motion, sliders)
+            if not math.isnan(beyond):
+                return last, beyond
+        last = time + step
+        if not _look(way, last, near, motion[0], sliders[0]):
+            return time, last
+        for i in range(3):
+            worst[0] = max(worst[0], abs(sliders[1, 1, i]))
+            worst[1] = max(worst[1], abs(sliders[1, 2, i]))
+            worst[2] = max(worst[2], abs(sliders[0, 2, i] - sliders[1, 2, i]) / step)
+    return last, math.nan
+
+
+@compiled(
+    f"f8({LEGS}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[::1])"
+)
+def survey(
+    legs: Array,
+    knots: Array,
+    pieces: Array,
+    in_sliders: bool,
+    law_knots: Array,
+    law_pieces: Array,
+    first: float,
+    until: float,
+    even: int,
+    step: float,
+    start: Array,
+    box: Array,
+    worst: Array,
+) -> float:
+    """Look at a path, run by a law, between two times; write the sliders' greatest velocity, acceleration and jerk.
+
+    It is looked at `even` times, at its knots, and where a position turns near its limit. Jerk is the change of
+    acceleration over a `step` [s], as the drives see it. `start` is the pose at the first time. `box` (2, 5) holds
+    the limits, low and high, of x, y, phi, lambda_10 and lambda_32. Returns when it is first out of reach, else
+    not a number; `worst` (3,) means nothing where it is.
+    """
+    way = Way(legs, knots, pieces, in_sliders, law_knots, law_pieces, box)
+    times = _moments(knots, law_knots, law_pieces, first, until, even, step)
+    near = start.copy()
+    worst[:] = 0.0
+    inside, beyond = _walk(way, times, step, near, worst)
+    if not math.isnan(beyond):
+        motion, sliders = np.empty((3, 3)), np.empty((6, 3))
+        inside = max(inside, first)
+        for _ in range(HALVINGS // 3):
+            middle = (inside + beyond) / 2.0
+            if _look(way, middle, near, motion, sliders):
+                inside = middle
+            else:
+                beyond = middle
+    return beyond

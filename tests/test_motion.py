@@ -1,0 +1,423 @@
+"""Goals of every kind at any moment: they arrive in time, wait for each other, and end exactly once."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from collections import Counter
+
+import msgspec
+import numpy as np
+import pytest
+from conftest import CONFIG, Rig
+from numpy.typing import NDArray
+from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
+from test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal
+
+from service.config import Config
+from service.errors import KinematicsError
+from service.kinematics import forward, inverse
+from service.limits import LEGS
+from service.messages import Goal, OwnLimits, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from service.modes import Mode
+from service.packets import Accepted, Answer, CommandRequest, GoalRequest
+
+DIRECTIONS = [np.array(d) * (0.15, 0.15, 0.85) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
+
+
+def outermost(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The last pose inside every limit on the straight way from the centre."""
+    platform, slider = CONFIG.limits.platform, CONFIG.limits.slider
+    low, high = 0.0, 2.0
+    for _ in range(60):
+        middle = (low + high) / 2.0
+        pose = middle * direction
+        try:
+            solved = inverse(ROBOT, pose)
+        except KinematicsError:
+            high = middle
+            continue
+        inside = all(
+            limits[0] <= value <= limits[1]
+            for values, bounds in (
+                (pose, (platform.x, platform.y, platform.phi)),
+                (solved.position, [slider.position] * 3),
+                (solved.passive_position, [slider.passive] * 3),
+            )
+            for value, limits in zip(values, bounds, strict=True)
+        )
+        low, high = (middle, high) if inside else (low, middle)
+    return low * direction
+
+
+def accepted(answer: Answer) -> Accepted:
+    assert isinstance(answer, Accepted), answer
+    return answer
+
+
+def stands(rig: Rig) -> bool:
+    return rig.mode is Mode.HOLDING and not rig.control._pilot.busy and rig.control.ready
+
+
+def bare(start: tuple[float, float, float], end: tuple[float, float, float]) -> float:
+    """How long Ruckig itself takes from rest to rest, within the platform's limits."""
+    limits = CONFIG.limits.platform
+    request, trajectory = InputParameter(3), Trajectory(3)
+    request.current_position, request.target_position = list(start), list(end)
+    request.max_velocity, request.max_acceleration = list(limits.velocity), list(limits.acceleration)
+    request.max_jerk = list(limits.jerk)
+    request.synchronization = Synchronization.Phase
+    Ruckig(3).calculate(request, trajectory)
+    return float(trajectory.duration)
+
+
+# ---------------------------------------------------------------------- arrival
+
+
+@pytest.mark.parametrize("end", [(0.05, 0.0, 0.0), (0.02, -0.06, 0.1), (-0.1, 0.03, -0.4), (0.0, 0.0, 0.02)])
+def test_no_later_than_ruckig_itself(rig: Rig, end: tuple[float, float, float]) -> None:
+    rig.enable()
+    answer = accepted(rig.goal("g1", *end))
+    assert answer.slowed == 1.0
+    taken = 1 + rig.until(rig.holds)
+    assert taken <= math.ceil(bare((0.0, 0.0, 0.0), end) / PERIOD) + 2
+
+
+@pytest.mark.parametrize("config", [CONFIG, SLOW], ids=["as shipped", "slow sliders"])
+def test_the_corners_of_the_workspace(config: Config) -> None:
+    rig = Rig(config)
+    rig.enable()
+    for number, direction in enumerate(DIRECTIONS):
+        corner = outermost(direction)
+        beyond = corner + 1e-5 * direction / np.linalg.norm(direction)
+        assert refusal(rig.goal(f"beyond{number}", *beyond.tolist())).code == "out_of_workspace"
+        assert rig.mode is Mode.HOLDING
+        accepted(rig.goal(f"corner{number}", *corner.tolist()))
+        rig.until(rig.holds)
+        assert rig.control.commanded.pose == pytest.approx(corner.tolist(), abs=1e-9)
+        accepted(rig.goal(f"back{number}", 0.0, 0.0, 0.0))
+        rig.until(rig.holds)
+    assert rig.control.fault is None
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("leg", range(3))
+@pytest.mark.parametrize("beyond", [-1e-5, 0.0, 2e-6])
+def test_the_very_end_of_a_sliders_travel(rig: Rig, leg: int, beyond: float) -> None:
+    limits = CONFIG.limits.slider.position
+    target = inverse(ROBOT, np.array([0.02, -0.01, 0.2])).position
+    target[leg] = limits[0] - beyond
+    rig.enable()
+    answer = rig.send("g1", SlidersGoal(tuple(target.tolist())))
+    if beyond > 0.0:
+        assert (refusal(answer).slider, refusal(answer).limit) == (LEGS[leg], limits[0])
+    elif isinstance(answer, Accepted):
+        rig.until(rig.holds)
+        assert rig.outcomes() == [("g1", "done")]
+    else:  # the platform's own limits are nearer
+        assert "platform" in refusal(answer).message or "passive" in refusal(answer).message
+
+
+def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(rig: Rig) -> None:
+    """Both ends inside, and by how much the middle is outside is less than what lies between two looks."""
+    rig.enable()
+    low = CONFIG.limits.platform.x[1]
+    for number, peak in enumerate((low - 1e-5, low + 1e-5)):
+        at = TrajectoryPoint(1.5, peak, 0.0, 0.0, velocity=(0.0, 0.0, 0.0), acceleration=(-0.4, 0.0, 0.0))
+        ends = TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(3.0, 0.0, 0.0, 0.0)
+        answer = rig.send(f"g{number}", TrajectoryGoal((ends[0], at, ends[1])))
+        if peak < low:
+            accepted(answer)
+            rig.until(rig.holds)
+        else:
+            assert "platform x: position" in refusal(answer).message
+    assert rig.control.fault is None
+
+
+def test_slowed_is_said(rig: Rig) -> None:
+    rig.enable()
+    rig.goal("g1", 0.0, 0.0, 0.84)
+    rig.until(rig.holds)
+    answer = accepted(rig.goal("g2", 0.03, 0.03, 0.84))
+    assert answer.slowed > 1.1
+    assert answer.duration == pytest.approx(answer.slowed * bare((0.0, 0.0, 0.84), (0.03, 0.03, 0.84)), rel=1e-3)
+    half = accepted(rig.goal("g3", 0.0, 0.0, 0.84, speed=0.1))
+    assert half.slowed == 1.0  # slow enough as it is
+
+
+# ---------------------------------------------------------------------- a goal's own limits
+
+
+def test_own_limits_are_kept(rig: Rig) -> None:
+    rig.enable()
+    own = OwnLimits(velocity=(0.02, 0.02, 0.1), acceleration=(0.1, 0.1, 1.0))
+    accepted(rig.send("g1", PoseGoal(0.05, 0.0, 0.0, limits=own)))
+    speeds = []
+    while rig.mode is Mode.MOVING:
+        speeds.append(rig.control.commanded.velocity[0])
+        rig.cycle()
+    assert max(speeds) == pytest.approx(0.02, rel=1e-6)
+    assert np.abs(np.diff(speeds)).max() <= 0.1 * PERIOD * 1.001
+
+
+def test_own_limits_above_the_robots_are_refused(rig: Rig) -> None:
+    rig.enable()
+    answer = refusal(rig.send("g1", PoseGoal(0.05, 0.0, 0.0, limits=OwnLimits(velocity=(0.1, 0.3, 1.0)))))
+    assert (answer.code, answer.value, answer.limit) == ("above_limit", 0.3, 0.25)
+    assert "limits.velocity of y" in answer.message
+    assert rig.mode is Mode.HOLDING
+
+
+# ---------------------------------------------------------------------- goals that wait
+
+
+SQUARE = [(0.05, 0.0, 0.0), (0.05, 0.05, 0.1), (0.0, 0.05, 0.0), (0.0, 0.0, 0.0)]
+
+
+def square(rig: Rig, blend: float | None, speed: float = 1.0) -> int:
+    """Send a square at once; return how many cycles it takes."""
+    for number, pose in enumerate(SQUARE):
+        accepted(rig.send(f"q{number}", PoseGoal(*pose, blend=blend, speed=speed)))
+    begun = len(rig.rows)
+    rig.until(rig.holds, 20_000)
+    return len(rig.rows) - begun
+
+
+@pytest.mark.parametrize("blend", [0.0, 0.005, 0.02])
+def test_goals_wait_and_blend_within_their_radius(rig: Rig, blend: float) -> None:
+    rig.enable()
+    square(rig, blend)
+    assert rig.outcomes() == [(f"q{number}", "done") for number in range(4)]
+    poses = forward(ROBOT, rig.setpoints()[:, 0])
+    for pose in SQUARE:
+        near = np.hypot(*(poses[:, :2] - pose[:2]).T) + 0.3 * np.abs(poses[:, 2] - pose[2])
+        assert near.min() <= blend + 1e-9
+    assert_within_limits(rig)
+
+
+def test_a_wider_blend_is_quicker() -> None:
+    taken = []
+    for blend in (0.0, 0.005, 0.02):
+        rig = Rig()
+        rig.enable()
+        taken.append(square(rig, blend))
+        rig.bus.shutdown()
+    assert taken[0] > taken[1] > taken[2]
+
+
+def test_without_blend_the_next_goal_preempts(rig: Rig) -> None:
+    rig.enable()
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0))
+    rig.cycles(50)
+    assert not accepted(rig.send("g2", PoseGoal(0.0, 0.05, 0.0))).queued
+    assert rig.outcomes() == [("g1", "preempted")]
+
+
+def test_the_queue_has_an_end(rig: Rig) -> None:
+    rig.enable()
+    depth = CONFIG.motion.queue
+    for number in range(depth + 1):
+        answer = accepted(rig.send(f"g{number}", PoseGoal(0.001, 0.0, 0.1 * (1 + number % 3), blend=0.0)))
+        assert answer.queued == (number > 0)
+    refused = refusal(rig.send("more", PoseGoal(0.0, 0.0, 0.0)))
+    assert (refused.code, refused.limit) == ("queue_full", depth)
+    rig.until(rig.holds, 20_000)
+    done = [(f"g{number}", "done") for number in range(depth + 1)]
+    assert rig.outcomes() == [("more", "rejected"), *done]
+
+
+@pytest.mark.parametrize("name", ["stop", "pause", "quick_stop"])
+@pytest.mark.parametrize("wait", [20, 150, 260])
+def test_a_queue_is_stopped_or_paused_as_a_whole(rig: Rig, name: str, wait: int) -> None:
+    rig.enable()
+    for number, pose in enumerate(SQUARE):
+        rig.send(f"q{number}", PoseGoal(*pose, blend=0.01))
+    rig.cycles(wait)
+    rig.command(name)
+    if name == "pause":
+        rig.cycles(30)
+        assert rig.control.commanded.at_rest
+        rig.command("resume")
+        rig.until(rig.holds)
+        assert rig.outcomes() == [(f"q{number}", "done") for number in range(4)]
+    else:
+        end = {"stop": "stopped", "quick_stop": "faulted"}[name]
+        assert [goal_id for goal_id, _ in rig.outcomes()] == [f"q{number}" for number in range(4)]
+        assert {outcome for _, outcome in rig.outcomes()} <= {"done", end}
+        assert rig.outcomes()[-1][1] == end
+    if name != "quick_stop":
+        assert_within_limits(rig)
+
+
+def test_a_waiting_goal_can_be_stopped_alone(rig: Rig) -> None:
+    rig.enable()
+    for number, pose in enumerate(SQUARE):
+        rig.send(f"q{number}", PoseGoal(*pose, blend=0.01))
+    rig.cycle(CommandRequest(99, "ann", "stop", goal="q2"))
+    rig.until(rig.holds)
+    assert sorted(rig.outcomes()) == [("q0", "done"), ("q1", "done"), ("q2", "stopped"), ("q3", "stopped")]
+    assert rig.control.commanded.pose == pytest.approx(SQUARE[1], abs=1e-9)
+    rig.cycle(CommandRequest(100, "ann", "stop", goal="q2"))
+    assert refusal(rig.answers[-1]).code == "no_goal"
+    assert_within_limits(rig)
+
+
+def test_a_waiting_goal_expires(rig: Rig) -> None:
+    rig.enable()
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0, speed=0.2, blend=0.01))
+    accepted(rig.send("g2", PoseGoal(0.05, 0.05, 0.0, valid_for=0.3)))
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g2", "expired"), ("g1", "done")]
+    assert rig.control.commanded.pose == pytest.approx((0.05, 0.0, 0.0), abs=1e-9)
+    assert_within_limits(rig)
+
+
+# ---------------------------------------------------------------------- thousands
+
+KINDS = ("pose", "pose", "pose", "sliders", "velocity", "trajectory")
+ORDERS = ("stop", "pause", "resume", "override", "disable", "quick_stop", "enable", "reset", "break")
+
+
+def random_goal(rnd: random.Random, rig: Rig) -> Goal:
+    """A goal of any kind, reachable or not."""
+    pose = rnd.uniform(-0.16, 0.16), rnd.uniform(-0.16, 0.16), rnd.uniform(-1.0, 0.8)
+    if rnd.random() < 0.6:
+        pose = pose[0] / 3.0, pose[1] / 3.0, pose[2] / 2.0
+    valid = rnd.choice((None, None, None, 0.01, 1.0))
+    match rnd.choice(KINDS):
+        case "pose":
+            blend = rnd.choice((None, None, 0.0, 0.01))
+            return PoseGoal(*pose, speed=rnd.choice((1.0, 1.0, 0.3)), blend=blend, valid_for=valid)
+        case "sliders":
+            return SlidersGoal(tuple(inverse(ROBOT, np.array(pose)).position.tolist()), valid_for=valid)
+        case "velocity":
+            return VelocityGoal(pose[0], pose[1], 2.0 * pose[2], timeout=0.05)
+        case _:
+            start = rig.control.commanded.pose
+            end = [value + rnd.uniform(-0.01, 0.01) for value in start]
+            points = TrajectoryPoint(0.0, start[0], start[1], start[2]), TrajectoryPoint(0.3, end[0], end[1], end[2])
+            return TrajectoryGoal(points, stretch=rnd.random() < 0.5)
+
+
+def meddle(rnd: random.Random, rig: Rig) -> None:
+    """Send a command at random, or break a drive; bring the robot back where it has been taken out of service."""
+    if rig.mode is Mode.FAULT:
+        for drive in rig.drives:
+            drive.silent = False
+        rig.cycles(20)
+        rig.order("reset")
+        rig.cycles(250)
+    elif rig.mode is Mode.DISABLED:
+        rig.order("enable")
+        rig.cycles(20)
+    else:
+        what = rnd.choices(ORDERS, (6, 6, 9, 9, 1, 1, 2, 2, 1))[0]
+        if what == "break":
+            rig.drives[rnd.randrange(3)].fail(0x4310)
+        else:
+            rig.order(what, rnd.choice((0.3, 1.0, 1.0, 1.6)) if what == "override" else None)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig) -> None:
+    rnd = random.Random(20_090_901)
+    rig.enable()
+    number = 10_000
+    for k in range(number):
+        rig.post(f"g{k}", random_goal(rnd, rig))
+        rig.cycles(600 if k % 100 == 50 else rnd.choice((0, 0, 1, 3, 10, 30)))
+        if rnd.random() < 0.1:
+            meddle(rnd, rig)
+        if k % 100 == 0:
+            rig.rows.clear()
+            rig.seen.clear()
+    rig.until(lambda: rig.control.ready and not rig._posted and not rig.control._pilot.busy, 50_000)
+    rig.order("override", 1.0)
+    rig.order("stop")
+    rig.until(lambda: rig.mode in (Mode.HOLDING, Mode.DISABLED, Mode.FAULT))
+    counted = Counter(goal_id for goal_id, _ in rig.outcomes())
+    assert set(counted.values()) == {1}
+    assert len(counted) == number
+    assert {outcome for _, outcome in rig.outcomes()} == {
+        "done",
+        "rejected",
+        "preempted",
+        "stopped",
+        "expired",
+        "faulted",
+    }
+    answered = Counter(getattr(answer, "ticket", None) for answer in rig.answers)
+    assert set(answered.values()) == {1}
+    said = [happening.message for happening in rig.happenings if happening.kind == "fault"]
+    assert all("emergency 4310" in message or message == "quick_stop by ann" for message in said), set(said)
+
+
+# ---------------------------------------------------------------------- while a goal is being planned
+
+
+@pytest.mark.parametrize("name", ["stop", "disable", "quick_stop"])
+def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
+    rig = Rig(SLOW)
+    rig.enable()
+    rig.goal("g1", 0.08, 0.0, 0.0)
+    rig.cycles(300)
+    rig.post("g2", PoseGoal(-0.05, 0.05, 0.4))
+    assert rig.control._pilot.busy  # from this motion it takes more than a step
+    rig.order(name)
+    rig.until(lambda: rig.mode in (Mode.HOLDING, Mode.DISABLED, Mode.FAULT))
+    end = "faulted" if name == "quick_stop" else "stopped"
+    assert sorted(rig.outcomes()) == [("g1", end), ("g2", end)]
+    moved = rig.control.commanded.pose
+    rig.cycles(300)
+    if name == "stop":
+        assert rig.control.commanded.pose == moved
+    rig.bus.shutdown()
+
+
+def test_of_two_ways_the_sooner_is_taken() -> None:
+    """Planned from the same motion, with lower limits and after a stop: the reply's duration is the lesser."""
+    durations: dict[bool, list[float]] = {False: [], True: []}
+    for wait in range(150, 900, 50):
+        rig = Rig(SLOW)
+        rig.enable()
+        rig.goal("g1", 0.08, 0.02, 0.3)
+        rig.cycles(wait)
+        if rig.mode is not Mode.MOVING:
+            break
+        began = len(rig.rows)
+        answer = accepted(rig.goal("g2", -0.05, 0.05, -0.3))
+        durations[answer.stops_first].append(answer.duration)
+        rig.until(rig.holds)
+        assert (len(rig.rows) - began) * PERIOD == pytest.approx(answer.duration, abs=0.03)
+        assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
+        assert_within_limits(rig)
+        rig.bus.shutdown()
+    assert durations[True] or durations[False]
+
+
+def test_a_renewed_goal_request_is_held_until_the_one_before_is_planned() -> None:
+    rig = Rig(SLOW)
+    rig.enable()
+    rig.goal("g1", 0.08, 0.0, 0.0)
+    rig.cycles(300)
+    for k in range(5):
+        rig.post(f"p{k}", PoseGoal(-0.05 + 0.01 * k, 0.05, 0.4))
+    rig.until(lambda: stands(rig))
+    ends = rig.outcomes()
+    assert ends[-1] == ("p4", "done")
+    assert [goal_id for goal_id, _ in ends] == ["g1", "p0", "p1", "p2", "p3", "p4"]
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
+def test_a_goal_that_came_before_a_stop_but_waits_is_stopped(rig: Rig) -> None:
+    rig.enable()
+    request = GoalRequest(7, "ann", "late", PoseGoal(0.05, 0.0, 0.0), round(rig.now * 1e9))
+    rig.cycle(msgspec.structs.replace(request, withdrawn="stop by ann"))
+    assert refusal(rig.answers[-1]).code == "stopped"
+    assert rig.outcomes() == [("late", "stopped")]
+    rig.cycles(20)
+    assert rig.control.commanded.at_rest

@@ -1,0 +1,208 @@
+"""Recordings read into numpy: what the recorder wrote, bit for bit; of a file that was cut off, all that is whole."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import made
+import numpy as np
+import pytest
+import rerun as rr
+from numpy.typing import NDArray
+
+from service.columns import Column, Timelines, chunks, structs
+from service.config import SIM, load
+from service.errors import ServiceError
+from service.messages import Event
+from service.reading import read
+from service.recorder import Recorder
+from service.records import DTYPE
+from service.scene import FIELDS, Scene
+
+WALL_NS = 1_795_245_300_000_000_000
+BATCH = 40
+
+
+def written(path: Path, sent: NDArray[np.void], events: tuple[Event, ...] = (), close: bool = True) -> Recorder:
+    """Record, with all of it in the file; left open as by a process that is killed unless `close`."""
+    recorder = Recorder(
+        load(SIM), path.parent, path=path, live=False, wall_ns=lambda: WALL_NS, monotonic_ns=lambda: made.MONOTONIC_NS
+    )
+    for start in range(0, len(sent), BATCH):
+        recorder.records(sent[start : start + BATCH].tobytes())
+    for event in events:
+        recorder.event(event)
+    if close:
+        recorder.close()
+    return recorder
+
+
+def test_records_are_equal_bit_for_bit(tmp_path: Path) -> None:
+    sent = made.records(1.234)
+    sent["commanded_velocity"][7] = np.nan, -0.0, np.inf
+    sent["drive_state"][9] = 1, 2, 255
+    sent["overruns"][11] = 2**62 + 1
+    written(tmp_path / "a.rrd", sent)
+    recording = read(tmp_path / "a.rrd")
+    assert recording.records.dtype == DTYPE
+    assert recording.records.tobytes() == sent.tobytes()
+
+
+def test_times_are_nominal_and_of_the_wall_clock(tmp_path: Path) -> None:
+    written(tmp_path / "a.rrd", made.records(0.5))
+    recording = read(tmp_path / "a.rrd")
+    assert recording.t.tolist() == [cycle / 1000 for cycle in range(500)]
+    since = recording.wall - np.datetime64(WALL_NS, "ns")
+    assert np.array_equal(since, np.arange(500) * np.timedelta64(1_000_000, "ns"))
+
+
+def test_events_are_in_order_with_their_times(tmp_path: Path) -> None:
+    moving = Event(2, 0.6, 600, WALL_NS * 1e-9, "mode", "info", "moving: goal g-1 of ann", mode="moving")
+    fault = Event(3, 0.75, 750, WALL_NS * 1e-9, "fault", "error", "drive B: silent")
+    written(tmp_path / "a.rrd", made.records(0.1), (fault, moving))
+    events = read(tmp_path / "a.rrd").events
+    assert [(line.t, line.level, line.text) for line in events] == [
+        (0.6, "INFO", moving.message),
+        (0.75, "ERROR", fault.message),
+    ]
+    assert abs(events[0].wall - np.datetime64(WALL_NS, "ns")) < np.timedelta64(1, "us")
+
+
+def test_the_name_is_the_sessions(tmp_path: Path) -> None:
+    written(tmp_path / "other.rrd", made.records(0.1))
+    recording = read(tmp_path / "other.rrd")
+    assert re.fullmatch(r"demo-2026112\d-\d{6}", recording.name)
+    assert recording.texts == {}
+
+
+def test_a_gap_stays_a_gap_and_batches_are_put_in_order(tmp_path: Path) -> None:
+    sent = made.records(0.6)
+    later_first = np.concatenate([sent[400:], sent[:200]])
+    written(tmp_path / "a.rrd", later_first)
+    recording = read(tmp_path / "a.rrd")
+    assert recording.records["cycle"].tolist() == [*range(200), *range(400, 600)]
+    assert np.array_equal(recording.t, recording.records["cycle"] / 1000)
+
+
+def test_texts_that_hold_for_the_whole_session_come_by_entity(tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    stream = rr.RecordingStream("trirail")
+    stream.save(path)
+    stream.log("config", rr.TextDocument("[robot]\nname = 'x'"), static=True)
+    stream.log("passing", rr.TextDocument("not for the whole session"))
+    stream.send_chunks(Scene(load(SIM), 0).complete(made.records(0.1)))
+    stream.disconnect()
+    recording = read(path)
+    assert recording.texts == {"/config": "[robot]\nname = 'x'"}
+    assert len(recording.records) == 100
+
+
+# ---------------------------------------------------------------------- files that were cut off
+
+
+def test_a_file_that_was_never_closed_holds_all_that_was_written(tmp_path: Path) -> None:
+    sent = made.records(0.8)
+    recorder = written(tmp_path / "a.rrd", sent, close=False)
+    try:
+        assert read(tmp_path / "a.rrd").records.tobytes() == sent.tobytes()
+    finally:
+        recorder.close()
+
+
+def test_a_killed_recorder_leaves_what_it_has_written(tmp_path: Path) -> None:
+    script = (
+        "import os, signal, sys; from pathlib import Path; import made; from test_reading import written\n"
+        "kept = written(Path(sys.argv[1]), made.records(0.8), close=False)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    path, tests = tmp_path / "a.rrd", Path(__file__).parent
+    assert subprocess.run([sys.executable, "-c", script, path], cwd=tests, check=False).returncode == -9
+    assert read(path).records.tobytes() == made.records(0.8).tobytes()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.77, 0.9, 1.0 - 1e-6])
+def test_wherever_a_file_is_cut_the_records_before_are_read(tmp_path: Path, share: float) -> None:
+    sent = made.records(2.0)
+    written(tmp_path / "whole.rrd", sent)
+    content = (tmp_path / "whole.rrd").read_bytes()
+    (tmp_path / "cut.rrd").write_bytes(content[: round(share * len(content))])
+    records = read(tmp_path / "cut.rrd").records
+    assert records.tobytes() == sent[: len(records)].tobytes()
+    assert abs(len(records) / len(sent) - share) < 0.2
+    assert (tmp_path / "cut.rrd").stat().st_size == round(share * len(content))
+
+
+@pytest.mark.parametrize("close", [True, False])
+def test_a_file_that_ends_with_a_whole_message_is_read_where_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, close: bool
+) -> None:
+    """A recording may be larger than the room for temporary files."""
+    recorder = written(tmp_path / "a.rrd", made.records(0.2), close=close)
+    monkeypatch.setattr(shutil, "copyfile", None)
+    assert len(read(tmp_path / "a.rrd").records) == 200
+    if not close:
+        recorder.close()
+
+
+def test_every_length_of_the_last_message_is_survived(tmp_path: Path) -> None:
+    recorder = written(tmp_path / "a.rrd", made.records(0.2), close=False)
+    before = (tmp_path / "a.rrd").read_bytes()
+    recorder.event(Event(1, 0.2, 200, WALL_NS * 1e-9, "mode", "info", "the last line", mode="holding"))
+    after = (tmp_path / "a.rrd").read_bytes()
+    recorder.close()
+    for length in {len(before), len(before) + 1, len(before) + 15, len(before) + 16, len(after) - 1, len(after)}:
+        (tmp_path / "cut.rrd").write_bytes(after[:length])
+        recording = read(tmp_path / "cut.rrd")
+        assert len(recording.records) == 200
+        assert [line.text for line in recording.events] == ["the last line"] * (length == len(after))
+
+
+# ---------------------------------------------------------------------- what is refused
+
+
+def test_what_is_no_recording_is_refused_with_its_path(tmp_path: Path) -> None:
+    text, empty, cut = (tmp_path / name for name in ("text.rrd", "empty.rrd", "cut.rrd"))
+    text.write_text("t,x,y\n")
+    empty.write_bytes(b"")
+    written(tmp_path / "whole.rrd", made.records(0.1))
+    cut.write_bytes((tmp_path / "whole.rrd").read_bytes()[:1000])
+    for path, why in {
+        tmp_path / "absent.rrd": "No such file or directory",
+        tmp_path: "Is a directory",
+        text: "not a recording: an RRD file begins with RRF2",
+        empty: "not a recording: an RRD file begins with RRF2",
+        cut: "holds no",
+    }.items():
+        with pytest.raises(ServiceError, match=f"^{re.escape(str(path))}: {why}") as raised:
+            read(path)
+        assert "\n" not in str(raised.value)
+
+
+def test_a_recording_without_records_is_refused(tmp_path: Path) -> None:
+    written(tmp_path / "a.rrd", made.records(0.1)[:0])
+    with pytest.raises(ServiceError, match=r"a\.rrd: holds no records of cycles"):
+        read(tmp_path / "a.rrd")
+
+
+@pytest.mark.parametrize(
+    ("layout", "differs"),
+    [
+        ([(name, DTYPE[name]) for name in DTYPE.names or () if name != "pose"], "pose"),
+        ([*((name, DTYPE[name]) for name in DTYPE.names or ()), ("stance", "<f8")], "stance"),
+        ([(name, "<f8" if name == "mode" else DTYPE[name]) for name in DTYPE.names or ()], "mode"),
+        ([(name, ("<f8", (6,)) if name == "velocity" else DTYPE[name]) for name in DTYPE.names or ()], "velocity"),
+    ],
+)
+def test_records_of_another_version_are_refused_by_field(tmp_path: Path, layout: Any, differs: str) -> None:
+    path, other = tmp_path / "a.rrd", np.zeros(10, layout)
+    stream = rr.RecordingStream("trirail")
+    stream.save(path)
+    stream.send_chunks(chunks(Timelines(1000, 0).of(other), [Column("/record", FIELDS, structs(other))]))
+    stream.disconnect()
+    with pytest.raises(ServiceError, match=rf"a\.rrd: written by another version: its records differ in {differs}$"):
+        read(path)

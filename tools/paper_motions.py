@@ -1,0 +1,108 @@
+"""The paper's three motions, by equation (5): of the platform, of the sliders, and of the sliders to 50 digits."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.algebra import Array
+from service.errors import ServiceError
+from service.geometry import LEGS, Geometry
+from service.kinematics import inverse
+
+L0 = 0.3
+"""Centre to summit of the fixed triangle [m]."""
+DURATION = 3.0
+"""[s]"""
+TABLES = Path(__file__).resolve().parents[1] / "tests" / "data"
+"""The solution of the loop equations (11) for the three examples, to 50 digits."""
+
+
+class Example(NamedTuple):
+    """A motion of the platform by equation (5), from the central configuration to twice `amplitude`."""
+
+    name: str
+    title: str
+    amplitude: tuple[float, float, float]  # x* [m], y* [m], phi* [rad]
+
+
+class Quantity(NamedTuple):
+    """What a figure shows of the sliders."""
+
+    name: str
+    column: str  # in the tables, and with a slider's name
+    symbol: str
+    unit: str
+
+
+class Curves(NamedTuple):
+    """The three sliders over time, wherever they come from: t (N,) [s], the others (N, 3) in m, m/s, m/s²."""
+
+    t: Array
+    position: Array  # lambda_10
+    velocity: Array  # v_10
+    acceleration: Array  # gamma_10
+
+    def of(self, quantity: Quantity) -> Array:
+        """Return what the figures of a quantity show, (N, 3)."""
+        return self[1 + QUANTITIES.index(quantity)]
+
+
+EXAMPLES = (
+    Example("rotation", "Rotation", (0.0, 0.0, math.pi / 12)),
+    Example("translation_x", "Motion along x", (0.025, 0.0, 0.0)),
+    Example("translation_y", "Motion along y", (0.0, 0.025, 0.0)),
+)
+QUANTITIES = (  # in the order of the fields of Curves
+    Quantity("displacement", "lambda10", r"\lambda_{10}", "m"),
+    Quantity("velocity", "v10", "v_{10}", "m/s"),
+    Quantity("acceleration", "gamma10", r"\gamma_{10}", "m/s²"),
+)
+
+
+def platform(example: Example, t: Array) -> tuple[Array, Array, Array]:
+    """Return the platform's pose, velocity and acceleration at times t (N,) [s] by (5), (N, 3) each."""
+    w = math.pi / 3.0
+    return (
+        np.outer(1.0 - np.cos(w * t), example.amplitude),
+        np.outer(w * np.sin(w * t), example.amplitude),
+        np.outer(w * w * np.cos(w * t), example.amplitude),
+    )
+
+
+def computed(example: Example, t: Array) -> Curves:
+    """Return the motion of the sliders at times t (N,) [s], by (5) and the inverse kinematics."""
+    motion = inverse(Geometry.symmetric(L0), *platform(example, t))
+    return Curves(t, motion.position, motion.velocity, motion.acceleration)
+
+
+def tabulated(example: Example) -> Curves:
+    """Return the exact motion of the sliders. Raises ServiceError if its table cannot be read."""
+    path = TABLES / f"paper_{example.name}.csv"
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise ServiceError(f"{path}: {error.strerror}") from error
+    columns = [[f"{quantity.column}_{leg}" for leg in LEGS] for quantity in QUANTITIES]
+    position, velocity, acceleration = (
+        np.array([[float(row[key]) for key in keys] for row in rows]) for keys in columns
+    )
+    return Curves(np.array([float(row["t"]) for row in rows]), position, velocity, acceleration)
+
+
+def figures() -> Iterator[tuple[int, Example, Quantity]]:
+    """Yield the paper's figures with their numbers."""
+    pairs = ((example, quantity) for example in EXAMPLES for quantity in QUANTITIES)
+    for number, (example, quantity) in enumerate(pairs, start=3):
+        yield number, example, quantity
+
+
+def greatest_difference(curves: Curves, reference: Curves, quantity: Quantity) -> float:
+    """Return the greatest difference of a quantity in its unit, over the sliders and the same times."""
+    return float(np.max(np.abs(curves.of(quantity) - reference.of(quantity))))

@@ -1,0 +1,125 @@
+"""The paper's three motions by a running service: sent to it over Zenoh, read back from its recording.
+
+The service is one of its own, on simulated drives (configs/sim.toml), on a socket in a folder that is removed again.
+Each motion of equation (5) goes to it as a timed trajectory. Equation (5) begins and ends with an acceleration at
+standstill, of up to 0.032 m/s² at a slider: that is a jerk of 32 m/s³ for one cycle of 1 ms, at its beginning and its
+end, which the sliders' limit of configs/sim.toml, 400 m/s³, allows.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from paper_motions import DURATION, EXAMPLES, Curves, Example, platform
+
+from service import spawned
+from service.algebra import Array
+from service.client import Goal, Robot
+from service.config import SIM, load
+from service.errors import RefusedError, ServiceError
+from service.messages import TrajectoryPoint
+from service.modes import MODES, Mode
+from service.reading import Recording, read
+
+SPACING = 0.02
+"""Between the points of a trajectory [s]. The remainder of the service's quintics between them is
+f⁽⁶⁾ τ³ (h − τ)³ / 720 at a time τ of an interval h: in position, velocity and acceleration at most h⁶/46080,
+√5 h⁵/30000 and h⁴/1920 of the sixth derivative, here 5e-17 m, 9e-15 m/s and 3e-12 m/s². Rounding is no smaller, and
+grows as points come closer."""
+WITHIN = 60.0
+"""How long a motion may take: a busy machine's time runs slower [s]."""
+USER = "paper"
+REACHED = 2
+"""Cycles from the one that writes a setpoint to the SYNC at which a drive should have reached it: it takes the setpoint
+up at the SYNC between (service.control.Control.observe)."""
+
+
+class Driven(NamedTuple):
+    """A motion as the service carried it out, at t = 1, 2, … periods."""
+
+    commanded: Curves
+    """Setpoints of the sliders."""
+    measured: Array
+    """Where the drives say that the sliders were when they were to reach these, (N, 3) [m]."""
+
+
+def drive(recording: Path, say: Callable[[str], None]) -> dict[Example, Driven]:
+    """Have a service of its own follow the motions, recorded to a file, and return what it did. Raises TrirailError."""
+    period = load(SIM).period
+    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+        config, locator = spawned.private(Path(folder))
+        say("starting a service on simulated drives")
+        with spawned.service(config, recording) as service:
+            with Robot(load(config).robot.name, locator, user=USER) as robot:
+                robot.enable()
+                for example in EXAMPLES:
+                    say(f"{example.name}: {DURATION:g} s, from the centre")
+                    _finish(robot.move_to(x=0.0, y=0.0, phi=0.0), "the way back to the centre")
+                    _finish(_send(robot, example), example.name)
+                robot.disable()
+            if code := spawned.end(service):
+                raise ServiceError(f"the service ended with exit code {code}")
+    made = read(recording)
+    return {example: driven(made, _name(example), period) for example in EXAMPLES}
+
+
+def points(example: Example) -> list[TrajectoryPoint]:
+    """Return a motion as a timed trajectory, exact in position, velocity and acceleration at its points."""
+    t = np.linspace(0.0, DURATION, round(DURATION / SPACING) + 1)
+    rows = zip(t.tolist(), *(values.tolist() for values in platform(example, t)), strict=True)
+    return [
+        TrajectoryPoint(time, x, y, phi, tuple(velocity), tuple(acceleration))
+        for time, (x, y, phi), velocity, acceleration in rows
+    ]
+
+
+def driven(recording: Recording, goal: str, period: float) -> Driven:
+    """Cut the motion to a goal out of a recording, in time with equation (5). Raises ServiceError.
+
+    Nothing is fitted. The log names the goal and the cycle that set the robot in motion for it. In that cycle the
+    motion advanced by one period for the first time (service.control.Control.advance), so its setpoints
+    are those of t = 1 period, those of the k-th cycle of motion t = k periods, and t = 0 is the standstill before.
+    That time ran like this throughout is checked by the progress in each record.
+    """
+    records = recording.records
+    began = [line.t for line in recording.events if line.text == f"{Mode.MOVING}: goal {goal} of {USER}"]
+    if len(began) != 1:
+        raise ServiceError(f"the recording's log says {len(began)} times, not once, that goal {goal} began")
+    first = int(np.searchsorted(recording.t, began[0] - period / 2.0))
+    moving = records["mode"][first:] == MODES.index(Mode.MOVING)
+    n = int(np.argmin(np.append(moving, False)))
+    span = records[first : first + n + REACHED]
+    t = np.arange(1.0, n + 1.0) * period
+    wanted = round(DURATION / period)
+    if n != wanted or not np.array_equal(np.diff(span["cycle"]), np.ones(n + REACHED - 1)):
+        raise ServiceError(f"goal {goal}: {n} cycles of motion are recorded; wanted are {wanted} without a gap")
+    if np.max(np.abs(span["progress"][:n] * DURATION - t)) > 1e-3 * period:
+        raise ServiceError(f"goal {goal}: its time did not run evenly, by the progress in its records")
+    position, velocity, acceleration = (
+        span[:n][f"commanded_{each}"] for each in ("position", "velocity", "acceleration")
+    )
+    return Driven(Curves(t, position, velocity, acceleration), span["position"][REACHED:])
+
+
+def _name(example: Example) -> str:
+    return f"paper-{example.name}"
+
+
+def _send(robot: Robot, example: Example) -> Goal:
+    try:
+        return robot.follow(points(example), id=_name(example))
+    except RefusedError as error:
+        raise RefusedError(error.code, f"the service refused {example.name}: {error}") from error
+
+
+def _finish(goal: Goal, name: str) -> None:
+    try:
+        result = goal.wait(WITHIN)
+    except TimeoutError as error:
+        raise ServiceError(f"{name}: {error}") from error
+    if result.outcome != "done":
+        raise ServiceError(f"{name} ended {result.outcome}: {result.message}")
