@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 
 from drivers import frames
-from drivers.interface import DriveFault, PowerState
+from drivers.interface import Counts, DriveFault, PowerState
 from drivers.scaling import Scale
 
 MISSED_SYNCS = 3
 MISSED_HEARTBEATS = 3
+MISSED_STATUSES = 3
 RESET_TIME = 2 * frames.STATUS_PERIOD
 """How long a drive may take to leave fault after a fault reset, in which it tells its state twice [s]."""
 
@@ -22,9 +23,12 @@ class Axis:
 
     __slots__ = (
         "_heartbeat_timeout",
+        "_missing",
         "_operational",
         "_restarted",
+        "command_age",
         "controlword",
+        "counts",
         "error_code",
         "event",
         "heard",
@@ -36,6 +40,8 @@ class Axis:
         "reset_until",
         "scale",
         "state",
+        "status_heard",
+        "stopping_since",
         "unanswered",
     )
 
@@ -50,6 +56,8 @@ class Axis:
         """It has reached operation enabled since that was asked for."""
         self.controlword = frames.DISABLE_VOLTAGE
         """The last one sent."""
+        self.command_age = 0
+        """SYNCs since it was sent."""
         self.error_code = 0
         """What the drive last gave as the reason of its fault; 0 once it said that is over."""
         self.event: DriveFault | None = None
@@ -58,10 +66,16 @@ class Axis:
         """SYNCs since the last position."""
         self.heard = math.inf
         """Time of the last heartbeat [s]."""
+        self.status_heard = math.inf
+        """Time of the last statusword [s]."""
+        self.stopping_since: float | None = None
+        """Since when it has been seen on its quick-stop ramp [s]."""
+        self.counts = Counts()
         self.reset_until = -math.inf
         """Until when a fault reset is under way [s]."""
         self.left_operational = False
         """It said that it is operational no more, and was not started again since."""
+        self._missing = 0
         self._operational = False
         self._restarted = False
         self._heartbeat_timeout = MISSED_HEARTBEATS * heartbeat
@@ -70,11 +84,22 @@ class Axis:
         """TPDO2: the position sampled at a SYNC."""
         (counts,) = frames.POSITION.unpack(data)
         self.position = self.scale.metres(counts)
+        if self._missing and not self.unanswered:  # the second one in a cycle: an earlier cycle's has come after all
+            self._missing -= 1
+            late, lost = self.counts.feedback_late + 1, self.counts.feedback_lost - 1
+            self.counts = self.counts._replace(feedback_late=late, feedback_lost=lost)
         self.unanswered = 0
+        self._operational = True  # CiA 301: PDOs are sent in NMT operational only
 
-    def on_status(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
+    def miss_position(self) -> None:
+        """A cycle has ended without a position."""
+        self._missing += 1
+        self.counts = self.counts._replace(feedback_lost=self.counts.feedback_lost + 1)
+
+    def on_status(self, data: bytes | bytearray, now: float) -> None:
         """TPDO1: the statusword, when it changes and from time to time."""
         (statusword,) = frames.STATUSWORD.unpack(data)
+        self.status_heard = now
         self.take_status(statusword)
 
     def take_status(self, statusword: int) -> None:
@@ -83,11 +108,13 @@ class Axis:
         if state is None:
             self.tell("state", 0, f"statusword {statusword:04X} is that of no CiA 402 state")
             return
-        self.state = state
         if state is PowerState.OPERATION_ENABLED:
             self.powered_up = True
         if state not in _IN_FAULT:
+            if self.state in _IN_FAULT:
+                self.error_code = 0  # it was the fault's reason
             self.reset_until = -math.inf
+        self.state = state
 
     def on_emergency(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """EMCY: an error code, of which 00xxh say that errors are over (CiA 301)."""
@@ -106,22 +133,26 @@ class Axis:
             self._operational = True
         elif state == frames.BOOT_UP:
             self._restarted = True
+            self.state = PowerState.NOT_READY_TO_SWITCH_ON
             # Takes the place of an earlier event, for it is the one that a reset cannot help.
             self.event = self._fault("state", 0, "has restarted and lost its set-up; restart the service")
         elif self._operational:  # before that, it is a heartbeat from before the drive was started
             self._operational = False
             self.left_operational = True
+            # It tells its state no more, and will not be enabled: by 6007h it stops when it leaves operational.
+            self.state = PowerState.NOT_READY_TO_SWITCH_ON
             self.tell("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
 
     def forgive(self, now: float) -> None:
         """Forget what happened, but not what lasts, and allow time for a fault reset."""
         if not self._restarted:
             self.event = None
-        if self.state is PowerState.FAULT:
+        if self.state is PowerState.FAULT or self.left_operational:  # not operational, it did not tell of a fault
             self.reset_until = now + RESET_TIME
         if self.left_operational:
             self.left_operational = False
             self.unanswered = 0
+            self.status_heard = now
 
     def tell(self, cause: str, code: int, text: str) -> None:
         """Keep the first event since faults were last reset."""
@@ -136,10 +167,14 @@ class Axis:
             if now >= self.reset_until:
                 reason = f", error {self.error_code:04X}" if self.error_code else ""
                 return self._fault("fault", self.error_code, f"{self.state}{reason}")
+        elif self.error_code:  # CiA 301: in force until the drive sends "error reset", code 00xxh
+            return self._fault("emcy", self.error_code, f"emergency {self.error_code:04X} is still in force")
         elif self.unanswered >= MISSED_SYNCS:
             return self._fault("silent", 0, f"no position for {self.unanswered} SYNCs in a row")
         elif now - self.heard > self._heartbeat_timeout:
             return self._fault("heartbeat", 0, f"no heartbeat for {now - self.heard:.3g} s")
+        elif now - self.status_heard > MISSED_STATUSES * frames.STATUS_PERIOD:
+            return self._fault("silent", 0, f"no statusword for {now - self.status_heard:.3g} s")
         elif (
             self.powered_up
             and wanted is PowerState.OPERATION_ENABLED

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import can
 
-from drivers import config
+from drivers import canerrors, config
 from drivers.capture import Capture, CapturedBus
 from drivers.cia402 import Cia402
 from drivers.errors import BusError, DriveError
@@ -73,22 +73,13 @@ def connect(
 
 def _explained(section: config.Can, error: Exception) -> str:
     """One line that says why the bus did not open and what to do about it."""
-    number = _error_number(error)
+    number = canerrors.error_number(error)
     if number == errno.EAFNOSUPPORT:
         return "this kernel has no SocketCAN (address family AF_CAN); load it with: modprobe can_raw"
     if section.interface == "socketcan" and number == errno.ENODEV:
         return f'there is no CAN interface "{section.channel}"; {_bring_up(section)}'
     reason = " ".join(str(error).split())
     return f'cannot open CAN interface {section.interface}, channel "{section.channel}": {reason}'
-
-
-def _error_number(error: BaseException | None) -> int | None:
-    """The system's error number, from the error or from what caused it."""
-    while error is not None:
-        if isinstance(error, OSError):
-            return error.errno
-        error = error.__cause__
-    return None
 
 
 def _bring_up(section: config.Can) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import can
 
-from drivers import config, frames, setup402
+from drivers import canerrors, config, frames, setup402
 from drivers.axis402 import Axis
 from drivers.errors import BusError
 from drivers.interface import NAMES, DriveFault, Feedback, PowerState, Triple
@@ -22,9 +22,18 @@ from drivers.scaling import scale_of
 MOST_FRAMES = 1000
 """Frames taken in by one `read` at most, so that a chattering bus cannot hold it."""
 STOPPING_TIME = 1.0
-"""How long `close` waits for powered drives to come down their quick-stop ramp [s]."""
-BUS_OFF = 0x040
-"""Error class of a SocketCAN error frame: the controller has left the bus (linux/can/error.h)."""
+"""How long drives have to come down their quick-stop ramp; then power is taken off a drive that has not [s]."""
+REPEAT_AFTER = 3
+"""A controlword that a drive does not follow is sent again after so many SYNCs: the frame may be lost."""
+UNSENT_CYCLES = 3
+"""So many cycles in a row with a full transmit queue are a fault."""
+HIGH_LOAD = 0.8
+"""Worst-case share of the bus from which on people are warned: what is not cyclic has to wait."""
+
+_ON_THE_WAY = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON)
+"""States from which a drive that is to be enabled goes on by controlwords."""
+_CAN_MOVE_OR_SOON = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED)
+"""States in which no drive stays that has been told to stop or to lose power."""
 
 Clock = Callable[[], float]
 Handler = Callable[[bytearray, float], None]
@@ -67,6 +76,12 @@ class Cia402:
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
         self._fault: DriveFault | None = None
+        self._warnings: list[str] = []
+        self._warned: set[str] = set()
+        self._unsent = False
+        self._unsent_cycles = 0
+        self._period = 0.0
+        self._synced = 0.0
         self._closed = False
 
     def configure(self, period: float) -> None:
@@ -90,35 +105,52 @@ class Cia402:
             axis.error_code = start.error_code
             axis.take_status(start.statusword)
         self.bus_load = load
+        if load > HIGH_LOAD:
+            self._warn(f"CAN bus: {rate:g} Hz takes {load:.0%} of it at worst; keep below {HIGH_LOAD:.0%}")
+        self._period = period
 
     def sync(self) -> None:
         """Send SYNC: the drives take up the setpoints written since the last one and sample positions."""
+        self._unsent_cycles = self._unsent_cycles + 1 if self._unsent else 0
+        self._unsent = False
         self._send(self._sync)
-        now = self._clock()
+        now = self._synced = self._clock()
         if self._heartbeat_due is None:
             # The drives' watchdogs and ours begin with the first cycle, however long ago the set-up was.
             self._heartbeat_due = now
             for axis in self._axes:
-                axis.heard = now
+                axis.heard = axis.status_heard = now
         if now >= self._heartbeat_due:
             self._heartbeat_due = now + self._drives.heartbeat
             self._send(self._heartbeat)
         self._stopped_in_this_cycle = False
         for axis in self._axes:
             axis.unanswered += 1
+            axis.command_age += 1
 
     def read(self) -> Feedback:
         """Take in every frame that has arrived."""
         now = self._clock()
         self._receive(now)
         a, b, c = self._axes
+        for axis in self._axes:
+            if axis.unanswered:
+                axis.miss_position()
         if self._fault is None:
             for axis in self._axes:
                 fault = axis.fault(now, self._wanted)
                 if fault is not None:
                     self._fail(fault)
                     break
-        return Feedback((a.position, b.position, c.position), (a.state, b.state, c.state), self._fault)
+        warnings = tuple(self._warnings)
+        self._warnings.clear()
+        return Feedback(
+            (a.position, b.position, c.position),
+            (a.state, b.state, c.state),
+            self._fault,
+            (a.counts, b.counts, c.counts),
+            warnings,
+        )
 
     def write(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints [m] and velocity feed-forward [m/s], to be taken up at the next SYNC.
@@ -128,6 +160,9 @@ class Cia402:
         """
         if self._stopped_in_this_cycle:
             return
+        late = self._clock() - self._synced > self._period
+        if self._wanted is not PowerState.OPERATION_ENABLED:
+            self._command()  # where frames have to wait, those that stop go before setpoints
         messages = []
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             try:
@@ -137,8 +172,11 @@ class Cia402:
                 self._fail(DriveFault(axis.name, "setpoint", 0, text))
                 return
             messages.append(frames.message(frames.RPDO2 + axis.node, data))
-        for message in messages:
-            self._send(message)
+        for axis, message in zip(self._axes, messages, strict=True):
+            if not self._send(message):
+                axis.counts = axis.counts._replace(setpoints_lost=axis.counts.setpoints_lost + 1)
+            elif late:
+                axis.counts = axis.counts._replace(setpoints_late=axis.counts.setpoints_late + 1)
         self._command()
 
     def enable(self) -> None:
@@ -166,6 +204,7 @@ class Cia402:
     def reset(self) -> None:
         """Forget the fault and clear the drives' own; never powers them up. What persists is found again."""
         self._fault = None
+        self._warned.clear()
         now = self._clock()
         for axis in self._axes:
             if axis.left_operational:  # its set-up is still there: only a restarted drive needs a new one
@@ -205,8 +244,7 @@ class Cia402:
 
     def _take(self, message: can.Message, now: float) -> None:
         if message.is_error_frame:
-            if message.arbitration_id & BUS_OFF:
-                self._fail(DriveFault("", "bus", 0, "CAN bus: the controller went bus-off"))
+            self._take_error(canerrors.report(message))
             return
         if message.is_extended_id or message.is_remote_frame or message.arbitration_id not in self._handlers:
             return
@@ -216,26 +254,64 @@ class Cia402:
         except struct.error:
             axis.tell("frame", 0, f"frame {message.arbitration_id:03X} has wrong length {len(message.data)}")
 
+    def _take_error(self, report: canerrors.Report) -> None:
+        if report.gravity is canerrors.Gravity.FAULT:
+            self._fail(DriveFault("", "bus", 0, f"CAN bus: {report.text}"))
+        elif report.gravity is canerrors.Gravity.WARNING:
+            self._warn(f"CAN bus: {report.text}")
+
     def _command(self) -> None:
-        """Send the controlwords that differ from the last ones: one transition per drive at a time."""
+        """Send the controlwords that are due: one transition per drive at a time."""
+        now = self._clock()
         for axis in self._axes:
-            if axis.state is PowerState.FAULT and self._clock() < axis.reset_until:
-                # Bit 7 stays up until the drive is out of fault: some look at it once in a few cycles only.
-                word = frames.FAULT_RESET
-            else:
-                word = frames.controlword(axis.state, self._wanted)
-            if word != axis.controlword and self._send(
+            word = self._word(axis, now)
+            repeat = axis.command_age >= REPEAT_AFTER and self._is_not_followed(axis, word)
+            if (word != axis.controlword or repeat) and self._send(
                 frames.message(frames.RPDO1 + axis.node, frames.CONTROLWORD.pack(word))
             ):
                 axis.controlword = word
+                axis.command_age = 0
+
+    def _word(self, axis: Axis, now: float) -> int:
+        """The controlword that a drive is to have now."""
+        if axis.state is PowerState.FAULT and now < axis.reset_until:
+            # Bit 7 stays up until the drive is out of fault: some look at it once in a few cycles only.
+            return frames.FAULT_RESET
+        if axis.state is not PowerState.QUICK_STOP_ACTIVE:
+            axis.stopping_since = None
+        elif axis.stopping_since is None:
+            axis.stopping_since = now
+        elif now - axis.stopping_since > STOPPING_TIME:
+            return frames.DISABLE_VOLTAGE  # it does not come to stand by its ramp: its brake is what remains
+        return frames.controlword(axis.state, self._wanted)
+
+    def _is_not_followed(self, axis: Axis, word: int) -> bool:
+        """Whether a controlword, by what the drive says, has not taken it where it is to go."""
+        if self._wanted is PowerState.OPERATION_ENABLED:
+            return axis.state in _ON_THE_WAY
+        if axis.state is PowerState.QUICK_STOP_ACTIVE:
+            return word == frames.DISABLE_VOLTAGE
+        return axis.state in _CAN_MOVE_OR_SOON
 
     def _send(self, message: can.Message) -> bool:
+        """Send a frame; one that a full queue does not take is left out and, for a few cycles, no fault."""
         try:
             self._bus.send(message, timeout=0)
         except (can.CanError, OSError) as error:
-            self._fail(DriveFault("", "bus", 0, f"CAN bus: cannot send: {error}"))
+            text = f"CAN bus: cannot send: {canerrors.cannot_send(error)}"
+            self._unsent = True
+            if canerrors.queue_is_full(error) and self._unsent_cycles < UNSENT_CYCLES - 1:
+                self._warn(text)
+            else:
+                self._fail(DriveFault("", "bus", 0, text))
             return False
         return True
+
+    def _warn(self, text: str) -> None:
+        """Tell something once, until faults are reset."""
+        if text not in self._warned:
+            self._warned.add(text)
+            self._warnings.append(text)
 
     def _fail(self, fault: DriveFault) -> None:
         """Latch the first fault; drives that have power, or are getting it, are stopped."""

@@ -40,6 +40,19 @@ class DriveFault(NamedTuple):
     """One line for people, with drive, cause and code in it."""
 
 
+class Counts(NamedTuple):
+    """What of one drive's cyclic traffic went wrong since the start; none of it is a fault by itself."""
+
+    feedback_late: int = 0
+    """Positions that came after the cycle they were due in."""
+    feedback_lost: int = 0
+    """Cycles without a position that did not come later either."""
+    setpoints_late: int = 0
+    """Setpoints written after the next SYNC was due."""
+    setpoints_lost: int = 0
+    """Setpoints that the bus did not take."""
+
+
 class Feedback(NamedTuple):
     """What the three drives last said, as of the newest SYNC."""
 
@@ -48,6 +61,9 @@ class Feedback(NamedTuple):
     state: tuple[PowerState, PowerState, PowerState]
     fault: DriveFault | None
     """The first fault since the last reset, else None."""
+    counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
+    warnings: tuple[str, ...] = ()
+    """What people should know and is no fault, a line each; told in one feedback only."""
 
 
 class Drives(Protocol):

@@ -46,6 +46,7 @@ _OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.FAULT: "fault
 _GO_ON = (Event.GOAL, Event.STANDSTILL, Event.POWERED, Event.PAUSE, Event.RESUME, Event.ENABLE, Event.RESET)
 """Events that leave alone what has been sent but not begun."""
 _POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
+_FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 
 
 class Control:
@@ -62,6 +63,7 @@ class Control:
         self._pilot = Pilot(self._goals, self._course, config.period)
         self._queue_depth = config.motion.queue
         self._waiting: deque[GoalRequest] = deque()
+        self._step = config.limits.slider.velocity * config.period
         self._following_error_limit = config.limits.slider.following_error
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._settle_cycles = max(3, round(SETTLE / config.period))
@@ -81,6 +83,8 @@ class Control:
         self.rows: list[list[float]] = self._sliders.tolist()
         """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 of the setpoints."""
         self.following_error: Triple = STILL
+        self._jumps = False, False, False
+        """Which sliders were measured where none can be so soon: what they say is not followed."""
         self._written: deque[Triple] = deque([STILL, STILL], maxlen=2)
         self._entered = 0
         self._now_ns = 0
@@ -91,6 +95,7 @@ class Control:
         """Take the measured sliders for the commanded ones, before the first cycle."""
         self.feedback = feedback
         self._written.extend((feedback.position, feedback.position))
+        self.rows[0] = list(feedback.position)
         self._follow_measured()
         # What runs for the first time is slow: plan and check a motion now, not in a cycle.
         nearby = Course(rest([value + 1e-3 for value in self.pose]), self._period)
@@ -114,9 +119,16 @@ class Control:
         self.following_error = (due[0] - now[0], due[1] - now[1], due[2] - now[2])
         self.feedback = feedback
         self._measured[:] = now
-        if forward_into(self._legs, self._measured, self._pose, self._pose) == 0:
+        a, b, c = self.velocity
+        most = 2.0 * self._step / period  # a lost position makes the next step a double one
+        self._jumps = abs(a) > most, abs(b) > most, abs(c) > most
+        if not any(self._jumps) and forward_into(self._legs, self._measured, self._pose, self._pose) == 0:
             x, y, phi = self._pose.tolist()
             self.pose = (x, y, phi)
+        else:
+            self._pose[:] = self.pose  # the search for the next one begins where the robot was
+        for warning in feedback.warnings:
+            self.desk.tell("service", "warning", warning)
         mode = self.state.mode
         if feedback.fault is not None:
             self.trip(feedback.fault.message)
@@ -312,7 +324,7 @@ class Control:
         if decided.action is Action.POWER_UP:
             self._check_start()
         if decided.action is Action.CLEAR and self.powered:
-            raise RefusedError("stopping", "the drives are still stopping: send reset again when they stand")
+            raise RefusedError("stopping", self._still_powered())
         reason = f"{request.name} by {request.user}"
         if event is Event.QUICK_STOP:
             self.trip(reason)
@@ -346,10 +358,22 @@ class Control:
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
 
+    def _still_powered(self) -> str:
+        """Tell which drives, by what they said last, can still move."""
+        states = zip(NAMES, self.feedback.state, strict=True)
+        said = ", ".join(f"drive {name} is {state}" for name, state in states if state in _POWERED)
+        return f"{said} by what it said last: send reset again when the drives stand (fault: {self.fault})"
+
     def _check_start(self) -> None:
         """Refuse to enable where the robot stands outside what it may do."""
         position = self.feedback.position
+        for name, setpoint, measured in zip(NAMES, self.rows[0], position, strict=True):
+            if not abs(setpoint - measured) <= self._step:
+                raise RefusedError(
+                    "not_at_rest", f"slider {name} moves too fast for its setpoint to follow: enable when it stands"
+                )
         self._measured[:] = position
+        self._pose[:] = self.pose
         unreachable = forward_into(self._legs, self._measured, self._pose, self._pose)
         self._motion[:] = 0.0
         self._motion[0] = self._pose
@@ -381,7 +405,8 @@ class Control:
             case "reset":
                 if mode is Mode.FAULT:
                     return f"the cause is still there: {self.fault}"
-                return None if self.cycle - since < self._settle_cycles else ""
+                settled = self.cycle - since >= self._settle_cycles
+                return "" if settled and not any(state in _FAULTY for state in self.feedback.state) else None
             case _:
                 return None if self.powered else ""
 
@@ -458,13 +483,19 @@ class Control:
             self.trip(f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected")
 
     def _follow_measured(self) -> None:
-        """Make the setpoint of every drive without power the position that it measures: nothing moves on enable."""
-        before, now = self.rows[0], self.feedback.position
+        """Make the setpoint of every drive without power the position that it measures: nothing moves on enable.
+
+        Where that is not where the slider was commanded to be, the setpoint goes there at the slider's speed: a drive
+        that missed the command to stop must not jump either. A position that jumps is not followed.
+        """
+        stopped_now = self.state.mode is Mode.FAULT and self._entered == self.cycle  # no setpoint is sent then
         held = self.state.mode is Mode.ENABLING
-        position = [
-            last if held and state is PowerState.OPERATION_ENABLED else measured
-            for last, measured, state in zip(before, now, self.feedback.state, strict=True)
-        ]
+        position = []
+        for last, measured, jumps, state in zip(
+            self.rows[0], self.feedback.position, self._jumps, self.feedback.state, strict=True
+        ):
+            stays = stopped_now or jumps or (held and state is PowerState.OPERATION_ENABLED)
+            position.append(last if stays else last + max(-self._step, min(measured - last, self._step)))
         self._course.commanded = rest(self.pose)
         self._motion[:] = 0.0
         self._motion[0] = self.pose

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 from collections.abc import Iterator
 
@@ -362,6 +363,21 @@ class TestPower:
         assert feedback.fault is None
         assert enabled.enable().fault is None
 
+    def test_a_controlword_that_got_lost_is_sent_again(self, enabled: Rig) -> None:
+        enabled.bus.faults.add("B drop rpdo1 for 1 frame")
+        enabled.drives.quick_stop()
+        feedback = enabled.cycles(10)
+        assert feedback.state == (P.SWITCH_ON_DISABLED,) * 3
+        assert enabled.controlwords() == [[0x02], [0x02, 0x02], [0x02]]
+
+    def test_a_drive_that_does_not_come_to_stand_loses_its_power(self, enabled: Rig) -> None:
+        enabled.devices[2].servo.forced_velocity = 1000.0
+        enabled.drives.quick_stop()
+        enabled.cycles(990)
+        assert enabled.devices[2].state is P.QUICK_STOP_ACTIVE
+        assert enabled.cycles(20).state == (P.SWITCH_ON_DISABLED,) * 3
+        assert enabled.devices[2].servo.velocity == 0.0
+
     def test_drive_that_drops_out_unasked(self, enabled: Rig) -> None:
         enabled.devices[1].objects[0x6040, 0].write(frames.DISABLE_VOLTAGE)
         feedback = enabled.found("state", within=1)
@@ -459,6 +475,32 @@ class TestFaults:
             ready.devices[1].silent = False
             assert ready.cycle().fault is None
 
+    def test_emergency_in_force_is_no_matter_of_the_past(self, ready: Rig) -> None:
+        ready.devices[1].errors.report(0x4210)
+        ready.found("emcy", within=1)
+        ready.drives.reset()
+        fault = ready.cycle().fault
+        assert fault is not None
+        assert fault[:3] == ("B", "emcy", 0x4210)
+        ready.devices[1].errors.clear(0x4210)
+        ready.cycle()
+        ready.drives.reset()
+        assert ready.cycles(300).fault is None
+
+    def test_a_drive_out_of_fault_has_no_error_whether_or_not_it_says_so(self, ready: Rig) -> None:
+        ready.devices[1].fail(0x2310)
+        ready.cycles(5)
+        ready.bus.faults.add("B drop emcy")
+        ready.drives.reset()
+        assert ready.cycles(20).fault is None
+
+    def test_lost_statuswords(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.bus.faults.add("A drop tpdo1")
+        feedback = ready.found("silent", within=350)
+        assert feedback.fault is not None
+        assert "no statusword" in feedback.fault.message
+
     def test_lost_heartbeat(self, ready: Rig) -> None:
         ready.cycle()
         ready.devices[0].objects[0x1017, 0].write(0)
@@ -495,6 +537,7 @@ class TestFaults:
         assert fault is not None
         assert (fault.drive, fault.cause) == ("B", "state")
         assert "restart" in fault.message
+        assert ready.drives.read().state[1] is P.NOT_READY_TO_SWITCH_ON
         ready.drives.reset()
         assert ready.cycle().fault == fault
 
@@ -508,13 +551,48 @@ class TestFaults:
 
     def test_bus_that_takes_no_frame(self, enabled: Rig) -> None:
         enabled.bus.broken = True
+        feedback = enabled.cycles(2)
+        assert feedback.fault is None  # a queue that is full for a cycle or two
+        assert [counts.setpoints_lost for counts in enabled.cycle().counts] == [2, 2, 2]
         feedback = enabled.found("bus", within=1)
         assert feedback.fault is not None
         assert feedback.fault.drive == ""
         assert "Transmit buffer full" in feedback.fault.message
+        assert "txqueuelen" in feedback.fault.message
         enabled.bus.broken = False
         enabled.cycle()
         assert enabled.controlwords() == [[0x02]] * 3
+
+    def test_interface_that_is_down_is_no_full_queue(self, enabled: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+        def fail(msg: can.Message, timeout: float | None = None) -> None:
+            raise can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN)
+
+        monkeypatch.setattr(enabled.bus, "send", fail)
+        fault = enabled.found("bus", within=1).fault
+        assert fault is not None
+        assert "ip link set DEV up" in fault.message
+        monkeypatch.undo()
+
+    def test_a_full_queue_is_told_once_and_stops_first_what_must_stop(self, enabled: Rig) -> None:
+        enabled.bus.broken = True
+        assert "txqueuelen" in enabled.cycle().warnings[0]
+        assert enabled.cycle().warnings == ()
+        enabled.drives.quick_stop()
+        enabled.bus.broken = False
+        enabled.bus.sent.clear()
+        enabled.drives.sync()
+        enabled.drives.write(enabled.drives.read().position, ZERO)
+        order = [can_id & 0x780 for can_id, _ in enabled.bus.sent]
+        assert order == [frames.SYNC, *[frames.RPDO1] * 3, *[frames.RPDO2] * 3]
+
+    def test_a_controller_near_its_end_is_told_of_and_no_fault(self, enabled: Rig) -> None:
+        for _ in range(3):
+            enabled.bus.inject(0x004, b"\0\x20" + bytes(6), is_error_frame=True)
+        feedback = enabled.cycle()
+        assert feedback.fault is None
+        assert len(feedback.warnings) == 1
+        assert "error-passive" in feedback.warnings[0]
+        assert enabled.cycles(3).warnings == ()
 
     def test_bus_that_gives_no_frame(self, enabled: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
         def fail(timeout: float | None = None) -> can.Message | None:
@@ -561,6 +639,20 @@ class TestLateAnswers:
         late.cycle((START[0] + 1e-5, START[1], START[2]))
         positions = [late.cycle((START[0] + 1e-5, START[1], START[2])).position[0] for _ in range(4)]
         assert positions == pytest.approx([START[0], START[0], START[0] + 1e-5, START[0] + 1e-5], abs=1e-6)
+
+    def test_late_positions_are_counted_as_late_and_lost_ones_as_lost(self, ready: Rig) -> None:
+        ready.bus.faults.add("B delay 0.0005 tpdo2 for 1 frame")
+        ready.cycle()
+        assert [(c.feedback_late, c.feedback_lost) for c in ready.cycle().counts] == [(0, 0), (1, 0), (0, 0)]
+        ready.bus.faults.add("C drop tpdo2 for 2 frames")
+        assert [(c.feedback_late, c.feedback_lost) for c in ready.cycles(9).counts] == [(0, 0), (1, 0), (0, 2)]
+
+    def test_setpoints_after_the_next_tick_are_counted_as_late(self, ready: Rig) -> None:
+        ready.drives.sync()
+        position = ready.drives.read().position
+        ready.clock.now += 1.5 * PERIOD
+        ready.drives.write(position, ZERO)
+        assert [c.setpoints_late for c in ready.cycle().counts] == [1, 1, 1]
 
     def test_silence_is_three_answers_missing(self, late: Rig) -> None:
         late.cycles(5)

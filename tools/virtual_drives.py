@@ -1,12 +1,17 @@
 """The simulated drives as a program of its own, on any python-can bus.
 
 python tools/virtual_drives.py configs/sim.toml --interface unix --channel /tmp/can.sock
-python tools/virtual_drives.py configs/vcan.toml --interface socketcan --channel vcan0
+python tools/virtual_drives.py configs/vcan.toml --interface socketcan --channel vcan0 --faults faults.txt
+
+Faults come from a file, or are typed while it runs: `A silent for 0.5`, `with 0.01 C drop tpdo2`; `help` lists them.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
+import select
 import signal
 import sys
 from pathlib import Path
@@ -17,6 +22,7 @@ import can
 from drivers.config import Drives
 from drivers.interface import NAMES
 from drivers.simulated import SimulatedBus, simulated_bus
+from drivers.simulated.faultlines import HELP, FaultSyntaxError
 from drivers.unixbus import UnixBus
 from service.config import load
 from service.errors import TrirailError
@@ -39,18 +45,62 @@ class Report:
             if self._said.get(name) != state:
                 self._said[name] = state
                 position = axis.direction * drive.servo.position / axis.counts_per_metre + axis.offset
-                print(f"{name} {state}, {position * 1e3:.3f} mm", flush=True)
+                say(f"{name} {state}, {position * 1e3:.3f} mm")
 
 
-def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report) -> None:
+class Console:
+    """Takes up what is typed, line by line, without waiting for it."""
+
+    def __init__(self, bus: SimulatedBus) -> None:
+        self._faults = bus.faults
+        self._typed = b""
+        self._open = sys.stdin is not None
+
+    def poll(self) -> None:
+        """Carry out the lines that have come since."""
+        if not self._open or not select.select([sys.stdin], [], [], 0.0)[0]:
+            return
+        chunk = os.read(sys.stdin.fileno(), 4096)
+        self._open = bool(chunk)
+        *lines, self._typed = (self._typed + chunk).split(b"\n")
+        for line in lines:
+            self._obey(line.decode(errors="replace").strip())
+
+    def _obey(self, line: str) -> None:
+        match line:
+            case "":
+                return
+            case "help":
+                say(HELP)
+            case "list":
+                say("\n".join(self._faults.lines()) or "no faults")
+            case "clear":
+                self._faults.clear()
+                say("no faults")
+            case _:
+                try:
+                    self._faults.add(line)
+                except FaultSyntaxError as error:
+                    say(f"{error} (help lists all)")
+
+
+def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report, console: Console) -> None:
     """Carry frames between a bus and the simulated drives, until interrupted."""
     while True:
+        console.poll()
         frame = wire.recv(_POLL)
         if frame is not None:
-            drives.send(frame)
+            with contextlib.suppress(can.CanOperationError):  # bus-off: nobody hears it
+                drives.send(frame)
         while (answer := drives.recv(0.0)) is not None:
-            wire.send(answer)
+            if not answer.is_error_frame or _carries_error_frames(wire):
+                wire.send(answer)
         report.update()
+
+
+def _carries_error_frames(wire: can.BusABC) -> bool:
+    """Whether the others get an error frame as one; a real controller would send a data frame in its place."""
+    return isinstance(wire, UnixBus) or "vcan" in wire.channel_info or "virtual" in wire.channel_info.lower()
 
 
 def main() -> int:
@@ -59,6 +109,8 @@ def main() -> int:
     arguments.add_argument("config", type=Path, help="configuration file with [can] and [drives]")
     arguments.add_argument("--interface", required=True, help='"unix" (listens), or a python-can interface')
     arguments.add_argument("--channel", required=True, help="path of the socket, or the interface's channel")
+    arguments.add_argument("--faults", type=Path, help="file of faults, one a line")
+    arguments.add_argument("--seed", type=int, default=0, help="what faults that come by chance begin with")
     options = arguments.parse_args()
 
     signal.signal(signal.SIGINT, _interrupt)
@@ -69,7 +121,11 @@ def main() -> int:
             open_bus(options.interface, options.channel, config.can.bitrate) as wire,
             simulated_bus(config.can, config.drives) as bus,
         ):
-            bridge(wire, bus, Report(config.drives, bus))
+            bus.faults.tell = say
+            bus.faults.seed(options.seed)
+            if options.faults:
+                bus.faults.load(options.faults)
+            bridge(wire, bus, Report(config.drives, bus), Console(bus))
     except KeyboardInterrupt:
         pass
     except (TrirailError, can.CanError) as error:
@@ -83,6 +139,11 @@ def open_bus(interface: str, channel: str, bitrate: int) -> can.BusABC:
     if interface == "unix":
         return UnixBus(channel, listen=True)
     return can.Bus(channel=channel, interface=interface, bitrate=bitrate)
+
+
+def say(text: str) -> None:
+    """Print at once, also into a pipe."""
+    print(text, flush=True)
 
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -11,6 +12,7 @@ import can
 
 from drivers import config
 from drivers.simulated.drive import SimulatedDrive
+from drivers.simulated.faults import Faults
 from drivers.simulated.servo import Servo
 
 _STEP = 0.0005
@@ -20,41 +22,75 @@ _STEP = 0.0005
 class SimulatedBus(can.BusABC):
     """Carries frames between one python-can user and the drives, which live by its `send` and `recv`."""
 
-    def __init__(self, drives: Sequence[SimulatedDrive], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        drives: Sequence[SimulatedDrive],
+        clock: Callable[[], float] = time.monotonic,
+        faults: Faults | None = None,
+    ) -> None:
+        """`faults`, if there are to be any, are those of the same drives."""
         self.drives = tuple(drives)
+        self.faults = faults or Faults(self.drives, [1.0] * len(self.drives))
         self.channel_info = "simulated drives"
         self._clock = clock
         self._arrived: deque[can.Message] = deque()
         super().__init__(channel=self.channel_info)
         now = clock()
-        for drive in self.drives:
-            others = tuple(other for other in self.drives if other is not drive)
-            drive.connect(partial(self._deliver, others), now)
+        self.faults.connect(self._arrived.append, clock)
+        everyone = range(len(self.drives))
+        self._everyone = tuple(everyone)
+        for index, drive in enumerate(self.drives):
+            others = tuple(other for other in everyone if other != index)
+            drive.connect(partial(self._from_drive, index, others), now)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
-        """Bring a frame to every drive; their answers can be received at once."""
+        """Bring a frame to every drive; their answers can be received at once.
+
+        Raises can.CanOperationError while the controller is bus-off, as the system would of its full queue.
+        """
         if msg.is_extended_id or msg.is_error_frame:
             return
         now = self._clock()
+        if not self.faults.idle:
+            self.faults.poll(now)
+            if self.faults.bus_off:
+                raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
         if msg.is_remote_frame:
             for drive in self.drives:
                 drive.receive_remote(msg.arbitration_id, now)
-            return
-        can_id, data = msg.arbitration_id, bytes(msg.data)
-        for drive in self.drives:
-            drive.receive(can_id, data, now)
+        else:
+            self._to_drives(self._everyone, msg.arbitration_id, bytes(msg.data))
 
-    def _deliver(self, others: Sequence[SimulatedDrive], can_id: int, data: bytes) -> None:
-        """Bring a drive's frame to the user and the other drives."""
+    def _to_drives(self, indices: Sequence[int], can_id: int, data: bytes) -> None:
+        """Bring a frame to some drives, unless faults have it otherwise."""
+        if self.faults.idle:
+            now = self._clock()
+            for index in indices:
+                self.drives[index].receive(can_id, data, now)
+        else:
+            for index in indices:
+                self.faults.carry(index, True, can_id, data, partial(self._hand_in, index, can_id))
+
+    def _hand_in(self, index: int, can_id: int, data: bytes) -> None:
+        self.drives[index].receive(can_id, data, self._clock())
+
+    def _from_drive(self, index: int, others: Sequence[int], can_id: int, data: bytes) -> None:
+        """Bring a drive's frame to the user and the other drives, unless faults have it otherwise."""
+        if self.faults.idle:
+            self._hand_out(others, can_id, data)
+        else:
+            self.faults.carry(index, False, can_id, data, partial(self._hand_out, others, can_id))
+
+    def _hand_out(self, others: Sequence[int], can_id: int, data: bytes) -> None:
         self._arrived.append(can.Message(timestamp=time.time(), arbitration_id=can_id, is_extended_id=False, data=data))
-        now = self._clock()
-        for drive in others:
-            drive.receive(can_id, data, now)
+        self._to_drives(others, can_id, data)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         deadline = None if timeout is None else time.monotonic() + timeout
         while not self._arrived:
             now = self._clock()
+            if not self.faults.idle:
+                self.faults.poll(now)
             for drive in self.drives:
                 drive.poll(now)
             if self._arrived:
@@ -69,7 +105,7 @@ class SimulatedBus(can.BusABC):
 def simulated_bus(can: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic) -> SimulatedBus:
     """The three drives of a configuration on a bus of their own, at rest where `can.simulated.start` says."""
     simulated = can.simulated
-    devices = []
+    devices, scales = [], []
     for drive, start in zip(drives.each, simulated.start, strict=True):
         servo = Servo(
             round(drive.direction * (start - drive.offset) * drive.counts_per_metre),
@@ -79,4 +115,5 @@ def simulated_bus(can: config.Can, drives: config.Drives, clock: Callable[[], fl
             max_acceleration=simulated.max_acceleration * drive.counts_per_metre,
         )
         devices.append(SimulatedDrive(drive.node, servo, simulated.missed_syncs))
-    return SimulatedBus(devices, clock)
+        scales.append(drive.direction * drive.counts_per_metre)
+    return SimulatedBus(devices, clock, Faults(devices, scales))

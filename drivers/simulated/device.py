@@ -78,6 +78,11 @@ class Device:
         self._now = now
         self._reset(_ALL)
 
+    def restart(self, now: float) -> None:
+        """Lose supply and get it back at time `now` [s]."""
+        self._now = now
+        self._reset(_ALL)
+
     def receive(self, can_id: int, data: bytes, now: float) -> None:
         """Take in a data frame at time `now` [s]."""
         if can_id not in self._handlers or self.silent:

@@ -37,6 +37,10 @@ class Servo:
         """What the last step aimed at [counts]."""
         self.limited = False
         """Whether the last step was cut to a limit."""
+        self.forced_velocity: float | None = None
+        """A defect: the velocity [counts/s] that the slider has whatever it is told, until its brake holds it."""
+        self.lag: float | None = None
+        """A defect: how long it is behind its setpoint [s]; feed-forward does not help then."""
         self._feed_forward = 0.0
         self._feed_forward_gain = feed_forward_gain
         self._time_constant = time_constant
@@ -56,13 +60,14 @@ class Servo:
 
     def follow(self, target: float, feed_forward: float, step: float) -> None:
         """Move for `step` seconds towards `target` [counts] with `feed_forward` [counts/s] at its end."""
-        feed_forward *= self._feed_forward_gain
+        feed_forward *= self._feed_forward_gain if self.lag is None else 0.0
+        time_constant = self._time_constant if self.lag is None else self.lag
         slope = (target - self.setpoint) / step
         uncovered = slope - 0.5 * (self._feed_forward + feed_forward)
         gap = self.following_error
-        if self._time_constant > 0.0:
-            settled = uncovered * self._time_constant
-            closing = (gap - settled) * -math.expm1(-step / self._time_constant) / step
+        if time_constant > 0.0:
+            settled = uncovered * time_constant
+            closing = (gap - settled) * -math.expm1(-step / time_constant) / step
         else:
             closing = gap / step
 
@@ -77,11 +82,18 @@ class Servo:
         velocity = max(self.velocity - gain, min(velocity, self.velocity + gain))
         self.limited = velocity != wanted
         self.setpoint, self._feed_forward = target, feed_forward
+        if self.forced_velocity is not None:
+            velocity = self.forced_velocity
         self.velocity = velocity
         self.position += velocity * step
 
     def brake(self, deceleration: float, step: float) -> None:
         """Slow down for `step` seconds with `deceleration` [counts/s²], at most to standstill."""
+        if self.forced_velocity is not None:
+            self.velocity = self.forced_velocity
+            self.coast(step)
+            self.setpoint, self._feed_forward = self.position, 0.0
+            return
         moving = min(step, abs(self.velocity) / deceleration)
         lost = math.copysign(deceleration * moving, self.velocity)
         self.position += (self.velocity - 0.5 * lost) * moving

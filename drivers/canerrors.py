@@ -1,0 +1,166 @@
+"""What goes wrong on a CAN bus, in words: error frames, and frames that cannot be sent.
+
+Error frames are those of SocketCAN (linux/can/error.h): the identifier holds their classes, eight bytes of data the
+details. Controllers of other interfaces number theirs in ways of their own.
+"""
+
+from __future__ import annotations
+
+import errno
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+import can
+
+CONTROLLER: Final = 0x004
+BUS_OFF: Final = 0x040
+RESTARTED: Final = 0x100
+PASSIVE: Final = 0x30
+"""Details of class CONTROLLER, data[1]: error-passive in receiving or sending."""
+ACTIVE: Final = 0x40
+"""Details of class CONTROLLER, data[1]: error-active again."""
+
+_LOST_ARBITRATION, _PROTOCOL, _TRANSCEIVER = 0x002, 0x008, 0x010
+_LENGTH = 8
+"""Every error frame of SocketCAN has eight bytes (CAN_ERR_DLC)."""
+
+_CLASSES = {
+    0x001: "a frame was not sent in time",
+    0x020: "no acknowledgement: no other node hears us; are the drives powered, and on the same bitrate?",
+    BUS_OFF: (
+        "bus-off: 256 transmit errors, the controller has left the bus; check cable, termination and bitrate, then "
+        "restart the interface: ip link set DEV down, ip link set DEV up"
+    ),
+    0x080: "bus error",
+    RESTARTED: "the controller was restarted after bus-off",
+}
+_CONTROLLER = {
+    0x01: "receive buffer overflow, frames were lost",
+    0x02: "transmit buffer overflow, frames were lost",
+    0x04: "error-warning: 96 receive errors; check cable and termination",
+    0x08: "error-warning: 96 transmit errors; check cable and termination",
+    0x10: "error-passive: 128 receive errors; check cable, termination and bitrate",
+    0x20: "error-passive: 128 transmit errors; check cable, termination and bitrate",
+    ACTIVE: "error-active again",
+}
+_VIOLATIONS = {
+    0x01: "single bit error",
+    0x02: "frame format error",
+    0x04: "bit stuffing error",
+    0x08: "dominant bit not sent",
+    0x10: "recessive bit not sent",
+    0x20: "bus overload",
+    0x40: "active error announcement",
+}
+_LOCATIONS = {
+    0x02: "identifier",
+    0x03: "start of frame",
+    0x04: "RTR bit",
+    0x05: "IDE bit",
+    0x06: "identifier",
+    0x07: "identifier",
+    0x08: "CRC sequence",
+    0x09: "reserved bit 0",
+    0x0A: "data",
+    0x0B: "data length code",
+    0x0C: "RTR bit",
+    0x0D: "reserved bit 1",
+    0x0E: "identifier",
+    0x0F: "identifier",
+    0x12: "intermission",
+    0x18: "CRC delimiter",
+    0x19: "acknowledgement slot",
+    0x1A: "end of frame",
+    0x1B: "acknowledgement delimiter",
+}
+_WIRES = {
+    0x04: "no wire at CANH",
+    0x05: "CANH shorted to battery",
+    0x06: "CANH shorted to supply",
+    0x07: "CANH shorted to ground",
+    0x40: "no wire at CANL",
+    0x50: "CANL shorted to battery",
+    0x60: "CANL shorted to supply",
+    0x70: "CANL shorted to ground",
+    0x80: "CANL shorted to CANH",
+}
+
+
+class Gravity(IntEnum):
+    """How much a report of the controller matters."""
+
+    ROUTINE = 0
+    """Part of a bus that works: arbitration lost, errors over."""
+    WARNING = 1
+    """The bus still carries frames, but something is wrong with it."""
+    FAULT = 2
+    """The bus carries nothing any more."""
+
+
+class Report(NamedTuple):
+    """What an error frame says."""
+
+    gravity: Gravity
+    text: str
+
+
+def report(frame: can.Message) -> Report:
+    """Read an error frame; one that is not SocketCAN's is a warning that says so."""
+    kind, data = frame.arbitration_id, frame.data
+    if len(data) != _LENGTH:
+        return Report(Gravity.WARNING, f"error frame {kind:X} in the interface's own coding")
+    parts = [words for bit, words in _CLASSES.items() if kind & bit]
+    if kind & CONTROLLER:
+        parts += [words for bit, words in _CONTROLLER.items() if data[1] & bit] or ["controller problem"]
+    if kind & _PROTOCOL:
+        parts.append(_violation(data[2], data[3]))
+    if kind & _TRANSCEIVER:
+        parts.append(f"transceiver: {_WIRES.get(data[4], 'unspecified error')}")
+    if kind & _LOST_ARBITRATION:
+        parts.append("arbitration lost")
+    text = "; ".join(parts) or f"error frame {kind:X}"
+    if kind & BUS_OFF:
+        return Report(Gravity.FAULT, text)
+    told = kind & ~(_LOST_ARBITRATION | 0x200)  # 200h says only that the error counters are in the data
+    routine = not told or (told == CONTROLLER and data[1] == ACTIVE)
+    return Report(Gravity.ROUTINE if routine else Gravity.WARNING, text)
+
+
+def queue_is_full(error: Exception) -> bool:
+    """Whether a frame was not sent only because others still wait: it may be different in the next cycle."""
+    # ENOBUFS: the interface's queue takes no more; EAGAIN, and python-can without a number: the socket does not.
+    number = error_number(error)
+    return number in (errno.ENOBUFS, errno.EAGAIN) or (isinstance(error, can.CanOperationError) and number is None)
+
+
+def cannot_send(error: Exception) -> str:
+    """Why a frame could not be sent, and what to do."""
+    reason = " ".join(str(error).split())
+    if queue_is_full(error):
+        return (
+            f"{reason}: the transmit queue is full, because nobody acknowledges (are the drives powered? check cable, "
+            f"termination, bitrate) or it is shorter than a cycle's frames: ip link set DEV txqueuelen 100"
+        )
+    match error_number(error):
+        case errno.ENETDOWN:
+            return f"{reason}: the interface is down; bring it up: ip link set DEV up"
+        case errno.ENODEV | errno.ENXIO:
+            return f"{reason}: the interface is gone; is the adapter still plugged in?"
+    return reason
+
+
+def error_number(error: BaseException | None) -> int | None:
+    """The system's error number, from the error or from what caused it."""
+    while error is not None:
+        number = error.error_code if isinstance(error, can.CanError) else getattr(error, "errno", None)
+        if number is not None:
+            return int(number)
+        error = error.__cause__
+    return None
+
+
+def _violation(kind: int, location: int) -> str:
+    what = ", ".join(words for bit, words in _VIOLATIONS.items() if kind & bit) or "protocol violation"
+    when = " in sending" if kind & 0x80 else ""
+    where = f" at the {_LOCATIONS[location]}" if location in _LOCATIONS else ""
+    return f"{what}{when}{where}"

@@ -1,0 +1,297 @@
+"""The fault matrix: every fault on demand in every mode; what stops the robot, how soon, and what does not."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import can
+import numpy as np
+import pytest
+from conftest import CONFIG, Rig, changed
+
+from drivers import frames
+from drivers.interface import PowerState
+from service.modes import Mode
+from service.packets import CommandRequest, Confirmed, Refused
+
+REAL = changed(CONFIG, missed_syncs=3)
+"""Drives that miss SYNC as soon as real ones do."""
+PERIOD = REAL.period
+NODES = (1, 2, 3)
+RAMP = 100
+"""Cycles in which every motion here ends by the quick-stop ramp: 0.5 m/s at 10 m/s² takes 50."""
+LONG = 350
+
+
+class FaultRig(Rig):
+    """Keeps every setpoint that appeared on the bus, and whether its drive was enabled then."""
+
+    def __init__(self) -> None:
+        super().__init__(REAL)
+        self.targets: dict[int, list[tuple[int, bool]]] = {node: [] for node in NODES}
+
+    def _note(self, message: can.Message, timeout: float | None = None) -> None:
+        super()._note(message, timeout)
+        node = message.arbitration_id - frames.RPDO2
+        if node in NODES:
+            enabled = self.drives[node - 1].state is PowerState.OPERATION_ENABLED
+            self.targets[node].append((frames.SETPOINT.unpack(message.data)[0], enabled))
+
+    def faulty(self) -> bool:
+        return self.mode is Mode.FAULT
+
+    def stands(self) -> bool:
+        return all(
+            drive.state is not PowerState.OPERATION_ENABLED and drive.servo.velocity == 0.0 for drive in self.drives
+        )
+
+    def quick_stops(self) -> set[int]:
+        """Nodes that were sent the quick stop command in the last cycle."""
+        stop = frames.CONTROLWORD.pack(frames.QUICK_STOP)
+        return {m.arbitration_id - frames.RPDO1 for m in self.sent if bytes(m.data) == stop}
+
+    def inject(self, line: str) -> None:
+        self.bus.faults.add(line)
+
+
+def holding(rig: FaultRig) -> None:
+    rig.enable()
+    rig.cycles(50)
+    assert rig.mode is Mode.HOLDING
+
+
+def moving(rig: FaultRig) -> None:
+    rig.enable()
+    rig.goal("g1", 0.08, 0.08, 0.3)
+    rig.cycles(150)
+    assert rig.mode is Mode.MOVING
+    assert min(abs(velocity) for velocity in rig.control.velocity) > 0.2
+
+
+def stopping(rig: FaultRig) -> None:
+    moving(rig)
+    rig.cycle(CommandRequest(0, "ann", "stop", None))
+    assert rig.mode is Mode.STOPPING
+
+
+MODES: dict[str, tuple[Callable[[FaultRig], None], list[tuple[str, str]]]] = {
+    "holding": (holding, []),
+    "moving": (moving, [("g1", "faulted")]),
+    "stopping": (stopping, [("g1", "stopped")]),
+}
+"""How to get there, and how the goals end when a fault comes then. One more mode is one more line."""
+
+
+IN_MOTION = ("moving", "stopping")
+
+
+class Case(NamedTuple):
+    """A fault that stops the robot."""
+
+    line: str
+    within: int
+    """Cycles from the fault to the stop of all three drives."""
+    reason: str
+    """Pattern of what is said: drive, cause, code."""
+    modes: tuple[str, ...] = tuple(MODES)
+    """Where it makes a difference: a slider that is stuck holds well."""
+    stands: int = RAMP
+    """Cycles from there to standstill."""
+    lasts: bool = True
+    """Whether it can be seen without power: then a reset is refused while it lasts."""
+    curable: bool = True
+    """Whether a reset helps once the cause is gone."""
+
+
+STOP = [
+    # frames that do not come, come late or come wrong
+    Case("A drop tpdo2", 3, r"drive A: no position for 3 SYNCs in a row"),
+    Case("B drop tpdo1", 400, r"drive B: no statusword for 0\.3\d* s"),
+    Case("C drop heartbeat", 400, r"drive C: no heartbeat for 0\.3\d* s"),
+    Case("A drop sync", 4, r"drive A: (no position for 3 SYNCs|emergency 8700)"),
+    Case("all drop sync", 4, r"drive A: (no position for 3 SYNCs|emergency 8700)"),
+    Case("B drop rpdo2", 150, r"slider B: following error", IN_MOTION, lasts=False),
+    Case("B drop 0x77E", 400, r"drive B: emergency 8130"),
+    Case("A delay 0.01 tpdo2", 3, r"drive A: no position for 3 SYNCs in a row", lasts=False),
+    Case("A delay 0.05 rpdo2", 60, r"slider A: following error", IN_MOTION, lasts=False),
+    Case("C corrupt tpdo2", 30, r"slider C: following error", lasts=False),
+    Case("C corrupt rpdo2", 60, r"(slider C: following error|drive C: emergency 8611)", lasts=False),
+    Case(
+        "B corrupt tpdo1", 400, r"drive B: (statusword \w{4} is that of no|left operation enabled|fault)", lasts=False
+    ),
+    Case("A dlc 3 tpdo2", 1, r"drive A: frame 281 has wrong length 3"),
+    Case("A dlc 8 tpdo2", 1, r"drive A: frame 281 has wrong length 8"),
+    Case("A dlc 1 tpdo1", 110, r"drive A: frame 181 has wrong length 1"),
+    Case("A dlc 0 heartbeat", 110, r"drive A: frame 701 has wrong length 0"),
+    Case("B dlc 7 rpdo2", 2, r"drive B: emergency 8210, error register 11"),
+    Case("B dlc 1 sync", 1, r"drive B: emergency 8240, error register 11"),
+    # drives
+    Case("C silent", 3, r"drive C: no position for 3 SYNCs in a row"),
+    Case("all silent", 3, r"drive A: no position for 3 SYNCs in a row"),
+    Case("B emcy 4310 for 5", 1, r"drive B: emergency 4310, error register 09"),
+    Case("B fault 2310 for 5", 1, r"drive B: emergency 2310, error register 03"),
+    Case("A stuck", 60, r"slider A: following error", IN_MOTION, lasts=False),
+    Case("A lag 0.1", 100, r"slider A: following error", IN_MOTION, lasts=False),
+    Case("C runaway 0.1", 100, r"slider C: following error", stands=1100, lasts=False),
+    Case("C runaway -0.1", 100, r"slider C: following error", stands=1100, lasts=False),
+    Case("B reboot", 1, r"drive B: has restarted and lost its set-up; restart the service", curable=False),
+    # the bus
+    Case("bus-off", 1, r"CAN bus: bus-off"),
+    Case("babble 001", 3, r"drive A: no position for 3 SYNCs in a row"),
+]
+
+
+@pytest.fixture
+def rig() -> Iterator[FaultRig]:
+    made = FaultRig()
+    yield made
+    made.bus.shutdown()
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("case", STOP, ids=lambda case: case.line)
+def test_a_fault_stops_all_three_drives(rig: FaultRig, case: Case, mode: str) -> None:
+    MODES[mode][0](rig)
+    rig.inject(case.line)
+    if mode not in case.modes:
+        rig.cycles(LONG)
+        assert rig.mode is Mode.HOLDING
+        return
+    rig.until(rig.faulty, case.within + 1)
+    assert rig.quick_stops() == set(NODES)
+    reason = rig.control.fault
+    assert reason is not None
+    assert re.match(case.reason, reason)
+
+    rig.until(rig.stands, case.stands)
+    rig.cycles(LONG)
+    assert rig.stands()
+    assert rig.faulty()
+    assert rig.control.fault == reason
+    assert isinstance(rig.goal("g2", 0.0, 0.0, 0.0), Refused)
+
+    if case.lasts:
+        answer = rig.command("reset")
+        assert isinstance(answer, Refused)
+        assert "the cause is still there" in answer.message or "by what it said last" in answer.message
+        assert rig.faulty()
+    rig.bus.faults.clear()
+    rig.cycles(LONG)
+    assert isinstance(rig.command("reset"), Confirmed) is case.curable
+    assert rig.stands()
+    if case.curable:
+        rig.enable()
+        rig.goal("g3", 0.01, 0.0, 0.0)
+        rig.until(lambda: rig.mode is Mode.HOLDING)
+    expected = [*MODES[mode][1], ("g2", "rejected"), *([("g3", "done")] if case.curable else [])]
+    assert rig.outcomes() == expected
+    assert_no_jump(rig)
+
+
+def assert_no_jump(rig: FaultRig) -> None:
+    """No step between setpoints on the bus is above the velocity limit; none of an enabled drive above acceleration."""
+    limits, counts = rig.config.limits.slider, rig.config.drives.A.counts_per_metre
+    rounding = 2.0 / counts / PERIOD
+    for targets in rig.targets.values():
+        position = np.array([target for target, _ in targets]) / counts
+        enabled = np.array([enabled for _, enabled in targets])
+        velocity = np.diff(position) / PERIOD
+        assert np.abs(velocity).max() <= limits.velocity * 1.001 + rounding
+        always = enabled[2:] & enabled[1:-1] & enabled[:-2]
+        acceleration = np.diff(velocity)[always] / PERIOD
+        assert np.abs(acceleration).max() <= limits.acceleration * 1.001 + 2.0 * rounding / PERIOD
+
+
+GO_ON = [
+    *(f"A duplicate {kind} for 1 frames" for kind in ("sync", "rpdo2", "tpdo2", "tpdo1", "heartbeat")),
+    *(f"B drop {kind} for 1 frames" for kind in ("sync", "rpdo2", "tpdo2", "tpdo1", "heartbeat", "0x77E")),
+    "B drop tpdo2 for 2 frames",
+    "all drop tpdo2 for 3 frames",
+    "C drop heartbeat for 2 frames",
+    "A duplicate",
+    "A delay 0.0005 tpdo2",
+    "A delay 0.0015 tpdo2",
+    "all delay 0.0005 tpdo2",
+    "B delay 0.0005 rpdo2",
+    "A delay 0.05 heartbeat",
+    "with 0.1 all delay 0.0005 tpdo2",
+    "with 0.02 all drop rpdo2",
+    "error-passive",
+    "babble 7FF",
+]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("line", GO_ON)
+def test_what_does_not_stop_the_robot(rig: FaultRig, line: str, mode: str) -> None:
+    MODES[mode][0](rig)
+    rig.inject(line)
+    rig.cycles(800)
+    assert [said.message for said in rig.happenings if said.kind == "fault"] == []
+    assert rig.mode is Mode.HOLDING
+    assert [outcome for _, outcome in rig.outcomes()] == {"holding": [], "moving": ["done"], "stopping": ["stopped"]}[
+        mode
+    ]
+    assert_no_jump(rig)
+
+
+def by_hand(rig: FaultRig, index: int, metres: float) -> None:
+    """Move a slider that has no power."""
+    drive = rig.drives[index]
+    drive.servo.position += metres * rig.config.drives.A.counts_per_metre
+    drive.servo.setpoint = drive.servo.position
+    drive.objects[0x6064, 0].value = round(drive.servo.position)
+
+
+def test_a_position_that_jumps_for_a_cycle_moves_no_setpoint(rig: FaultRig) -> None:
+    rig.cycles(3)
+    by_hand(rig, 0, 0.1)
+    rig.cycle()
+    by_hand(rig, 0, -0.1)
+    rig.cycles(3)
+    assert {target for target, _ in rig.targets[1]} == {0}
+    assert rig.control.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+
+
+def test_a_slider_moved_by_hand_is_followed_without_a_jump_before_it_is_enabled(rig: FaultRig) -> None:
+    rig.cycles(3)
+    for index in range(3):
+        by_hand(rig, index, 0.02)
+    rig.cycles(2)
+    answer = rig.command("enable")
+    assert isinstance(answer, Refused)
+    assert answer.code == "not_at_rest"
+    rig.cycles(30)
+    rig.enable()
+    rig.cycles(10)
+    assert rig.control.feedback.position == pytest.approx((0.02, 0.02, 0.02), abs=1e-6)
+    assert_no_jump(rig)
+
+
+def test_the_pose_is_found_again_after_sliders_that_belong_to_none(rig: FaultRig) -> None:
+    for step in [8e-4] * 400 + [-8e-4] * 400:
+        for index in range(3):
+            by_hand(rig, index, step)
+        rig.cycle()
+    rig.cycles(3)
+    assert rig.control.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+
+
+def test_a_drive_that_does_not_leave_its_fault_is_not_reset(rig: FaultRig) -> None:
+    holding(rig)
+    rig.drives[1].fail(0x2310)
+    rig.until(rig.stands)
+    rig.drives[1].objects.on_write(0x6040, lambda entry, old: None)
+    answer = rig.command("reset")
+    assert isinstance(answer, Refused)
+    assert "drive B: fault, error 2310" in answer.message
+
+
+def test_a_warning_of_the_bus_is_an_event(rig: FaultRig) -> None:
+    rig.inject("error-passive")
+    rig.cycles(10)
+    told = [said.message for said in rig.happenings if said.level == "warning"]
+    assert len(told) == 1
+    assert "error-passive: 128 transmit errors; check cable" in told[0]
