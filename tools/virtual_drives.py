@@ -21,8 +21,8 @@ from drivers.unixbus import UnixBus
 from service.config import load
 from service.errors import TrirailError
 
-_POLL = 0.001
-"""How long to wait for a frame before the drives' own timers are looked at [s]."""
+_POLLS = 5
+"""So many times a cycle the drives' own timers are looked at, if no frame comes."""
 
 
 class Report:
@@ -42,10 +42,10 @@ class Report:
                 print(f"{name} {state}, {position * 1e3:.3f} mm", flush=True)
 
 
-def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report) -> None:
-    """Carry frames between a bus and the simulated drives, until interrupted."""
+def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report, poll: float) -> None:
+    """Carry frames between a bus and the simulated drives, until interrupted; look at their timers each `poll` [s]."""
     while True:
-        frame = wire.recv(_POLL)
+        frame = wire.recv(poll)
         if frame is not None:
             drives.send(frame)
         while (answer := drives.recv(0.0)) is not None:
@@ -69,7 +69,7 @@ def main() -> int:
             open_bus(options.interface, options.channel, config.can.bitrate) as wire,
             simulated_bus(config.can, config.drives) as bus,
         ):
-            bridge(wire, bus, Report(config.drives, bus))
+            bridge(wire, bus, Report(config.drives, bus), config.period / _POLLS)
     except KeyboardInterrupt:
         pass
     except (TrirailError, can.CanError) as error:
