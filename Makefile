@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 
-.PHONY: demo test bench clean
+.PHONY: demo test hil bench clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
@@ -15,6 +15,10 @@ test: $(READY)  ## everything that decides: lint, format, types, import contract
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 	$(VENV)/bin/pytest
+
+hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; installs what that needs, as root on Debian
+	$(VENV)/bin/python -m pip install --quiet --group hil
+	$(VENV)/bin/python tools/hil.py --install $(ARGS)
 
 bench: $(READY)  ## the loop and the kinematics, measured
 	$(VENV)/bin/python tools/bench.py loop

@@ -293,6 +293,31 @@ def events(*, service: Service = HERE) -> int:
     return 0
 
 
+@app.command
+def doctor(config: Path | None = None, /, *, json: Annotated[bool, Flag] = False) -> int:
+    """Check this machine and a configuration; exit 1 only if something would keep the robot from running.
+
+    Parameters
+    ----------
+    config
+        Configuration file; the simulated robot if absent.
+    json
+        Print one JSON object instead of words.
+    """
+    from service import probes
+    from service.config import SIM, load
+    from service.doctor import examine
+
+    settings = load(config or SIM)
+    checks = examine(settings, probes.machine(settings))
+    fit = all(check.verdict != "failure" for check in checks)
+    if json:
+        terminal.json({"ok": fit, "checks": msgspec.to_builtins(checks)})
+    else:
+        terminal.checks(checks)
+    return 0 if fit else 1
+
+
 app.command(offline.ik)
 app.command(offline.fk)
 app.command(offline.workspace)

@@ -6,6 +6,7 @@ import contextlib
 import math
 import sys
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -21,6 +22,7 @@ from service.messages import Event, GoalReply, Percentiles, State
 
 if TYPE_CHECKING:
     from service.config import Config
+    from service.doctor import Check
 
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
@@ -34,6 +36,7 @@ COLOURS = {
     "fault": "bold red",
 }
 LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}
+VERDICTS = {"ok": "green", "warning": "yellow", "failure": "bold red"}
 SILENT = 3.0
 """A service from which nothing is heard for so long is taken for gone [s]."""
 
@@ -133,6 +136,15 @@ def event(happened: Event) -> None:
     """Print an event on a line."""
     level = f"[{LEVELS[happened.level]}]{happened.level:7}[/]"
     out.print(f"{happened.seq:5}  {happened.t:9.3f} s  {level}  {escape(happened.message)}", soft_wrap=True)
+
+
+def checks(found: Sequence[Check]) -> None:
+    """Print each check on a line, and under it what to do."""
+    for check in found:
+        verdict = f"[{VERDICTS[check.verdict]}]{check.verdict:8}[/]"
+        out.print(f"{verdict} {check.name:13} {escape(check.found)}", soft_wrap=True)
+        if check.remedy:
+            out.print(f"{'':22} {escape(check.remedy)}", soft_wrap=True, style="dim")
 
 
 def _table(state: State, robot: str) -> Table:

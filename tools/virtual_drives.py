@@ -27,8 +27,8 @@ from drivers.unixbus import UnixBus
 from service.config import load
 from service.errors import TrirailError
 
-_POLL = 0.001
-"""How long to wait for a frame before the drives' own timers are looked at [s]."""
+_POLLS = 5
+"""So many times a cycle the drives' own timers are looked at, if no frame comes."""
 
 
 class Report:
@@ -84,11 +84,11 @@ class Console:
                     say(f"{error} (help lists all)")
 
 
-def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report, console: Console) -> None:
-    """Carry frames between a bus and the simulated drives, until interrupted."""
+def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report, console: Console, poll: float) -> None:
+    """Carry frames between a bus and the simulated drives, until interrupted; look at their timers each `poll` [s]."""
     while True:
         console.poll()
-        frame = wire.recv(_POLL)
+        frame = wire.recv(poll)
         if frame is not None:
             with contextlib.suppress(can.CanOperationError):  # bus-off: nobody hears it
                 drives.send(frame)
@@ -125,7 +125,7 @@ def main() -> int:
             bus.faults.seed(options.seed)
             if options.faults:
                 bus.faults.load(options.faults)
-            bridge(wire, bus, Report(config.drives, bus), Console(bus))
+            bridge(wire, bus, Report(config.drives, bus), Console(bus), config.period / _POLLS)
     except KeyboardInterrupt:
         pass
     except (TrirailError, can.CanError) as error:

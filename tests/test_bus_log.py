@@ -1,0 +1,145 @@
+"""The checks of tools/bus_log.py: a right log passes, and each wrong thing in it is noticed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import bus_log
+import pytest
+from bus_log import Frame
+
+from drivers import frames as layout
+from service.config import SIM, load
+
+CONFIG = load(SIM.parent / "socketcan.toml")
+PERIOD = CONFIG.period
+COUNTS = 1e6
+NODES = (1, 2, 3)
+WORDS = {5: (0x06, 0x31), 10: (0x07, 0x33), 15: (0x0F, 0x37), 380: (0x00, 0x50)}
+"""At some cycles the controlword, and the statusword that answers it a cycle later."""
+
+
+def good_log() -> list[Frame]:
+    """Powers up, moves with constant acceleration up and down again, and powers down."""
+    acceleration = 0.5
+    log = [Frame(0.0, layout.NMT, bytes((layout.NMT_START, node))) for node in NODES]
+    position = velocity = 0.0
+    for cycle in range(400):
+        t = 1.0 + cycle * PERIOD
+        log.append(Frame(t, layout.SYNC, b""))
+        change = acceleration * PERIOD * ((50 <= cycle < 150) - (200 <= cycle < 300))
+        position += (velocity + change / 2) * PERIOD
+        velocity += change
+        data = layout.SETPOINT.pack(round(position * COUNTS), round(velocity * COUNTS))
+        for node in NODES:
+            log.append(Frame(t + 2e-4, layout.RPDO2 + node, data))
+            if cycle in WORDS:
+                log.append(Frame(t + 3e-4, layout.RPDO1 + node, layout.CONTROLWORD.pack(WORDS[cycle][0])))
+            if cycle == 0 or cycle - 1 in WORDS:
+                status = WORDS[cycle - 1][1] if cycle else 0x50
+                log.append(Frame(t + 4e-4, layout.TPDO1 + node, layout.STATUSWORD.pack(status)))
+    return log
+
+
+GOOD = good_log()
+
+
+def problems(log: list[Frame], missed: int = 0, until: float = 9e9) -> list[str]:
+    return bus_log.problems(log, CONFIG, missed, until)
+
+
+def replaced(which: Callable[[Frame], bool], change: Callable[[Frame], Frame | None]) -> list[Frame]:
+    """The right log with one frame changed, or left out."""
+    index = next(number for number, frame in enumerate(GOOD) if which(frame))
+    new = change(GOOD[index])
+    return [*GOOD[:index], *([new] if new else []), *GOOD[index + 1 :]]
+
+
+def setpoint(frame: Frame, position: float = 0.0, velocity: float = 0.0) -> Frame:
+    """A setpoint changed by so much."""
+    counts, rate = layout.SETPOINT.unpack(frame.data)
+    data = layout.SETPOINT.pack(counts + round(position * COUNTS), rate + round(velocity * COUNTS))
+    return frame._replace(data=data)
+
+
+def test_a_right_log_has_no_problems() -> None:
+    assert problems(GOOD) == []
+    assert bus_log.differences(GOOD, GOOD) == []
+    assert bus_log.statistics(GOOD, CONFIG, 9e9)["interval_median_ms"] == pytest.approx(PERIOD * 1e3)
+
+
+def moving(frame: Frame) -> bool:
+    return frame.identifier == layout.RPDO2 + 2 and frame.t > 1.1
+
+
+@pytest.mark.parametrize(
+    ("which", "change", "said"),
+    [
+        (moving, lambda frame: setpoint(frame, position=2e-4), "step of"),
+        (moving, lambda frame: setpoint(frame, position=1e-6 * 20), "its feed-forward says"),
+        (moving, lambda frame: setpoint(frame, velocity=0.01), "feed-forward jumps"),
+        (moving, lambda frame: setpoint(frame, velocity=0.2), "is above 0.1"),
+        (moving, lambda frame: setpoint(frame, position=0.4), "is outside of"),
+        (
+            lambda frame: frame.identifier == layout.SYNC and frame.t > 1.2,
+            lambda frame: None,
+            "two setpoints between one SYNC and the next",
+        ),
+        (
+            lambda frame: frame.identifier == layout.RPDO1 + 1 and frame.data == b"\x07\x00",
+            lambda frame: None,
+            "controlword 000F after 0006",
+        ),
+        (
+            lambda frame: frame.identifier == layout.TPDO1 + 3 and frame.data == b"\x33\x00",
+            lambda frame: None,
+            "drive C: from ready to switch on to operation enabled",
+        ),
+        (
+            lambda frame: frame.identifier == layout.TPDO1 + 3 and frame.data == b"\x33\x00",
+            lambda frame: frame._replace(data=b"\x1f\x00"),
+            "fault at",
+        ),
+        (
+            lambda frame: frame.identifier == layout.RPDO1 + 1 and frame.data == b"\x00\x00",
+            lambda frame: None,
+            "which no controlword asked for",
+        ),
+        (lambda frame: frame.identifier == layout.NMT, lambda frame: None, "before NMT start"),
+    ],
+)
+def test_each_wrong_thing_is_noticed(
+    which: Callable[[Frame], bool], change: Callable[[Frame], Frame | None], said: str
+) -> None:
+    assert any(said in problem for problem in problems(replaced(which, change)))
+
+
+def test_setpoints_come_before_power() -> None:
+    late = [frame for frame in GOOD if frame.identifier != layout.RPDO2 + 1 or frame.t > 1.1]
+    assert any("before there is a setpoint" in problem for problem in problems(late))
+
+
+def test_a_drive_that_never_ran_is_noticed() -> None:
+    assert any("never in operation enabled" in problem for problem in problems(GOOD, until=1.012))
+
+
+def test_ticks_that_are_missed_must_be_told_of_and_never_caught_up() -> None:
+    gap = [frame for frame in GOOD if not 1.1 < frame.t < 1.1 + 10.5 * PERIOD]
+    assert any("10 of 399 ticks have none" in problem for problem in problems(gap))
+    burst = [
+        frame._replace(t=frame.t - 3 * PERIOD) if frame.identifier == layout.SYNC and frame.t > 1.2 else frame
+        for frame in GOOD
+    ]
+    assert any("too early" in problem for problem in problems(burst))
+
+
+def test_a_frame_that_the_service_did_not_send_is_noticed() -> None:
+    other = replaced(moving, lambda frame: setpoint(frame, position=1e-6))
+    (said,) = bus_log.differences(other, GOOD)
+    assert "identifier 302" in said
+
+
+def test_the_format_is_candumps(tmp_path: Path) -> None:
+    (tmp_path / "log").write_text("(1.500000) can1 080#\n(1.500100) can1 301#0102030405060708\n")
+    assert bus_log.read(tmp_path / "log") == [Frame(1.5, 0x080, b""), Frame(1.5001, 0x301, bytes(range(1, 9)))]

@@ -1,0 +1,181 @@
+"""The doctor: each check judges what was read as it should, names the remedy, and the command says it all."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from service import doctor, probes
+from service.clock import Tick
+from service.config import SIM, Config, load
+from service.doctor import Check, Machine
+from service.errors import ServiceError
+
+CONFIGS = SIM.parent
+SIMULATED = load(SIM)
+REAL = load(CONFIGS / "socketcan.toml")
+
+# What `ip -details -json link` says of an interface, shortened.
+LINK: dict[str, Any] = {
+    "ifname": "can0",
+    "flags": ["NOARP", "UP", "LOWER_UP", "ECHO"],
+    "txqlen": 100,
+    "linkinfo": {
+        "info_kind": "can",
+        "info_data": {
+            "state": "ERROR-ACTIVE",
+            "berr_counter": {"tx": 0, "rx": 0},
+            "bittiming": {"bitrate": 1_000_000},
+        },
+    },
+}
+GOOD = Machine(
+    release="6.1.0-rt",
+    preempt_rt=True,
+    af_can=True,
+    lacking=(),
+    clock_source="tsc",
+    resolution=1e-9,
+    cpu=3,
+    governor="performance",
+    isolated=(2, 3),
+    link=LINK,
+    ticks=(Tick(0, 20_000, 0),) * 2000,
+)
+
+
+def changed(config: Config, section: str, **values: object) -> Config:
+    return msgspec.structs.replace(config, **{section: msgspec.structs.replace(getattr(config, section), **values)})
+
+
+def link(state: str = "ERROR-ACTIVE", bitrate: int = 1_000_000, **values: object) -> dict[str, Any]:
+    data = {"state": state, "berr_counter": {"tx": 136, "rx": 7}, "bittiming": {"bitrate": bitrate}}
+    return LINK | {"linkinfo": {"info_kind": "can", "info_data": data}} | values
+
+
+def bad(checks: list[Check]) -> dict[str, Check]:
+    return {check.name: check for check in checks if check.verdict != "ok"}
+
+
+@pytest.mark.parametrize("config", [SIMULATED, REAL], ids=["simulated", "real"])
+def test_nothing_is_wrong_with_a_good_machine(config: Config) -> None:
+    checks = doctor.examine(config, GOOD)
+    assert not bad(checks)
+    assert len({check.name for check in checks}) == len(checks)
+
+
+@pytest.mark.parametrize(
+    ("values", "name", "verdict", "remedy"),
+    [
+        ({"preempt_rt": False}, "kernel", "warning", "linux-image-rt"),
+        ({"lacking": ("SCHED_FIFO: not permitted; run as root",)}, "rights", "failure", "run as root"),
+        ({"clock_source": "hpet"}, "clock", "warning", "clocksource=tsc"),
+        ({"resolution": 0.004}, "clock", "failure", "CONFIG_HIGH_RES_TIMERS"),
+        ({"governor": "powersave"}, "governor", "warning", "cpupower"),
+        ({"isolated": ()}, "processor", "warning", "isolcpus=3"),
+        ({"af_can": False}, "CAN", "failure", "modprobe can_raw"),
+        ({"link": None}, "can0", "failure", "adapter"),
+        ({"link": link(flags=["NOARP"])}, "can0", "failure", "ip link set can0 up type can bitrate 1000000"),
+        ({"link": link(bitrate=500_000)}, "can0 bitrate", "failure", "ip link set can0 down"),
+        ({"link": link("ERROR-WARNING")}, "can0 state", "warning", "termination"),
+        ({"link": link("ERROR-PASSIVE")}, "can0 state", "warning", "termination"),
+        ({"link": link("BUS-OFF")}, "can0 state", "failure", "ip link set can0 down"),
+        ({"link": link("STOPPED")}, "can0 state", "failure", ""),
+        ({"link": link(txqlen=10)}, "can0 queue", "warning", "txqueuelen"),
+        ({"ticks": (Tick(0, 0, 0), *(Tick(0, 900_000, 0),) * 3)}, "lateness", "warning", "loop.rate_hz"),
+        ({"ticks": (Tick(0, 0, 0), Tick(0, 0, 1), Tick(0, 0, 0))}, "lateness", "warning", "isolate"),
+        ({"ticks": (Tick(0, 0, 6), Tick(0, 0, 5), Tick(0, 0, 0))}, "lateness", "failure", "isolate"),
+    ],
+)
+def test_each_fault_of_a_machine_is_named_with_its_remedy(
+    values: dict[str, Any], name: str, verdict: str, remedy: str
+) -> None:
+    (found,) = bad(doctor.examine(REAL, msgspec.structs.replace(GOOD, **values))).values()
+    assert (found.name, found.verdict) == (name, verdict)
+    assert remedy in found.remedy
+    assert "\n" not in found.found + found.remedy
+
+
+def test_simulated_drives_need_no_real_machine() -> None:
+    desktop = msgspec.structs.replace(GOOD, preempt_rt=False, af_can=False, isolated=(), link=None)
+    assert not bad(doctor.examine(SIMULATED, desktop))
+
+
+def test_rights_are_a_failure_only_where_they_are_demanded() -> None:
+    lacking = ("SCHED_FIFO: not permitted; run as root",)
+    assert doctor.rights(lacking, "enforce").verdict == "failure"
+    assert doctor.rights(lacking, "prefer").verdict == "warning"
+    assert doctor.rights(("switched off",), "off").verdict == "warning"
+
+
+def test_missed_ticks_are_a_streak_only_in_a_row() -> None:
+    apart = (Tick(0, 0, 6), Tick(0, 0, 0), Tick(0, 0, 6))
+    assert doctor.lateness(apart, REAL).verdict == "warning"
+
+
+def test_a_virtual_interface_has_no_bitrate_to_be_wrong() -> None:
+    config = changed(REAL, "can", channel="vcan0")
+    virtual = {"flags": ["NOARP", "UP"], "linkinfo": {"info_kind": "vcan"}}
+    assert not bad(doctor.examine(config, msgspec.structs.replace(GOOD, link=virtual)))
+    (missing,) = bad(doctor.examine(config, msgspec.structs.replace(GOOD, link=None))).values()
+    assert "type vcan" in missing.remedy
+
+
+def test_another_interface_is_said_to_be_unknown() -> None:
+    checks = doctor.examine(changed(REAL, "can", interface="pcan"), GOOD)
+    assert bad(checks)["CAN"].verdict == "warning"
+
+
+@pytest.mark.parametrize(
+    ("bitrate", "rate", "verdict"),
+    [(1_000_000, 1000, "ok"), (500_000, 1000, "failure"), (800_000, 1000, "warning"), (500_000, 500, "ok")],
+)
+def test_bus_load(bitrate: int, rate: int, verdict: str) -> None:
+    config = changed(changed(REAL, "can", bitrate=bitrate), "loop", rate_hz=rate)
+    assert doctor.load(config).verdict == verdict
+
+
+@pytest.mark.parametrize(("text", "found"), [("", ()), ("3", (3,)), ("1-3,6,8-9", (1, 2, 3, 6, 8, 9))])
+def test_sets_of_processors(text: str, found: tuple[int, ...]) -> None:
+    assert probes.processors(text) == found
+
+
+def test_an_interface_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "SYSTEM", tmp_path)
+    assert probes.link("can7") is None
+
+
+def test_without_ip_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "class/net/can0").mkdir(parents=True)
+    monkeypatch.setattr(probes, "SYSTEM", tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ServiceError, match="iproute2"):
+        probes.link("can0")
+
+
+def test_ticks_are_those_of_the_period(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "MEASURED", 0.02)
+    found = probes.ticks(0.001)
+    assert len(found) == 20
+    assert all(tick.deadline_ns > 0 and tick.lateness_ns >= 0 for tick in found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("json_wanted", [True, False], ids=["json", "words"])
+def test_the_command(json_wanted: bool) -> None:
+    command = [sys.executable, "-m", "service", "doctor", str(SIM), *(["--json"] if json_wanted else [])]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stderr == ""
+    if json_wanted:
+        said = json.loads(done.stdout)
+        verdicts = {check["name"]: check["verdict"] for check in said["checks"]}
+        assert verdicts["CAN"] == "ok"
+        assert (done.returncode == 0) == said["ok"] == ("failure" not in verdicts.values())
+    else:
+        assert "simulated: no hardware is used" in done.stdout

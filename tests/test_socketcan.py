@@ -1,0 +1,168 @@
+"""The bus and the driver on real SocketCAN: the kernel's virtual bus, and the simulated drives behind it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import can
+import pytest
+
+from drivers import bus, frames
+from drivers.cia402 import Cia402
+from drivers.config import Can, Drive, Drives, Simulated
+from drivers.errors import BusError
+from drivers.interface import Feedback, PowerState
+from drivers.simulated import simulated_bus
+
+NAME = f"vcan{os.getpid() % 100_000}"
+SECTION = Can(interface="socketcan", channel=NAME, simulated=Simulated(missed_syncs=1000))
+DRIVES = Drives(
+    protocol="cia402",
+    A=Drive(node=1, counts_per_metre=1e6),
+    B=Drive(node=2, counts_per_metre=1e6),
+    C=Drive(node=3, counts_per_metre=1e6),
+    heartbeat=2.0,  # a machine that is emulated, or busy, is no drive that is lost
+    sdo_timeout=10.0,
+)
+PERIOD = 0.02
+WITHIN = 60.0
+"""How long a slow machine may take for anything [s]."""
+
+
+def lacking() -> str:
+    """Why there can be no virtual CAN bus here, empty where there can."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError:
+        return "this kernel has no SocketCAN (modprobe can_raw): make hil runs these in a machine that has"
+    try:
+        ip("link", "add", NAME, "type", "vcan")
+    except (OSError, subprocess.CalledProcessError) as error:
+        said = getattr(error, "stderr", None) or str(error)
+        return f"no virtual CAN bus can be made here (root, modprobe vcan): {said.strip()}"
+    ip("link", "delete", NAME)
+    return ""
+
+
+def ip(*arguments: str) -> None:
+    subprocess.run(("ip", *arguments), capture_output=True, text=True, check=True)
+
+
+LACKING = lacking()
+pytestmark = [pytest.mark.vcan, pytest.mark.skipif(bool(LACKING), reason=LACKING)]
+
+
+@pytest.fixture
+def interface() -> Iterator[str]:
+    """A virtual bus that is up."""
+    ip("link", "add", NAME, "type", "vcan")
+    ip("link", "set", NAME, "up")
+    yield NAME
+    ip("link", "delete", NAME)
+
+
+@pytest.fixture
+def drives(interface: str) -> Iterator[None]:
+    """The simulated drives on it."""
+    over, running = socket.socketpair()
+    simulated = simulated_bus(SECTION, DRIVES)
+    wire = bus.open_bus(SECTION, DRIVES)
+
+    def serve() -> None:
+        with selectors.DefaultSelector() as selector:
+            selector.register(wire, selectors.EVENT_READ)
+            selector.register(running, selectors.EVENT_READ)
+            while not any(key.fileobj is running for key, _ in selector.select(PERIOD / 5)):
+                with contextlib.suppress(can.CanError):  # the interface may be down
+                    while (frame := wire.recv(0)) is not None:
+                        simulated.send(frame)
+                while (answer := simulated.recv(0.0)) is not None:
+                    with contextlib.suppress(can.CanError):
+                        wire.send(answer)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    yield
+    over.send(b"!")
+    thread.join()
+    for part in (wire, simulated, over, running):
+        part.shutdown() if isinstance(part, can.BusABC) else part.close()
+
+
+@pytest.fixture
+def driver(drives: None) -> Iterator[Cia402]:
+    connected = bus.connect(SECTION, DRIVES)
+    assert isinstance(connected, Cia402)
+    yield connected
+    connected.close()
+
+
+def cycle(driver: Cia402, position: float = 0.0, *, heard: bool = True) -> Feedback:
+    """One cycle, as slow as the answers to its SYNC."""
+    driver.sync()
+    deadline = time.monotonic() + WITHIN
+    while True:
+        feedback = driver.read()
+        answered = all(axis.unanswered == 0 for axis in driver._axes)
+        if answered or not heard or feedback.fault or time.monotonic() > deadline:
+            driver.write((position,) * 3, (0.0,) * 3)
+            return feedback
+        os.sched_yield()
+
+
+def until(driver: Cia402, condition: Callable[[Feedback], bool], position: float = 0.0) -> Feedback:
+    deadline = time.monotonic() + WITHIN
+    while not condition(feedback := cycle(driver, position)):
+        assert feedback.fault is None, feedback.fault
+        assert time.monotonic() < deadline, feedback
+    return feedback
+
+
+def test_frames_pass_between_two_sockets(interface: str) -> None:
+    with bus.open_bus(SECTION, DRIVES) as one, bus.open_bus(SECTION, DRIVES) as other:
+        one.send(frames.message(0x123, b"\x01\x02"))
+        arrived = other.recv(WITHIN)
+        assert arrived is not None
+        assert (arrived.arbitration_id, bytes(arrived.data)) == (0x123, b"\x01\x02")
+        assert one.recv(0) is None, "a socket hears what it sent itself"
+
+
+def test_an_interface_that_is_not_there_is_named_with_its_remedy() -> None:
+    with pytest.raises(BusError, match=f"ip link add {NAME} type vcan"):
+        bus.open_bus(SECTION, DRIVES)
+
+
+def test_an_interface_that_is_down_is_named_with_its_remedy(interface: str) -> None:
+    ip("link", "set", NAME, "down")
+    with pytest.raises(BusError, match="is down"):
+        bus.open_bus(SECTION, DRIVES)
+
+
+def test_drives_are_set_up_powered_moved_and_left_without_power(driver: Cia402) -> None:
+    driver.configure(PERIOD)
+    cycle(driver)
+    driver.enable()
+    until(driver, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
+    until(driver, lambda feedback: min(feedback.position) > 0.9e-4, position=1e-4)
+    driver.disable()
+    until(driver, lambda feedback: set(feedback.state) == {PowerState.SWITCH_ON_DISABLED}, position=1e-4)
+
+
+def test_an_interface_that_goes_down_is_a_fault_of_the_bus(driver: Cia402) -> None:
+    driver.configure(PERIOD)
+    cycle(driver)
+    driver.enable()
+    until(driver, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
+    ip("link", "set", NAME, "down")
+    cycle(driver, heard=False)
+    fault = driver.read().fault
+    assert fault is not None
+    assert fault.cause == "bus"
+    assert "CAN bus" in fault.message

@@ -1,0 +1,246 @@
+"""Checks a log of CAN frames against CiA 301, CiA 402 and the robot's limits: what really was on the bus.
+
+It knows the standards' tables by itself and shares no code with the driver, but for the layout of its PDOs.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from can import CanutilsLogReader
+
+from drivers import frames as layout
+from drivers.config import Drive
+from drivers.interface import NAMES
+from service.config import Config
+
+HELD = {
+    "SYNC": "every SYNC is a tick of the period: none too early, none in a burst, none but the missed ones lacking",
+    "setpoints": "one per drive and SYNC, within the limits, without a step in position, velocity or acceleration",
+    "power": "controlwords and states in CiA 402's order, each state asked for, no power without a setpoint",
+    "capture": "the service's own log has the same frames in the same order",
+}
+"""What is true where `problems` and `differences` find none."""
+
+STATES = {
+    0x00: "not ready to switch on",
+    0x40: "switch on disabled",
+    0x21: "ready to switch on",
+    0x23: "switched on",
+    0x27: "operation enabled",
+    0x07: "quick stop active",
+    0x0F: "fault reaction active",
+    0x08: "fault",
+}
+"""Statusword 6041h: bits 0 to 3, 5 and 6, of which bit 5 says nothing in states with bit 3 or 6, or in the first."""
+
+ASKED_BY = {
+    ("not ready to switch on", "switch on disabled"): None,
+    ("switch on disabled", "ready to switch on"): {0x06},
+    ("ready to switch on", "switched on"): {0x07},
+    ("switched on", "operation enabled"): {0x0F},
+    ("operation enabled", "switched on"): {0x07},
+    ("switched on", "ready to switch on"): {0x06},
+    ("operation enabled", "ready to switch on"): {0x06},
+    ("operation enabled", "switch on disabled"): {0x00},
+    ("switched on", "switch on disabled"): {0x00, 0x02},
+    ("ready to switch on", "switch on disabled"): {0x00, 0x02},
+    ("operation enabled", "quick stop active"): {0x02},
+    ("quick stop active", "switch on disabled"): None,
+    ("fault reaction active", "fault"): None,
+    ("fault", "switch on disabled"): {0x80},
+}
+"""CiA 402's transitions, and the controlwords that ask for them; None for those that a drive makes by itself."""
+
+FOLLOWS = {0x07: {0x06, 0x0F}, 0x0F: {0x07}}
+"""The controlwords that may go before one that leads towards power."""
+
+
+class Frame(NamedTuple):
+    """A data frame with an 11-bit identifier."""
+
+    t: float
+    """Seconds since 1970."""
+    identifier: int
+    data: bytes
+
+
+class Setpoint(NamedTuple):
+    """A setpoint of one drive."""
+
+    t: float
+    position: float
+    """Of the slider [m]."""
+    velocity: float
+    """The feed-forward [m/s]."""
+
+
+def read(path: Path) -> list[Frame]:
+    """Read a log in candump's format."""
+    return [
+        Frame(message.timestamp, message.arbitration_id, bytes(message.data)) for message in CanutilsLogReader(path)
+    ]
+
+
+def problems(log: Sequence[Frame], config: Config, missed: int, until: float) -> list[str]:
+    """Return what is wrong in the frames before the time `until`, a line each; `missed` ticks the service told of."""
+    log = [frame for frame in log if frame.t < until]
+    syncs = [frame.t for frame in log if frame.identifier == layout.SYNC]
+    if len(syncs) < 3:
+        return [f"SYNC: {len(syncs)} in the log: nothing ran"]
+    found = list(_sync_problems(syncs, config.period, missed))
+    for name, drive in zip(NAMES, config.drives.each, strict=True):
+        found += (f"drive {name}: {problem}" for problem in _setpoint_problems(log, drive, config))
+        found += (f"drive {name}: {problem}" for problem in _power_problems(log, drive.node))
+    return found
+
+
+def differences(own: Sequence[Frame], log: Sequence[Frame]) -> list[str]:
+    """Return where the frames in the service's own log are not those of the bus, for each identifier."""
+    here, there = _by_identifier(own), _by_identifier(log)
+    found = []
+    for identifier, said in here.items():
+        heard = there.get(identifier, [])
+        # Its log begins when the service does and may end later: with frames that never got out of a dead interface.
+        shared = min(len(said), len(heard))
+        tail = len(heard) - len(said)
+        aligned = (heard[:shared], heard[tail:] if tail > 0 else heard)
+        if shared == 0 or said[:shared] not in aligned:
+            found.append(f"identifier {identifier:03X}: {len(said)} frames in the service's log, but others on the bus")
+    return found
+
+
+def statistics(log: Sequence[Frame], config: Config, until: float) -> dict[str, float]:
+    """Return numbers for people: how many frames, and the intervals of SYNC [ms]."""
+    log = [frame for frame in log if frame.t < until]
+    syncs = [frame.t for frame in log if frame.identifier == layout.SYNC]
+    intervals = sorted(after - before for before, after in itertools.pairwise(syncs))
+    return {
+        "frames": len(log),
+        "syncs": len(syncs),
+        "period_ms": round(config.period * 1e3, 3),
+        "interval_median_ms": round(intervals[len(intervals) // 2] * 1e3, 3),
+        "interval_p99_ms": round(intervals[len(intervals) * 99 // 100] * 1e3, 3),
+        "interval_max_ms": round(intervals[-1] * 1e3, 3),
+    }
+
+
+def _by_identifier(log: Sequence[Frame]) -> dict[int, list[bytes]]:
+    sorted_out: defaultdict[int, list[bytes]] = defaultdict(list)
+    for frame in log:
+        sorted_out[frame.identifier].append(frame.data)
+    return sorted_out
+
+
+def _sync_problems(syncs: Sequence[float], period: float, missed: int) -> Iterator[str]:
+    """Ticks come on a grid that begins with the first one: late ones are skipped, never made up for."""
+    began = syncs[0]
+    for number, t in enumerate(syncs):
+        # Not before its place on the grid, less what the first one was late itself.
+        if t - began < (number - 1) * period:
+            early = number * period - (t - began)
+            yield f"SYNC {number} comes {early:.4f} s too early: ticks were caught up in a burst"
+            return
+    ticks = round((syncs[-1] - began) / period)
+    lacking = ticks + 1 - len(syncs)
+    # A tick may be late by nearly a period at either end.
+    if abs(lacking - missed) > 2:
+        yield f"SYNC: {lacking} of {ticks} ticks have none, but the service says that it missed {missed}"
+
+
+def _setpoints(log: Sequence[Frame], drive: Drive) -> list[Setpoint]:
+    found = []
+    for frame in log:
+        if frame.identifier == layout.RPDO2 + drive.node:
+            position, velocity = layout.SETPOINT.unpack(frame.data)
+            factor = drive.direction / drive.counts_per_metre
+            found.append(Setpoint(frame.t, position * factor + drive.offset, velocity * factor))
+    return found
+
+
+def _setpoint_problems(log: Sequence[Frame], drive: Drive, config: Config) -> Iterator[str]:
+    """Within the limits, and continuous: each step is a velocity, each change of it an acceleration in the limits."""
+    limits, period = config.limits.slider, config.period
+    count = 1.0 / drive.counts_per_metre
+    points = _setpoints(log, drive)
+    if not points:
+        yield "no setpoint at all"
+        return
+    low, high = limits.position
+    for point in points:
+        if not low - count <= point.position <= high + count:
+            yield f"setpoint {point.position:.6f} m is outside of [{low:g}, {high:g}]"
+        if abs(point.velocity) > limits.velocity + count:
+            yield f"velocity feed-forward {point.velocity:.6f} m/s is above {limits.velocity:g}"
+    for before, after in itertools.pairwise(points):
+        step = after.position - before.position
+        if abs(step) > limits.velocity * period + 2 * count:
+            yield f"step of {step * 1e3:.4f} mm at {after.t:.6f}: {abs(step) / period:.3f} m/s"
+        # Velocity changes within the step by a·T at most, so that the step is its mean over the period.
+        mean = 0.5 * (before.velocity + after.velocity) * period
+        if abs(step - mean) > 0.25 * limits.acceleration * period**2 + 3 * count:
+            yield f"step of {step * 1e3:.4f} mm at {after.t:.6f}, but its feed-forward says {mean * 1e3:.4f} mm"
+        if abs(after.velocity - before.velocity) > limits.acceleration * period * 1.01 + 2 * count:
+            yield f"velocity feed-forward jumps by {after.velocity - before.velocity:.6f} m/s at {after.t:.6f}"
+    since_sync = 0
+    for frame in log:
+        if frame.identifier == layout.SYNC:
+            since_sync = 0
+        elif frame.identifier == layout.RPDO2 + drive.node:
+            since_sync += 1
+            if since_sync > 1:
+                yield f"two setpoints between one SYNC and the next, at {frame.t:.6f}"
+
+
+def _power_problems(log: Sequence[Frame], node: int) -> Iterator[str]:
+    """The order of controlwords, and the states that follow from them."""
+    word, state = 0x00, ""
+    words = {0x00}  # sent since the drive last told of a change
+    setpoint = started = False
+    for frame in log:
+        if frame.identifier == layout.NMT and frame.data[0] == layout.NMT_START and frame.data[1] in {0, node}:
+            started = True
+        elif frame.identifier == layout.RPDO2 + node:
+            setpoint = True
+        elif frame.identifier == layout.RPDO1 + node:
+            (new,) = layout.CONTROLWORD.unpack(frame.data)
+            if word not in FOLLOWS.get(new, {word}):
+                yield f"controlword {new:04X} after {word:04X}, at {frame.t:.6f}"
+            if new == 0x0F and not setpoint:
+                yield f"operation is enabled before there is a setpoint, at {frame.t:.6f}"
+            if not started:
+                yield f"controlword {new:04X} before NMT start, at {frame.t:.6f}"
+            word = new
+            words.add(new)
+        elif frame.identifier == layout.TPDO1 + node:
+            (status,) = layout.STATUSWORD.unpack(frame.data)
+            new_state = _state(status)
+            if new_state is None:
+                yield f"statusword {status:04X} is that of no state"
+            elif new_state != state:
+                if state:
+                    yield from _transition_problems(state, new_state, words, frame.t)
+                state, words = new_state, {word}
+    if "operation enabled" not in {
+        _state(layout.STATUSWORD.unpack(f.data)[0]) for f in log if f.identifier == layout.TPDO1 + node
+    }:
+        yield "was never in operation enabled"
+
+
+def _state(status: int) -> str | None:
+    return STATES.get(status & 0x6F) or STATES.get(status & 0x4F)
+
+
+def _transition_problems(before: str, after: str, words: set[int], t: float) -> Iterator[str]:
+    if after == "fault reaction active":
+        yield f"fault at {t:.6f}"
+    elif (before, after) not in ASKED_BY:
+        yield f"from {before} to {after} at {t:.6f}: no transition of CiA 402"
+    else:
+        asked = ASKED_BY[before, after]
+        if asked is not None and not asked & words:
+            yield f"from {before} to {after} at {t:.6f}, which no controlword asked for"
