@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -65,10 +65,17 @@ def vectors(values: NDArray[np.float64]) -> pa.ListArray:
 
 
 def strips(values: NDArray[np.float64]) -> pa.ListArray:
-    """Return (N, k, d) as N rows of one line each, through k points in single precision."""
+    """Return (N, m, k, d) as N rows of m lines, each through k points in single precision."""
     points = _vectors(values)
-    kind = pa.list_(pa.field("item", points.type, nullable=False))
-    return _lists(_lists(points, values.shape[1]).cast(kind), 1)
+    return _lists(_lines(points, np.arange(0, len(points) + 1, values.shape[2])), values.shape[1])
+
+
+def ragged(rows: Sequence[Sequence[NDArray[np.float64]]]) -> pa.ListArray:
+    """Return rows of so many lines, each through so many points, (k, 2), in single precision."""
+    lines = [line for row in rows for line in row]
+    points = _vectors(np.concatenate([np.empty((0, 2)), *lines]))
+    ends = np.cumsum([0, *map(len, rows)], dtype=np.int32)
+    return pa.ListArray.from_arrays(ends, _lines(points, np.cumsum([0, *map(len, lines)])))
 
 
 def structs(records: NDArray[np.void]) -> pa.ListArray:
@@ -91,6 +98,11 @@ def _times(t: NDArray[np.int64], wall: NDArray[np.int64]) -> list[rr.TimeColumn]
 def _vectors(values: NDArray[np.float64]) -> pa.FixedSizeListArray:
     kind = pa.list_(pa.field("item", pa.float32(), nullable=False), values.shape[-1])
     return pa.FixedSizeListArray.from_arrays(pa.array(_flat(values.astype(np.float32))), type=kind)
+
+
+def _lines(points: pa.Array, ends: NDArray[np.integer]) -> pa.ListArray:
+    kind = pa.list_(pa.field("item", points.type, nullable=False))
+    return pa.ListArray.from_arrays(ends.astype(np.int32), points, type=kind)
 
 
 def _lists(items: pa.Array, length: int) -> pa.ListArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 from ruckig import Trajectory
 
 from service.algebra import Array
-from service.paths import FOR_EVER, Path, advance, value
+from service.paths import FOR_EVER, Path, advance, constant, value
 
 STILL = (0.0, 0.0, 0.0)
 SAME_TIME = 1e-9
@@ -84,6 +85,13 @@ class Run:
     def ends(self) -> float:
         """When it stands, in time of its law [s]."""
         return min(end_of(self.path, self.law, self.target), FOR_EVER if self.target else float(self.law.knots[-2]))
+
+    def destination(self, near: Sequence[float]) -> Sequence[float]:
+        """Return the pose at the end of the path, on the branch of the pose `near`."""
+        self._near[:] = near
+        duration = self.path.duration
+        code = advance(self._legs, *self.path, *constant(1.0)[:2], duration, self._near, self._out)
+        return [math.nan] * 3 if code else self._out[0].tolist()
 
     def copy(self) -> Run:
         """Return the same motion, to be changed by itself."""

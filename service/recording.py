@@ -9,7 +9,7 @@ from pathlib import Path
 
 from service.config import Config
 from service.links import Closed, Link
-from service.packets import Happened, Kind, Welcome, decode_answer
+from service.packets import Happened, Kind, Situation, Welcome, decode_answer
 from service.recorder import Recorder
 
 
@@ -39,7 +39,10 @@ def main(config: Config, record: str | None, link: Link, ready: Callable[[object
                     said = decode_answer(content)
                     if isinstance(said, Happened):
                         recorder.event(said.event)
+                    elif isinstance(said, Situation):
+                        recorder.target(said.target)
                     elif isinstance(said, Welcome):
+                        recorder.bus_load(said.bus_load)
                         ready({"recording": str(recorder.path), "live": recorder.live_url})
     except Closed:
         pass
