@@ -12,7 +12,7 @@ from service.subject import Subject
 
 WINDOW = 8.0
 """How much of the past the plots show [s]."""
-MARGIN = 0.04
+MARGIN = 0.06
 """Room around the robot, as a share of its size."""
 
 
@@ -31,12 +31,13 @@ def layout(subject: Subject, bounds: Points) -> rrb.Blueprint:
         _plot("Angle φ  [°]", curves.PHI, window),
         _plot("Distance to singularity  [°]", curves.SINGULARITY, window),
         _plot("Loop timing  [µs]", curves.TIMING, window, legend=True),
+        row_shares=[18, 19, 25, 20],
     )
     events = rrb.TextLogView(
         name="Events",
         origin="/events",
         columns=rrb.TextLogColumns(
-            timeline_columns=[rrb.encodings.TimelineColumn("t")],
+            timeline_columns=[rrb.encodings.TimelineColumn("t", visible=False)],
             text_log_columns=["LogLevel", "Body"],
         ),
     )

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import palette
+from service.config import Range
 from service.geometry import LEGS
 from service.palette import Colour
 from service.subject import Subject
@@ -47,7 +48,7 @@ class Lines(NamedTuple):
 
 def plots(subject: Subject) -> dict[str, Lines]:
     """Return what is plotted, by entity, in the units of the curves."""
-    slider = subject.limits.slider
+    slider, platform = subject.limits.slider, subject.limits.platform
     error = slider.following_error * 1e6
     margin = float(np.degrees(subject.limits.singularity_margin))
     return {
@@ -55,7 +56,7 @@ def plots(subject: Subject) -> dict[str, Lines]:
         VELOCITY: _sliders(-slider.velocity * 1e3, slider.velocity * 1e3),
         ACCELERATION: _sliders(-slider.acceleration, slider.acceleration),
         ERROR: _sliders(-error, error)._replace(near=NEAR),
-        CENTRE: Lines((Line("x", palette.X), Line("y", palette.Y))),
+        CENTRE: Lines((Line("x", palette.X), Line("y", palette.Y)), _window(platform.x, platform.y)),
         PHI: Lines((Line("φ", palette.PHI),)),
         SINGULARITY: Lines((Line("distance", palette.SINGULARITY),), (Limit("margin", margin),)),
         TIMING: timing(subject.rate_hz, float("nan")),
@@ -106,6 +107,14 @@ def with_limits(moving: NDArray[np.float64], lines: Lines) -> NDArray[np.float64
     if lines.near and np.abs(moving).max() < lines.near * min(map(abs, limits)):
         table[:, count:] = np.nan
     return table
+
+
+def _window(x: Range, y: Range) -> tuple[Limit, ...]:
+    """Return the limits of the platform's centre, once where those of x and y are the same."""
+    if x == y:
+        return Limit("min", x[0] * 1e3), Limit("max", x[1] * 1e3)
+    ends = zip(("x min", "x max", "y min", "y max"), (*x, *y), strict=True)
+    return tuple(Limit(name, end * 1e3) for name, end in ends)
 
 
 def _sliders(low: float, high: float) -> Lines:

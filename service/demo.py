@@ -141,10 +141,10 @@ def _tour(robot: Robot) -> Iterator[_Row]:
     )
     with Progress(*columns, console=out) as progress:
         task = progress.add_task("the tour", total=len(TOUR), note="")
-        for leg in TOUR:
+        for number, leg in enumerate(TOUR, 1):
             began = time.monotonic()
             try:
-                goal = robot.move_to(x=leg.x, y=leg.y, phi=leg.phi, speed=leg.speed)
+                goal = robot.move_to(x=leg.x, y=leg.y, phi=leg.phi, speed=leg.speed, id=f"tour-{number}")
             except RefusedError as error:
                 result = Result("", "rejected", str(error))
             else:

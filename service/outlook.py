@@ -29,7 +29,7 @@ class Outlook:
     """A robot's workspace and singularities."""
 
     def __init__(self, geometry: Geometry, limits: Limits) -> None:
-        self.outline = lru_cache(_KEPT)(lambda step: _outline(geometry, limits, step))
+        self.outline = lru_cache(_KEPT)(lambda step: _outline(geometry, limits, int(step)))
         """The line around the permitted centres at φ = `step` ANGLE: (V + 1, 2) [m], closed; empty for none."""
         self._singular = lru_cache(_KEPT)(
             lambda x, y: np.array(singular_angles(geometry, (x * PLACE, y * PLACE)))[:, np.newaxis]

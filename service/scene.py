@@ -30,6 +30,7 @@ OUTLINES_HZ = 10
 
 FIELDS = rr.ComponentDescriptor("fields")
 SCALARS = rr.Scalars.descriptor_scalars()
+TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
 STATE = rr.StateChange.descriptor_state()
 LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
@@ -81,7 +82,7 @@ class Scene:
             table = curves.with_limits(values, self._plots[path])
             parts.append(Column(path, SCALARS, columns.scalars(table)))
         chunks = columns.chunks(self._timelines.of(newest), parts)
-        return chunks + self._workspace(newest[:: DRAWN_HZ // OUTLINES_HZ]) + self._modes(records)
+        return chunks + self._situation(records)
 
     def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
         """Return the pose that the goal leads to from the time of `record` on; None for no goal."""
@@ -92,25 +93,24 @@ class Scene:
         wall_ns = int(record["deadline_ns"]) + self._wall_offset_ns
         return remark(float(record["cycle"]) / self._rate_hz, wall_ns * 1e-9, level, message)
 
-    def _workspace(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return the outline of the workspace at the first record and wherever φ has changed."""
-        steps = self._outlook.steps(records["pose"][:, 2])
-        changed = np.diff(steps, prepend=steps[0] - 1) != 0
-        outlines = columns.ragged([[self._outlook.outline(step)] for step in steps[changed].tolist()])
-        column = Column("/robot/workspace", drawing.STRIPS, outlines)
-        return columns.chunks(self._timelines.of(records[changed]), [column])
-
-    def _modes(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return the mode at the first record and wherever it changes."""
-        entered = records[np.diff(records["mode"], prepend=len(MODES)) != 0]
-        modes = pa.array([[MODES[mode]] for mode in entered["mode"]])
-        return columns.chunks(self._timelines.of(entered), [Column("/mode", STATE, modes)])
+    def _situation(self, records: NDArray[np.void]) -> list[Chunk]:
+        """Return mode and outline of the workspace at the first record, where the mode changes, and as φ changes."""
+        changed = np.diff(records["mode"], prepend=len(MODES)) != 0
+        some = np.arange(0, len(records), max(1, self._rate_hz // OUTLINES_HZ))
+        steps = self._outlook.steps(records["pose"][some, 2])
+        changed[some] |= np.diff(steps, prepend=steps[0]) != 0
+        at = records[changed]
+        modes = pa.array([[MODES[mode]] for mode in at["mode"]])
+        outlines = columns.ragged([[self._outlook.outline(step)] for step in self._outlook.steps(at["pose"][:, 2])])
+        parts = [Column("/mode", STATE, modes), Column("/robot/workspace", drawing.STRIPS, outlines)]
+        return columns.chunks(self._timelines.of(at), parts)
 
 
 def remark(t: float, wall: float, level: Level, message: str) -> Chunk:
     """Return a line of the log at nominal time `t` [s] and wall clock `wall` [s since 1970]."""
-    line = rr.TextLog.columns(text=[message], level=[LEVELS[level]])
-    return Chunk.from_columns("/events", columns.moment(t, wall), line)
+    line = [Column("/events", TEXT, pa.array([[message]])), Column("/events", LEVEL, pa.array([[LEVELS[level]]]))]
+    (chunk,) = columns.chunks(columns.moment(t, wall), line)
+    return chunk
 
 
 def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
