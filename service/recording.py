@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,9 @@ from service.config import Config
 from service.links import Closed, Link
 from service.packets import Happened, Kind, Situation, Welcome, decode_answer
 from service.recorder import Recorder
+
+GATHER = 0.05
+"""How long to let packets gather before they are taken: to wake for each costs more than what is in it [s]."""
 
 
 def main(config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> int:
@@ -29,6 +33,7 @@ def main(config: Config, record: str | None, link: Link, ready: Callable[[object
     try:
         while not ending:
             poll.poll(500)
+            time.sleep(GATHER)
             while (packet := link.receive()) is not None:
                 content = packet[1:]
                 if packet[0] == Kind.RECORDS:
