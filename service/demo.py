@@ -77,7 +77,7 @@ def run(*, stay: bool, record: Path | None) -> int:
             state = robot.state()
             if stay and all(row.result.outcome == "done" for row in rows):
                 _report(rows, state, recording)
-                _stay(config.telemetry.live_port)
+                _stay()
             robot.disable()
         service.send_signal(signal.SIGTERM)
         code = service.wait(timeout=20)
@@ -178,13 +178,13 @@ def _report(rows: list[_Row], state: State, recording: Path) -> None:
     for lack in loop.lacking:
         out.print(f"[bold yellow]without[/]          {escape(lack)}", soft_wrap=True)
     out.print(f"[bold]recording[/]        {recording}", soft_wrap=True)
-    out.print(f"[bold]look at it[/]       .venv/bin/rerun {recording}", soft_wrap=True)
+    out.print(f"[bold]look at it[/]       .venv/bin/trirail view {recording}", soft_wrap=True)
 
 
-def _stay(live_port: int) -> None:
+def _stay() -> None:
     out.print()
     out.print("The service stays up, enabled. In another terminal: trirail goto 0.03 0.02 0.2 --wait")
-    out.print(f"Live view: .venv/bin/rerun --connect rerun+http://127.0.0.1:{live_port}/proxy", soft_wrap=True)
+    out.print("Live view: trirail view, or in the browser: trirail view --web")
     out.print("Ctrl-C ends it.")
     with contextlib.suppress(KeyboardInterrupt):
         signal.pause()
