@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 
-.PHONY: demo test bench clean
+.PHONY: demo test ci-packages bench clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
@@ -15,6 +15,9 @@ test: $(READY)  ## everything that decides: lint, format, types, import contract
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 	$(VENV)/bin/pytest
+
+ci-packages:  ## the system's packages for the tests of the viewers; those tests are skipped without
+	.ci/packages
 
 bench: $(READY)  ## the loop and the kinematics, measured
 	$(VENV)/bin/python tools/bench.py loop

@@ -12,7 +12,7 @@ from service.subject import Subject
 
 WINDOW = 8.0
 """How much of the past the plots show [s]."""
-MARGIN = 0.06
+MARGIN = 0.09
 """Room around the robot, as a share of its size."""
 
 
