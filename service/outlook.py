@@ -5,6 +5,7 @@ Both are looked up for poses rounded a little and kept, so that a recorder can a
 
 from __future__ import annotations
 
+import itertools
 import math
 from functools import lru_cache
 
@@ -20,8 +21,6 @@ ANGLE = math.radians(0.5)
 """Workspace outlines are those of multiples of this φ [rad]."""
 PLACE = 2e-3
 """Singular angles are those with the centre at multiples of this, in x and y [m]."""
-EVERY = 10
-"""Distances are to the singular angles of every tenth pose: these angles hardly move."""
 _KEPT = 4096
 
 
@@ -34,6 +33,11 @@ class Outlook:
         self._singular = lru_cache(_KEPT)(
             lambda x, y: np.array(singular_angles(geometry, (x * PLACE, y * PLACE)))[:, np.newaxis]
         )
+        # On the symmetric robot the singular angles are the same everywhere, and need to be found only once.
+        self._everywhere = all(
+            singular_angles(geometry, corner) == singular_angles(geometry)
+            for corner in itertools.product(limits.platform.x, limits.platform.y)
+        )
 
     def steps(self, phi: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return which outlines belong to angles [rad]."""
@@ -41,13 +45,20 @@ class Outlook:
 
     def distance(self, poses: Points) -> NDArray[np.float64]:
         """Return by what angle [rad] φ differs from the nearest singular one, (N,), for poses (N, 3)."""
+        if self._everywhere:
+            return _least(poses[:, 2], self._singular(0, 0))
         found = np.empty(len(poses))
-        for start in range(0, len(poses), EVERY):
-            some = slice(start, start + EVERY)
-            x, y = np.rint(poses[start, :2] / PLACE).astype(int).tolist()
-            between = np.abs(poses[some, 2] - self._singular(x, y))
-            found[some] = np.abs(between - math.tau * np.rint(between / math.tau)).min(axis=0)
+        places = np.rint(poses[:, :2] / PLACE).astype(int)
+        for k, (x, y) in enumerate(places.tolist()):
+            found[k : k + 1] = _least(poses[k : k + 1, 2], self._singular(x, y))
         return found
+
+
+def _least(phi: NDArray[np.float64], singular: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the least angle between phi, (N,), and any of the singular angles, (K, 1)."""
+    between = phi - singular
+    least: NDArray[np.float64] = np.abs(between - math.tau * np.rint(between / math.tau)).min(axis=0)
+    return least
 
 
 def _outline(geometry: Geometry, limits: Limits, step: int) -> Points:
