@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 
-.PHONY: demo test hil bench clean
+.PHONY: demo test hil ci-packages bench clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
@@ -19,6 +19,9 @@ test: $(READY)  ## everything that decides: lint, format, types, import contract
 hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; installs what that needs, as root on Debian
 	$(VENV)/bin/python -m pip install --quiet --group hil
 	$(VENV)/bin/python tools/hil.py --install $(ARGS)
+
+ci-packages:  ## the system's packages for the tests of the viewers; those tests are skipped without
+	.ci/packages
 
 bench: $(READY)  ## the loop and the kinematics, measured
 	$(VENV)/bin/python tools/bench.py loop

@@ -232,6 +232,14 @@ class Control:
         *stops, run = course.runs
         return run.progress, run.remaining + sum(stop.ends - stop.time for stop in stops)
 
+    @property
+    def target(self) -> Triple | None:
+        """The pose that the running goal leads to; None without one, and for a jog."""
+        if self.desk.goal is None or self.desk.goal.is_jog or not self._course.runs:
+            return None
+        x, y, phi = self._course.last.destination(self.commanded.pose)
+        return (x, y, phi)
+
     def trip(self, reason: str) -> None:
         """Stop all three drives in this cycle and latch the reason."""
         if self.state.mode is Mode.FAULT:

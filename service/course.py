@@ -25,6 +25,11 @@ class Course:
         return self._turn is not None
 
     @property
+    def last(self) -> Run:
+        """The motion that leads to the goal; there has to be one."""
+        return self._later[-1] if self._later else self.runs[-1]
+
+    @property
     def remaining(self) -> float:
         """Time until it stands [s]."""
         if self._turn is not None:

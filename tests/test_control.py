@@ -577,3 +577,18 @@ def test_any_sequence_is_smooth_and_ends_every_goal_once(config: Config, steps: 
     assert [said.message for said in rig.happenings if said.kind == "fault"] == []
     assert sorted(goal_id or "" for goal_id, _ in rig.outcomes()) == sorted(ids)
     assert_within_limits(rig)
+
+
+def test_the_target_is_where_the_goal_leads(rig: Rig) -> None:
+    rig.enable()
+    assert rig.control.target is None
+    rig.goal("a", 0.03, -0.02, 0.2)
+    assert rig.control.target == pytest.approx((0.03, -0.02, 0.2))
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    assert rig.control.target is None
+    rig.send("b", SlidersGoal(position=(0.02, 0.0, -0.01)))
+    target = rig.control.target
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    assert target == pytest.approx(rig.control.commanded.pose, abs=1e-9)
+    rig.send("jog", VelocityGoal(x=0.01, y=0.0, phi=0.0))
+    assert rig.control.target is None

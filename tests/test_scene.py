@@ -6,17 +6,23 @@ import math
 from typing import Any
 
 import made
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from service.config import SIM, LegTable, load
+from service.gateway import _info
 from service.geometry import Geometry, Leg
 from service.mechanism import Mechanism, sliders
+from service.messages import Info
 from service.modes import MODES, Mode
+from service.outlook import Outlook
 from service.records import DTYPE
 from service.scene import Scene, remark
+from service.singularity import distance_to_singularity
+from service.subject import Subject
 
 CONFIG = load(SIM)
 WALL_OFFSET_NS = 1_700_000_000_000_000_000
@@ -31,7 +37,7 @@ GENERAL = Geometry(
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return Scene(CONFIG, WALL_OFFSET_NS)
+    return Scene(Subject.configured(CONFIG), WALL_OFFSET_NS)
 
 
 def by_entity(chunks: list[Chunk]) -> dict[str, Chunk]:
@@ -66,7 +72,7 @@ def test_sliders_are_drawn_on_their_rail_and_on_their_edge(geometry: Geometry) -
     records["pose"], records["position"] = records["commanded_pose"], records["commanded_position"]
     parts = Mechanism.of(geometry, CONFIG.limits.slider)
     config = _with_geometry(geometry)
-    drawn = by_entity(Scene(config, 0).drawn(records))
+    drawn = by_entity(Scene(Subject.configured(config), 0).drawn(records))
 
     points = values(drawn["/robot/sliders"], "Points2D:positions")
     centre = values(drawn["/robot/platform"], "Transform3D:translation")[:, 0, :2]
@@ -132,7 +138,7 @@ def test_no_spike_is_lost_to_thinning(scene: Scene) -> None:
     error = values(drawn["/sliders/following_error"], "Scalars:scalars")
     assert error[12, :2] == pytest.approx([-2000.0, 1000.0])
     timing = values(drawn["/loop/timing"], "Scalars:scalars")
-    assert timing[27, 1:] == pytest.approx([5000.0, 1000.0])  # with the budget
+    assert timing[27, [1, 3]] == pytest.approx([5000.0, 1000.0])  # with the period
 
 
 def test_a_gap_in_the_cycles_is_a_gap_in_time(scene: Scene) -> None:
@@ -166,8 +172,6 @@ def test_what_is_still_is_there_once(scene: Scene) -> None:
 
 
 def _with_geometry(geometry: Geometry) -> Any:
-    import msgspec
-
     legs = tuple(LegTable(**{name: getattr(leg, name) for name in Leg.__slots__}) for leg in geometry.legs)
     table = msgspec.structs.replace(CONFIG.geometry, l0=None, leg=legs)
     return msgspec.structs.replace(CONFIG, geometry=table)
@@ -179,3 +183,40 @@ def _beside(points: NDArray[Any], start: NDArray[Any], end: NDArray[Any]) -> NDA
     off = points - start
     distance: NDArray[Any] = along[:, 0] * off[:, 1] - along[:, 1] * off[:, 0]
     return distance
+
+
+def test_the_goal_is_drawn_where_it_leads_and_not_without_one(scene: Scene) -> None:
+    record = made.records(0.1)[-1]
+    (chunk,) = scene.goal(record, (0.03, -0.02, 0.4))
+    (lines,) = chunk.to_record_batch().column("LineStrips2D:strips").to_pylist()
+    outline = np.array(lines[0])
+    assert outline[:3].mean(axis=0) == pytest.approx([0.03, -0.02], abs=1e-6)
+    (home,) = Mechanism.of(Geometry.symmetric(0.3), CONFIG.limits.slider).outline
+    assert math.dist(outline[0], (0.03, -0.02)) == pytest.approx(math.dist(home[0], (0.0, 0.0)), abs=1e-6)
+    turned = np.arctan2(*(outline[0] - [0.03, -0.02])[::-1]) - np.arctan2(*home[0][::-1])
+    assert math.remainder(turned, math.tau) == pytest.approx(0.4, abs=1e-5)
+    (none,) = scene.goal(record, None)
+    assert none.to_record_batch().column("LineStrips2D:strips").to_pylist() == [[]]
+
+
+def test_the_distance_to_singularity_is_that_of_the_mathematics() -> None:
+    for geometry, tolerance in ((Geometry.symmetric(0.3), 1e-9), (GENERAL, math.radians(1.5))):
+        poses = made.records(5.0)["commanded_pose"][::10]
+        found = Outlook(geometry, CONFIG.limits).distance(poses)
+        assert found == pytest.approx(np.abs(distance_to_singularity(geometry, poses)), abs=tolerance)
+
+
+def test_limits_of_the_following_error_come_into_view_with_it(scene: Scene) -> None:
+    records = made.records(0.1)
+    limits = values(by_entity(scene.drawn(records))["/sliders/following_error"], "Scalars:scalars")[:, 3:]
+    assert np.isnan(limits.astype(float)).all()
+    records["following_error"][50, 1] = 0.5e-3
+    limits = values(by_entity(scene.drawn(records))["/sliders/following_error"], "Scalars:scalars")[:, 3:]
+    assert np.all(limits == [-4000.0, 4000.0])
+
+
+def test_a_robot_is_the_same_by_its_configuration_and_by_its_services_words() -> None:
+    info = msgspec.json.decode(msgspec.json.encode(_info(CONFIG)), type=Info)
+    told, configured = Subject.told(info), Subject.configured(CONFIG)
+    assert (told.name, told.limits, told.rate_hz) == (configured.name, configured.limits, configured.rate_hz)
+    assert told.geometry.legs == configured.geometry.legs

@@ -8,12 +8,14 @@ import os
 import re
 import selectors
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
@@ -26,6 +28,7 @@ from service.client import Robot
 from service.config import SIM
 from service.errors import RefusedError, ServiceError
 from service.messages import GoalReply, OwnLimits, State
+from service.remote import RemoteView
 from service.session import open_client
 
 pytestmark = pytest.mark.slow
@@ -345,6 +348,23 @@ def test_goals_wait_blend_and_are_cancelled(service: Service) -> None:
     assert json.loads(waiting.stdout)["outcome"] == "done"
 
 
+def test_a_view_is_drawn_from_what_the_service_publishes(shared: tuple[Service, Robot, zenoh.Session]) -> None:
+    service, robot, _ = shared
+    with RemoteView(robot.info(), service.locator) as view:
+        host = socket.create_connection(("127.0.0.1", urlsplit(view.url).port or 0), timeout=5.0)
+        host.close()
+        began = view._show.t
+        goal = robot.move_to(x=0.01, y=0.0, phi=0.0)
+        assert goal.wait(timeout=10.0).outcome == "done"
+        until(robot, lambda _: view._show.t > began + 0.2)
+    assert (view._lost, view._relay.skipped) == (0, 0)
+    assert view._bus_load == pytest.approx(0.75, abs=0.001)
+    assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
+    refused = trirail("view", "--web", locator=service.locator)
+    assert refused.returncode == 1
+    assert "trirail view --records draws one here" in refused.stderr
+
+
 def test_the_service_is_seen_alive(shared: tuple[Service, Robot, zenoh.Session]) -> None:
     _, _, session = shared
     assert [reply.ok is not None for reply in session.liveliness().get("trirail/demo/alive")] == [True]
@@ -457,8 +477,6 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> N
 def test_a_start_that_fails_says_why_in_one_line(
     tmp_path: Path, before: str, after: str, said: str | tuple[str, ...]
 ) -> None:
-    import socket
-
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         text = SIM.read_text().replace('"tcp/127.0.0.1:7447"', f'"unixsock-stream/{tmp_path}/z"')

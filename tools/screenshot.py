@@ -9,14 +9,17 @@ import argparse
 import io
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from PIL import Image
 from rerun.experimental import ViewerClient
+
+from service.sinks import free_port
 
 TIMEOUT = 60.0
 SETTLE = 2.0
@@ -36,23 +39,35 @@ def main() -> int:
     if not arguments.recording.is_file():
         parser.error(f"{arguments.recording} is not a file")
     width, height = (int(number) for number in arguments.size.split("x"))
-    port = _free_port()
-    command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen"]
-    command += ["--window-size", f"{width}x{height + TITLE_BAR}", "--port", str(port), str(arguments.recording)]
+    with viewer(arguments.recording, width, height) as client:
+        if arguments.at is not None:
+            client.set_time("t", duration=arguments.at, play_state="paused")
+        picture(client).save(arguments.picture)
+    return 0
+
+
+@contextmanager
+def viewer(recording: Path, width: int, height: int) -> Iterator[ViewerClient]:
+    """Run a viewer without a window until it has loaded a recording; yield a client of it."""
+    port = free_port()
+    command = [sys.executable, "-m", "rerun_cli", "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1"]
+    command += ["--window-size", f"{width}x{height + TITLE_BAR}", "--port", str(port), str(recording)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-    ) as viewer:
+    ) as process:
         try:
-            client = _connect(viewer, f"rerun+http://127.0.0.1:{port}/proxy")
+            client = _connect(process, f"rerun+http://127.0.0.1:{port}/proxy")
             client.run_command("ui.toggle_top_panel")
-            if arguments.at is not None:
-                client.set_time("t", duration=arguments.at, play_state="paused")
-            time.sleep(SETTLE)
-            picture = Image.open(io.BytesIO(client.take_screenshot()))
-            picture.crop((0, TITLE_BAR, width, TITLE_BAR + height)).save(arguments.picture)
+            yield client
         finally:
-            os.killpg(viewer.pid, signal.SIGTERM)  # `python -m rerun` does not pass the signal on to the viewer
-    return 0
+            os.killpg(process.pid, signal.SIGTERM)  # `python -m rerun_cli` does not pass the signal on to the viewer
+
+
+def picture(client: ViewerClient) -> Image.Image:
+    """Take a picture of what a viewer shows, without the strip for a window's buttons."""
+    time.sleep(SETTLE)
+    whole = Image.open(io.BytesIO(client.take_screenshot()))
+    return whole.crop((0, TITLE_BAR, whole.width, whole.height))
 
 
 def _connect(viewer: subprocess.Popen[str], url: str) -> ViewerClient:
@@ -71,13 +86,6 @@ def _connect(viewer: subprocess.Popen[str], url: str) -> ViewerClient:
             return client
         time.sleep(0.2)
     raise SystemExit(f"the viewer has not loaded the recording within {TIMEOUT:g} s")
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 if __name__ == "__main__":

@@ -1,0 +1,198 @@
+"""The viewers: what they show is looked at, in pictures that they take of themselves."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import made
+import msgspec
+import numpy as np
+import pytest
+import screenshot
+from chromium import chromium
+from PIL import Image
+from rerun.chunk import RrdReader
+
+from service import columns, view
+from service.columns import Column
+from service.config import SIM, load
+from service.recorder import Recorder
+from service.scene import SCALARS
+from service.sinks import Relay, free_port
+
+VIEWS = {
+    "demo: 3-PRP planar robot",
+    "Mode",
+    "Events",
+    "Slider position λ  [mm]",
+    "Slider velocity  [mm/s]",
+    "Slider acceleration  [m/s²]",
+    "Following error  [µm], limit ±4 mm",
+    "Centre x, y  [mm]",
+    "Angle φ  [°]",
+    "Distance to singularity  [°]",
+    "Loop timing  [µs]",
+}
+WITHIN = 60.0
+INSTALL = "make ci-packages installs it on Debian"
+needs_vulkan = pytest.mark.skipif(
+    not list(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json")),
+    reason=f"no software Vulkan driver (mesa-vulkan-drivers): {INSTALL}",
+)
+needs_chromium = pytest.mark.skipif(shutil.which("chromium") is None, reason=f"no chromium: {INSTALL}")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of ten seconds of motion."""
+    path = tmp_path_factory.mktemp("recording") / "made.rrd"
+    recorder = Recorder(load(SIM), path.parent, path=path, live=False)
+    recorder.bus_load(0.75)
+    recorder.target((0.05, 0.02, 0.3))
+    records = made.records(10.0)
+    for start in range(0, len(records), 50):
+        recorder.records(records[start : start + 50].tobytes())
+    recorder.close()
+    return path
+
+
+def colours(picture: Image.Image) -> int:
+    """Return how many colours cover at least a few pixels: a blank picture has a handful."""
+    _, counts = np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0, return_counts=True)
+    return int(np.count_nonzero(counts > 20))
+
+
+def near(picture: Image.Image, colour: tuple[int, ...]) -> int:
+    """Return how many pixels are of about a colour."""
+    return int(np.count_nonzero(np.abs(np.asarray(picture.convert("RGB")).astype(int) - colour[:3]).max(axis=2) < 24))
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + WITHIN
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.1)
+
+
+@pytest.mark.viewer
+@needs_vulkan
+def test_the_viewer_shows_every_view_without_complaint(recording: Path, tmp_path: Path) -> None:
+    from service import palette
+
+    with screenshot.viewer(recording, 1280, 800) as client:
+        views = {shown.name: shown for shown in client.get_state().views}
+        picture = screenshot.picture(client)
+    assert views.keys() >= VIEWS
+    assert [report for name in VIEWS for report in views[name].reports] == []
+    assert colours(picture) > 40
+    for colour in (*palette.SLIDERS, palette.PLATFORM, palette.X, palette.SINGULARITY):
+        assert near(picture, colour) > 50, colour
+
+
+@contextmanager
+def trirail_view(*arguments: object) -> Iterator[str]:
+    """Run `trirail view --web`, yield the page's address, and see that it ends well."""
+    command = [sys.executable, "-m", "service", "view", "--web", "--json", *map(str, arguments)]
+    environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as process:
+        assert process.stdout is not None
+        try:
+            yield msgspec.json.decode(process.stdout.readline())["url"]
+        finally:
+            process.send_signal(signal.SIGTERM)
+            code = process.wait(20)
+    assert code == 0
+
+
+@pytest.mark.viewer
+@needs_chromium
+def test_the_browser_shows_a_recording(recording: Path, tmp_path: Path) -> None:
+    from service import palette
+
+    with trirail_view(recording) as url, chromium("chromium", tmp_path) as page:
+        page.open(f"{url}&renderer=webgl")
+        found = lambda: all(near(page.picture(), colour) > 50 for colour in palette.SLIDERS)  # noqa: E731
+        until(found, "the sliders' colours")
+        assert colours(page.picture()) > 40
+
+
+def test_what_serves_the_browser_listens_on_the_loopback_alone(recording: Path) -> None:
+    with trirail_view(recording) as url:
+        ports = [int(found) for found in re.findall(r"(?::|%3A)(\d+)", url)]
+        assert len(ports) == 2
+        listening = Path("/proc/net/tcp").read_text() + Path("/proc/net/tcp6").read_text()
+        for port in ports:
+            addresses = re.findall(rf"^\s*\d+: ([0-9A-F]+):{port:04X} \S+ 0A ", listening, re.MULTILINE)
+            assert addresses == ["0100007F"]
+
+
+@pytest.mark.parametrize(
+    ("locator", "local"),
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/127.8.0.1:7447", True),
+        ("tls/localhost:7447", True),
+        ("tcp/[::1]:7447#iface=lo", True),
+        ("unixsock-stream//run/trirail/zenoh", True),
+        ("tcp/192.168.1.7:7447", False),
+        ("quic/robot.example:7447", False),
+        ("tcp/[2001:db8::1]:7447", False),
+    ],
+)
+def test_which_locators_stay_on_this_machine(locator: str, local: bool) -> None:
+    assert view.is_local(locator) is local
+
+
+def test_a_frozen_viewer_is_skipped_counted_and_does_not_stop_the_file(tmp_path: Path) -> None:
+    config = load(SIM)
+    config = msgspec.structs.replace(config, telemetry=msgspec.structs.replace(config.telemetry, live_port=free_port()))
+    recorder = Recorder(config, tmp_path)
+    relay = recorder._live
+    assert relay is not None
+    copy = tmp_path / "viewer.rrd"
+    command = [sys.executable, "-m", "rerun_cli", "--save", str(copy), recorder.live_url]
+    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        records = made.records(20.0)
+        until(lambda: copy.exists() and copy.stat().st_size > 0, "the viewer has connected")
+        os.killpg(viewer.pid, signal.SIGSTOP)
+        noise = np.random.default_rng(0).normal(size=(1, 1_000_000))
+        for _ in range(200):  # 8 MB each; what is between server and viewer holds some 400 MB
+            relay.send(columns.chunks(columns.moment(0.0, 0.0), [Column("/bulk", SCALARS, columns.scalars(noise))]))
+            if not drained(relay):
+                break
+        else:
+            raise AssertionError("the frozen viewer holds nothing up")
+        for start in range(0, len(records), 20):
+            recorder.records(records[start : start + 20].tobytes())
+        skipped = recorder.skipped
+        assert skipped > 0
+    finally:
+        os.killpg(viewer.pid, signal.SIGKILL)
+        viewer.wait()
+        recorder.close()
+    chunks = list(RrdReader(recorder.path).stream())
+    assert sum(chunk.num_rows for chunk in chunks if chunk.entity_path == "/record") == len(records)
+    assert recorder.lost == 0
+    said = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == "/events"]
+    texts = [text for batch in said for (text,) in batch.column("TextLog:text").to_pylist()]
+    assert f"0 batches in the file (disk full or failing), {skipped} in the live view" in texts[-1]
+
+
+def drained(relay: Relay) -> bool:
+    """Return whether all that waits is handed on within a few seconds."""
+    deadline = time.monotonic() + 5.0
+    while relay._waiting:
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True
