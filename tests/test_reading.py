@@ -23,6 +23,7 @@ from service.reading import read
 from service.recorder import Recorder
 from service.records import DTYPE
 from service.scene import FIELDS, Scene
+from service.subject import Subject
 
 WALL_NS = 1_795_245_300_000_000_000
 BATCH = 40
