@@ -87,7 +87,7 @@ class Recorder:
 
     def event(self, event: Event) -> None:
         """Take an event."""
-        self._show.event(event)
+        self._show.events([event])
 
     def target(self, pose: Sequence[float] | None) -> None:
         """Take the pose that the goal leads to; None for no goal."""

@@ -87,9 +87,9 @@ class Show:
             for stream in self._streams:
                 stream.log(path, archetype, static=True)
 
-    def event(self, event: Event) -> None:
-        """Take an event."""
-        self._send([remark(event.t, event.time, event.level, event.message)])
+    def events(self, events: Sequence[Event]) -> None:
+        """Take events, as one batch."""
+        self._send([remark(event.t, event.time, event.level, event.message) for event in events])
 
     def say(self, level: Level, message: str) -> None:
         """Write a line of the log at the time of the newest record."""
