@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import selectors
 import signal
@@ -215,6 +216,7 @@ def notify(state: str) -> None:
     """Tell systemd, where it asked for it: sd_notify(3)."""
     address = os.environ.get("NOTIFY_SOCKET")
     if address:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+        # An end of systemd's must not keep the robot from being stopped.
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender, contextlib.suppress(OSError):
             sender.connect("\0" + address[1:] if address.startswith("@") else address)
             sender.send(state.encode())

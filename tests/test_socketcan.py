@@ -56,7 +56,14 @@ def ip(*arguments: str) -> None:
 
 
 LACKING = lacking()
-pytestmark = [pytest.mark.vcan, pytest.mark.skipif(bool(LACKING), reason=LACKING)]
+pytestmark = [
+    pytest.mark.vcan,
+    pytest.mark.skipif(bool(LACKING), reason=LACKING),
+    # python-can leaves its socket to the garbage collector where there is no such interface.
+    pytest.mark.filterwarnings(
+        r"ignore:Exception ignored in. <socket\.socket.*family=29:pytest.PytestUnraisableExceptionWarning"
+    ),
+]
 
 
 @pytest.fixture

@@ -99,17 +99,14 @@ def problems(log: Sequence[Frame], config: Config, missed: int, until: float) ->
     return found
 
 
-def differences(own: Sequence[Frame], log: Sequence[Frame]) -> list[str]:
-    """Return where the frames in the service's own log are not those of the bus, for each identifier."""
-    here, there = _by_identifier(own), _by_identifier(log)
+def differences(own: Sequence[Frame], log: Sequence[Frame], until: float) -> list[str]:
+    """Return where the frames in the service's own log, before `until`, are no run of those on the bus."""
+    here, there = _by_identifier([frame for frame in own if frame.t < until]), _by_identifier(log)
     found = []
     for identifier, said in here.items():
         heard = there.get(identifier, [])
-        # Its log begins when the service does and may end later: with frames that never got out of a dead interface.
-        shared = min(len(said), len(heard))
-        tail = len(heard) - len(said)
-        aligned = (heard[:shared], heard[tail:] if tail > 0 else heard)
-        if shared == 0 or said[:shared] not in aligned:
+        # Its log begins and ends at other times.
+        if not any(heard[start : start + len(said)] == said for start in range(len(heard) - len(said) + 1)):
             found.append(f"identifier {identifier:03X}: {len(said)} frames in the service's log, but others on the bus")
     return found
 

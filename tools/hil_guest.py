@@ -44,8 +44,10 @@ def main() -> int:
     result: dict[str, Any] = {"checks": {}, "failure": None}
     try:
         with Machine(folder, config, frames) as machine:
-            scenario(machine, result["checks"])
-            result |= machine.told
+            try:
+                scenario(machine, result["checks"])
+            finally:
+                result |= machine.told
     except (Failed, TrirailError, TimeoutError, OSError, subprocess.SubprocessError) as error:
         result["failure"] = f"{type(error).__name__}: {error}"
     finally:
@@ -226,9 +228,9 @@ def expect(result: Result, outcome: str, robot: Robot) -> None:
 
 
 def _stopped(log: str) -> bool:
-    """Whether the newest line of each drive says that it has no power."""
+    """Whether the newest line of each drive says that its watchdog has put it in fault, where it has no power."""
     newest = {line[0]: line for line in log.splitlines() if line[:2] in {"A ", "B ", "C "}}
-    return len(newest) == 3 and all("switch on disabled" in line for line in newest.values())
+    return len(newest) == 3 and all(line[2:].startswith("fault,") for line in newest.values())
 
 
 def _loop(state: State) -> dict[str, Any]:
