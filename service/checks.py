@@ -21,6 +21,8 @@ from service.survey import survey
 PLANNED = (0.98, 0.98, 0.93)
 """Share of the sliders' limits of velocity, acceleration and jerk that plans make use of: the rest is for what lies
 between the moments that are looked at, where jerk varies most."""
+LAWS = (0.99, 0.99, 0.98)
+"""Share of the same that changes of a path's rate make use of, on top of what the path itself does."""
 GAP = 0.02
 """Between moments at which a path is looked at, besides its knots [s]."""
 FEWEST, MOST = 16, 64
@@ -36,12 +38,14 @@ class Look(NamedTuple):
 
     excess: float
     """How many times too fast it is for a slider."""
+    bearable: bool
+    """Whether the sliders can bear it, with what is kept for changes of rate."""
     beyond: float
     """When it is out of reach [s]; not a number where it never is."""
 
     @property
     def fits(self) -> bool:
-        """Whether the robot can do it."""
+        """Whether a path can be planned so."""
         return math.isnan(self.beyond) and self.excess <= 1.0
 
 
@@ -52,6 +56,7 @@ class Checker:
         platform, slider = limits.platform, limits.slider
         self.slider_limits = np.array(PLANNED) * [slider.velocity, slider.acceleration, slider.jerk]
         """Velocity, acceleration and jerk that plans make use of."""
+        self._law_limits = np.array(LAWS) * [slider.velocity, slider.acceleration, slider.jerk]
         self._legs = geometry.packed()
         self._bounds = bounds
         self._period = period
@@ -68,7 +73,8 @@ class Checker:
         worst, start = np.zeros(3), np.array(pose, dtype=np.float64)
         beyond = survey(self._legs, *path, *law[:2], first, until, even, self._period, start, self._box, worst)
         # The same path k times slower has k times less velocity, k² less acceleration and k³ less jerk.
-        return Look(float(((worst / self.slider_limits) ** self._powers).max()), beyond)
+        excess = float(((worst / self.slider_limits) ** self._powers).max())
+        return Look(excess, math.isnan(beyond) and bool((worst <= self._law_limits).all()), beyond)
 
     def whole(self, path: Path, pose: Sequence[float]) -> Steps[float]:
         """Return how many times too fast a path is. Raises RefusedError where it leaves the workspace."""

@@ -102,7 +102,7 @@ class Control:
         for goal in (PoseGoal(*self.pose), SlidersGoal(feedback.position)):
             with contextlib.suppress(RefusedError):
                 nearby.take(finish(self._goals.plan(goal, nearby, 1.0)).runs)
-                finish(self._goals.laws.change(nearby.runs[0], 0.0, self.pose))
+                finish(self._goals.laws.try_change(nearby.runs[0], 0.0, self.pose))
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""

@@ -158,7 +158,7 @@ class Goals:
         stop = course.runs[0].copy()
         stop.seams.clear()
         if stop.target != 0.0:
-            yield from self.laws.change(stop, 0.0, course.commanded.pose, STOPS)
+            yield from self.laws.try_change(stop, 0.0, course.commanded.pose, STOPS)
         end = stop.state(stop.ends - stop.time, course.commanded.pose).pose
         plan = yield from self._plan(goal, rest(end))
         run = yield from self.laws.begin(plan.path, rate, end)
@@ -209,7 +209,7 @@ class Goals:
         last = longer.reaches(longer.path.duration)
         if not math.isfinite(last):  # it is to stop before: it will go on at full speed at most, or be looked at anew
             law, first, last = constant(1.0), s, longer.path.duration
-        return self._checker.look(longer.path, law, first, last, _state(run.path, s).pose).fits
+        return self._checker.look(longer.path, law, first, last, _state(run.path, s).pose).bearable
 
 
 def _one_step(steps: Steps[T]) -> T | None:

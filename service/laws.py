@@ -16,7 +16,7 @@ from service.solver import solved
 from service.steps import Steps
 
 SHARES = tuple(0.6**k for k in range(12))
-"""Of the quickest change of rate, tried one after the other before the old law is left to go on."""
+"""Of the quickest change of rate, tried one after the other."""
 FASTEST = 10.0
 """No rate is greater."""
 
@@ -38,21 +38,27 @@ class Laws:
         rate = yield from self.possible(path, 0.0, rate, pose)
         return Run(self._legs, path, constant(rate), rate)
 
-    def change(self, run: Run, rate: float, pose: Sequence[float], shares: Sequence[float] = SHARES) -> Steps[None]:
+    def change(self, run: Run, rate: float, pose: Sequence[float]) -> Steps[None]:
         """Let the time along a path run at another rate: as soon as the sliders' limits allow, as fast as they do.
 
-        Where nothing gentler than the old law fits, that goes on: to the end of the path, where it stands too.
-        The run may go on between the steps.
+        Until then the old law goes on, as the run does between the steps: at the end of the path it stands too.
         """
         rate = yield from self.possible(run.path, run.at.s, rate, pose)
+        while not run.arrived:
+            if (yield from self.try_change(run, rate, pose)):
+                return
+
+    def try_change(self, run: Run, rate: float, pose: Sequence[float], shares: Sequence[float] = SHARES) -> Steps[bool]:
+        """Do the same at one of some shares of the quickest change, the first that the sliders can bear, if any."""
         for share in shares:
             law = self._ramp(run, rate, share)
             if law is not None:
                 until = min(arrival(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
-                if self._checker.look(run.path, law, 0.0, until, pose).fits:
+                if self._checker.look(run.path, law, 0.0, until, pose).bearable:
                     run.change_law(law, rate)
-                    return
-                yield
+                    return True
+            yield
+        return False
 
     def possible(self, path: Path, s: float, rate: float, pose: Sequence[float]) -> Steps[float]:
         """Return the rate, or the greatest at which the sliders can take the path from `s` on."""

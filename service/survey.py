@@ -111,7 +111,7 @@ def _turns(way: Way, last: float, time: float, near: Array, motion: Array, slide
 
 
 @compiled()
-def _walk(way: Way, times: Array, step: float, near: Array, worst: Array) -> tuple[float, float]:
+def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst: Array) -> tuple[float, float]:
     """Look at a path at ascending times and a step later; return the last time within reach, and one beyond it."""
     motion, sliders = np.empty((3, 3, 3)), np.empty((3, 6, 3))
     last = -math.inf
@@ -131,7 +131,14 @@ def _walk(way: Way, times: Array, step: float, near: Array, worst: Array) -> tup
         for i in range(3):
             worst[0] = max(worst[0], abs(sliders[1, 1, i]))
             worst[1] = max(worst[1], abs(sliders[1, 2, i]))
-            worst[2] = max(worst[2], abs(sliders[0, 2, i] - sliders[1, 2, i]) / step)
+            # The mean jerk of this step, and what the velocity says of its beginning and its end: a rate may change
+            # within a single step, where the accelerations before and after are the same.
+            change = sliders[0, 1, i] - sliders[1, 1, i]
+            early = 2.0 * (change / step - sliders[1, 2, i]) / step
+            late = 2.0 * (sliders[0, 2, i] - change / step) / step
+            worst[2] = max(worst[2], abs(early + late) / 2.0)
+            if time >= 0.0 and last <= until:  # else it is the step from or to a standstill, in which nothing else is
+                worst[2] = max(worst[2], abs(early), abs(late))
     return last, math.nan
 
 
@@ -155,16 +162,16 @@ def survey(
 ) -> float:
     """Look at a path, run by a law, between two times; write the sliders' greatest velocity, acceleration and jerk.
 
-    It is looked at `even` times, at its knots, and where a position turns near its limit. Jerk is the change of
-    acceleration over a `step` [s], as the drives see it. `start` is the pose at the first time. `box` (2, 5) holds
-    the limits, low and high, of x, y, phi, lambda_10 and lambda_32. Returns when it is first out of reach, else
+    It is looked at `even` times, at its knots, and where a position turns near its limit. Jerk is what the setpoints
+    before and after a `step` [s] say of it, as the drives see it. `start` is the pose at the first time. `box` (2, 5)
+    holds the limits, low and high, of x, y, phi, lambda_10 and lambda_32. Returns when it is first out of reach, else
     not a number; `worst` (3,) means nothing where it is.
     """
     way = Way(legs, knots, pieces, in_sliders, law_knots, law_pieces, box)
     times = _moments(knots, law_knots, law_pieces, first, until, even, step)
     near = start.copy()
     worst[:] = 0.0
-    inside, beyond = _walk(way, times, step, near, worst)
+    inside, beyond = _walk(way, times, until, step, near, worst)
     if not math.isnan(beyond):
         motion, sliders = np.empty((3, 3)), np.empty((6, 3))
         inside = max(inside, first)
