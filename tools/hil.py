@@ -77,11 +77,12 @@ def main() -> int:
     signal.signal(signal.SIGTERM, _interrupt)
     say = Progress(sys.stderr if options.json else sys.stdout)
     report: dict[str, Any] = {"ok": False, "checks": {}, "failure": None}
-    folder = options.keep or Path(tempfile.mkdtemp(prefix="trirail-hil-"))
+    folder: Path | None = None
     try:
         if options.install:
             install(say)
         kernel = requirements()
+        folder = options.keep or Path(tempfile.mkdtemp(prefix="trirail-hil-"))
         folder.mkdir(parents=True, exist_ok=True)
         run(folder.resolve(), kernel, time.monotonic() + options.timeout, say, report)
         report["ok"] = True
@@ -89,8 +90,10 @@ def main() -> int:
         report["failure"] = str(failed)
     except KeyboardInterrupt:
         report["failure"] = "interrupted"
-    if report["ok"] and not options.keep:
-        shutil.rmtree(folder)
+    if folder is not None:
+        (folder / "python.img").unlink(missing_ok=True)  # a gigabyte
+        if not options.keep and (report["ok"] or report["failure"] == "interrupted"):
+            shutil.rmtree(folder)
     if options.json:
         print(json.dumps(report), flush=True)
     elif report["ok"]:

@@ -99,6 +99,15 @@ class Machine:
         """What a program has said so far."""
         return (self._folder / f"{name}.log").read_text(errors="replace")
 
+    def doctor(self) -> str:
+        """What `trirail doctor` says of can0. Raises Failed unless all of it is well."""
+        command = (sys.executable, "-m", "service", "doctor", self._folder / "robot.toml", "--json")
+        said = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=False)
+        can0 = [check for check in json.loads(said.stdout)["checks"] if check["name"].startswith("can0")]
+        if len(can0) != 3 or any(check["verdict"] != "ok" for check in can0):
+            raise Failed(f"the doctor says of can0: {can0}")
+        return ", ".join(f"{check['name']} {check['found']}" for check in can0)
+
     def drives(self) -> None:
         """Start the frames' log and the drives on can1."""
         with self._frames.open("wb") as log:
@@ -168,6 +177,7 @@ def scenario(machine: Machine, checks: dict[str, str]) -> None:
         checks[check] = detail
         print(f"guest {time.monotonic() - began:5.0f} s  {check}: {detail}", flush=True)
 
+    held("doctor", machine.doctor())
     machine.drives()
     held("drives", "three virtual drives on can1")
     service = machine.service()
