@@ -21,9 +21,13 @@ class Axis:
     """One drive's newest feedback; the `on_` methods take a frame's data or raise struct.error."""
 
     __slots__ = (
+        "_between",
         "_heartbeat_timeout",
         "_operational",
+        "_prompt",
         "_restarted",
+        "_sampled",
+        "_syncs",
         "controlword",
         "error_code",
         "event",
@@ -36,7 +40,6 @@ class Axis:
         "reset_until",
         "scale",
         "state",
-        "unanswered",
     )
 
     def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
@@ -54,8 +57,6 @@ class Axis:
         """What the drive last gave as the reason of its fault; 0 once it said that is over."""
         self.event: DriveFault | None = None
         """A fault that a frame told of, rather than a state that lasts."""
-        self.unanswered = 0
-        """SYNCs since the last position."""
         self.heard = math.inf
         """Time of the last heartbeat [s]."""
         self.reset_until = -math.inf
@@ -64,13 +65,42 @@ class Axis:
         """It said that it is operational no more, and was not started again since."""
         self._operational = False
         self._restarted = False
+        self._syncs = 0
+        """How many were sent."""
+        self._sampled = 0
+        """The number of the SYNC at which the position was sampled."""
+        self._between = False
+        """This cycle's frames have been read, and the next SYNC was not sent."""
+        self._prompt = False
+        """The last position came before the cycle of its SYNC had read."""
         self._heartbeat_timeout = MISSED_HEARTBEATS * heartbeat
 
+    @property
+    def age(self) -> int:
+        """SYNCs sent after the one at which the position was sampled."""
+        return self._syncs - self._sampled
+
+    def sync_sent(self) -> None:
+        """Count a SYNC: positions that come from now on may be answers to it."""
+        self._syncs += 1
+        self._between = False
+
+    def read_over(self) -> None:
+        """This cycle's frames have been read: positions that come from now on answer its SYNC, but late."""
+        self._between = True
+
     def on_position(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
-        """TPDO2: the position sampled at a SYNC."""
+        """TPDO2: the position sampled at a SYNC; it does not say at which.
+
+        Answers take less than a cycle, so one that is there before the next SYNC is sent answers the last one. One
+        that comes just after a SYNC answers that one where the one before is answered, or where the drive's answers
+        have been so prompt; else it is the late answer to the one before.
+        """
         (counts,) = frames.POSITION.unpack(data)
         self.position = self.scale.metres(counts)
-        self.unanswered = 0
+        late = not self._between and not self._prompt and self._sampled < self._syncs - 1
+        self._sampled = self._syncs - late
+        self._prompt = not self._between and not late
 
     def on_status(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """TPDO1: the statusword, when it changes and from time to time."""
@@ -121,12 +151,22 @@ class Axis:
             self.reset_until = now + RESET_TIME
         if self.left_operational:
             self.left_operational = False
-            self.unanswered = 0
+            self._sampled = self._syncs
 
     def tell(self, cause: str, code: int, text: str) -> None:
         """Keep the first event since faults were last reset."""
         if self.event is None:
             self.event = self._fault(cause, code, text)
+
+    def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
+        """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not.
+
+        A drive in fault has a fault of its own to tell.
+        """
+        if self.state is PowerState.SWITCH_ON_DISABLED or self.state in _IN_FAULT:
+            return None
+        text = f"is {self.state} {seconds:g} s after {wanted}; switch on disabled was expected"
+        return self._fault("timeout", 0, text)
 
     def fault(self, now: float, wanted: frames.Wanted) -> DriveFault | None:
         """What is wrong with the drive at time `now`, given what it was asked for."""
@@ -135,9 +175,11 @@ class Axis:
         if self.state in _IN_FAULT:
             if now >= self.reset_until:
                 reason = f", error {self.error_code:04X}" if self.error_code else ""
+                if self.reset_until > -math.inf:
+                    reason += f", still {RESET_TIME:g} s after a fault reset"
                 return self._fault("fault", self.error_code, f"{self.state}{reason}")
-        elif self.unanswered >= MISSED_SYNCS:
-            return self._fault("silent", 0, f"no position for {self.unanswered} SYNCs in a row")
+        elif self._missed >= MISSED_SYNCS:
+            return self._fault("silent", 0, f"no position for {self._missed} SYNCs in a row")
         elif now - self.heard > self._heartbeat_timeout:
             return self._fault("heartbeat", 0, f"no heartbeat for {now - self.heard:.3g} s")
         elif (
@@ -147,6 +189,11 @@ class Axis:
         ):
             return self._fault("state", 0, f"left operation enabled unasked: {self.state}")
         return None
+
+    @property
+    def _missed(self) -> int:
+        """SYNCs without an answer; one whose answer is not due yet does not count."""
+        return self.age - (not self._prompt)
 
     def _fault(self, cause: str, code: int, text: str) -> DriveFault:
         return DriveFault(self.name, cause, code, f"drive {self.name}: {text}")

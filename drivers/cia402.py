@@ -7,6 +7,7 @@ setpoints, heartbeats. So the controlword of a quick stop goes before setpoints 
 from __future__ import annotations
 
 import contextlib
+import math
 import struct
 import time
 from collections.abc import Callable
@@ -21,8 +22,6 @@ from drivers.scaling import scale_of
 
 MOST_FRAMES = 1000
 """Frames taken in by one `read` at most, so that a chattering bus cannot hold it."""
-STOPPING_TIME = 1.0
-"""How long `close` waits for powered drives to come down their quick-stop ramp [s]."""
 BUS_OFF = 0x040
 """Error class of a SocketCAN error frame: the controller has left the bus (linux/can/error.h)."""
 
@@ -65,6 +64,8 @@ class Cia402:
         )
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
+        self._off_by = math.inf
+        """When the drives must have lost their power [s]; inf where that was not asked for, or has been told of."""
         self._stopped_in_this_cycle = False
         self._fault: DriveFault | None = None
         self._closed = False
@@ -92,9 +93,14 @@ class Cia402:
         self.bus_load = load
 
     def sync(self) -> None:
-        """Send SYNC: the drives take up the setpoints written since the last one and sample positions."""
-        self._send(self._sync)
+        """Send SYNC: the drives take up the setpoints written since the last one and sample positions.
+
+        What has arrived is taken in before: positions among it answer the SYNC before.
+        """
+        self._stopped_in_this_cycle = False
         now = self._clock()
+        self._receive(now)
+        self._send(self._sync)
         if self._heartbeat_due is None:
             # The drives' watchdogs and ours begin with the first cycle, however long ago the set-up was.
             self._heartbeat_due = now
@@ -103,22 +109,27 @@ class Cia402:
         if now >= self._heartbeat_due:
             self._heartbeat_due = now + self._drives.heartbeat
             self._send(self._heartbeat)
-        self._stopped_in_this_cycle = False
         for axis in self._axes:
-            axis.unanswered += 1
+            axis.sync_sent()
 
     def read(self) -> Feedback:
         """Take in every frame that has arrived."""
         now = self._clock()
         self._receive(now)
         a, b, c = self._axes
-        if self._fault is None:
-            for axis in self._axes:
-                fault = axis.fault(now, self._wanted)
-                if fault is not None:
-                    self._fail(fault)
-                    break
-        return Feedback((a.position, b.position, c.position), (a.state, b.state, c.state), self._fault)
+        for axis in self._axes:
+            axis.read_over()
+            fault = axis.fault(now, self._wanted) if self._fault is None else None
+            if fault is not None:
+                self._fail(fault)
+        if now >= self._off_by:
+            self._tell_powered()
+        return Feedback(
+            (a.position, b.position, c.position),
+            (a.state, b.state, c.state),
+            self._fault,
+            (a.age, b.age, c.age),
+        )
 
     def write(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints [m] and velocity feed-forward [m/s], to be taken up at the next SYNC.
@@ -149,17 +160,21 @@ class Cia402:
         if self._fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
             return
         self._wanted = PowerState.OPERATION_ENABLED
+        self._off_by = math.inf
         for axis in self._axes:
             axis.powered_up = False
 
     def disable(self) -> None:
-        """Take power off; meant for a robot at standstill."""
-        self._wanted = PowerState.SWITCH_ON_DISABLED
+        """Take power off; meant for a robot at standstill. A drive that keeps it is a fault, of cause "timeout"."""
+        self._power_off(PowerState.SWITCH_ON_DISABLED)
         self._command()
 
     def quick_stop(self) -> None:
-        """Make every drive stop by its own quick-stop ramp, in this cycle, and end without power."""
-        self._wanted = PowerState.QUICK_STOP_ACTIVE
+        """Make every drive stop by its own quick-stop ramp, in this cycle, and end without power.
+
+        A drive that keeps it is a fault, of cause "timeout", and takes the place of the fault that stopped it.
+        """
+        self._power_off(PowerState.QUICK_STOP_ACTIVE)
         self._stopped_in_this_cycle = True
         self._command()
 
@@ -167,6 +182,8 @@ class Cia402:
         """Forget the fault and clear the drives' own; never powers them up. What persists is found again."""
         self._fault = None
         now = self._clock()
+        if self._wanted is not PowerState.OPERATION_ENABLED:
+            self._off_by = now + self._drives.stop_timeout
         for axis in self._axes:
             if axis.left_operational:  # its set-up is still there: only a restarted drive needs a new one
                 self._send(frames.nmt(frames.NMT_START, axis.node))
@@ -237,6 +254,21 @@ class Cia402:
             return False
         return True
 
+    def _power_off(self, wanted: frames.Wanted) -> None:
+        if self._wanted is not wanted:
+            self._off_by = self._clock() + self._drives.stop_timeout
+        self._wanted = wanted
+
+    def _tell_powered(self) -> None:
+        """Tell of a drive that still has power where none should, once."""
+        self._off_by = math.inf
+        wanted = "quick stop" if self._wanted is PowerState.QUICK_STOP_ACTIVE else "disable"
+        for axis in self._axes:
+            fault = axis.late_for(wanted, self._drives.stop_timeout)
+            if fault is not None:
+                self._fault = fault
+                return
+
     def _fail(self, fault: DriveFault) -> None:
         """Latch the first fault; drives that have power, or are getting it, are stopped."""
         if self._fault is None:
@@ -248,7 +280,7 @@ class Cia402:
         if not self._powered():
             return
         self.quick_stop()
-        deadline = self._clock() + STOPPING_TIME
+        deadline = self._clock() + self._drives.stop_timeout
         while self._powered() and (left := deadline - self._clock()) > 0:
             message = self._bus.recv(left)
             if message is None:

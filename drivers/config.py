@@ -63,6 +63,8 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     """The drives' own following error window, object 6065h [m]."""
     quick_stop_deceleration: Positive = 10.0
     """Object 6085h [m/s²]."""
+    stop_timeout: Positive = 1.0
+    """How long a drive may take to lose its power, down the quick-stop ramp or when it is disabled [s]."""
     sdo_timeout: Positive = 0.5
     """How long a drive may take to answer a configuration request [s]."""
 

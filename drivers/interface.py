@@ -33,7 +33,7 @@ class DriveFault(NamedTuple):
     drive: str
     """Name of the drive, or "" where the bus itself is at fault."""
     cause: str
-    """One of emcy, fault, silent, heartbeat, state, frame, setpoint, bus."""
+    """One of emcy, fault, silent, heartbeat, state, timeout, frame, setpoint, bus."""
     code: int
     """The EMCY or 603Fh error code, 0 where there is none."""
     message: str
@@ -41,13 +41,16 @@ class DriveFault(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """What the three drives last said, as of the newest SYNC."""
+    """What the three drives have said by now."""
 
     position: Triple
     """Measured slider positions [m]."""
     state: tuple[PowerState, PowerState, PowerState]
     fault: DriveFault | None
-    """The first fault since the last reset, else None."""
+    """The first fault since the last reset, or that a drive did not stop after it; else None."""
+    age: tuple[int, int, int] = (0, 0, 0)
+    """How many SYNCs before the newest one each position was sampled: 0 where a drive has answered it already, 1
+    where the answer is still on its way, more where answers were lost."""
 
 
 class Drives(Protocol):

@@ -28,6 +28,8 @@ Triple = tuple[float, float, float]
 
 SETTLE = 0.1
 """How long the drives may take to leave their fault state after a reset [s]."""
+OLDEST = 3
+"""The greatest age of a position that is looked at, in SYNCs: at the next one the drive is silent."""
 
 _COMMANDS = {
     "enable": Event.ENABLE,
@@ -73,7 +75,8 @@ class Control:
         self.rows: list[list[float]] = self._sliders.tolist()
         """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 of the setpoints."""
         self.following_error: Triple = STILL
-        self._written: deque[Triple] = deque([STILL, STILL], maxlen=2)
+        self._written: deque[Triple] = deque([STILL] * (2 + OLDEST), maxlen=2 + OLDEST)
+        """The setpoints of the last cycles, the newest at the right."""
         self.override = 1.0
         """The rate at which motions are to run."""
         self._runs: deque[Run] = deque()
@@ -85,7 +88,7 @@ class Control:
     def start(self, feedback: Feedback) -> None:
         """Take the measured sliders for the commanded ones, before the first cycle."""
         self.feedback = feedback
-        self._written.extend((feedback.position, feedback.position))
+        self._written.extend([feedback.position] * (2 + OLDEST))
         self._follow_measured()
         # What runs for the first time is slow: plan and check a motion now, not in a cycle.
         nearby = rest([value + 1e-3 for value in self.pose])
@@ -102,23 +105,16 @@ class Control:
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
         self.cycle += 1
-        period = self._period
-        before, now = self.feedback.position, feedback.position
-        self.velocity = (
-            (now[0] - before[0]) / period,
-            (now[1] - before[1]) / period,
-            (now[2] - before[2]) / period,
-        )
-        # A drive reaches at this SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
-        due = self._written[0]
-        self.following_error = (due[0] - now[0], due[1] - now[1], due[2] - now[2])
-        self.feedback = feedback
-        self._measured[:] = now
+        before, self.feedback = self.feedback, feedback
+        self._compare(before)
+        self._measured[:] = feedback.position
         if forward_into(self._legs, self._measured, self._pose, self._pose) == 0:
             x, y, phi = self._pose.tolist()
             self.pose = (x, y, phi)
         mode = self.state.mode
         if feedback.fault is not None:
+            if mode is Mode.FAULT and feedback.fault != before.fault:
+                self.desk.tell("fault", "error", feedback.fault.message)  # the first one stays, but this came of it
             self.trip(feedback.fault.message)
         elif mode is Mode.ENABLING:
             self._power_up()
@@ -131,6 +127,20 @@ class Control:
                     )
                     break
         self.desk.settle(self._verdict, self.state.mode)
+
+    def _compare(self, before: Feedback) -> None:
+        """Work out velocities and following errors, for the SYNC at which each position was sampled."""
+        velocity, error = list(self.velocity), [0.0, 0.0, 0.0]
+        for n, (now, age, last, last_age) in enumerate(
+            zip(self.feedback.position, self.feedback.age, before.position, before.age, strict=True)
+        ):
+            cycles = 1 + last_age - age
+            if cycles > 0:  # else there is no newer position
+                velocity[n] = (now - last) / (cycles * self._period)
+            # A drive reaches at a SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
+            error[n] = self._written[-2 - min(age, OLDEST)][n] - now
+        self.velocity = (velocity[0], velocity[1], velocity[2])
+        self.following_error = (error[0], error[1], error[2])
 
     def handle(self, request: Request, now_ns: int) -> None:
         """Carry out one request at a time of the monotonic clock, or refuse it."""
@@ -174,7 +184,7 @@ class Control:
             self.trip(f"slider {NAMES[singular - 1]}: no setpoint, the commanded pose is singular or not a number")
             return
         rows = self._sliders.tolist()
-        violation = self._bounds.setpoint(rows, self._written[1]) or self._bounds.pose(self.commanded.pose)
+        violation = self._bounds.setpoint(rows, self._written[-1]) or self._bounds.pose(self.commanded.pose)
         if violation:
             self.trip(f"setpoint refused: {violation}")
             return
@@ -278,6 +288,9 @@ class Control:
     def _verdict(self, name: str, since: int) -> str | None:
         """Return "" when the command is carried out, None while it is not, else why it never will be."""
         mode = self.state.mode
+        fault = self.feedback.fault
+        if name in ("disable", "quick_stop") and fault is not None and fault.cause == "timeout":
+            return fault.message
         match name:
             case "enable":
                 if mode is Mode.ENABLING:

@@ -362,6 +362,50 @@ class TestPower:
         assert feedback.fault is None
         assert enabled.enable().fault is None
 
+    def test_drive_that_does_not_stop_is_named_with_its_state(self, enabled: Rig) -> None:
+        enabled.devices[1].objects.on_write(0x6040, lambda entry, old: None)
+        enabled.drives.quick_stop()
+        feedback = enabled.cycles(round(CONFIG.stop_timeout / PERIOD) - 1)
+        assert feedback.fault is None
+        assert enabled.found("timeout", within=3).fault == (
+            "B", "timeout", 0,
+            "drive B: is operation enabled 1 s after quick stop; switch on disabled was expected",
+        )  # fmt: skip
+
+    def test_drive_that_stays_in_quick_stop_is_named_with_its_state(self, enabled: Rig) -> None:
+        enabled.devices[2].objects[0x605A, 0].value = 6  # as a drive that does not do what it was told
+        enabled.drives.quick_stop()
+        fault = enabled.found("timeout", within=1010).fault
+        assert fault is not None
+        assert fault.message.startswith("drive C: is quick stop active 1 s after quick stop")
+
+    def test_drive_that_does_not_stop_after_a_fault_is_told_of_as_well(self, enabled: Rig) -> None:
+        enabled.devices[1].objects.on_write(0x6040, lambda entry, old: None)
+        enabled.devices[0].fail(0x4310)
+        fault = enabled.found("emcy", within=2).fault
+        enabled.cycles(1010)
+        assert fault is not None
+        assert fault.drive == "A"
+        fault = enabled.cycle().fault
+        assert fault is not None
+        assert fault[:3] == ("B", "timeout", 0)
+
+    def test_drive_that_keeps_its_power_when_disabled_is_named_with_its_state(self, enabled: Rig) -> None:
+        enabled.devices[0].objects.on_write(0x6040, lambda entry, old: None)
+        enabled.drives.disable()
+        fault = enabled.found("timeout", within=1010).fault
+        assert fault is not None
+        assert fault.message == "drive A: is operation enabled 1 s after disable; switch on disabled was expected"
+
+    def test_drives_that_stop_and_lose_power_are_no_fault(self, enabled: Rig) -> None:
+        enabled.drives.disable()
+        assert enabled.cycles(1500).fault is None
+        enabled.enable()
+        enabled.drives.quick_stop()
+        assert enabled.cycles(1500).fault is None
+        assert enabled.enable().fault is None
+        assert enabled.cycles(1500).fault is None
+
     def test_drive_that_drops_out_unasked(self, enabled: Rig) -> None:
         enabled.devices[1].objects[0x6040, 0].write(frames.DISABLE_VOLTAGE)
         feedback = enabled.found("state", within=1)
@@ -451,6 +495,30 @@ class TestFaults:
         fault = ready.cycle().fault
         assert fault is not None
         assert fault[:3] == ("B", "silent", 0)
+
+    def test_prompt_positions_have_no_age_and_lost_ones_leave_none(self, ready: Rig) -> None:
+        assert ready.cycle().age == (0, 0, 0)
+        ready.devices[1].silent = True
+        assert [ready.cycle().age for _ in range(2)] == [(0, 1, 0), (0, 2, 0)]
+        ready.devices[1].silent = False
+        assert ready.cycle().age == (0, 0, 0)
+
+    def test_position_that_is_there_before_the_next_sync_answers_the_last_one(self, ready: Rig) -> None:
+        ready.cycles(3)
+        for node in (1, 5, 9):
+            ready.devices[(1, 5, 9).index(node)].silent = True
+        for _ in range(5):
+            ready.clock.now += PERIOD
+            ready.drives.sync()
+            assert ready.drives.read().fault is None
+            for node in (1, 5, 9):
+                ready.bus.inject(frames.TPDO2 + node, bytes(4))
+        ready.drives.sync()
+        feedback = ready.drives.read()
+        assert feedback.age == (1, 1, 1)
+        assert feedback.fault is None
+        for device in ready.devices:
+            device.silent = False
 
     def test_one_lost_position_is_not(self, ready: Rig) -> None:
         for _ in range(5):
@@ -562,6 +630,17 @@ class TestLateAnswers:
         positions = [late.cycle((START[0] + 1e-5, START[1], START[2])).position[0] for _ in range(4)]
         assert positions == pytest.approx([START[0], START[0], START[0] + 1e-5, START[0] + 1e-5], abs=1e-6)
 
+    def test_age_of_the_position_is_told(self, late: Rig) -> None:
+        assert [late.cycle().age for _ in range(5)] == [(1, 1, 1)] * 5
+
+    def test_age_counts_what_was_lost(self, late: Rig) -> None:
+        late.cycles(3)
+        late.devices[1].silent = True
+        late.cycle()  # reads the last answer
+        late.devices[1].silent = False
+        assert late.cycle().age == (1, 2, 1)
+        assert late.cycle().age == (1, 1, 1)
+
     def test_silence_is_three_answers_missing(self, late: Rig) -> None:
         late.cycles(5)
         late.devices[2].silent = True
@@ -612,6 +691,7 @@ class TestReset:
         feedback = enabled.found("fault", within=250)
         assert feedback.fault is not None
         assert feedback.fault[:3] == ("A", "fault", 0x2310)
+        assert feedback.fault.message == "drive A: fault, error 2310, still 0.2 s after a fault reset"
         enabled.cycle()
         assert enabled.controlwords()[0] == [0x02, 0x80, 0x02]
 
