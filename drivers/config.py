@@ -46,6 +46,8 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     """-1 where counts fall as the slider position rises."""
     offset: float = 0.0
     """Slider position at zero counts [m]."""
+    eds: str | None = None
+    """Its maker's EDS, relative to the configuration file; the shipped servo.eds when absent."""
 
 
 class Drives(Struct, frozen=True, forbid_unknown_fields=True):

@@ -7,17 +7,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import can
-import canopen
 
-from drivers import frames
+from drivers import eds, frames
 from drivers.config import Drive, Drives
 from drivers.errors import BusError, DriveError
 from drivers.interface import NAMES, PowerState
 from drivers.scaling import Scale, unsigned
 from drivers.sdo import INVALID, NO_REMOTE_REQUEST, Client, Clock, Remote
-
-OBJECTS = Path(__file__).with_name("servo.eds")
-"""Object dictionary of a CiA 402 servo drive: names and types of the objects used here."""
 
 CYCLIC_SYNCHRONOUS_POSITION = 8
 POWERED = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
@@ -25,6 +21,8 @@ POWERED = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUIC
 
 Setting = tuple[int, int, int]
 """Index, subindex and value of an object."""
+_USED = ((0x1000, 0), (0x603F, 0), (0x6040, 0), (0x6041, 0), (0x6061, 0), (0x6064, 0), (0x607A, 0), (0x60B1, 0))
+"""Objects that are read or mapped, beside those that are set."""
 
 
 class Start(NamedTuple):
@@ -51,11 +49,11 @@ def configure(
         _settings(name, drive, drives, scale, period)
         for name, drive, scale in zip(NAMES, drives.each, scales, strict=True)
     ]
-    objects = canopen.import_od(str(OBJECTS))
-    remotes = [
-        Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock))
-        for name, drive in zip(NAMES, drives.each, strict=True)
-    ]
+    remotes = []
+    for name, drive, wanted in zip(NAMES, drives.each, settings, strict=True):
+        needed = (*_USED, *(setting[:2] for setting in wanted))
+        objects = eds.load(name, Path(drive.eds) if drive.eds else eds.SERVO, drive.node, needed)
+        remotes.append(Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock)))
     for drive in drives.each:
         _send(bus, frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node))
     for remote in remotes:

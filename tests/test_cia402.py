@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import can
+import canopen
+import msgspec
 import pytest
 
 from drivers import frames
 from drivers.cia402 import Cia402
 from drivers.config import Drive, Drives
+from drivers.eds import SERVO
 from drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 from drivers.interface import Feedback, PowerState, Triple
-from drivers.setup402 import interpolation_period
+from drivers.scaling import scale_of
+from drivers.setup402 import _settings, interpolation_period
 from drivers.simulated import Servo, SimulatedBus, SimulatedDrive
+from drivers.simulated.dictionary import Entry
 
 P = PowerState
 PERIOD = 0.001
@@ -27,6 +33,12 @@ CONFIG = Drives(
     C=Drive(node=9, counts_per_metre=1e6),
     sdo_timeout=0.01,
 )
+SCALE = scale_of("A", CONFIG.A)
+
+
+def changed(name: str, **keys: object) -> Drives:
+    """The configuration, with one drive's keys changed."""
+    return msgspec.structs.replace(CONFIG, **{name: msgspec.structs.replace(getattr(CONFIG, name), **keys)})
 
 
 class Clock:
@@ -256,6 +268,64 @@ class TestConfigure:
             DriveError, match=r"drive C: cannot write 10000000 to object 6085:00 .*read only .*06010002"
         ):
             new.drives.configure(PERIOD)
+
+    def test_refusal_names_object_wanted_and_found(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of every object that is set: a drive that says it took the value and did not."""
+        objects = canopen.import_od(str(SERVO))
+        told = Entry.encode
+        settings = [*dict.fromkeys(setting[:2] for setting in _settings("A", CONFIG.A, CONFIG, SCALE, PERIOD))]
+        assert {index for index, _ in settings} >= {0x60C2, 0x6065, 0x605A, 0x605E, 0x1016, 0x1017, 0x1029}
+        assert {index for index, _ in settings} >= {0x1400, 0x1401, 0x1600, 0x1601, 0x1800, 0x1801, 0x1A00, 0x1A01}
+        for index, subindex in settings:
+            rig = Rig()
+            lying = rig.devices[0].objects[index, subindex]
+
+            def encode(entry: Entry, lying: Entry = lying) -> bytes:
+                truth = told(entry)
+                return bytes([truth[0] ^ 1]) + truth[1:] if entry is lying else truth
+
+            monkeypatch.setattr(Entry, "encode", encode)
+            with pytest.raises(ConfigurationRefused) as refused:
+                rig.drives.configure(PERIOD)
+            name = objects.get_variable(index, subindex).qualname
+            assert str(refused.value).startswith(f"drive A: object {index:04X}:{subindex:02X} ({name}): wanted ")
+            assert ", found " in str(refused.value)
+            rig.drives.close()
+
+    def test_drives_of_other_makes_by_their_own_eds(self, tmp_path: Path) -> None:
+        text = SERVO.read_text().replace("[6085]\nParameterName=Quick stop deceleration", "[6085]\nParameterName=Ramp")
+        (tmp_path / "other.eds").write_text(text)
+        rig = Rig(changed("B", eds=str(tmp_path / "other.eds")))
+        entry = rig.devices[1].objects[0x6085, 0]
+        entry.on_write = lambda entry, old: setattr(entry, "value", 1)
+        with pytest.raises(ConfigurationRefused, match=r"drive B: object 6085:00 \(Ramp\): wanted 20000000, found 1"):
+            rig.drives.configure(PERIOD)
+        rig.drives.close()
+
+    def test_eds_that_is_not_there(self) -> None:
+        with pytest.raises(DriveError, match=r"drive C: cannot read EDS /nowhere/x\.eds: No such file or directory"):
+            Rig(changed("C", eds="/nowhere/x.eds")).drives.configure(PERIOD)
+
+    @pytest.mark.parametrize(
+        "content", [b"hello", b"\xff\xfe\x00", b"[DeviceInfo]\n[1000]\nObjectType=0x7\nDataType=zz\n"]
+    )
+    def test_eds_that_is_none(self, tmp_path: Path, content: bytes) -> None:
+        (tmp_path / "x.eds").write_bytes(content)
+        with pytest.raises(DriveError, match=r"^drive A: \S*x\.eds is not an EDS as CiA 306 has it: .+") as refused:
+            Rig(changed("A", eds=str(tmp_path / "x.eds"))).drives.configure(PERIOD)
+        assert "\n" not in str(refused.value)
+
+    def test_eds_without_an_object_that_is_needed(self, tmp_path: Path) -> None:
+        text = SERVO.read_text()
+        begin = text.index("[60B1]")
+        (tmp_path / "x.eds").write_text(text[:begin] + text[text.index("[60C2]") :].replace("0x60B1", "0x60F4"))
+        rig = Rig(changed("A", eds=str(tmp_path / "x.eds")))
+        with pytest.raises(
+            DriveError,
+            match=r"drive A: EDS \S*x\.eds lacks object 60B1:00 \(Velocity offset\), needed for the velocity",
+        ):
+            rig.drives.configure(PERIOD)
+        assert rig.bus.sent == []  # refused before any drive was spoken to
 
     def test_drive_in_fault_is_set_up_all_the_same(self, new: Rig) -> None:
         new.devices[1].fail(0x3210)

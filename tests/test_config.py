@@ -89,3 +89,10 @@ def test_a_robot_as_built() -> None:
     )
     text = TEXT.replace("l0 = 0.3", legs, 1).replace("phi = [-1.2, 0.85]", "phi = [-0.5, 0.5]")
     assert parse(text).geometry.leg is not None
+
+
+def test_an_eds_lies_beside_the_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(TEXT.replace("[drives.B]\n", '[drives.B]\neds = "makes/b.eds"\n'))
+    drives = load(path).drives
+    assert [drive.eds for drive in drives.each] == [None, str(tmp_path / "makes/b.eds"), None]
