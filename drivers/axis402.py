@@ -26,33 +26,61 @@ class Axis:
         "_operational",
         "_prompt",
         "_restarted",
-        "_sampled",
-        "_syncs",
         "controlword",
+        "counts",
+        "cyclic",
         "error_code",
         "event",
+        "follows",
         "heard",
+        "held",
+        "homed",
         "left_operational",
+        "mode_bits",
+        "mute",
         "name",
         "node",
         "position",
         "powered_up",
         "reset_until",
+        "sampled",
         "scale",
+        "sdo_answer",
+        "seen_clear",
         "state",
+        "statusword",
+        "syncs",
     )
 
     def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
         self.name = name
         self.node = node
         self.scale = scale
+        self.counts = 0
+        """Actual position."""
         self.position = math.nan
         """Actual position [m]."""
+        self.statusword = 0
+        """The newest one."""
+        self.seen_clear = 0
+        """Statusword bits that have been 0 since somebody began to watch."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.powered_up = False
         """It has reached operation enabled since that was asked for."""
         self.controlword = frames.DISABLE_VOLTAGE
         """The last one sent."""
+        self.mode_bits = 0
+        """Controlword bits that go with "enable operation"."""
+        self.held: int | None = None
+        """The position [counts] that it gets in place of setpoints."""
+        self.cyclic = True
+        """It is in cyclic synchronous position mode for sure."""
+        self.follows = True
+        """It follows setpoints, or soon will: those that come are to hold it."""
+        self.homed = True
+        """Its position is counted from a known place."""
+        self.sdo_answer: bytes | None = None
+        """The newest answer about an object."""
         self.error_code = 0
         """What the drive last gave as the reason of its fault; 0 once it said that is over."""
         self.event: DriveFault | None = None
@@ -61,13 +89,14 @@ class Axis:
         """Time of the last heartbeat [s]."""
         self.reset_until = -math.inf
         """Until when a fault reset is under way [s]."""
+        self.mute = False
+        """Its last heartbeat was that of a drive that sends no PDO: its state has to be asked for."""
         self.left_operational = False
         """It said that it is operational no more, and was not started again since."""
-        self._operational = False
-        self._restarted = False
-        self._syncs = 0
+        self._operational = self._restarted = False
+        self.syncs = 0
         """How many were sent."""
-        self._sampled = 0
+        self.sampled = 0
         """The number of the SYNC at which the position was sampled."""
         self._between = False
         """This cycle's frames have been read, and the next SYNC was not sent."""
@@ -78,11 +107,11 @@ class Axis:
     @property
     def age(self) -> int:
         """SYNCs sent after the one at which the position was sampled."""
-        return self._syncs - self._sampled
+        return self.syncs - self.sampled
 
     def sync_sent(self) -> None:
         """Count a SYNC: positions that come from now on may be answers to it."""
-        self._syncs += 1
+        self.syncs += 1
         self._between = False
 
     def read_over(self) -> None:
@@ -97,10 +126,24 @@ class Axis:
         have been so prompt; else it is the late answer to the one before.
         """
         (counts,) = frames.POSITION.unpack(data)
-        self.position = self.scale.metres(counts)
-        late = not self._between and not self._prompt and self._sampled < self._syncs - 1
-        self._sampled = self._syncs - late
+        self.take_position(counts)
+        self._operational = True  # else it would send no PDO
+        late = not self._between and not self._prompt and self.sampled < self.syncs - 1
+        self.sampled = self.syncs - late
         self._prompt = not self._between and not late
+
+    def take_position(self, counts: int) -> None:
+        """Note an actual position."""
+        self.counts = counts
+        self.position = self.scale.metres(counts)
+
+    def on_sdo(self, data: bytes | bytearray, now: float) -> None:
+        """An SDO server's answer; one that is not eight bytes long is none (CiA 301)."""
+        if len(data) != 8:
+            return
+        self.sdo_answer = bytes(data)
+        if self.sdo_answer[:4] == frames.STATUSWORD_UPLOADED:
+            self.on_status(data[4:6], now)
 
     def on_status(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """TPDO1: the statusword, when it changes and from time to time."""
@@ -109,6 +152,8 @@ class Axis:
 
     def take_status(self, statusword: int) -> None:
         """Note the state in a statusword."""
+        self.statusword = statusword
+        self.seen_clear |= ~statusword
         state = frames.power_state(statusword)
         if state is None:
             self.tell("state", 0, f"statusword {statusword:04X} is that of no CiA 402 state")
@@ -142,6 +187,7 @@ class Axis:
             self._operational = False
             self.left_operational = True
             self.tell("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
+        self.mute = self.left_operational and state != frames.OPERATIONAL
 
     def forgive(self, now: float) -> None:
         """Forget what happened, but not what lasts, and allow time for a fault reset."""
@@ -151,7 +197,7 @@ class Axis:
             self.reset_until = now + RESET_TIME
         if self.left_operational:
             self.left_operational = False
-            self._sampled = self._syncs
+            self.sampled = self.syncs
 
     def tell(self, cause: str, code: int, text: str) -> None:
         """Keep the first event since faults were last reset."""

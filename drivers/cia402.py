@@ -1,4 +1,4 @@
-"""Three CiA 402 drives on CANopen in cyclic synchronous position mode: drivers.interface.Drives.
+"""Three CiA 402 drives on CANopen in cyclic synchronous position mode, and homing: drivers.interface.Drives.
 
 The identifiers give the priorities on the bus: SYNC, emergencies, statuswords, controlwords, positions,
 setpoints, heartbeats. So the controlword of a quick stop goes before setpoints that still wait.
@@ -17,6 +17,7 @@ import can
 from drivers import config, frames, setup402
 from drivers.axis402 import Axis
 from drivers.errors import BusError
+from drivers.homing402 import Homing
 from drivers.interface import NAMES, DriveFault, Feedback, PowerState, Triple
 from drivers.scaling import scale_of
 
@@ -58,6 +59,8 @@ class Cia402:
             self._handlers[frames.TPDO2 + axis.node] = axis, axis.on_position
             self._handlers[frames.EMCY + axis.node] = axis, axis.on_emergency
             self._handlers[frames.HEARTBEAT + axis.node] = axis, axis.on_heartbeat
+            self._handlers[frames.SDO_ANSWER + axis.node] = axis, axis.on_sdo
+        self._homing = Homing(self._axes, drives, self._send)
         self._sync = frames.message(frames.SYNC, b"")
         self._heartbeat = frames.message(
             frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL)
@@ -87,7 +90,7 @@ class Cia402:
         scales = tuple(axis.scale for axis in self._axes)
         starts = setup402.configure(self._bus, self._drives, scales, period, self._clock)
         for axis, start in zip(self._axes, starts, strict=True):
-            axis.position = axis.scale.metres(start.counts)
+            axis.take_position(start.counts)
             axis.error_code = start.error_code
             axis.take_status(start.statusword)
         self.bus_load = load
@@ -119,16 +122,26 @@ class Cia402:
         a, b, c = self._axes
         for axis in self._axes:
             axis.read_over()
+            if axis.mute:
+                axis.mute = False
+                self._send(frames.message(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
             fault = axis.fault(now, self._wanted) if self._fault is None else None
             if fault is not None:
                 self._fail(fault)
         if now >= self._off_by:
             self._tell_powered()
+        if self._fault is None:
+            fault = self._homing.step(now)
+            if fault is not None:
+                self._fail(fault)
         return Feedback(
             (a.position, b.position, c.position),
             (a.state, b.state, c.state),
             self._fault,
             (a.age, b.age, c.age),
+            self._homing.under_way,
+            (a.follows, b.follows, c.follows),
+            (a.homed, b.homed, c.homed),
         )
 
     def write(self, position: Triple, velocity: Triple) -> None:
@@ -142,7 +155,10 @@ class Cia402:
         messages = []
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             try:
-                data = frames.SETPOINT.pack(axis.scale.counts(metres), axis.scale.counts_per_second(rate))
+                if axis.held is None:
+                    data = frames.SETPOINT.pack(axis.scale.counts(metres), axis.scale.counts_per_second(rate))
+                else:
+                    data = frames.SETPOINT.pack(axis.held, 0)
             except (ValueError, OverflowError, struct.error):
                 text = f"drive {axis.name}: cannot take setpoint {metres:g} m, {rate:g} m/s"
                 self._fail(DriveFault(axis.name, "setpoint", 0, text))
@@ -163,6 +179,19 @@ class Cia402:
         self._off_by = math.inf
         for axis in self._axes:
             axis.powered_up = False
+        self._homing.restore()
+
+    def home(self) -> None:
+        """Begin to home the drives that have a homing method, one after the other: see drivers.homing402.
+
+        Does nothing unless all drives have power and no fault is latched.
+        """
+        if self._fault is None and all(axis.state is PowerState.OPERATION_ENABLED for axis in self._axes):
+            self._homing.start()
+
+    def stop_homing(self) -> None:
+        """Halt the drive that is being homed; in the end it follows setpoints again, where it stands."""
+        self._homing.stop()
 
     def disable(self) -> None:
         """Take power off; meant for a robot at standstill. A drive that keeps it is a fault, of cause "timeout"."""
@@ -235,12 +264,16 @@ class Cia402:
 
     def _command(self) -> None:
         """Send the controlwords that differ from the last ones: one transition per drive at a time."""
+        # No drive gets power while one of them may not follow setpoints.
+        wanted = PowerState.QUICK_STOP_ACTIVE if self._homing.restoring else self._wanted
         for axis in self._axes:
             if axis.state is PowerState.FAULT and self._clock() < axis.reset_until:
                 # Bit 7 stays up until the drive is out of fault: some look at it once in a few cycles only.
                 word = frames.FAULT_RESET
             else:
-                word = frames.controlword(axis.state, self._wanted)
+                word = frames.controlword(axis.state, wanted)
+                if word == frames.ENABLE_OPERATION:
+                    word |= axis.mode_bits
             if word != axis.controlword and self._send(
                 frames.message(frames.RPDO1 + axis.node, frames.CONTROLWORD.pack(word))
             ):
@@ -258,6 +291,7 @@ class Cia402:
         if self._wanted is not wanted:
             self._off_by = self._clock() + self._drives.stop_timeout
         self._wanted = wanted
+        self._homing.abandon()
 
     def _tell_powered(self) -> None:
         """Tell of a drive that still has power where none should, once."""

@@ -33,7 +33,7 @@ class DriveFault(NamedTuple):
     drive: str
     """Name of the drive, or "" where the bus itself is at fault."""
     cause: str
-    """One of emcy, fault, silent, heartbeat, state, timeout, frame, setpoint, bus."""
+    """One of emcy, fault, silent, heartbeat, state, timeout, homing, frame, setpoint, bus."""
     code: int
     """The EMCY or 603Fh error code, 0 where there is none."""
     message: str
@@ -51,6 +51,12 @@ class Feedback(NamedTuple):
     age: tuple[int, int, int] = (0, 0, 0)
     """How many SYNCs before the newest one each position was sampled: 0 where a drive has answered it already, 1
     where the answer is still on its way, more where answers were lost."""
+    homing: bool = False
+    """Drives are being homed."""
+    follows: tuple[bool, bool, bool] = (True, True, True)
+    """Whether each drive follows setpoints; one that is being homed moves by itself."""
+    homed: tuple[bool, bool, bool] = (True, True, True)
+    """Whether each position is counted from a known place: always with absolute encoders, else after homing."""
 
 
 class Drives(Protocol):
@@ -77,6 +83,16 @@ class Drives(Protocol):
 
     def enable(self) -> None:
         """Begin to power up; the following cycles carry it out, the feedback's states tell when it is done."""
+
+    def home(self) -> None:
+        """Begin to home the drives whose positions are not absolute; the following cycles carry it out.
+
+        Powered drives at standstill only. What is written for a drive is not for it while it does not follow; in
+        the cycle in which it follows again, that must be the position that was fed back one cycle before.
+        """
+
+    def stop_homing(self) -> None:
+        """Halt the drive that is being homed; in the end every drive follows setpoints again, where it stands."""
 
     def disable(self) -> None:
         """Take power off; meant for a robot at standstill."""

@@ -39,6 +39,7 @@ _COMMANDS = {
     "reset": Event.RESET,
     "pause": Event.PAUSE,
     "resume": Event.RESUME,
+    "home": Event.HOME,
 }
 _OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.FAULT: "faulted"}
 """How a goal ends on an event after which it is not under way; else it is stopped."""
@@ -55,6 +56,7 @@ class Control:
         self._legs = robot.packed()
         self._bounds = Bounds(config.limits, config.period)
         self._planner = Planner(robot, config.limits, self._bounds, config.period)
+        self._can_home = any(drive.homing is not None for drive in config.drives.each)
         self._following_error_limit = config.limits.slider.following_error
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._settle_cycles = max(3, round(SETTLE / config.period))
@@ -118,7 +120,7 @@ class Control:
             self.trip(feedback.fault.message)
         elif mode is Mode.ENABLING:
             self._power_up()
-        elif mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
+        elif mode in (Mode.HOMING, Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
             for name, error in zip(NAMES, self.following_error, strict=True):
                 if not abs(error) <= self._following_error_limit:
                     self.trip(
@@ -126,11 +128,15 @@ class Control:
                         f"{self._following_error_limit * 1e3:g} mm"
                     )
                     break
+            else:
+                if not feedback.homing:
+                    self._homing_over()
         self.desk.settle(self._verdict, self.state.mode)
 
     def _compare(self, before: Feedback) -> None:
         """Work out velocities and following errors, for the SYNC at which each position was sampled."""
         velocity, error = list(self.velocity), [0.0, 0.0, 0.0]
+        follows = self.feedback.follows
         for n, (now, age, last, last_age) in enumerate(
             zip(self.feedback.position, self.feedback.age, before.position, before.age, strict=True)
         ):
@@ -138,7 +144,8 @@ class Control:
             if cycles > 0:  # else there is no newer position
                 velocity[n] = (now - last) / (cycles * self._period)
             # A drive reaches at a SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
-            error[n] = self._written[-2 - min(age, OLDEST)][n] - now
+            if follows[n]:
+                error[n] = self._written[-2 - min(age, OLDEST)][n] - now
         self.velocity = (velocity[0], velocity[1], velocity[2])
         self.following_error = (error[0], error[1], error[2])
 
@@ -174,7 +181,7 @@ class Control:
 
     def solve(self) -> None:
         """Solve the sliders for the commanded state, by the paper's recursion; pass the last gate, or trip."""
-        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
+        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.homed:
             self._follow_measured()
             return
         for row, values in enumerate(self.commanded):
@@ -207,6 +214,11 @@ class Control:
         return any(state in _POWERED for state in self.feedback.state)
 
     @property
+    def homed(self) -> bool:
+        """Whether it is known where the sliders are."""
+        return all(self.feedback.homed)
+
+    @property
     def progress(self) -> tuple[float, float]:
         """Share of the running motion's time that is over, and what remains of it [s]."""
         if not self._runs:
@@ -229,6 +241,8 @@ class Control:
         decided = step(self.state, Event.GOAL)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
+        if not self.homed:
+            raise RefusedError("not_homed", "it is not known where the sliders are: send home first")
         goal = request.goal
         if goal.valid_for is not None and now_ns - request.received_ns > goal.valid_for * 1e9:
             raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")
@@ -242,10 +256,12 @@ class Control:
             self._take_override(request)
             return
         event = _COMMANDS[request.name]
+        if event is Event.HOME and not self._can_home:
+            raise RefusedError("nothing_to_home", "absolute encoders: there is nothing to home")
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
-        if decided.action is Action.POWER_UP:
+        if decided.action is Action.POWER_UP and self.homed:
             self._check_start()
         if decided.action is Action.CLEAR and self.powered:
             raise RefusedError("stopping", "the drives are still stopping: send reset again when they stand")
@@ -300,6 +316,10 @@ class Control:
                 return None if mode is Mode.STOPPING or self.powered else ""
             case "stop" | "pause":
                 return None if mode is Mode.STOPPING else ""
+            case "home":
+                if mode in (Mode.HOMING, Mode.STOPPING):
+                    return None
+                return "" if self.homed else self.fault or "stopped before every drive was homed"
             case "resume" | "override":
                 return ""
             case "reset":
@@ -311,7 +331,7 @@ class Control:
 
     # ------------------------------------------------------------------ from state to state
 
-    def _go(self, event: Event, reason: str) -> None:
+    def _go(self, event: Event, reason: str) -> None:  # noqa: PLR0912  a branch for each action
         """Step the modes and carry out the action."""
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
@@ -332,6 +352,10 @@ class Control:
                 self._runs.pop()
             case Action.RESUME:
                 self._run_at(self.override)
+            case Action.HOME:
+                self._drives.home()
+            case Action.STOP_HOMING:
+                self._drives.stop_homing()
         before, self.state = self.state, decided.state
         if self.state.mode is not before.mode:
             self._entered = self.cycle
@@ -363,12 +387,10 @@ class Control:
     def _power_up(self) -> None:
         """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""
         if all(state is PowerState.OPERATION_ENABLED for state in self.feedback.state):
-            self._measured[:] = self.rows[0]
-            if forward_into(self._legs, self._measured, self._pose, self._pose):
-                self.trip("the measured sliders belong to no pose")
-                return
-            self.commanded = rest(self._pose.tolist())
-            self._go(Event.POWERED, "all drives are enabled")
+            if not self.homed:
+                self._go(Event.POWERED, "all drives are enabled; where the sliders are is not known: send home")
+            elif self._rest_at_setpoints():
+                self._go(Event.POWERED, "all drives are enabled")
         elif self.cycle - self._entered > self._enable_cycles:
             waiting = [
                 f"drive {name} is {state}"
@@ -378,13 +400,37 @@ class Control:
             seconds = self._enable_cycles * self._period
             self.trip(f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected")
 
+    def _homing_over(self) -> None:
+        """Hold where homing has ended, or was stopped."""
+        if self.state.mode is Mode.STOPPING and not self.homed:
+            self._go(Event.STANDSTILL, "standstill")
+        elif self.state.mode is Mode.HOMING:
+            try:
+                self._check_start()
+            except RefusedError as refusal:
+                self.trip(f"all drives are homed, but {refusal}")
+                return
+            if self._rest_at_setpoints():
+                self._go(Event.HOMED, "all drives are homed")
+
+    def _rest_at_setpoints(self) -> bool:
+        """Command the pose that belongs to the setpoints, at rest; trip where there is none."""
+        self._measured[:] = self.rows[0]
+        if forward_into(self._legs, self._measured, self._pose, self._pose):
+            self.trip("the measured sliders belong to no pose")
+            return False
+        self.commanded = rest(self._pose.tolist())
+        return True
+
     def _follow_measured(self) -> None:
-        """Make the setpoint of every drive without power the position that it measures: nothing moves on enable."""
+        """Make the setpoint of every drive that none holds the position that it measures: nothing moves on enable."""
         before, now = self.rows[0], self.feedback.position
-        held = self.state.mode is Mode.ENABLING
+        held = self.state.mode not in (Mode.DISABLED, Mode.FAULT)
         position = [
-            last if held and state is PowerState.OPERATION_ENABLED else measured
-            for last, measured, state in zip(before, now, self.feedback.state, strict=True)
+            last if held and follows and state is PowerState.OPERATION_ENABLED else measured
+            for last, measured, state, follows in zip(
+                before, now, self.feedback.state, self.feedback.follows, strict=True
+            )
         ]
         self.commanded = rest(self.pose)
         self._motion[:] = 0.0

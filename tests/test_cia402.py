@@ -287,8 +287,11 @@ class TestConfigure:
             monkeypatch.setattr(Entry, "encode", encode)
             with pytest.raises(ConfigurationRefused) as refused:
                 rig.drives.configure(PERIOD)
-            name = objects.get_variable(index, subindex).qualname
-            assert str(refused.value).startswith(f"drive A: object {index:04X}:{subindex:02X} ({name}): wanted ")
+            variable = objects.get_variable(index, subindex)
+            assert variable is not None
+            assert str(refused.value).startswith(
+                f"drive A: object {index:04X}:{subindex:02X} ({variable.qualname}): wanted "
+            )
             assert ", found " in str(refused.value)
             rig.drives.close()
 
