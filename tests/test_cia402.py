@@ -13,7 +13,7 @@ import pytest
 
 from drivers import frames
 from drivers.cia402 import Cia402
-from drivers.config import Drive, Drives
+from drivers.config import Drive, Drives, Homing
 from drivers.eds import SERVO
 from drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 from drivers.interface import Feedback, PowerState, Triple
@@ -34,6 +34,7 @@ CONFIG = Drives(
     sdo_timeout=0.01,
 )
 SCALE = scale_of("A", CONFIG.A)
+HOMING = Homing(method=19, speed_switch=0.02, speed_zero=0.005, acceleration=0.5)
 
 
 def changed(name: str, **keys: object) -> Drives:
@@ -329,6 +330,29 @@ class TestConfigure:
         ):
             rig.drives.configure(PERIOD)
         assert rig.bus.sent == []  # refused before any drive was spoken to
+
+    def test_homing_is_set_where_the_encoder_is_not_absolute(self) -> None:
+        rig = Rig(changed("B", homing=HOMING))
+        rig.drives.configure(PERIOD)
+        objects = rig.devices[1].objects
+        keys = [(0x6098, 0), (0x6099, 1), (0x6099, 2), (0x609A, 0), (0x607C, 0)]
+        assert [objects[key].value for key in keys] == [19, 40_000, 10_000, 1_000_000, 0]
+        assert rig.drives.read().homed == (True, False, True)
+        assert [rig.devices[0].objects[key].value for key in keys] == [0] * 5
+        rig.drives.close()
+
+    def test_drive_without_homing_mode_is_not_homed(self) -> None:
+        rig = Rig(changed("B", homing=HOMING))
+        rig.devices[1].objects[0x6502, 0].value = 0x80
+        with pytest.raises(DriveError, match=r"drive B: object 6502:00 .* is 00000080, without homing mode"):
+            rig.drives.configure(PERIOD)
+        rig.drives.close()
+
+    def test_homing_method_that_a_drive_has_not_is_refused(self) -> None:
+        rig = Rig(changed("C", homing=msgspec.structs.replace(HOMING, method=33)))
+        with pytest.raises(DriveError, match=r"drive C: cannot write 33 to object 6098:00 \(Homing method\)"):
+            rig.drives.configure(PERIOD)
+        rig.drives.close()
 
     def test_drive_in_fault_is_set_up_all_the_same(self, new: Rig) -> None:
         new.devices[1].fail(0x3210)

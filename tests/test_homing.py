@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Iterator, Sequence
 
 import can
+import canopen
 import msgspec
 import numpy as np
 import pytest
+from canopen.profiles.p402 import BaseNode402
 from conftest import CONFIG, Delay, Rig, changed
 
 from drivers import config, frames
+from drivers.eds import SERVO
 from drivers.interface import PowerState
+from drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from service.config import Config, geometry
 from service.kinematics import inverse
 from service.modes import Event, Mode
@@ -365,3 +371,50 @@ def test_a_robot_that_does_not_know_where_it_is_holds(rig: Rig) -> None:
     assert rig.mode is Mode.HOLDING
     settled(rig)
     assert np.max(np.ptp(rig.setpoints()[:, 0], axis=0)) < 1e-12
+
+
+# ---------------------------------------------------------------------- by a master that this project did not write
+
+
+class Shared(SimulatedBus):
+    """The simulated bus for a master with a thread of its own."""
+
+    def __init__(self, drives: list[SimulatedDrive]) -> None:
+        self._lock = threading.Lock()
+        super().__init__(drives)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        with self._lock:
+            super().send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        end = time.monotonic() + (timeout or 0.0)
+        while True:
+            with self._lock:
+                message = super().recv(0.0)
+            if message is not None or time.monotonic() >= end:
+                return message
+            time.sleep(0.0005)
+
+
+@pytest.mark.parametrize("method", [19, 37])
+def test_a_stock_canopen_master_homes_the_simulated_drive(method: int) -> None:
+    servo = Servo(0, time_constant=0.0, max_velocity=1e6, max_acceleration=1e8)
+    drive = SimulatedDrive(5, servo, home_switch=2000)
+    network = canopen.Network(Shared([drive]))
+    network.connect()
+    try:
+        node = BaseNode402(5, str(SERVO))  # type: ignore[no-untyped-call]
+        network.add_node(node)
+        node.sdo[0x6098].raw = method
+        node.sdo[0x6099][1].raw = 50_000
+        node.sdo[0x6099][2].raw = 10_000
+        node.sdo[0x609A].raw = 2_000_000
+        node.state = "SWITCH ON DISABLED"
+        assert node.homing(timeout=20)  # type: ignore[no-untyped-call]
+        assert node.sdo[0x6041].raw & 0x3400 == 0x1400
+        assert node.op_mode == "HOMING"
+        assert abs(node.sdo[0x6064].raw) <= 10_000**2 / 2 / 2_000_000 + 10
+        node.state = "SWITCH ON DISABLED"
+    finally:
+        network.disconnect()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from service import palette, terminal
 from service.modes import (
     DISABLED,
     ENABLING,
@@ -229,6 +230,11 @@ def test_step(state: State, event: Event) -> None:
         assert decided.message
     else:
         assert decided == Step(*wanted)
+
+
+def test_every_mode_has_its_colours() -> None:
+    assert set(palette.MODES) == set(Mode)
+    assert set(terminal.COLOURS) == set(Mode)
 
 
 @pytest.mark.parametrize("state", STATES)
