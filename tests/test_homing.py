@@ -202,8 +202,6 @@ def test_the_frames_of_one_drive(rig: Rig) -> None:
 
 
 def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    rig.enable()
-    rig.command("home")
     drive = rig.drives[0]
     forget = drive.homing.forget
 
@@ -213,6 +211,8 @@ def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pyte
         drive.homing.attained = attained and drive.objects[0x6040, 0].value & frames.HOMING_START == 0
 
     monkeypatch.setattr(drive.homing, "forget", keep)
+    rig.enable()
+    rig.command("home")
     begin(rig, 1)
     moved = 0.0
     before = true_positions(rig)[0]
