@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from drivers import frames
+from drivers.answers import Answers
 from drivers.interface import Counts, DriveFault, PowerState
 from drivers.scaling import Scale
 
@@ -16,6 +17,7 @@ RESET_TIME = 2 * frames.STATUS_PERIOD
 
 _NMT_STATES = {frames.STOPPED: "stopped", frames.PRE_OPERATIONAL: "pre-operational"}
 _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
+_WITHOUT_POWER = (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.SWITCH_ON_DISABLED)
 
 
 class Axis:
@@ -23,34 +25,49 @@ class Axis:
 
     __slots__ = (
         "_heartbeat_timeout",
-        "_missing",
         "_operational",
         "_restarted",
+        "actual",
+        "answers",
         "command_age",
         "controlword",
-        "counts",
+        "cyclic",
         "error_code",
         "event",
+        "follows",
         "heard",
+        "held",
+        "homed",
         "left_operational",
+        "mode_bits",
+        "mute",
         "name",
         "node",
         "position",
         "powered_up",
         "reset_until",
         "scale",
+        "sdo_answer",
+        "seen_clear",
+        "setpoints_late",
+        "setpoints_lost",
         "state",
         "status_heard",
-        "stopping_since",
-        "unanswered",
+        "statusword",
     )
 
     def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
         self.name = name
         self.node = node
         self.scale = scale
+        self.actual = 0
+        """Actual position [counts]."""
         self.position = math.nan
         """Actual position [m]."""
+        self.statusword = 0
+        """The newest one."""
+        self.seen_clear = 0
+        """Statusword bits that have been 0 since somebody began to watch."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.powered_up = False
         """It has reached operation enabled since that was asked for."""
@@ -58,43 +75,62 @@ class Axis:
         """The last one sent."""
         self.command_age = 0
         """SYNCs since it was sent."""
+        self.mode_bits = 0
+        """Controlword bits that go with "enable operation"."""
+        self.held: int | None = None
+        """The position [counts] that it gets in place of setpoints."""
+        self.cyclic = True
+        """It is in cyclic synchronous position mode for sure."""
+        self.follows = True
+        """It follows setpoints, or soon will: those that come are to hold it."""
+        self.homed = True
+        """Its position is counted from a known place."""
+        self.sdo_answer: bytes | None = None
+        """The newest answer about an object."""
         self.error_code = 0
         """What the drive last gave as the reason of its fault; 0 once it said that is over."""
         self.event: DriveFault | None = None
         """A fault that a frame told of, rather than a state that lasts."""
-        self.unanswered = 0
-        """SYNCs since the last position."""
         self.heard = math.inf
         """Time of the last heartbeat [s]."""
         self.status_heard = math.inf
         """Time of the last statusword [s]."""
-        self.stopping_since: float | None = None
-        """Since when it has been seen on its quick-stop ramp [s]."""
-        self.counts = Counts()
+        self.answers = Answers()
+        self.setpoints_late = self.setpoints_lost = 0
+        """Setpoints written after the next SYNC was due, and those that the bus did not take."""
         self.reset_until = -math.inf
         """Until when a fault reset is under way [s]."""
+        self.mute = False
+        """Its last heartbeat was that of a drive that sends no PDO: its state has to be asked for."""
         self.left_operational = False
         """It said that it is operational no more, and was not started again since."""
-        self._missing = 0
-        self._operational = False
-        self._restarted = False
+        self._operational = self._restarted = False
         self._heartbeat_timeout = MISSED_HEARTBEATS * heartbeat
+
+    @property
+    def counts(self) -> Counts:
+        """What of its cyclic traffic went wrong."""
+        return Counts(self.answers.late, self.answers.lost, self.setpoints_late, self.setpoints_lost)
 
     def on_position(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
         """TPDO2: the position sampled at a SYNC."""
         (counts,) = frames.POSITION.unpack(data)
-        self.position = self.scale.metres(counts)
-        if self._missing and not self.unanswered:  # the second one in a cycle: an earlier cycle's has come after all
-            self._missing -= 1
-            late, lost = self.counts.feedback_late + 1, self.counts.feedback_lost - 1
-            self.counts = self.counts._replace(feedback_late=late, feedback_lost=lost)
-        self.unanswered = 0
+        self.take_position(counts)
+        self.answers.come()
         self._operational = True  # CiA 301: PDOs are sent in NMT operational only
 
-    def miss_position(self) -> None:
-        """A cycle has ended without a position."""
-        self._missing += 1
-        self.counts = self.counts._replace(feedback_lost=self.counts.feedback_lost + 1)
+    def take_position(self, counts: int) -> None:
+        """Note an actual position."""
+        self.actual = counts
+        self.position = self.scale.metres(counts)
+
+    def on_sdo(self, data: bytes | bytearray, now: float) -> None:
+        """An SDO server's answer; one that is not eight bytes long is none (CiA 301)."""
+        if len(data) != 8:
+            return
+        self.sdo_answer = bytes(data)
+        if self.sdo_answer[:4] == frames.STATUSWORD_UPLOADED:
+            self.on_status(data[4:6], now)
 
     def on_status(self, data: bytes | bytearray, now: float) -> None:
         """TPDO1: the statusword, when it changes and from time to time."""
@@ -104,6 +140,8 @@ class Axis:
 
     def take_status(self, statusword: int) -> None:
         """Note the state in a statusword."""
+        self.statusword = statusword
+        self.seen_clear |= ~statusword
         state = frames.power_state(statusword)
         if state is None:
             self.tell("state", 0, f"statusword {statusword:04X} is that of no CiA 402 state")
@@ -139,9 +177,10 @@ class Axis:
         elif self._operational:  # before that, it is a heartbeat from before the drive was started
             self._operational = False
             self.left_operational = True
-            # It tells its state no more, and will not be enabled: by 6007h it stops when it leaves operational.
+            # Unknown until it answers, which stopped ones do not; by 6007h it stops when it leaves operational.
             self.state = PowerState.NOT_READY_TO_SWITCH_ON
             self.tell("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
+        self.mute = self.left_operational and state != frames.OPERATIONAL
 
     def forgive(self, now: float) -> None:
         """Forget what happened, but not what lasts, and allow time for a fault reset."""
@@ -151,13 +190,23 @@ class Axis:
             self.reset_until = now + RESET_TIME
         if self.left_operational:
             self.left_operational = False
-            self.unanswered = 0
+            self.answers.forgive()
             self.status_heard = now
 
     def tell(self, cause: str, code: int, text: str) -> None:
         """Keep the first event since faults were last reset."""
         if self.event is None:
             self.event = self._fault(cause, code, text)
+
+    def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
+        """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not.
+
+        A drive in fault, or that is not operational, has a fault of its own to tell.
+        """
+        if self.state in _WITHOUT_POWER or self.state in _IN_FAULT:
+            return None
+        text = f"is {self.state} {seconds:g} s after {wanted}; switch on disabled was expected"
+        return self._fault("timeout", 0, text)
 
     def fault(self, now: float, wanted: frames.Wanted) -> DriveFault | None:
         """What is wrong with the drive at time `now`, given what it was asked for."""
@@ -166,11 +215,13 @@ class Axis:
         if self.state in _IN_FAULT:
             if now >= self.reset_until:
                 reason = f", error {self.error_code:04X}" if self.error_code else ""
+                if self.reset_until > -math.inf:
+                    reason += f", still {RESET_TIME:g} s after a fault reset"
                 return self._fault("fault", self.error_code, f"{self.state}{reason}")
         elif self.error_code:  # CiA 301: in force until the drive sends "error reset", code 00xxh
             return self._fault("emcy", self.error_code, f"emergency {self.error_code:04X} is still in force")
-        elif self.unanswered >= MISSED_SYNCS:
-            return self._fault("silent", 0, f"no position for {self.unanswered} SYNCs in a row")
+        elif self.answers.missed >= MISSED_SYNCS:
+            return self._fault("silent", 0, f"no position for {self.answers.missed} SYNCs in a row")
         elif now - self.heard > self._heartbeat_timeout:
             return self._fault("heartbeat", 0, f"no heartbeat for {now - self.heard:.3g} s")
         elif now - self.status_heard > MISSED_STATUSES * frames.STATUS_PERIOD:

@@ -1,4 +1,4 @@
-"""Three CiA 402 drives on CANopen in cyclic synchronous position mode: drivers.interface.Drives.
+"""Three CiA 402 drives on CANopen in cyclic synchronous position mode, and homing: drivers.interface.Drives.
 
 The identifiers give the priorities on the bus: SYNC, emergencies, statuswords, controlwords, positions,
 setpoints, heartbeats. So the controlword of a quick stop goes before setpoints that still wait.
@@ -7,6 +7,7 @@ setpoints, heartbeats. So the controlword of a quick stop goes before setpoints 
 from __future__ import annotations
 
 import contextlib
+import math
 import struct
 import time
 from collections.abc import Callable
@@ -16,13 +17,12 @@ import can
 from drivers import canerrors, config, frames, setup402
 from drivers.axis402 import Axis
 from drivers.errors import BusError
+from drivers.homing402 import Homing
 from drivers.interface import NAMES, DriveFault, Feedback, PowerState, Triple
 from drivers.scaling import scale_of
 
 MOST_FRAMES = 1000
 """Frames taken in by one `read` at most, so that a chattering bus cannot hold it."""
-STOPPING_TIME = 1.0
-"""How long drives have to come down their quick-stop ramp; then power is taken off a drive that has not [s]."""
 REPEAT_AFTER = 3
 """A controlword that a drive does not follow is sent again after so many SYNCs: the frame may be lost."""
 UNSENT_CYCLES = 3
@@ -68,12 +68,18 @@ class Cia402:
             self._handlers[frames.TPDO2 + axis.node] = axis, axis.on_position
             self._handlers[frames.EMCY + axis.node] = axis, axis.on_emergency
             self._handlers[frames.HEARTBEAT + axis.node] = axis, axis.on_heartbeat
+            self._handlers[frames.SDO_ANSWER + axis.node] = axis, axis.on_sdo
+        self._homing = Homing(self._axes, drives, self._send)
         self._sync = frames.message(frames.SYNC, b"")
         self._heartbeat = frames.message(
             frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL)
         )
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
+        self._off_by = math.inf
+        """When the drives must have lost their power [s]; inf where that was not asked for, or has been told of."""
+        self._asked = ""
+        """By what that was asked for."""
         self._stopped_in_this_cycle = False
         self._fault: DriveFault | None = None
         self._warnings: list[str] = []
@@ -101,7 +107,7 @@ class Cia402:
         scales = tuple(axis.scale for axis in self._axes)
         starts = setup402.configure(self._bus, self._drives, scales, period, self._clock)
         for axis, start in zip(self._axes, starts, strict=True):
-            axis.position = axis.scale.metres(start.counts)
+            axis.take_position(start.counts)
             axis.error_code = start.error_code
             axis.take_status(start.statusword)
         self.bus_load = load
@@ -110,11 +116,15 @@ class Cia402:
         self._period = period
 
     def sync(self) -> None:
-        """Send SYNC: the drives take up the setpoints written since the last one and sample positions."""
+        """Send SYNC: the drives take up the setpoints written since the last one and sample positions.
+
+        What has arrived is taken in before: positions among it answer the SYNC before.
+        """
         self._unsent_cycles = self._unsent_cycles + 1 if self._unsent else 0
-        self._unsent = False
-        self._send(self._sync)
+        self._unsent = self._stopped_in_this_cycle = False
         now = self._synced = self._clock()
+        self._receive(now)
+        self._send(self._sync)
         if self._heartbeat_due is None:
             # The drives' watchdogs and ours begin with the first cycle, however long ago the set-up was.
             self._heartbeat_due = now
@@ -123,9 +133,8 @@ class Cia402:
         if now >= self._heartbeat_due:
             self._heartbeat_due = now + self._drives.heartbeat
             self._send(self._heartbeat)
-        self._stopped_in_this_cycle = False
         for axis in self._axes:
-            axis.unanswered += 1
+            axis.answers.sync_sent()
             axis.command_age += 1
 
     def read(self) -> Feedback:
@@ -134,14 +143,19 @@ class Cia402:
         self._receive(now)
         a, b, c = self._axes
         for axis in self._axes:
-            if axis.unanswered:
-                axis.miss_position()
+            axis.answers.read_over()
+            if axis.mute:
+                axis.mute = False
+                self._send(frames.message(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
+            fault = axis.fault(now, self._wanted) if self._fault is None else None
+            if fault is not None:
+                self._fail(fault)
+        if now >= self._off_by:
+            self._take_power_off()
         if self._fault is None:
-            for axis in self._axes:
-                fault = axis.fault(now, self._wanted)
-                if fault is not None:
-                    self._fail(fault)
-                    break
+            fault = self._homing.step(now)
+            if fault is not None:
+                self._fail(fault)
         warnings = tuple(self._warnings)
         self._warnings.clear()
         return Feedback(
@@ -150,6 +164,10 @@ class Cia402:
             self._fault,
             (a.counts, b.counts, c.counts),
             warnings,
+            (a.answers.age, b.answers.age, c.answers.age),
+            self._homing.under_way,
+            (a.follows, b.follows, c.follows),
+            (a.homed, b.homed, c.homed),
         )
 
     def write(self, position: Triple, velocity: Triple) -> None:
@@ -166,7 +184,10 @@ class Cia402:
         messages = []
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             try:
-                data = frames.SETPOINT.pack(axis.scale.counts(metres), axis.scale.counts_per_second(rate))
+                if axis.held is None:
+                    data = frames.SETPOINT.pack(axis.scale.counts(metres), axis.scale.counts_per_second(rate))
+                else:
+                    data = frames.SETPOINT.pack(axis.held, 0)
             except (ValueError, OverflowError, struct.error):
                 text = f"drive {axis.name}: cannot take setpoint {metres:g} m, {rate:g} m/s"
                 self._fail(DriveFault(axis.name, "setpoint", 0, text))
@@ -174,9 +195,9 @@ class Cia402:
             messages.append(frames.message(frames.RPDO2 + axis.node, data))
         for axis, message in zip(self._axes, messages, strict=True):
             if not self._send(message):
-                axis.counts = axis.counts._replace(setpoints_lost=axis.counts.setpoints_lost + 1)
+                axis.setpoints_lost += 1
             elif late:
-                axis.counts = axis.counts._replace(setpoints_late=axis.counts.setpoints_late + 1)
+                axis.setpoints_late += 1
         self._command()
 
     def enable(self) -> None:
@@ -187,17 +208,35 @@ class Cia402:
         if self._fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
             return
         self._wanted = PowerState.OPERATION_ENABLED
+        self._off_by = math.inf
         for axis in self._axes:
             axis.powered_up = False
+        self._homing.restore()
+
+    def home(self) -> None:
+        """Begin to home the drives that have a homing method, one after the other: see drivers.homing402.
+
+        Does nothing unless all drives have power and no fault is latched.
+        """
+        if self._fault is None and all(axis.state is PowerState.OPERATION_ENABLED for axis in self._axes):
+            self._homing.start()
+
+    def stop_homing(self) -> None:
+        """Halt the drive that is being homed; in the end it follows setpoints again, where it stands."""
+        self._homing.stop()
 
     def disable(self) -> None:
-        """Take power off; meant for a robot at standstill."""
-        self._wanted = PowerState.SWITCH_ON_DISABLED
+        """Take power off; meant for a robot at standstill. A drive that keeps it is a fault, of cause "timeout"."""
+        self._power_off(PowerState.SWITCH_ON_DISABLED, "disable")
         self._command()
 
     def quick_stop(self) -> None:
-        """Make every drive stop by its own quick-stop ramp, in this cycle, and end without power."""
-        self._wanted = PowerState.QUICK_STOP_ACTIVE
+        """Make every drive stop by its own quick-stop ramp, in this cycle, and end without power.
+
+        A drive that has it after `stop_timeout` is told to lose it at once, and is a fault, of cause "timeout", that
+        takes the place of the one that stopped it.
+        """
+        self._power_off(PowerState.QUICK_STOP_ACTIVE, "quick stop")
         self._stopped_in_this_cycle = True
         self._command()
 
@@ -206,6 +245,8 @@ class Cia402:
         self._fault = None
         self._warned.clear()
         now = self._clock()
+        if self._wanted is not PowerState.OPERATION_ENABLED:
+            self._give_time_to_stop("reset")
         for axis in self._axes:
             if axis.left_operational:  # its set-up is still there: only a restarted drive needs a new one
                 self._send(frames.nmt(frames.NMT_START, axis.node))
@@ -277,21 +318,21 @@ class Cia402:
         if axis.state is PowerState.FAULT and now < axis.reset_until:
             # Bit 7 stays up until the drive is out of fault: some look at it once in a few cycles only.
             return frames.FAULT_RESET
-        if axis.state is not PowerState.QUICK_STOP_ACTIVE:
-            axis.stopping_since = None
-        elif axis.stopping_since is None:
-            axis.stopping_since = now
-        elif now - axis.stopping_since > STOPPING_TIME:
-            return frames.DISABLE_VOLTAGE  # it does not come to stand by its ramp: its brake is what remains
-        return frames.controlword(axis.state, self._wanted)
+        word = frames.controlword(axis.state, self._next)
+        return word | axis.mode_bits if word == frames.ENABLE_OPERATION else word
 
     def _is_not_followed(self, axis: Axis, word: int) -> bool:
         """Whether a controlword, by what the drive says, has not taken it where it is to go."""
-        if self._wanted is PowerState.OPERATION_ENABLED:
-            return axis.state in _ON_THE_WAY
+        if self._next is PowerState.OPERATION_ENABLED:
+            return axis.state in _ON_THE_WAY or not axis.cyclic  # of its mode's bits the state does not tell
         if axis.state is PowerState.QUICK_STOP_ACTIVE:
             return word == frames.DISABLE_VOLTAGE
         return axis.state in _CAN_MOVE_OR_SOON
+
+    @property
+    def _next(self) -> frames.Wanted:
+        """What drives are asked for now: none gets power while one of them may not follow setpoints."""
+        return PowerState.QUICK_STOP_ACTIVE if self._homing.restoring else self._wanted
 
     def _send(self, message: can.Message) -> bool:
         """Send a frame; one that a full queue does not take is left out and, for a few cycles, no fault."""
@@ -313,6 +354,25 @@ class Cia402:
             self._warned.add(text)
             self._warnings.append(text)
 
+    def _power_off(self, wanted: frames.Wanted, asked: str) -> None:
+        if self._wanted is not wanted:
+            self._give_time_to_stop(asked)
+        self._wanted = wanted
+        self._homing.abandon()
+
+    def _give_time_to_stop(self, asked: str) -> None:
+        self._off_by, self._asked = self._clock() + self._drives.stop_timeout, asked
+
+    def _take_power_off(self) -> None:
+        """Tell of a drive that has not stopped in time, once; its brake is what remains."""
+        self._off_by = math.inf
+        self._wanted = PowerState.SWITCH_ON_DISABLED
+        for axis in self._axes:
+            fault = axis.late_for(self._asked, self._drives.stop_timeout)
+            if fault is not None:
+                self._fault = fault
+                return
+
     def _fail(self, fault: DriveFault) -> None:
         """Latch the first fault; drives that have power, or are getting it, are stopped."""
         if self._fault is None:
@@ -324,7 +384,7 @@ class Cia402:
         if not self._powered():
             return
         self.quick_stop()
-        deadline = self._clock() + STOPPING_TIME
+        deadline = self._clock() + self._drives.stop_timeout
         while self._powered() and (left := deadline - self._clock()) > 0:
             message = self._bus.recv(left)
             if message is None:

@@ -37,6 +37,25 @@ class Can(Struct, frozen=True, forbid_unknown_fields=True):
     simulated: Simulated = Simulated()
 
 
+class Homing(Struct, frozen=True, forbid_unknown_fields=True):
+    """How a drive with an incremental encoder finds its zero, in homing mode: [drives.A.homing], and so on."""
+
+    method: Annotated[int, Meta(ge=-128, le=127)]
+    """Object 6098h. Its directions are those of the drive's own counts; negative ones are the maker's."""
+    speed_switch: Positive
+    """Object 6099h:01, while the switch is searched [m/s]."""
+    speed_zero: Positive
+    """Object 6099h:02, while its edge or the index pulse is searched [m/s]."""
+    acceleration: Positive
+    """Object 609Ah [m/s²]."""
+    timeout: Annotated[float, Meta(gt=0.0, le=180.0)] = 60.0
+    """How long it may take [s]; so it bounds the way that a slider goes where it meets no switch."""
+
+    def __post_init__(self) -> None:
+        if self.method == 0:
+            raise ValueError("method 0 is no homing: leave the table out where the encoder is absolute")
+
+
 class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     """One drive: section [drives.A], [drives.B] or [drives.C]."""
 
@@ -45,7 +64,11 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     direction: Literal[1, -1] = 1
     """-1 where counts fall as the slider position rises."""
     offset: float = 0.0
-    """Slider position at zero counts [m]."""
+    """Slider position at zero counts [m]; after homing, that at home."""
+    homing: Homing | None = None
+    """None where the encoder is absolute."""
+    eds: str | None = None
+    """Its maker's EDS, relative to the configuration file; the shipped servo.eds when absent."""
 
 
 class Drives(Struct, frozen=True, forbid_unknown_fields=True):
@@ -63,6 +86,8 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     """The drives' own following error window, object 6065h [m]."""
     quick_stop_deceleration: Positive = 10.0
     """Object 6085h [m/s²]."""
+    stop_timeout: Positive = 1.0
+    """How long a drive may take to lose its power, down the quick-stop ramp or when it is disabled [s]."""
     sdo_timeout: Positive = 0.5
     """How long a drive may take to answer a configuration request [s]."""
 

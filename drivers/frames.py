@@ -36,6 +36,11 @@ EMERGENCY: Final = Struct("<HB5s")
 NMT_STATE: Final = Struct("<B")
 """Heartbeat and boot-up: the sender's NMT state."""
 
+STATUSWORD_UPLOAD: Final = b"\x40\x41\x60\x00" + bytes(4)
+"""SDO request for the statusword 6041h."""
+STATUSWORD_UPLOADED: Final = b"\x4b\x41\x60\x00"
+"""How its answer begins; the two bytes of the statusword follow."""
+
 NMT_START: Final = 0x01
 NMT_PRE_OPERATIONAL: Final = 0x80
 
@@ -50,6 +55,10 @@ SHUTDOWN: Final = 0x06
 SWITCH_ON: Final = 0x07
 ENABLE_OPERATION: Final = 0x0F
 FAULT_RESET: Final = 0x80
+HOMING_START: Final = 0x10
+"""Bit 4 in homing mode, beside ENABLE_OPERATION."""
+HALT: Final = 0x100
+"""Bit 8: stop and stand still, with power."""
 
 STATUS_PERIOD: Final = 0.1
 """A drive repeats an unchanged statusword this often: event timer 1800h:05 [s]."""

@@ -33,7 +33,7 @@ class DriveFault(NamedTuple):
     drive: str
     """Name of the drive, or "" where the bus itself is at fault."""
     cause: str
-    """One of emcy, fault, silent, heartbeat, state, frame, setpoint, bus."""
+    """One of emcy, fault, silent, heartbeat, state, timeout, homing, frame, setpoint, bus."""
     code: int
     """The EMCY or 603Fh error code, 0 where there is none."""
     message: str
@@ -44,9 +44,9 @@ class Counts(NamedTuple):
     """What of one drive's cyclic traffic went wrong since the start; none of it is a fault by itself."""
 
     feedback_late: int = 0
-    """Positions that came after the cycle they were due in."""
+    """Positions that came a cycle later than the one before did."""
     feedback_lost: int = 0
-    """Cycles without a position that did not come later either."""
+    """SYNCs that were never answered, as far as later answers show."""
     setpoints_late: int = 0
     """Setpoints written after the next SYNC was due."""
     setpoints_lost: int = 0
@@ -54,16 +54,25 @@ class Counts(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """What the three drives last said, as of the newest SYNC."""
+    """What the three drives have said by now."""
 
     position: Triple
     """Measured slider positions [m]."""
     state: tuple[PowerState, PowerState, PowerState]
     fault: DriveFault | None
-    """The first fault since the last reset, else None."""
+    """The first fault since the last reset, or that a drive did not stop after it; else None."""
     counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
     warnings: tuple[str, ...] = ()
     """What people should know and is no fault, a line each; told in one feedback only."""
+    age: tuple[int, int, int] = (0, 0, 0)
+    """How many SYNCs before the newest one each position was sampled: 0 where a drive has answered it already, 1
+    where the answer is still on its way, more where answers were lost."""
+    homing: bool = False
+    """Drives are being homed."""
+    follows: tuple[bool, bool, bool] = (True, True, True)
+    """Whether each drive follows setpoints; one that is being homed moves by itself."""
+    homed: tuple[bool, bool, bool] = (True, True, True)
+    """Whether each position is counted from a known place: always with absolute encoders, else after homing."""
 
 
 class Drives(Protocol):
@@ -90,6 +99,16 @@ class Drives(Protocol):
 
     def enable(self) -> None:
         """Begin to power up; the following cycles carry it out, the feedback's states tell when it is done."""
+
+    def home(self) -> None:
+        """Begin to home the drives whose positions are not absolute; the following cycles carry it out.
+
+        Powered drives at standstill only. What is written for a drive is not for it while it does not follow; in
+        the cycle in which it follows again, that must be the position that was fed back one cycle before.
+        """
+
+    def stop_homing(self) -> None:
+        """Halt the drive that is being homed; in the end every drive follows setpoints again, where it stands."""
 
     def disable(self) -> None:
         """Take power off; meant for a robot at standstill."""

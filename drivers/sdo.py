@@ -96,7 +96,7 @@ class Remote:
     def _variable(self, index: int, subindex: int) -> ODVariable:
         variable = self.client.od.get_variable(index, subindex)
         if variable is None:
-            raise DriveError(f"object {index:04X}:{subindex:02X} is not in the drives' EDS")
+            raise DriveError(f"drive {self.name}: object {index:04X}:{subindex:02X} is not in its EDS")
         return variable
 
     @contextmanager

@@ -7,24 +7,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 import can
-import canopen
 
-from drivers import frames
-from drivers.config import Drive, Drives
+from drivers import eds, frames
+from drivers.config import Drive, Drives, Homing
 from drivers.errors import BusError, DriveError
+from drivers.homing402 import CYCLIC_SYNCHRONOUS_POSITION, HOMING
 from drivers.interface import NAMES, PowerState
 from drivers.scaling import Scale, unsigned
 from drivers.sdo import INVALID, NO_REMOTE_REQUEST, Client, Clock, Remote
 
-OBJECTS = Path(__file__).with_name("servo.eds")
-"""Object dictionary of a CiA 402 servo drive: names and types of the objects used here."""
-
-CYCLIC_SYNCHRONOUS_POSITION = 8
 POWERED = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 """States in which a drive may have current in its motor."""
 
 Setting = tuple[int, int, int]
 """Index, subindex and value of an object."""
+_USED = ((0x1000, 0), (0x603F, 0), (0x6040, 0), (0x6041, 0), (0x6061, 0), (0x6064, 0), (0x607A, 0), (0x60B1, 0))
+"""Objects that are read or mapped, beside those that are set."""
 
 
 class Start(NamedTuple):
@@ -51,15 +49,17 @@ def configure(
         _settings(name, drive, drives, scale, period)
         for name, drive, scale in zip(NAMES, drives.each, scales, strict=True)
     ]
-    objects = canopen.import_od(str(OBJECTS))
-    remotes = [
-        Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock))
-        for name, drive in zip(NAMES, drives.each, strict=True)
-    ]
+    remotes = []
+    for name, drive, wanted in zip(NAMES, drives.each, settings, strict=True):
+        needed = (*_USED, *(setting[:2] for setting in wanted), *([(0x6502, 0)] if drive.homing else []))
+        objects = eds.load(name, Path(drive.eds) if drive.eds else eds.SERVO, drive.node, needed)
+        remotes.append(Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock)))
     for drive in drives.each:
         _send(bus, frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node))
-    for remote in remotes:
+    for remote, drive in zip(remotes, drives.each, strict=True):
         _check_is_idle_servo(remote)
+        if drive.homing is not None:
+            _check_homes(remote)
     for remote, wanted in zip(remotes, settings, strict=True):
         _apply(remote, wanted)
     for drive in drives.each:
@@ -108,6 +108,16 @@ def _check_is_idle_servo(remote: Remote) -> None:
         raise DriveError(f"drive {remote.name}: keeps its power on when told off (statusword {statusword:04X})")
 
 
+def _check_homes(remote: Remote) -> None:
+    """CiA 402-2, 6502h: bit n - 1 stands for mode n."""
+    modes = remote.read(0x6502)
+    if not modes >> (HOMING - 1) & 1:
+        raise DriveError(
+            f"drive {remote.name}: object 6502:00 (supported drive modes) is {modes:08X}, without homing mode; "
+            f"leave [drives.{remote.name}.homing] out if its encoder is absolute"
+        )
+
+
 def _settings(name: str, drive: Drive, drives: Drives, scale: Scale, period: float) -> list[Setting]:
     """Everything a drive must be told, in order."""
     heartbeat = round(1000 * drives.heartbeat)
@@ -129,6 +139,7 @@ def _settings(name: str, drive: Drive, drives: Drives, scale: Scale, period: flo
         (0x6060, 0, CYCLIC_SYNCHRONOUS_POSITION),
         (0x60C2, 1, value),
         (0x60C2, 2, exponent),
+        *(_homing(name, drive.homing, scale) if drive.homing is not None else ()),
         *_pdo(0x1400, frames.RPDO1 + drive.node, ((0x1400, 2, 255),), (0x6040_00_10,)),
         *_pdo(0x1401, frames.RPDO2 + drive.node, ((0x1401, 2, 1),), (0x607A_00_20, 0x60B1_00_20)),
         *_pdo(
@@ -143,6 +154,19 @@ def _settings(name: str, drive: Drive, drives: Drives, scale: Scale, period: flo
             ((0x1801, 2, 1),),
             (0x6064_00_20,),
         ),
+    ]
+
+
+def _homing(name: str, homing: Homing, scale: Scale) -> list[Setting]:
+    def speed(key: str, value: float) -> int:
+        return unsigned(name, scale, f"homing.{key}", value)
+
+    return [
+        (0x6098, 0, homing.method),
+        (0x6099, 1, speed("speed_switch", homing.speed_switch)),
+        (0x6099, 2, speed("speed_zero", homing.speed_zero)),
+        (0x609A, 0, speed("acceleration", homing.acceleration)),
+        (0x607C, 0, 0),  # makers differ in its sign; where home is, the drive's `offset` says
     ]
 
 

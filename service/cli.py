@@ -251,6 +251,12 @@ def reset(*, service: Service = HERE) -> int:
 
 
 @app.command
+def home(*, service: Service = HERE) -> int:
+    """Find where the sliders are, where the encoders are not absolute: one drive after the other, slowly."""
+    return _command("home", service)
+
+
+@app.command
 def status(*, service: Service = HERE) -> int:
     """Print the present state."""
     from service.client import Robot

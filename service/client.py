@@ -43,6 +43,8 @@ from service.messages import Goal as _Message
 
 REPLY_WITHIN = 20.0
 """How long a command may take to be carried out [s]."""
+HOME_WITHIN = 600.0
+"""How long homing may take [s]: three drives of the greatest time-out there is."""
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -266,6 +268,10 @@ class Robot:
         """Clear a fault whose cause is gone; the robot is disabled afterwards."""
         self.command("reset")
 
+    def home(self) -> None:
+        """Home the drives whose positions are not absolute; return when all are and the robot holds."""
+        self.command("home")
+
     def pause(self) -> None:
         """Stop on the path; return when the robot stands. The goal is kept for resume."""
         self.command("pause")
@@ -280,7 +286,8 @@ class Robot:
 
     def command(self, name: str, content: bytes | None = None) -> CommandReply:
         """Send a command; return once the service confirms that it has been carried out."""
-        return self._ask(self._key("cmd", self.user, name), CommandReply, content)
+        within = HOME_WITHIN if name == "home" else REPLY_WITHIN
+        return self._ask(self._key("cmd", self.user, name), CommandReply, content, within)
 
     def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""
@@ -337,13 +344,13 @@ class Robot:
         if goal is not None:
             goal._end(Result(event.id, event.outcome, event.message))
 
-    def _ask(self, key: str, kind: type[T], payload: bytes | None = None) -> T:
+    def _ask(self, key: str, kind: type[T], payload: bytes | None = None, within: float = REPLY_WITHIN) -> T:
         """Query and decode the one reply. An empty one means that nobody is there, or may not be asked."""
         for reply in self._session.get(
             key,
             payload=payload,
             encoding=session.JSON if payload else None,
-            timeout=REPLY_WITHIN,
+            timeout=within,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.REAL_TIME,
             express=True,

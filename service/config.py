@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from drivers.config import Can, Drives, Positive
+from drivers.interface import NAMES
 from service.errors import ConfigError
 from service.geometry import Geometry, Leg, singular_angles
 
@@ -159,7 +160,7 @@ def load(path: Path) -> Config:
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; configs/sim.toml is one to start from") from error
     try:
-        return parse(text)
+        return _beside(path, parse(text))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 
@@ -179,6 +180,16 @@ def parse(text: str) -> Config:
         raise ConfigError(_explain(str(error), raw)) from error
     _check(config)
     return config
+
+
+def _beside(path: Path, config: Config) -> Config:
+    """The configuration with its drives' EDS files where they lie: relative to the configuration file."""
+    drives = config.drives
+    for name, drive in zip(NAMES, drives.each, strict=True):
+        if drive.eds is not None:
+            found = msgspec.structs.replace(drive, eds=str(path.parent / drive.eds))
+            drives = msgspec.structs.replace(drives, **{name: found})
+    return msgspec.structs.replace(config, drives=drives)
 
 
 def geometry(table: GeometryTable) -> Geometry:

@@ -31,6 +31,8 @@ Triple = tuple[float, float, float]
 
 SETTLE = 0.1
 """How long the drives may take to leave their fault state after a reset [s]."""
+OLDEST = 3
+"""The greatest age of a position that is looked at, in SYNCs: at the next one the drive is silent."""
 
 _COMMANDS = {
     "enable": Event.ENABLE,
@@ -40,6 +42,7 @@ _COMMANDS = {
     "reset": Event.RESET,
     "pause": Event.PAUSE,
     "resume": Event.RESUME,
+    "home": Event.HOME,
 }
 _OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.FAULT: "faulted"}
 """How a goal ends on an event after which it is not under way; else it is stopped."""
@@ -64,6 +67,7 @@ class Control:
         self._queue_depth = config.motion.queue
         self._waiting: deque[GoalRequest] = deque()
         self._step = config.limits.slider.velocity * config.period
+        self._can_home = any(drive.homing is not None for drive in config.drives.each)
         self._following_error_limit = config.limits.slider.following_error
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._settle_cycles = max(3, round(SETTLE / config.period))
@@ -85,7 +89,8 @@ class Control:
         self.following_error: Triple = STILL
         self._jumps = False, False, False
         """Which sliders were measured where none can be so soon: what they say is not followed."""
-        self._written: deque[Triple] = deque([STILL, STILL], maxlen=2)
+        self._written: deque[Triple] = deque([STILL] * (2 + OLDEST), maxlen=2 + OLDEST)
+        """The setpoints of the last cycles, the newest at the right."""
         self._entered = 0
         self._now_ns = 0
 
@@ -94,7 +99,7 @@ class Control:
     def start(self, feedback: Feedback) -> None:
         """Take the measured sliders for the commanded ones, before the first cycle."""
         self.feedback = feedback
-        self._written.extend((feedback.position, feedback.position))
+        self._written.extend([feedback.position] * (2 + OLDEST))
         self.rows[0] = list(feedback.position)
         self._follow_measured()
         # What runs for the first time is slow: plan and check a motion now, not in a cycle.
@@ -107,20 +112,11 @@ class Control:
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
         self.cycle += 1
-        period = self._period
-        before, now = self.feedback.position, feedback.position
-        self.velocity = (
-            (now[0] - before[0]) / period,
-            (now[1] - before[1]) / period,
-            (now[2] - before[2]) / period,
-        )
-        # A drive reaches at this SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
-        due = self._written[0]
-        self.following_error = (due[0] - now[0], due[1] - now[1], due[2] - now[2])
-        self.feedback = feedback
-        self._measured[:] = now
+        before, self.feedback = self.feedback, feedback
+        self._compare(before)
+        self._measured[:] = feedback.position
         a, b, c = self.velocity
-        most = 2.0 * self._step / period  # a lost position makes the next step a double one
+        most = 2.0 * self._step / self._period  # the age may be one off, and makes a step a double one
         self._jumps = abs(a) > most, abs(b) > most, abs(c) > most
         if not any(self._jumps) and forward_into(self._legs, self._measured, self._pose, self._pose) == 0:
             x, y, phi = self._pose.tolist()
@@ -131,10 +127,12 @@ class Control:
             self.desk.tell("service", "warning", warning)
         mode = self.state.mode
         if feedback.fault is not None:
+            if mode is Mode.FAULT and feedback.fault != before.fault:
+                self.desk.tell("fault", "error", feedback.fault.message)  # the first one stays, but this came of it
             self.trip(feedback.fault.message)
         elif mode is Mode.ENABLING:
             self._power_up()
-        elif mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
+        elif mode in (Mode.HOMING, Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
             for name, error in zip(NAMES, self.following_error, strict=True):
                 if not abs(error) <= self._following_error_limit:
                     self.trip(
@@ -142,7 +140,26 @@ class Control:
                         f"{self._following_error_limit * 1e3:g} mm"
                     )
                     break
+            else:
+                if not feedback.homing:
+                    self._homing_over()
         self.desk.settle(self._verdict, self.state.mode)
+
+    def _compare(self, before: Feedback) -> None:
+        """Work out velocities and following errors, for the SYNC at which each position was sampled."""
+        velocity, error = list(self.velocity), [0.0, 0.0, 0.0]
+        follows = self.feedback.follows
+        for n, (now, age, last, last_age) in enumerate(
+            zip(self.feedback.position, self.feedback.age, before.position, before.age, strict=True)
+        ):
+            cycles = 1 + last_age - age
+            if cycles > 0:  # else there is no newer position
+                velocity[n] = (now - last) / (cycles * self._period)
+            # A drive reaches at a SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
+            if follows[n]:
+                error[n] = self._written[-2 - min(age, OLDEST)][n] - now
+        self.velocity = (velocity[0], velocity[1], velocity[2])
+        self.following_error = (error[0], error[1], error[2])
 
     def handle(self, request: Request, now_ns: int) -> None:
         """Take one request at a time of the monotonic clock: goals wait until those before them are planned."""
@@ -175,7 +192,7 @@ class Control:
 
     def solve(self) -> None:
         """Solve the sliders for the commanded state, by the paper's recursion; pass the last gate, or trip."""
-        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
+        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.homed:
             self._follow_measured()
             return
         for row, values in enumerate(self.commanded):
@@ -185,7 +202,7 @@ class Control:
             self.trip(f"slider {NAMES[singular - 1]}: no setpoint, the commanded pose is singular or not a number")
             return
         rows = self._sliders.tolist()
-        violation = self._bounds.setpoint(rows, self._written[1]) or self._bounds.pose(self.commanded.pose)
+        violation = self._bounds.setpoint(rows, self._written[-1]) or self._bounds.pose(self.commanded.pose)
         if violation:
             self.trip(f"setpoint refused: {violation}")
             return
@@ -222,6 +239,11 @@ class Control:
     def override(self) -> float:
         """The rate at which motions are to run."""
         return self._pilot.override
+
+    @property
+    def homed(self) -> bool:
+        """Whether it is known where the sliders are."""
+        return all(self.feedback.homed)
 
     @property
     def progress(self) -> tuple[float, float]:
@@ -281,6 +303,8 @@ class Control:
         decided = step(self.state, Event.GOAL)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
+        if not self.homed:
+            raise RefusedError("not_homed", "it is not known where the sliders are: send home first")
         goal = request.goal
         if goal.valid_for is not None and self._now_ns - request.received_ns > goal.valid_for * 1e9:
             raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")
@@ -323,6 +347,8 @@ class Control:
             self._take_override(request)
             return
         event = _COMMANDS[request.name]
+        if event is Event.HOME and not self._can_home:
+            raise RefusedError("nothing_to_home", "absolute encoders: there is nothing to home")
         if request.goal is not None and self._stops_only(request.goal, f"{request.name} by {request.user}"):
             self.desk.undertake(request, self.cycle)
             return
@@ -330,7 +356,9 @@ class Control:
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
         if decided.action is Action.POWER_UP:
-            self._check_start()
+            self._check_rest()
+            if self.homed:
+                self._check_start()
         if decided.action is Action.CLEAR and self.powered:
             raise RefusedError("stopping", self._still_powered())
         reason = f"{request.name} by {request.user}"
@@ -372,14 +400,17 @@ class Control:
         said = ", ".join(f"drive {name} is {state}" for name, state in states if state in _POWERED)
         return f"{said} by what it said last: send reset again when the drives stand (fault: {self.fault})"
 
-    def _check_start(self) -> None:
-        """Refuse to enable where the robot stands outside what it may do."""
-        position = self.feedback.position
-        for name, setpoint, measured in zip(NAMES, self.rows[0], position, strict=True):
+    def _check_rest(self) -> None:
+        """Refuse to enable while a setpoint is on its way to where its slider is."""
+        for name, setpoint, measured in zip(NAMES, self.rows[0], self.feedback.position, strict=True):
             if not abs(setpoint - measured) <= self._step:
                 raise RefusedError(
                     "not_at_rest", f"slider {name} moves too fast for its setpoint to follow: enable when it stands"
                 )
+
+    def _check_start(self) -> None:
+        """Refuse to enable where the robot stands outside what it may do."""
+        position = self.feedback.position
         self._measured[:] = position
         self._pose[:] = self.pose
         unreachable = forward_into(self._legs, self._measured, self._pose, self._pose)
@@ -399,6 +430,9 @@ class Control:
     def _verdict(self, name: str, since: int) -> str | None:
         """Return "" when the command is carried out, None while it is not, else why it never will be."""
         mode = self.state.mode
+        fault = self.feedback.fault
+        if name in ("disable", "quick_stop") and fault is not None and fault.cause == "timeout":
+            return fault.message
         match name:
             case "enable":
                 if mode is Mode.ENABLING:
@@ -408,6 +442,10 @@ class Control:
                 return None if mode is Mode.STOPPING or self.powered else ""
             case "stop" | "pause":
                 return None if mode is Mode.STOPPING else ""
+            case "home":
+                if mode in (Mode.HOMING, Mode.STOPPING):
+                    return None
+                return "" if self.homed else self.fault or "stopped before every drive was homed"
             case "resume" | "override":
                 return ""
             case "reset":
@@ -420,7 +458,7 @@ class Control:
 
     # ------------------------------------------------------------------ from state to state
 
-    def _go(self, event: Event, reason: str) -> None:
+    def _go(self, event: Event, reason: str) -> None:  # noqa: PLR0912  a branch for each action
         """Step the modes and carry out the action."""
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
@@ -441,6 +479,10 @@ class Control:
                 self._brake()
             case Action.RESUME:
                 self._pilot.run_at(self.override)
+            case Action.HOME:
+                self._drives.home()
+            case Action.STOP_HOMING:
+                self._drives.stop_homing()
         before, self.state = self.state, decided.state
         if self.state.mode is not before.mode:
             self._entered = self.cycle
@@ -475,12 +517,10 @@ class Control:
     def _power_up(self) -> None:
         """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""
         if all(state is PowerState.OPERATION_ENABLED for state in self.feedback.state):
-            self._measured[:] = self.rows[0]
-            if forward_into(self._legs, self._measured, self._pose, self._pose):
-                self.trip("the measured sliders belong to no pose")
-                return
-            self._course.commanded = rest(self._pose.tolist())
-            self._go(Event.POWERED, "all drives are enabled")
+            if not self.homed:
+                self._go(Event.POWERED, "all drives are enabled; where the sliders are is not known: send home")
+            elif self._rest_at_setpoints():
+                self._go(Event.POWERED, "all drives are enabled")
         elif self.cycle - self._entered > self._enable_cycles:
             waiting = [
                 f"drive {name} is {state}"
@@ -490,20 +530,56 @@ class Control:
             seconds = self._enable_cycles * self._period
             self.trip(f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected")
 
+    def _homing_over(self) -> None:
+        """Hold where homing has ended, or was stopped."""
+        if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self._course.runs:
+            return  # no homing has been under way
+        if self.homed:
+            try:
+                self._check_start()
+            except RefusedError as refusal:
+                self.trip(f"all drives are homed, but {refusal}")
+                return
+            if not self._rest_at_setpoints():
+                return
+        if self.state.mode is Mode.STOPPING:
+            self._go(Event.STANDSTILL, "standstill")
+        else:
+            self._go(Event.HOMED, "all drives are homed")
+
+    def _rest_at_setpoints(self) -> bool:
+        """Command the pose that belongs to the setpoints, at rest; trip where there is none."""
+        self._measured[:] = self.rows[0]
+        if forward_into(self._legs, self._measured, self._pose, self._pose):
+            self.trip("the measured sliders belong to no pose")
+            return False
+        self._course.commanded = rest(self._pose.tolist())
+        return True
+
     def _follow_measured(self) -> None:
-        """Make the setpoint of every drive without power the position that it measures: nothing moves on enable.
+        """Make the setpoint of every drive that none holds the position that it measures: nothing moves on enable.
 
         Where that is not where the slider was commanded to be, the setpoint goes there at the slider's speed: a drive
-        that missed the command to stop must not jump either. A position that jumps is not followed.
+        that missed the command to stop must not jump either. A position that jumps is not followed. A drive that
+        moves by itself, to be homed, gets no setpoint: what is meant for it is its position at once.
         """
         stopped_now = self.state.mode is Mode.FAULT and self._entered == self.cycle  # no setpoint is sent then
-        held = self.state.mode is Mode.ENABLING
+        held = self.state.mode not in (Mode.DISABLED, Mode.FAULT)
         position = []
-        for last, measured, jumps, state in zip(
-            self.rows[0], self.feedback.position, self._jumps, self.feedback.state, strict=True
+        for last, measured, jumps, state, follows in zip(
+            self.rows[0],
+            self.feedback.position,
+            self._jumps,
+            self.feedback.state,
+            self.feedback.follows,
+            strict=True,
         ):
-            stays = stopped_now or jumps or (held and state is PowerState.OPERATION_ENABLED)
-            position.append(last if stays else last + max(-self._step, min(measured - last, self._step)))
+            if not follows:
+                position.append(measured)
+            elif stopped_now or jumps or (held and state is PowerState.OPERATION_ENABLED):
+                position.append(last)
+            else:
+                position.append(last + max(-self._step, min(measured - last, self._step)))
         self._course.commanded = rest(self.pose)
         self._motion[:] = 0.0
         self._motion[0] = self.pose

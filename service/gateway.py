@@ -41,7 +41,7 @@ from service.packets import (
 from service.records import unpack
 from service.state import StateMaker
 
-COMMANDS = ("enable", "disable", "stop", "quick_stop", "reset", "pause", "resume", "override")
+COMMANDS = ("enable", "disable", "stop", "quick_stop", "reset", "home", "pause", "resume", "override")
 UNREAD = 65_536
 """Messages from Zenoh that may wait to be read; beyond that the oldest get no answer."""
 BACKLOG = 20_000
@@ -76,6 +76,8 @@ class Gateway:
 
     def __init__(self, config: Config, link: Link, opened: zenoh.Session) -> None:
         self._robot = config.robot.name
+        homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
+        self._home_within = REPLY_WITHIN + sum(homing)
         self._link = link
         self._session = opened
         self._info = _info(config)
@@ -260,7 +262,8 @@ class Gateway:
     def _forward(self, incoming: Incoming, make: Callable[[int], Request]) -> None:
         self._tickets += 1
         if self._link.send(message(make(self._tickets))):
-            self._waiting[self._tickets] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
+            within = self._home_within if incoming.key.endswith("/home") else REPLY_WITHIN
+            self._waiting[self._tickets] = _Waiting(incoming, time.monotonic() + within)
         else:
             self._reply(incoming, ErrorReply("busy", "too many requests at once: send it again"))
 
@@ -309,7 +312,7 @@ class Gateway:
     def _give_up_late(self) -> None:
         now = time.monotonic()
         for ticket in [ticket for ticket, waiting in self._waiting.items() if waiting.deadline < now]:
-            self._answer(ticket, ErrorReply("timeout", f"not carried out within {REPLY_WITHIN:g} s"))
+            self._answer(ticket, ErrorReply("timeout", "not carried out in time"))
 
     def _reply(self, incoming: Incoming, content: msgspec.Struct) -> None:
         query = incoming.query

@@ -11,6 +11,7 @@ class Mode(StrEnum):
 
     DISABLED = "disabled"
     ENABLING = "enabling"
+    HOMING = "homing"
     HOLDING = "holding"
     MOVING = "moving"
     STOPPING = "stopping"
@@ -32,7 +33,9 @@ class Event(Enum):
     RESET = auto()
     PAUSE = auto()
     RESUME = auto()
+    HOME = auto()
     POWERED = auto()  # all drives reached operation enabled
+    HOMED = auto()  # all drives know where they are, and follow setpoints again
     STANDSTILL = auto()  # the commanded motion has ended
     FAULT = auto()  # a drive, the bus or a setpoint is bad
     GATEWAY_LOST = auto()
@@ -51,6 +54,8 @@ class Action(Enum):
     RESUME = auto()
     QUICK_STOP = auto()
     CLEAR = auto()
+    HOME = auto()
+    STOP_HOMING = auto()
 
 
 class State(NamedTuple):
@@ -82,6 +87,7 @@ class Refusal(NamedTuple):
 
 DISABLED = State(Mode.DISABLED)
 ENABLING = State(Mode.ENABLING)
+HOMING = State(Mode.HOMING)
 HOLDING = State(Mode.HOLDING)
 MOVING = State(Mode.MOVING)
 STOPPING = State(Mode.STOPPING)
@@ -90,11 +96,14 @@ PAUSING = State(Mode.STOPPING, paused=True)
 PAUSED = State(Mode.HOLDING, paused=True)
 FAULT = State(Mode.FAULT)
 
-STATES = (DISABLED, ENABLING, HOLDING, MOVING, STOPPING, STOPPING_TO_DISABLE, PAUSING, PAUSED, FAULT)
+STATES = (DISABLED, ENABLING, HOMING, HOLDING, MOVING, STOPPING, STOPPING_TO_DISABLE, PAUSING, PAUSED, FAULT)
 
 _NO_FAULT = Refusal("no_fault", "there is no fault to reset")
 _DISABLED = Refusal("not_enabled", "the robot is disabled: send enable first")
-_ENABLING = Refusal("not_enabled", "the drives are still powering up: send the goal when the mode is holding")
+_ENABLING = Refusal("not_enabled", "the drives are still powering up: send it again when the mode is holding")
+_HOMING = Refusal("homing", "the robot is homing: send the goal when the mode is holding")
+_MOVING = Refusal("moving", "the robot is moving: send stop, then home")
+_PAUSED = Refusal("moving", "a goal is paused: send stop, then home")
 _STOPPING = Refusal("stopping", "the robot is stopping: send it again when the mode is holding")
 _DISABLING = Refusal("stopping", "the robot is stopping to be disabled: send enable when the mode is disabled")
 _FAULT = Refusal("fault", "the robot is in fault: remove the cause, then send reset and enable")
@@ -111,6 +120,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.GOAL: _DISABLED,
         Event.PAUSE: _NO_GOAL,
         Event.RESUME: _NOT_PAUSED,
+        Event.HOME: _DISABLED,
         Event.RESET: _NO_FAULT,
         Event.QUICK_STOP: _TRIP,
         Event.FAULT: _TRIP,
@@ -121,6 +131,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.PAUSE: _NO_GOAL,
         Event.RESUME: _NOT_PAUSED,
         Event.STOP: _POWER_OFF,
+        Event.HOME: _ENABLING,
         Event.RESET: _NO_FAULT,
         Event.POWERED: Step(HOLDING),
         Event.GATEWAY_LOST: _POWER_OFF,
@@ -129,11 +140,26 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.QUICK_STOP: _TRIP,
         Event.FAULT: _TRIP,
     },
+    HOMING: {
+        Event.DISABLE: Step(STOPPING_TO_DISABLE, Action.STOP_HOMING),
+        Event.GOAL: _HOMING,
+        Event.STOP: Step(STOPPING, Action.STOP_HOMING),
+        Event.PAUSE: _NO_GOAL,
+        Event.RESUME: _NOT_PAUSED,
+        Event.RESET: _NO_FAULT,
+        Event.HOMED: Step(HOLDING),
+        Event.GATEWAY_LOST: Step(STOPPING, Action.STOP_HOMING),
+        Event.LATE: Step(STOPPING, Action.STOP_HOMING),
+        Event.SHUTDOWN: Step(STOPPING_TO_DISABLE, Action.STOP_HOMING),
+        Event.QUICK_STOP: _TRIP,
+        Event.FAULT: _TRIP,
+    },
     HOLDING: {
         Event.DISABLE: _POWER_OFF,
         Event.GOAL: Step(MOVING, Action.START),
         Event.PAUSE: _NO_GOAL,
         Event.RESUME: _NOT_PAUSED,
+        Event.HOME: Step(HOMING, Action.HOME),
         Event.RESET: _NO_FAULT,
         Event.SHUTDOWN: _POWER_OFF,
         Event.QUICK_STOP: _TRIP,
@@ -144,6 +170,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.GOAL: Step(MOVING, Action.START),
         Event.STOP: Step(STOPPING, Action.BRAKE),
         Event.PAUSE: Step(PAUSING, Action.BRAKE),
+        Event.HOME: _MOVING,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: Step(HOLDING),
         Event.GATEWAY_LOST: Step(STOPPING, Action.BRAKE),
@@ -157,6 +184,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.GOAL: _STOPPING,
         Event.PAUSE: _NO_GOAL,
         Event.RESUME: _NOT_PAUSED,
+        Event.HOME: _STOPPING,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: Step(HOLDING),
         Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),
@@ -168,6 +196,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.GOAL: _DISABLING,
         Event.PAUSE: _NO_GOAL,
         Event.RESUME: _NOT_PAUSED,
+        Event.HOME: _DISABLING,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: _POWER_OFF,
         Event.QUICK_STOP: _TRIP,
@@ -178,6 +207,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.GOAL: Step(MOVING, Action.START),
         Event.STOP: Step(STOPPING),
         Event.RESUME: Step(MOVING, Action.RESUME),
+        Event.HOME: _PAUSED,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: Step(PAUSED),
         Event.GATEWAY_LOST: Step(STOPPING),
@@ -191,6 +221,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.GOAL: Step(MOVING, Action.START),
         Event.STOP: Step(HOLDING),
         Event.RESUME: Step(MOVING, Action.RESUME),
+        Event.HOME: _PAUSED,
         Event.RESET: _NO_FAULT,
         Event.GATEWAY_LOST: Step(HOLDING),
         Event.SHUTDOWN: _POWER_OFF,
@@ -202,6 +233,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.GOAL: _FAULT,
         Event.PAUSE: _FAULT,
         Event.RESUME: _FAULT,
+        Event.HOME: _FAULT,
         Event.RESET: Step(DISABLED, Action.CLEAR),
     },
 }

@@ -35,6 +35,7 @@ LIMIT: Colour = (196, 148, 64)
 MODES: dict[Mode, Colour] = {
     Mode.DISABLED: (96, 102, 114),
     Mode.ENABLING: (190, 140, 50),
+    Mode.HOMING: (134, 104, 190),
     Mode.HOLDING: (44, 128, 148),
     Mode.MOVING: (56, 146, 84),
     Mode.STOPPING: (196, 104, 44),

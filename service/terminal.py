@@ -30,6 +30,7 @@ err = Console(stderr=True, highlight=False)
 COLOURS = {
     "disabled": "dim",
     "enabling": "cyan",
+    "homing": "magenta",
     "holding": "green",
     "moving": "bold green",
     "stopping": "yellow",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import itertools
 import math
 import os
@@ -44,10 +45,33 @@ def changed(config: Config, **simulated: object) -> Config:
     return msgspec.structs.replace(config, can=msgspec.structs.replace(config.can, simulated=behaviour))
 
 
+Delay = Callable[[can.Message], float]
+"""How long the bus takes for a frame from a drive [s]."""
+
+
+def delay_answers(bus: can.BusABC, delay: Delay, clock: Callable[[], float]) -> None:
+    """Let what the drives send be received only after its delay, as on a wire, and in the order of arrival."""
+    receive = bus.recv
+    travelling: list[tuple[float, int, can.Message]] = []
+    number = itertools.count()
+
+    def recv(timeout: float | None = None) -> can.Message | None:
+        while (message := receive(timeout)) is not None:
+            wait = delay(message)
+            if wait == 0.0:
+                return message
+            heapq.heappush(travelling, (clock() + wait, next(number), message))
+        if travelling and travelling[0][0] <= clock() + 1e-9:
+            return heapq.heappop(travelling)[2]
+        return None
+
+    bus.recv = recv  # type: ignore[method-assign]
+
+
 class Rig:
     """Runs cycles of control, driver and drives, and keeps what was said and every frame that was sent."""
 
-    def __init__(self, config: Config = CONFIG) -> None:
+    def __init__(self, config: Config = CONFIG, delay: Delay | None = None) -> None:
         self.config = config
         self.now = 100.0
         self.bus = simulated_bus(config.can, config.drives, lambda: self.now)
@@ -56,6 +80,8 @@ class Rig:
         self.bus.send = self._note  # type: ignore[assignment,method-assign]
         self.driver = Cia402(self.bus, config.can.bitrate, config.drives, lambda: self.now)
         self.driver.configure(config.period)
+        if delay is not None:
+            delay_answers(self.bus, delay, lambda: self.now)
         self.control = Control(config, self.driver)
         self.driver.sync()
         self.control.start(self.driver.read())

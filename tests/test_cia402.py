@@ -5,17 +5,23 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import can
+import canopen
+import msgspec
 import pytest
 
 from drivers import frames
 from drivers.cia402 import Cia402
-from drivers.config import Drive, Drives
+from drivers.config import Drive, Drives, Homing
+from drivers.eds import SERVO
 from drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 from drivers.interface import Feedback, PowerState, Triple
-from drivers.setup402 import interpolation_period
+from drivers.scaling import scale_of
+from drivers.setup402 import _settings, interpolation_period
 from drivers.simulated import Servo, SimulatedBus, SimulatedDrive
+from drivers.simulated.dictionary import Entry
 
 P = PowerState
 PERIOD = 0.001
@@ -28,6 +34,13 @@ CONFIG = Drives(
     C=Drive(node=9, counts_per_metre=1e6),
     sdo_timeout=0.01,
 )
+SCALE = scale_of("A", CONFIG.A)
+HOMING = Homing(method=19, speed_switch=0.02, speed_zero=0.005, acceleration=0.5)
+
+
+def changed(name: str, **keys: object) -> Drives:
+    """The configuration, with one drive's keys changed."""
+    return msgspec.structs.replace(CONFIG, **{name: msgspec.structs.replace(getattr(CONFIG, name), **keys)})
 
 
 class Clock:
@@ -258,6 +271,90 @@ class TestConfigure:
         ):
             new.drives.configure(PERIOD)
 
+    def test_refusal_names_object_wanted_and_found(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of every object that is set: a drive that says it took the value and did not."""
+        objects = canopen.import_od(str(SERVO))
+        told = Entry.encode
+        settings = [*dict.fromkeys(setting[:2] for setting in _settings("A", CONFIG.A, CONFIG, SCALE, PERIOD))]
+        assert {index for index, _ in settings} >= {0x60C2, 0x6065, 0x605A, 0x605E, 0x1016, 0x1017, 0x1029}
+        assert {index for index, _ in settings} >= {0x1400, 0x1401, 0x1600, 0x1601, 0x1800, 0x1801, 0x1A00, 0x1A01}
+        for index, subindex in settings:
+            rig = Rig()
+            lying = rig.devices[0].objects[index, subindex]
+
+            def encode(entry: Entry, lying: Entry = lying) -> bytes:
+                truth = told(entry)
+                return bytes([truth[0] ^ 1]) + truth[1:] if entry is lying else truth
+
+            monkeypatch.setattr(Entry, "encode", encode)
+            with pytest.raises(ConfigurationRefused) as refused:
+                rig.drives.configure(PERIOD)
+            variable = objects.get_variable(index, subindex)
+            assert variable is not None
+            assert str(refused.value).startswith(
+                f"drive A: object {index:04X}:{subindex:02X} ({variable.qualname}): wanted "
+            )
+            assert ", found " in str(refused.value)
+            rig.drives.close()
+
+    def test_drives_of_other_makes_by_their_own_eds(self, tmp_path: Path) -> None:
+        text = SERVO.read_text().replace("[6085]\nParameterName=Quick stop deceleration", "[6085]\nParameterName=Ramp")
+        (tmp_path / "other.eds").write_text(text)
+        rig = Rig(changed("B", eds=str(tmp_path / "other.eds")))
+        entry = rig.devices[1].objects[0x6085, 0]
+        entry.on_write = lambda entry, old: setattr(entry, "value", 1)
+        with pytest.raises(ConfigurationRefused, match=r"drive B: object 6085:00 \(Ramp\): wanted 20000000, found 1"):
+            rig.drives.configure(PERIOD)
+        rig.drives.close()
+
+    def test_eds_that_is_not_there(self) -> None:
+        with pytest.raises(DriveError, match=r"drive C: cannot read EDS /nowhere/x\.eds: No such file or directory"):
+            Rig(changed("C", eds="/nowhere/x.eds")).drives.configure(PERIOD)
+
+    @pytest.mark.parametrize(
+        "content", [b"hello", b"\xff\xfe\x00", b"[DeviceInfo]\n[1000]\nObjectType=0x7\nDataType=zz\n"]
+    )
+    def test_eds_that_is_none(self, tmp_path: Path, content: bytes) -> None:
+        (tmp_path / "x.eds").write_bytes(content)
+        with pytest.raises(DriveError, match=r"^drive A: \S*x\.eds is not an EDS as CiA 306 has it: .+") as refused:
+            Rig(changed("A", eds=str(tmp_path / "x.eds"))).drives.configure(PERIOD)
+        assert "\n" not in str(refused.value)
+
+    def test_eds_without_an_object_that_is_needed(self, tmp_path: Path) -> None:
+        text = SERVO.read_text()
+        begin = text.index("[60B1]")
+        (tmp_path / "x.eds").write_text(text[:begin] + text[text.index("[60C2]") :].replace("0x60B1", "0x60F4"))
+        rig = Rig(changed("A", eds=str(tmp_path / "x.eds")))
+        with pytest.raises(
+            DriveError,
+            match=r"drive A: EDS \S*x\.eds lacks object 60B1:00 \(Velocity offset\), needed for the velocity",
+        ):
+            rig.drives.configure(PERIOD)
+        assert rig.bus.sent == []  # refused before any drive was spoken to
+
+    def test_homing_is_set_where_the_encoder_is_not_absolute(self) -> None:
+        rig = Rig(changed("B", homing=HOMING))
+        rig.drives.configure(PERIOD)
+        objects = rig.devices[1].objects
+        keys = [(0x6098, 0), (0x6099, 1), (0x6099, 2), (0x609A, 0), (0x607C, 0)]
+        assert [objects[key].value for key in keys] == [19, 40_000, 10_000, 1_000_000, 0]
+        assert rig.drives.read().homed == (True, False, True)
+        assert [rig.devices[0].objects[key].value for key in keys] == [0] * 5
+        rig.drives.close()
+
+    def test_drive_without_homing_mode_is_not_homed(self) -> None:
+        rig = Rig(changed("B", homing=HOMING))
+        rig.devices[1].objects[0x6502, 0].value = 0x80
+        with pytest.raises(DriveError, match=r"drive B: object 6502:00 .* is 00000080, without homing mode"):
+            rig.drives.configure(PERIOD)
+        rig.drives.close()
+
+    def test_homing_method_that_a_drive_has_not_is_refused(self) -> None:
+        rig = Rig(changed("C", homing=msgspec.structs.replace(HOMING, method=33)))
+        with pytest.raises(DriveError, match=r"drive C: cannot write 33 to object 6098:00 \(Homing method\)"):
+            rig.drives.configure(PERIOD)
+        rig.drives.close()
+
     def test_drive_in_fault_is_set_up_all_the_same(self, new: Rig) -> None:
         new.devices[1].fail(0x3210)
         new.drives.configure(PERIOD)
@@ -378,6 +475,50 @@ class TestPower:
         assert enabled.cycles(20).state == (P.SWITCH_ON_DISABLED,) * 3
         assert enabled.devices[2].servo.velocity == 0.0
 
+    def test_drive_that_does_not_stop_is_named_with_its_state(self, enabled: Rig) -> None:
+        enabled.devices[1].objects.on_write(0x6040, lambda entry, old: None)
+        enabled.drives.quick_stop()
+        feedback = enabled.cycles(round(CONFIG.stop_timeout / PERIOD) - 1)
+        assert feedback.fault is None
+        assert enabled.found("timeout", within=3).fault == (
+            "B", "timeout", 0,
+            "drive B: is operation enabled 1 s after quick stop; switch on disabled was expected",
+        )  # fmt: skip
+
+    def test_drive_that_stays_in_quick_stop_is_named_with_its_state(self, enabled: Rig) -> None:
+        enabled.devices[2].objects[0x605A, 0].value = 6  # as a drive that does not do what it was told
+        enabled.drives.quick_stop()
+        fault = enabled.found("timeout", within=1010).fault
+        assert fault is not None
+        assert fault.message.startswith("drive C: is quick stop active 1 s after quick stop")
+
+    def test_drive_that_does_not_stop_after_a_fault_is_told_of_as_well(self, enabled: Rig) -> None:
+        enabled.devices[1].objects.on_write(0x6040, lambda entry, old: None)
+        enabled.devices[0].fail(0x4310)
+        fault = enabled.found("emcy", within=2).fault
+        enabled.cycles(1010)
+        assert fault is not None
+        assert fault.drive == "A"
+        fault = enabled.cycle().fault
+        assert fault is not None
+        assert fault[:3] == ("B", "timeout", 0)
+
+    def test_drive_that_keeps_its_power_when_disabled_is_named_with_its_state(self, enabled: Rig) -> None:
+        enabled.devices[0].objects.on_write(0x6040, lambda entry, old: None)
+        enabled.drives.disable()
+        fault = enabled.found("timeout", within=1010).fault
+        assert fault is not None
+        assert fault.message == "drive A: is operation enabled 1 s after disable; switch on disabled was expected"
+
+    def test_drives_that_stop_and_lose_power_are_no_fault(self, enabled: Rig) -> None:
+        enabled.drives.disable()
+        assert enabled.cycles(1500).fault is None
+        enabled.enable()
+        enabled.drives.quick_stop()
+        assert enabled.cycles(1500).fault is None
+        assert enabled.enable().fault is None
+        assert enabled.cycles(1500).fault is None
+
     def test_drive_that_drops_out_unasked(self, enabled: Rig) -> None:
         enabled.devices[1].objects[0x6040, 0].write(frames.DISABLE_VOLTAGE)
         feedback = enabled.found("state", within=1)
@@ -467,6 +608,30 @@ class TestFaults:
         fault = ready.cycle().fault
         assert fault is not None
         assert fault[:3] == ("B", "silent", 0)
+
+    def test_prompt_positions_have_no_age_and_lost_ones_leave_none(self, ready: Rig) -> None:
+        assert ready.cycle().age == (0, 0, 0)
+        ready.devices[1].silent = True
+        assert [ready.cycle().age for _ in range(2)] == [(0, 1, 0), (0, 2, 0)]
+        ready.devices[1].silent = False
+        assert ready.cycle().age == (0, 0, 0)
+
+    def test_position_that_is_there_before_the_next_sync_answers_the_last_one(self, ready: Rig) -> None:
+        ready.cycles(3)
+        for node in (1, 5, 9):
+            ready.devices[(1, 5, 9).index(node)].silent = True
+        for _ in range(5):
+            ready.clock.now += PERIOD
+            ready.drives.sync()
+            assert ready.drives.read().fault is None
+            for node in (1, 5, 9):
+                ready.bus.inject(frames.TPDO2 + node, bytes(4))
+        ready.drives.sync()
+        feedback = ready.drives.read()
+        assert feedback.age == (1, 1, 1)
+        assert feedback.fault is None
+        for device in ready.devices:
+            device.silent = False
 
     def test_one_lost_position_is_not(self, ready: Rig) -> None:
         for _ in range(5):
@@ -640,7 +805,11 @@ class TestLateAnswers:
         positions = [late.cycle((START[0] + 1e-5, START[1], START[2])).position[0] for _ in range(4)]
         assert positions == pytest.approx([START[0], START[0], START[0] + 1e-5, START[0] + 1e-5], abs=1e-6)
 
+    def test_positions_that_always_take_long_are_not_late(self, late: Rig) -> None:
+        assert [(c.feedback_late, c.feedback_lost) for c in late.cycles(20).counts] == [(0, 0)] * 3
+
     def test_late_positions_are_counted_as_late_and_lost_ones_as_lost(self, ready: Rig) -> None:
+        ready.cycle()
         ready.bus.faults.add("B delay 0.0005 tpdo2 for 1 frame")
         ready.cycle()
         assert [(c.feedback_late, c.feedback_lost) for c in ready.cycle().counts] == [(0, 0), (1, 0), (0, 0)]
@@ -653,6 +822,17 @@ class TestLateAnswers:
         ready.clock.now += 1.5 * PERIOD
         ready.drives.write(position, ZERO)
         assert [c.setpoints_late for c in ready.cycle().counts] == [1, 1, 1]
+
+    def test_age_of_the_position_is_told(self, late: Rig) -> None:
+        assert [late.cycle().age for _ in range(5)] == [(1, 1, 1)] * 5
+
+    def test_age_counts_what_was_lost(self, late: Rig) -> None:
+        late.cycles(3)
+        late.devices[1].silent = True
+        late.cycle()  # reads the last answer
+        late.devices[1].silent = False
+        assert late.cycle().age == (1, 2, 1)
+        assert late.cycle().age == (1, 1, 1)
 
     def test_silence_is_three_answers_missing(self, late: Rig) -> None:
         late.cycles(5)
@@ -704,6 +884,7 @@ class TestReset:
         feedback = enabled.found("fault", within=250)
         assert feedback.fault is not None
         assert feedback.fault[:3] == ("A", "fault", 0x2310)
+        assert feedback.fault.message == "drive A: fault, error 2310, still 0.2 s after a fault reset"
         enabled.cycle()
         assert enabled.controlwords()[0] == [0x02, 0x80, 0x02]
 

@@ -89,3 +89,34 @@ def test_a_robot_as_built() -> None:
     )
     text = TEXT.replace("l0 = 0.3", legs, 1).replace("phi = [-1.2, 0.85]", "phi = [-0.5, 0.5]")
     assert parse(text).geometry.leg is not None
+
+
+HOMING = "[drives.B.homing]\nmethod = {method}\nspeed_switch = 0.02\nspeed_zero = {zero}\nacceleration = 0.5\n"
+
+
+def test_homing_is_for_drives_that_have_a_table_of_it() -> None:
+    assert [drive.homing for drive in parse(TEXT).drives.each] == [None, None, None]
+    drives = parse(TEXT.replace("[drives.C]\n", HOMING.format(method=-3, zero=0.005) + "[drives.C]\n")).drives
+    assert drives.B.homing is not None
+    assert (drives.A.homing, drives.B.homing.method, drives.C.homing) == (None, -3, None)
+
+
+@pytest.mark.parametrize(
+    ("method", "zero", "said"),
+    [
+        (0, 0.005, "drives.B.homing = {'method': 0"),
+        (300, 0.005, "drives.B.homing.method = 300: expected int <= 127"),
+        (19, 0.0, "drives.B.homing.speed_zero = 0.0: expected float > 0.0"),
+    ],
+)
+def test_homing_that_is_refused(method: int, zero: float, said: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        parse(TEXT.replace("[drives.C]\n", HOMING.format(method=method, zero=zero) + "[drives.C]\n"))
+    assert said in str(refused.value)
+
+
+def test_an_eds_lies_beside_the_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(TEXT.replace("[drives.B]\n", '[drives.B]\neds = "makes/b.eds"\n'))
+    drives = load(path).drives
+    assert [drive.eds for drive in drives.each] == [None, str(tmp_path / "makes/b.eds"), None]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import zlib
 
+import can
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig, changed
+from conftest import CONFIG, Delay, Rig, changed
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from drivers import frames
 from drivers.interface import PowerState
@@ -97,6 +100,17 @@ def test_a_drive_that_does_not_power_up_is_named(rig: Rig, monkeypatch: pytest.M
     assert rig.mode is Mode.FAULT
     assert "drive A is switch on disabled" in answer.message
     assert "2 s after enable" in answer.message
+
+
+@pytest.mark.parametrize("name", ["disable", "quick_stop"])
+def test_a_drive_that_keeps_its_power_is_named_with_its_state(rig: Rig, name: str) -> None:
+    rig.enable()
+    rig.drives[1].objects.on_write(0x6040, lambda entry, old: None)
+    answer = refusal(rig.command(name))
+    assert rig.mode is Mode.FAULT
+    said = f"drive B: is operation enabled 1 s after {name.replace('_', ' ')}; switch on disabled was expected"
+    assert said in answer.message
+    assert any(said in happening.message for happening in rig.happenings if happening.kind == "fault")
 
 
 # ---------------------------------------------------------------------- goals
@@ -277,6 +291,79 @@ def test_goals_in_the_wrong_mode(rig: Rig) -> None:
     rig.control.happen(Event.GATEWAY_LOST, "gone")
     assert refusal(rig.goal("g3", 0.0, 0.0, 0.1)).code == "stopping"
     assert rig.outcomes() == [("g1", "rejected"), ("g2", "stopped"), ("g3", "rejected")]
+
+
+# ---------------------------------------------------------------------- feedback that is on its way
+
+
+def part_of_a_cycle(message: can.Message) -> float:
+    return 0.4 * PERIOD
+
+
+def a_cycle(message: can.Message) -> float:
+    return PERIOD
+
+
+def one_drive_late(message: can.Message) -> float:
+    return 0.4 * PERIOD if message.arbitration_id == frames.TPDO2 + 2 else 0.0
+
+
+def as_it_comes(message: can.Message) -> float:
+    return zlib.crc32(bytes(message.data)) % 10 * 0.1 * PERIOD
+
+
+def jogged(delay: Delay | None) -> tuple[Rig, NDArray[np.float64], NDArray[np.float64]]:
+    """Jog along x and back; following errors and velocities of the sliders in every cycle."""
+    rig = Rig(CONFIG, delay)
+    rig.enable()
+    rig.cycles(5)
+    errors, velocities = [], []
+    for n in range(600):
+        if n % 50 == 0:
+            rig.send("j1" if n < 300 else "j2", VelocityGoal(0.2 if n < 300 else -0.2, 0.0, 0.0, timeout=0.2))
+        else:
+            rig.cycle()
+        errors.append(rig.control.following_error)
+        velocities.append(rig.control.velocity)
+    rig.bus.shutdown()
+    return rig, np.array(errors), np.array(velocities)
+
+
+@pytest.mark.parametrize("delay", [part_of_a_cycle, a_cycle, one_drive_late, as_it_comes])
+def test_a_following_error_is_the_same_however_late_it_is_known(delay: Delay) -> None:
+    _, prompt, prompt_velocity = jogged(None)
+    rig, late, late_velocity = jogged(delay)
+    assert rig.control.fault is None
+    assert np.abs(prompt).max() < 1e-4
+    age = 1 if delay in (part_of_a_cycle, a_cycle) else 0
+    # The same errors, each a cycle later where the answers are; a cycle at 0.2 m/s is 0.2 mm.
+    assert np.abs(late[1:] - prompt[: len(prompt) - 1] if age else late - prompt)[10:].max() < 2e-5
+    assert np.abs(late_velocity).max() < 1.1 * np.abs(prompt_velocity).max()
+
+
+@pytest.mark.parametrize("late", [0.0, 0.4, 1.0])
+def test_a_lost_answer_is_no_step_in_error_or_velocity(late: float) -> None:
+    lost: list[float] = []
+
+    def delay(message: can.Message) -> float:
+        if lost and message.arbitration_id == frames.TPDO2 + 2:
+            return lost.pop()
+        return late * PERIOD
+
+    rig = Rig(CONFIG, delay)
+    rig.enable()
+    rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=2.0))
+    rig.cycles(300)
+    velocity = rig.control.velocity
+    for number in (1, 2):
+        lost += [math.inf] * number
+        for _ in range(6):
+            rig.cycle()
+            assert max(map(abs, rig.control.following_error)) < 1e-4
+            assert rig.control.velocity == pytest.approx(velocity, rel=0.01, abs=1e-4)
+        assert not lost
+    assert rig.mode is Mode.MOVING
+    rig.bus.shutdown()
 
 
 # ---------------------------------------------------------------------- faults

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -10,9 +11,11 @@ import can
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig, changed
+from test_homing import incremental
 
 from drivers import frames
 from drivers.interface import PowerState
+from service.config import Config
 from service.modes import Mode
 from service.packets import CommandRequest, Confirmed, Refused
 
@@ -23,21 +26,28 @@ NODES = (1, 2, 3)
 RAMP = 100
 """Cycles in which every motion here ends by the quick-stop ramp: 0.5 m/s at 10 m/s² takes 50."""
 LONG = 350
+INCREMENTAL = changed(incremental(), missed_syncs=3)
+"""The same with drives that are to be homed."""
 
 
 class FaultRig(Rig):
-    """Keeps every setpoint that appeared on the bus, and whether its drive was enabled then."""
+    """Keeps every setpoint that appeared on the bus, and whether its drive was enabled then.
 
-    def __init__(self) -> None:
-        super().__init__(REAL)
-        self.targets: dict[int, list[tuple[int, bool]]] = {node: [] for node in NODES}
+    Drives that move by themselves take none: not a number.
+    """
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.targets: dict[int, list[tuple[float, bool]]] = {node: [] for node in NODES}
 
     def _note(self, message: can.Message, timeout: float | None = None) -> None:
         super()._note(message, timeout)
         node = message.arbitration_id - frames.RPDO2
         if node in NODES:
-            enabled = self.drives[node - 1].state is PowerState.OPERATION_ENABLED
-            self.targets[node].append((frames.SETPOINT.unpack(message.data)[0], enabled))
+            drive = self.drives[node - 1]
+            enabled = drive.state is PowerState.OPERATION_ENABLED
+            target = frames.SETPOINT.unpack(message.data)[0] if drive.objects[0x6061, 0].value == 8 else math.nan
+            self.targets[node].append((target, enabled))
 
     def faulty(self) -> bool:
         return self.mode is Mode.FAULT
@@ -76,15 +86,37 @@ def stopping(rig: FaultRig) -> None:
     assert rig.mode is Mode.STOPPING
 
 
-MODES: dict[str, tuple[Callable[[FaultRig], None], list[tuple[str, str]]]] = {
-    "holding": (holding, []),
-    "moving": (moving, [("g1", "faulted")]),
-    "stopping": (stopping, [("g1", "stopped")]),
+def homing(rig: FaultRig) -> None:
+    holding(rig)
+    rig.cycle(CommandRequest(0, "ann", "home"))
+    rig.cycles(100)
+    assert rig.mode is Mode.HOMING
+    assert rig.control.feedback.follows == (False, True, True)
+    assert rig.drives[0].servo.velocity != 0.0
+
+
+class Begin(NamedTuple):
+    """How to get into a mode, and how what is under way then ends."""
+
+    enter: Callable[[FaultRig], None]
+    faulted: tuple[tuple[str, str], ...] = ()
+    """Goals and their ends where a fault comes."""
+    otherwise: tuple[tuple[str, str], ...] = ()
+    """Goals and their ends where none comes."""
+    config: Config = REAL
+
+
+MODES = {
+    "holding": Begin(holding),
+    "moving": Begin(moving, (("g1", "faulted"),), (("g1", "done"),)),
+    "stopping": Begin(stopping, (("g1", "stopped"),), (("g1", "stopped"),)),
+    "homing": Begin(homing, config=INCREMENTAL),
 }
-"""How to get there, and how the goals end when a fault comes then. One more mode is one more line."""
+"""One more mode is one more line."""
 
 
 IN_MOTION = ("moving", "stopping")
+NOT_HOMING = ("holding", *IN_MOTION)
 
 
 class Case(NamedTuple):
@@ -141,23 +173,41 @@ STOP = [
     Case("bus-off", 1, r"CAN bus: bus-off"),
     Case("babble 001", 3, r"drive A: no position for 3 SYNCs in a row"),
 ]
+STOP_HOMING = [
+    Case("A stuck", 5500, r"drive A: homing: home was not attained within 5 s", lasts=False),
+    Case("A runaway 0.001", 5500, r"drive A: homing: home was not attained within 5 s", stands=1100, lasts=False),
+    Case("A drop 0x581", 2000, r"drive A: homing: no answer about object 60\w\w:00", lasts=False),
+    Case("A drop 0x601", 2000, r"drive A: homing: no answer about object 60\w\w:00", lasts=False),
+    Case("A corrupt tpdo2", 2000, r"slider A: following error", lasts=False),
+]
+"""Faults of the drive that is being homed."""
 
 
 @pytest.fixture
-def rig() -> Iterator[FaultRig]:
-    made = FaultRig()
+def mode() -> str:
+    """Without a mode to begin in."""
+    return "holding"
+
+
+@pytest.fixture
+def rig(mode: str) -> Iterator[FaultRig]:
+    made = FaultRig(MODES[mode].config)
     yield made
     made.bus.shutdown()
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("case", STOP, ids=lambda case: case.line)
+@pytest.mark.parametrize(
+    ("mode", "case"),
+    [*((mode, case) for case in STOP for mode in MODES), *(("homing", case) for case in STOP_HOMING)],
+    ids=lambda value: value.line if isinstance(value, Case) else value,
+)
 def test_a_fault_stops_all_three_drives(rig: FaultRig, case: Case, mode: str) -> None:
-    MODES[mode][0](rig)
+    begun = MODES[mode]
+    begun.enter(rig)
     rig.inject(case.line)
     if mode not in case.modes:
         rig.cycles(LONG)
-        assert rig.mode is Mode.HOLDING
+        assert rig.mode in (Mode.HOLDING, Mode.HOMING)
         return
     rig.until(rig.faulty, case.within + 1)
     assert rig.quick_stops() == set(NODES)
@@ -183,9 +233,11 @@ def test_a_fault_stops_all_three_drives(rig: FaultRig, case: Case, mode: str) ->
     assert rig.stands()
     if case.curable:
         rig.enable()
+        if not rig.control.homed:
+            assert isinstance(rig.command("home"), Confirmed)
         rig.goal("g3", 0.01, 0.0, 0.0)
         rig.until(lambda: rig.mode is Mode.HOLDING)
-    expected = [*MODES[mode][1], ("g2", "rejected"), *([("g3", "done")] if case.curable else [])]
+    expected = [*begun.faulted, ("g2", "rejected"), *([("g3", "done")] if case.curable else [])]
     assert rig.outcomes() == expected
     assert_no_jump(rig)
 
@@ -198,10 +250,10 @@ def assert_no_jump(rig: FaultRig) -> None:
         position = np.array([target for target, _ in targets]) / counts
         enabled = np.array([enabled for _, enabled in targets])
         velocity = np.diff(position) / PERIOD
-        assert np.abs(velocity).max() <= limits.velocity * 1.001 + rounding
+        assert np.nanmax(np.abs(velocity)) <= limits.velocity * 1.001 + rounding
         always = enabled[2:] & enabled[1:-1] & enabled[:-2]
         acceleration = np.diff(velocity)[always] / PERIOD
-        assert np.abs(acceleration).max() <= limits.acceleration * 1.001 + 2.0 * rounding / PERIOD
+        assert np.nanmax(np.abs(acceleration)) <= limits.acceleration * 1.001 + 2.0 * rounding / PERIOD
 
 
 GO_ON = [
@@ -226,14 +278,14 @@ GO_ON = [
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("line", GO_ON)
 def test_what_does_not_stop_the_robot(rig: FaultRig, line: str, mode: str) -> None:
-    MODES[mode][0](rig)
+    begun = MODES[mode]
+    begun.enter(rig)
     rig.inject(line)
     rig.cycles(800)
+    rig.until(rig.holds)
     assert [said.message for said in rig.happenings if said.kind == "fault"] == []
-    assert rig.mode is Mode.HOLDING
-    assert [outcome for _, outcome in rig.outcomes()] == {"holding": [], "moving": ["done"], "stopping": ["stopped"]}[
-        mode
-    ]
+    assert rig.control.homed
+    assert tuple(rig.outcomes()) == begun.otherwise
     assert_no_jump(rig)
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from service import palette, terminal
 from service.modes import (
     DISABLED,
     ENABLING,
     FAULT,
     HOLDING,
+    HOMING,
     MOVING,
     PAUSED,
     PAUSING,
@@ -38,6 +40,8 @@ TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
         E.RESET: REFUSED,
         E.PAUSE: REFUSED,
         E.RESUME: REFUSED,
+        E.HOME: REFUSED,
+        E.HOMED: (DISABLED, Action.NOTHING),
         E.POWERED: (DISABLED, Action.NOTHING),
         E.STANDSTILL: (DISABLED, Action.NOTHING),
         E.FAULT: (FAULT, Action.QUICK_STOP),
@@ -54,12 +58,32 @@ TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
         E.RESET: REFUSED,
         E.PAUSE: REFUSED,
         E.RESUME: REFUSED,
+        E.HOME: REFUSED,
+        E.HOMED: (ENABLING, Action.NOTHING),
         E.POWERED: (HOLDING, Action.NOTHING),
         E.STANDSTILL: (ENABLING, Action.NOTHING),
         E.FAULT: (FAULT, Action.QUICK_STOP),
         E.GATEWAY_LOST: (DISABLED, Action.POWER_DOWN),
         E.LATE: (DISABLED, Action.POWER_DOWN),
         E.SHUTDOWN: (DISABLED, Action.POWER_DOWN),
+    },
+    HOMING: {
+        E.ENABLE: (HOMING, Action.NOTHING),
+        E.DISABLE: (STOPPING_TO_DISABLE, Action.STOP_HOMING),
+        E.GOAL: REFUSED,
+        E.STOP: (STOPPING, Action.STOP_HOMING),
+        E.QUICK_STOP: (FAULT, Action.QUICK_STOP),
+        E.RESET: REFUSED,
+        E.PAUSE: REFUSED,
+        E.RESUME: REFUSED,
+        E.HOME: (HOMING, Action.NOTHING),
+        E.HOMED: (HOLDING, Action.NOTHING),
+        E.POWERED: (HOMING, Action.NOTHING),
+        E.STANDSTILL: (HOMING, Action.NOTHING),
+        E.FAULT: (FAULT, Action.QUICK_STOP),
+        E.GATEWAY_LOST: (STOPPING, Action.STOP_HOMING),
+        E.LATE: (STOPPING, Action.STOP_HOMING),
+        E.SHUTDOWN: (STOPPING_TO_DISABLE, Action.STOP_HOMING),
     },
     HOLDING: {
         E.ENABLE: (HOLDING, Action.NOTHING),
@@ -70,6 +94,8 @@ TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
         E.RESET: REFUSED,
         E.PAUSE: REFUSED,
         E.RESUME: REFUSED,
+        E.HOME: (HOMING, Action.HOME),
+        E.HOMED: (HOLDING, Action.NOTHING),
         E.POWERED: (HOLDING, Action.NOTHING),
         E.STANDSTILL: (HOLDING, Action.NOTHING),
         E.FAULT: (FAULT, Action.QUICK_STOP),
@@ -86,6 +112,8 @@ TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
         E.RESET: REFUSED,
         E.PAUSE: (PAUSING, Action.BRAKE),
         E.RESUME: (MOVING, Action.NOTHING),
+        E.HOME: REFUSED,
+        E.HOMED: (MOVING, Action.NOTHING),
         E.POWERED: (MOVING, Action.NOTHING),
         E.STANDSTILL: (HOLDING, Action.NOTHING),
         E.FAULT: (FAULT, Action.QUICK_STOP),
@@ -102,6 +130,8 @@ TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
         E.RESET: REFUSED,
         E.PAUSE: REFUSED,
         E.RESUME: REFUSED,
+        E.HOME: REFUSED,
+        E.HOMED: (STOPPING, Action.NOTHING),
         E.POWERED: (STOPPING, Action.NOTHING),
         E.STANDSTILL: (HOLDING, Action.NOTHING),
         E.FAULT: (FAULT, Action.QUICK_STOP),
@@ -118,6 +148,8 @@ TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
         E.RESET: REFUSED,
         E.PAUSE: REFUSED,
         E.RESUME: REFUSED,
+        E.HOME: REFUSED,
+        E.HOMED: (STOPPING_TO_DISABLE, Action.NOTHING),
         E.POWERED: (STOPPING_TO_DISABLE, Action.NOTHING),
         E.STANDSTILL: (DISABLED, Action.POWER_DOWN),
         E.FAULT: (FAULT, Action.QUICK_STOP),
@@ -134,6 +166,8 @@ TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
         E.RESET: REFUSED,
         E.PAUSE: (PAUSING, Action.NOTHING),
         E.RESUME: (MOVING, Action.RESUME),
+        E.HOME: REFUSED,
+        E.HOMED: (PAUSING, Action.NOTHING),
         E.POWERED: (PAUSING, Action.NOTHING),
         E.STANDSTILL: (PAUSED, Action.NOTHING),
         E.FAULT: (FAULT, Action.QUICK_STOP),
@@ -150,6 +184,8 @@ TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
         E.RESET: REFUSED,
         E.PAUSE: (PAUSED, Action.NOTHING),
         E.RESUME: (MOVING, Action.RESUME),
+        E.HOME: REFUSED,
+        E.HOMED: (PAUSED, Action.NOTHING),
         E.POWERED: (PAUSED, Action.NOTHING),
         E.STANDSTILL: (PAUSED, Action.NOTHING),
         E.FAULT: (FAULT, Action.QUICK_STOP),
@@ -166,6 +202,8 @@ TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
         E.RESET: (DISABLED, Action.CLEAR),
         E.PAUSE: REFUSED,
         E.RESUME: REFUSED,
+        E.HOME: REFUSED,
+        E.HOMED: (FAULT, Action.NOTHING),
         E.POWERED: (FAULT, Action.NOTHING),
         E.STANDSTILL: (FAULT, Action.NOTHING),
         E.FAULT: (FAULT, Action.NOTHING),
@@ -192,6 +230,11 @@ def test_step(state: State, event: Event) -> None:
         assert decided.message
     else:
         assert decided == Step(*wanted)
+
+
+def test_every_mode_has_its_colours() -> None:
+    assert set(palette.MODES) == set(Mode)
+    assert set(terminal.COLOURS) == set(Mode)
 
 
 @pytest.mark.parametrize("state", STATES)

@@ -625,8 +625,8 @@ def test_quick_stop_that_does_not_stay_ends_in_switch_on_disabled_and_cannot_res
     assert rig.state() is S.SWITCH_ON_DISABLED
 
 
-def test_only_mode_8_is_supported_and_none_follows_nothing(rig: Rig) -> None:
-    assert rig.read(0x6502) == 1 << 7
+def test_modes_6_and_8_are_supported_and_none_follows_nothing(rig: Rig) -> None:
+    assert rig.read(0x6502) == 1 << 5 | 1 << 7
     in_state(rig, S.OPERATION_ENABLED)
     assert rig.read(0x6061) == 8
     rig.write(0x6060, 0, b"\0")
@@ -635,6 +635,126 @@ def test_only_mode_8_is_supported_and_none_follows_nothing(rig: Rig) -> None:
     rig.write(0x607A, 0, pack("<i", START + 100))
     rig.wait(0.1)
     assert rig.read(0x6064) == START
+
+
+# Homing (CiA 402-2, mode 6). The switch is at START - 3000 or START + 3000, in counts as at power-on.
+
+START_HOMING = ENABLE | 0x10
+HALT = 0x100
+REACHED, ATTAINED, ERROR = 1 << 10, 1 << 12, 1 << 13
+
+
+def homing_rig(method: int, switch: int | None) -> Rig:
+    """A drive that is enabled in homing mode."""
+    rig = Rig()
+    rig.drive.homing.switch = switch
+    rig.write(0x6098, 0, pack("<b", method))
+    rig.write(0x6099, 1, pack("<I", 50_000))
+    rig.write(0x6099, 2, pack("<I", 10_000))
+    rig.write(0x609A, 0, pack("<I", 2_000_000))
+    in_state(rig, S.OPERATION_ENABLED)
+    rig.write(0x6060, 0, b"\x06")
+    assert rig.read(0x6061) == 6
+    assert homing_bits(rig) == REACHED  # not started
+    return rig
+
+
+def homing_bits(rig: Rig) -> int:
+    return rig.read(0x6041) & (REACHED | ATTAINED | ERROR)
+
+
+@pytest.mark.parametrize(("method", "direction"), [(17, 1), (18, -1), (19, -1), (20, 1), (21, 1), (22, -1)])
+@pytest.mark.parametrize("switch", [START - 3000, START + 3000])
+@pytest.mark.parametrize("offset", [0, -700])
+def test_homing_ends_behind_the_edge_from_where_it_counts(
+    method: int, direction: int, switch: int, offset: int
+) -> None:
+    rig = homing_rig(method, switch)
+    rig.write(0x607C, 0, pack("<i", offset))
+    rig.write(0x6040, 0, pack("<H", START_HOMING))
+    assert homing_bits(rig) == 0
+    speeds = set()
+    for _ in range(4000):
+        rig.wait(0.0005)
+        speeds.add(round(rig.servo.velocity))
+        if homing_bits(rig):
+            break
+    assert homing_bits(rig) == REACHED | ATTAINED
+    assert max(abs(speed) for speed in speeds) == 50_000
+    assert direction * 10_000 in speeds  # the edge is crossed slowly, and always from the same side
+    beyond = rig.read(0x6064) - offset
+    assert 0 <= direction * beyond <= 10_000**2 / 2 / 2_000_000 + 10  # as far as it takes to brake
+    assert rig.drive.homing.switch == offset
+    rig.wait(0.1)
+    assert rig.read(0x6064) - offset == beyond
+
+
+@pytest.mark.parametrize("method", [35, 37])
+def test_homing_where_it_stands_moves_nothing(method: int) -> None:
+    rig = homing_rig(method, None)
+    rig.write(0x607C, 0, pack("<i", 123))
+    rig.write(0x6040, 0, pack("<H", START_HOMING))
+    assert homing_bits(rig) == REACHED | ATTAINED
+    assert rig.read(0x6064) == 123
+    rig.write(0x6060, 0, b"\x08")
+    rig.write(0x607A, 0, pack("<i", 123))
+    rig.wait(0.1)
+    assert rig.read(0x6064) == 123
+
+
+def test_homing_that_is_interrupted_stands_and_is_not_attained() -> None:
+    rig = homing_rig(19, START + 3000)
+    rig.write(0x6040, 0, pack("<H", START_HOMING))
+    rig.wait(0.04)
+    rig.write(0x6040, 0, pack("<H", ENABLE))
+    assert homing_bits(rig) == 0
+    rig.wait(0.1)
+    assert homing_bits(rig) == REACHED
+    before = rig.read(0x6064)
+    rig.wait(0.1)
+    assert rig.read(0x6064) == before != START
+
+
+def test_homing_that_is_halted_goes_on_afterwards() -> None:
+    rig = homing_rig(19, START + 3000)
+    rig.write(0x6040, 0, pack("<H", START_HOMING))
+    rig.wait(0.04)
+    rig.write(0x6040, 0, pack("<H", START_HOMING | HALT))
+    rig.wait(0.1)
+    assert homing_bits(rig) == REACHED
+    rig.write(0x6040, 0, pack("<H", START_HOMING))
+    rig.wait(1.0)
+    assert homing_bits(rig) == REACHED | ATTAINED
+
+
+def test_homing_without_method_or_speed_is_an_error() -> None:
+    rig = homing_rig(0, START)
+    rig.write(0x6040, 0, pack("<H", START_HOMING))
+    assert homing_bits(rig) == REACHED | ERROR
+    rig = homing_rig(19, START + 100)
+    rig.write(0x6099, 2, pack("<I", 0))
+    rig.write(0x6040, 0, pack("<H", START_HOMING))
+    assert homing_bits(rig) == REACHED | ERROR
+
+
+def test_homing_methods_that_it_has_not_are_refused(rig: Rig) -> None:
+    for method in (-1, 1, 16, 33, 38):
+        assert rig.write_refused(0x6098, 0, pack("<b", method)) == 0x06090030
+
+
+def test_quick_stop_ends_homing() -> None:
+    rig = homing_rig(19, START + 3000)
+    rig.write(0x6040, 0, pack("<H", START_HOMING))
+    rig.wait(0.04)
+    rig.write(0x6040, 0, pack("<H", QUICK_STOP))
+    rig.wait(0.1)
+    assert rig.state() is S.QUICK_STOP_ACTIVE
+    assert not homing_bits(rig) & ATTAINED
+    rig.write(0x6040, 0, pack("<H", ENABLE))
+    assert rig.state() is S.OPERATION_ENABLED
+    before = rig.read(0x6064)
+    rig.wait(0.1)
+    assert rig.read(0x6064) == before  # it does not go on by itself
 
 
 # Motion.

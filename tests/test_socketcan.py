@@ -117,7 +117,7 @@ def cycle(driver: Cia402, position: float = 0.0, *, heard: bool = True) -> Feedb
     deadline = time.monotonic() + WITHIN
     while True:
         feedback = driver.read()
-        answered = all(axis.unanswered == 0 for axis in driver._axes)
+        answered = feedback.age == (0, 0, 0)
         if answered or not heard or feedback.fault or time.monotonic() > deadline:
             driver.write((position,) * 3, (0.0,) * 3)
             return feedback

@@ -103,17 +103,23 @@ class SimulatedBus(can.BusABC):
 
 
 def simulated_bus(can: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic) -> SimulatedBus:
-    """The three drives of a configuration on a bus of their own, at rest where `can.simulated.start` says."""
+    """The three drives of a configuration on a bus of their own, at rest where `can.simulated.start` says.
+
+    A drive that is to be homed does not know where that is: it counts from 0 at power-on, and has its home switch
+    at the position that the configuration gives for zero counts.
+    """
     simulated = can.simulated
     devices, scales = [], []
     for drive, start in zip(drives.each, simulated.start, strict=True):
+        counts = round(drive.direction * (start - drive.offset) * drive.counts_per_metre)
+        switch = None if drive.homing is None else -counts
         servo = Servo(
-            round(drive.direction * (start - drive.offset) * drive.counts_per_metre),
+            counts if switch is None else 0,
             time_constant=simulated.time_constant,
             feed_forward_gain=simulated.feed_forward_gain,
             max_velocity=simulated.max_velocity * drive.counts_per_metre,
             max_acceleration=simulated.max_acceleration * drive.counts_per_metre,
         )
-        devices.append(SimulatedDrive(drive.node, servo, simulated.missed_syncs))
+        devices.append(SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch))
         scales.append(drive.direction * drive.counts_per_metre)
     return SimulatedBus(devices, clock, Faults(devices, scales))

@@ -1,4 +1,4 @@
-"""A servo drive as CiA 402 has it, in cyclic synchronous position mode, on a simulated axis."""
+"""A servo drive as CiA 402 has it, in cyclic synchronous position and homing mode, on a simulated axis."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Final
 from drivers.interface import PowerState
 from drivers.simulated.device import Device, Nmt
 from drivers.simulated.dictionary import INVALID_VALUE, Entry, SdoAbort
+from drivers.simulated.homing import EDGES, STANDING, Homing
 from drivers.simulated.power import FAULT_RESET, STATUS, commanded
 from drivers.simulated.servo import Servo
 
@@ -18,8 +19,9 @@ FOLLOWING_ERROR = 0x8611
 SYNC_LOST = 0x8700
 
 NO_MODE = 0
+HOMING = 6
 CYCLIC_SYNCHRONOUS_POSITION = 8
-_MODES = (NO_MODE, CYCLIC_SYNCHRONOUS_POSITION)
+_MODES = (NO_MODE, HOMING, CYCLIC_SYNCHRONOUS_POSITION)
 """What 6060h takes; 6502h tells the same."""
 
 _STOP_AND_DISABLE, _STOP_AND_STAY = 2, 6
@@ -27,12 +29,19 @@ _STOP_AND_DISABLE, _STOP_AND_STAY = 2, 6
 
 _WINDOW_OFF = 0xFFFFFFFF
 
-# Statusword bits beside the state's (CiA 402-2, 6041h; bits 12 and 13 as mode 8 defines them).
+# Controlword bits beside the command's (CiA 402-2, 6040h; bit 4 as mode 6 defines it).
+_HOMING_START = 1 << 4
+_HALT = 1 << 8
+
+# Statusword bits beside the state's (CiA 402-2, 6041h; bits 12 and 13 as modes 8 and 6 define them).
 _VOLTAGE_ENABLED = 1 << 4
 _REMOTE = 1 << 9
 _INTERNAL_LIMIT = 1 << 11
 _FOLLOWS_COMMAND = 1 << 12
 _FOLLOWING_ERROR_BIT = 1 << 13
+_TARGET_REACHED = 1 << 10
+_HOMING_ATTAINED = 1 << 12
+_HOMING_ERROR = 1 << 13
 
 _STOPPING = (PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 _POWERED = (PowerState.OPERATION_ENABLED, *_STOPPING)
@@ -47,10 +56,11 @@ class SimulatedDrive(Device):
     the time; until the SYNC is found lost, it keeps its velocity. Without power it is held by its brake.
     """
 
-    def __init__(self, node: int, servo: Servo, missed_syncs: int = 3) -> None:
+    def __init__(self, node: int, servo: Servo, missed_syncs: int = 3, home_switch: float | None = None) -> None:
         super().__init__(node, EDS)
         self._missed_syncs = missed_syncs
         self.servo = servo
+        self.homing = Homing(servo, home_switch)
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self._synchronised = False
         self._moved_at = 0.0
@@ -59,6 +69,7 @@ class SimulatedDrive(Device):
         self._beyond_window: float | None = None
         o = self.objects
         self._error_code = o[0x603F, 0]
+        self._controlword = o[0x6040, 0]
         self._statusword = o[0x6041, 0]
         self._quick_stop_option = o[0x605A, 0]
         self._mode = o[0x6060, 0]
@@ -75,6 +86,7 @@ class SimulatedDrive(Device):
         o.on_write(0x605A, self._quick_stop_option_written)
         o.on_write(0x6060, self._mode_written)
         o.on_write(0x607A, self._target_written)
+        o.on_write(0x6098, self._method_written)
         o.on_write(0x60C2, self._period_written)
 
     def fail(self, code: int) -> None:
@@ -92,6 +104,7 @@ class SimulatedDrive(Device):
         self.fault = 0
         self._synchronised = self._setpoint_given = False
         self._moved_at = self._now
+        self.homing.forget()
         self._update_period()
         self._change(PowerState.SWITCH_ON_DISABLED)
 
@@ -145,6 +158,8 @@ class SimulatedDrive(Device):
         state = commanded(self.state, entry.value, self._stays_stopped)
         if state is not self.state:
             self._change(state)
+        elif self._homes:
+            self._home(entry.value, old)
 
     @property
     def _stays_stopped(self) -> bool:
@@ -153,6 +168,7 @@ class SimulatedDrive(Device):
     def _change(self, state: PowerState) -> None:
         if self.state is PowerState.OPERATION_ENABLED:
             self._setpoint_given = False
+            self.homing.interrupt()
         self.state = state
         if state not in _POWERED:
             self.servo.hold()
@@ -170,6 +186,8 @@ class SimulatedDrive(Device):
         if self._follows_command:
             self.servo.follow(self._target.value, feed_forward, step)
             self._watch_following_error(step)
+        elif self._homes and self.homing.under_way:
+            self.homing.move(step, bool(self._controlword.value & _HALT))
         else:
             self.servo.brake(self._quick_stop_deceleration.value, step)
             if self.servo.velocity == 0.0:
@@ -179,6 +197,20 @@ class SimulatedDrive(Device):
     @property
     def _follows_command(self) -> bool:
         return self.state is PowerState.OPERATION_ENABLED and self._mode.value == CYCLIC_SYNCHRONOUS_POSITION
+
+    @property
+    def _homes(self) -> bool:
+        return self.state is PowerState.OPERATION_ENABLED and self._mode.value == HOMING
+
+    def _home(self, word: int, old: int) -> None:
+        """CiA 402-2, homing mode: bit 4 of the controlword starts when it rises and interrupts when it falls."""
+        if word & ~old & _HOMING_START:
+            o = self.objects
+            method, offset = o[0x6098, 0].value, o[0x607C, 0].value
+            self.homing.start(method, o[0x6099, 1].value, o[0x6099, 2].value, o[0x609A, 0].value, offset)
+        elif old & ~word & _HOMING_START:
+            self.homing.interrupt()
+        self._publish()
 
     def _standstill(self) -> None:
         """Transition 14, or 12 where the quick stop does not stay active."""
@@ -208,9 +240,21 @@ class SimulatedDrive(Device):
             status |= _FOLLOWS_COMMAND
             if servo.limited:
                 status |= _INTERNAL_LIMIT
+        if self._mode.value == HOMING:
+            status |= self._homing_bits()
         if self.fault == FOLLOWING_ERROR:
             status |= _FOLLOWING_ERROR_BIT
         self._statusword.value = status
+
+    def _homing_bits(self) -> int:
+        """CiA 402-2, homing mode: error, attained and target reached, of which the last says that the axis stands."""
+        homing = self.homing
+        meant_to_stand = not homing.under_way or bool(self._controlword.value & _HALT)
+        return (
+            _TARGET_REACHED * (meant_to_stand and self.servo.velocity == 0.0)
+            | _HOMING_ATTAINED * homing.attained
+            | _HOMING_ERROR * homing.failed
+        )
 
     # Writes.
 
@@ -218,11 +262,17 @@ class SimulatedDrive(Device):
         if entry.value not in (_STOP_AND_DISABLE, _STOP_AND_STAY):
             raise SdoAbort(INVALID_VALUE)
 
-    def _mode_written(self, entry: Entry, _old: int) -> None:
+    def _mode_written(self, entry: Entry, old: int) -> None:
         if entry.value not in _MODES:
             raise SdoAbort(INVALID_VALUE)
+        if entry.value != old:
+            self.homing.forget()
         self._mode_display.value = entry.value
         self._publish()
+
+    def _method_written(self, entry: Entry, _old: int) -> None:
+        if entry.value not in (NO_MODE, *EDGES, *STANDING):
+            raise SdoAbort(INVALID_VALUE)
 
     def _target_written(self, _entry: Entry, _old: int) -> None:
         self._setpoint_given = True

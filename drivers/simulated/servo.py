@@ -100,6 +100,21 @@ class Servo:
         self.velocity = self.velocity - lost if moving == step else 0.0
         self.setpoint, self._feed_forward = self.position, 0.0
 
+    def run(self, velocity: float, acceleration: float, step: float) -> None:
+        """Come to `velocity` [counts/s] with `acceleration` [counts/s²] for `step` seconds, following no setpoint."""
+        change = acceleration * step
+        before = self.velocity
+        self.velocity = max(before - change, min(velocity, before + change))
+        if self.forced_velocity is not None:
+            before = self.velocity = self.forced_velocity
+        self.position += 0.5 * (before + self.velocity) * step
+        self.setpoint, self._feed_forward = self.position, 0.0
+
+    def shift(self, by: float) -> None:
+        """Count from elsewhere: nothing moves, but every position is `by` counts more."""
+        self.position += by
+        self.setpoint += by
+
     def coast(self, step: float) -> None:
         """Keep the velocity for `step` seconds, as a drive does that waits for its next setpoint."""
         self.position += self.velocity * step

@@ -1,0 +1,457 @@
+"""Homing, from the command down to the frames: incremental encoders, whose positions mean nothing at first."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+
+import can
+import canopen
+import msgspec
+import numpy as np
+import pytest
+from canopen.profiles.p402 import BaseNode402
+from conftest import CONFIG, Delay, Rig, changed
+
+from drivers import config, frames
+from drivers.eds import SERVO
+from drivers.interface import PowerState
+from drivers.simulated import Servo, SimulatedBus, SimulatedDrive
+from service.config import Config, geometry
+from service.kinematics import inverse
+from service.modes import Event, Mode
+from service.packets import Accepted, Answer, CommandRequest, Confirmed, Refused
+
+PERIOD = CONFIG.period
+HOMES = (-0.01, 0.012, 0.02)
+"""Where the sliders' switches are [m]."""
+START = (0.004, -0.003, 0.001)
+"""Where the sliders stand at power-on [m]; the drives do not know."""
+HOMING = config.Homing(method=19, speed_switch=0.05, speed_zero=0.01, acceleration=2.0, timeout=5.0)
+
+
+def incremental(method: int = 19, homes: Sequence[float] = HOMES, **keys: object) -> Config:
+    """A robot of drives that are to be homed, and that count from 0 at power-on."""
+    robot = changed(CONFIG, start=START)
+    homing = msgspec.structs.replace(HOMING, method=method, **keys)
+    drives = robot.drives
+    for name, home in zip("ABC", homes, strict=True):
+        drive = msgspec.structs.replace(getattr(drives, name), offset=home, homing=homing)
+        drives = msgspec.structs.replace(drives, **{name: drive})
+    return msgspec.structs.replace(robot, drives=drives)
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    made = Rig(incremental())
+    yield made
+    made.bus.shutdown()
+
+
+def refusal(answer: Answer) -> Refused:
+    assert isinstance(answer, Refused), answer
+    return answer
+
+
+def true_positions(rig: Rig) -> list[float]:
+    """Where the sliders are, whatever the drives count: the switch is where the configuration says [m]."""
+    found = []
+    for device, drive in zip(rig.drives, rig.config.drives.each, strict=True):
+        assert device.homing.switch is not None
+        beyond = device.servo.position - device.homing.switch
+        found.append(drive.direction * beyond / drive.counts_per_metre + drive.offset)
+    return found
+
+
+def modes(rig: Rig) -> list[int]:
+    return [drive.objects[0x6061, 0].value for drive in rig.drives]
+
+
+def begin(rig: Rig, cycles: int = 0) -> None:
+    """Send home, and let so many cycles pass."""
+    rig.cycle(CommandRequest(99, "ann", "home"))
+    assert rig.mode is Mode.HOMING
+    rig.cycles(cycles)
+
+
+def settled(rig: Rig) -> None:
+    """Every drive follows setpoints and stands, and goes on standing."""
+    assert modes(rig) == [8, 8, 8]
+    assert rig.control.feedback.follows == (True, True, True)
+    before = true_positions(rig)
+    rig.cycles(200)
+    assert true_positions(rig) == pytest.approx(before, abs=2e-7)
+
+
+# ---------------------------------------------------------------------- what it comes to
+
+
+@pytest.mark.parametrize("method", [17, 18, 19, 20, 21, 22])
+@pytest.mark.parametrize("start", [START, (-0.03, 0.03, 0.03)])
+def test_afterwards_positions_are_true(method: int, start: tuple[float, float, float]) -> None:
+    rig = Rig(changed(incremental(method), start=start))
+    rig.enable()
+    assert rig.control.feedback.position == HOMES  # what counts of 0 stand for: not where they are
+    answer = rig.command("home")
+    assert isinstance(answer, Confirmed)
+    assert answer.mode == "holding"
+    assert rig.control.feedback.homed == (True, True, True)
+    assert rig.control.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+    assert true_positions(rig) == pytest.approx(HOMES, abs=1e-4)  # it brakes behind the edge
+    settled(rig)
+    assert isinstance(rig.goal("g1", 0.02, 0.01, 0.1), Accepted)
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    assert rig.control.pose == pytest.approx((0.02, 0.01, 0.1), abs=1e-6)
+    rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("method", [35, 37])
+def test_home_is_where_it_stands(method: int) -> None:
+    rig = Rig(incremental(method))
+    rig.enable()
+    rig.command("home")
+    assert rig.control.feedback.homed == (True, True, True)
+    assert rig.control.feedback.position == pytest.approx(HOMES, abs=2e-7)
+    assert true_positions(rig) == pytest.approx(START)
+    settled(rig)
+    rig.bus.shutdown()
+
+
+def test_only_what_is_not_absolute_is_homed() -> None:
+    drives = msgspec.structs.replace(incremental().drives, B=CONFIG.drives.B)
+    rig = Rig(msgspec.structs.replace(incremental(), drives=drives))
+    assert rig.control.feedback.homed == (False, True, False)
+    rig.enable()
+    seen = set()
+    rig.cycle(CommandRequest(99, "ann", "home"))
+    while rig.mode is Mode.HOMING:
+        seen.add(tuple(modes(rig)))
+        rig.cycle()
+    assert seen == {(8, 8, 8), (6, 8, 8), (8, 8, 6)}
+    assert rig.control.feedback.homed == (True, True, True)
+    rig.bus.shutdown()
+
+
+# ---------------------------------------------------------------------- how it gets there
+
+
+def part_of_a_cycle(message: can.Message) -> float:
+    return 0.4 * PERIOD
+
+
+def a_cycle(message: can.Message) -> float:
+    return PERIOD
+
+
+def one_drive_late(message: can.Message) -> float:
+    return 0.4 * PERIOD if message.arbitration_id == frames.TPDO2 + 2 else 0.0
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("method", [19, 37])
+@pytest.mark.parametrize("delay", [None, part_of_a_cycle, a_cycle, one_drive_late])
+def test_one_moves_at_a_time_and_none_jumps(delay: Delay | None, method: int, direction: int) -> None:
+    robot = incremental(method)
+    turned = msgspec.structs.replace(robot.drives.B, direction=direction)
+    rig = Rig(msgspec.structs.replace(robot, drives=msgspec.structs.replace(robot.drives, B=turned)), delay)
+    rig.enable()
+    rig.cycles(5)
+    begin(rig)
+    order: list[int] = []
+    targets: list[tuple[int, int]] = []
+    while rig.mode is Mode.HOMING:
+        before, was, counted = true_positions(rig), modes(rig), [drive.servo.position for drive in rig.drives]
+        rig.cycle()
+        for n, (b, now) in enumerate(zip(before, true_positions(rig), strict=True)):
+            if was[n] == 6 and n not in order:
+                order.append(n)
+            if was[n] == 8 or method == 37:
+                assert method == 37 or abs(now - b) < 2e-7  # it follows setpoints, which hold it
+            assert abs(now - b) <= HOMING.speed_switch * PERIOD * 1.001 or method == 37
+        for n, drive in enumerate(rig.drives):
+            if was[n] == 6 and modes(rig)[n] == 8:
+                targets.append((drive.objects[0x607A, 0].value, drive.objects[0x6064, 0].value))
+                assert drive.objects[0x60B1, 0].value == 0
+                assert abs(drive.servo.position - counted[n]) <= 1
+        assert sum(mode == 6 for mode in modes(rig)) <= 1
+    assert rig.control.fault is None
+    assert order == [0, 1, 2]
+    assert len(targets) == 3
+    for target, actual in targets:
+        assert abs(target - actual) <= 1  # counts of 0.1 µm
+    settled(rig)
+    rig.bus.shutdown()
+
+
+def test_the_frames_of_one_drive(rig: Rig) -> None:
+    """Mode 6, start, mode 8, each only when the one before is done; and setpoints in every cycle."""
+    rig.enable()
+    begin(rig)
+    said: list[str] = []
+    word = frames.ENABLE_OPERATION
+    while rig.control.feedback.homing is False or not rig.control.feedback.homed[0]:
+        rig.cycle()
+        for message in rig.sent:
+            if message.arbitration_id == frames.SDO_REQUEST + 1 and message.data[0] == 0x2F:
+                said.append(f"mode {message.data[4]}")
+            elif message.arbitration_id == frames.RPDO1 + 1:
+                before, (word,) = word, frames.CONTROLWORD.unpack(message.data)
+                if word != before:  # else it is sent again, for it may have got lost
+                    said.append(f"controlword {word:04X}")
+        setpoints = [m.arbitration_id for m in rig.sent if m.arbitration_id & 0x780 == frames.RPDO2]
+        assert setpoints == [frames.RPDO2 + node for node in (1, 2, 3)]
+    assert said == ["mode 6", "controlword 001F", "controlword 000F", "mode 8"]
+
+
+@pytest.mark.parametrize("word", [0x1F, 0x0F, 0x10F])
+def test_a_controlword_that_gets_lost_is_sent_again(rig: Rig, monkeypatch: pytest.MonkeyPatch, word: int) -> None:
+    rig.enable()
+    receive = rig.drives[0].receive
+    lost: list[bytes] = []
+
+    def lose(can_id: int, data: bytes, now: float) -> None:
+        if can_id == frames.RPDO1 + 1 and data == frames.CONTROLWORD.pack(word) and not lost:
+            lost.append(data)
+        else:
+            receive(can_id, data, now)
+
+    begin(rig, 0 if word == 0x1F else 30)
+    monkeypatch.setattr(rig.drives[0], "receive", lose)
+    if word == 0x10F:
+        rig.command("stop")
+    rig.until(rig.holds, 2000)
+    assert lost
+    settled(rig)
+    assert isinstance(rig.command("home"), Confirmed)
+    assert rig.control.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+
+
+def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = rig.drives[0]
+    forget = drive.homing.forget
+
+    def keep() -> None:  # a drive that tells of its last homing until the next one is started
+        attained = drive.homing.attained
+        forget()
+        drive.homing.attained = attained and drive.objects[0x6040, 0].value & frames.HOMING_START == 0
+
+    monkeypatch.setattr(drive.homing, "forget", keep)
+    rig.enable()
+    rig.command("home")
+    begin(rig, 1)
+    moved = 0.0
+    before = true_positions(rig)[0]
+    while not rig.control.feedback.homed[0]:
+        rig.cycle()
+        moved = max(moved, abs(true_positions(rig)[0] - before))
+    assert moved > 5e-5
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+
+
+# ---------------------------------------------------------------------- what stops it
+
+
+WHEN = [0, 1, 3, 8, 21, 150, 301, 460]
+"""Cycles after the command: while the mode changes, under way, at the edge, between two drives."""
+
+
+@pytest.mark.parametrize("when", WHEN)
+@pytest.mark.parametrize(
+    ("event", "end"),
+    [
+        ("stop", Mode.HOLDING),
+        ("disable", Mode.DISABLED),
+        (Event.GATEWAY_LOST, Mode.HOLDING),
+        (Event.LATE, Mode.HOLDING),
+        (Event.SHUTDOWN, Mode.DISABLED),
+    ],
+)
+def test_a_stop_halts_it_and_it_can_begin_again(event: str | Event, end: Mode, when: int) -> None:
+    rig = Rig(incremental(), part_of_a_cycle if when % 2 else None)
+    rig.enable()
+    begin(rig, when)
+    if isinstance(event, Event):
+        rig.control.happen(event, "it happened")
+        rig.until(lambda: rig.mode is end, 400)
+    else:
+        assert isinstance(rig.command(event), Confirmed)
+    assert rig.mode is end
+    assert rig.control.fault is None
+    assert not all(rig.control.feedback.homed)
+    assert refusal(next(a for a in rig.answers if getattr(a, "ticket", None) == 99)).code == "failed"
+    settled(rig)
+    if end is Mode.DISABLED:
+        rig.enable()
+    assert refusal(rig.goal("g1", 0.0, 0.0, 0.1)).code == "not_homed"
+    assert isinstance(rig.command("home"), Confirmed)
+    assert rig.control.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+    rig.bus.shutdown()
+
+
+def test_a_stop_when_the_last_drive_is_home_comes_too_late(rig: Rig) -> None:
+    rig.enable()
+    begin(rig)
+    rig.until(lambda: rig.drives[2].homing.attained)
+    assert isinstance(rig.command("stop"), Confirmed)
+    assert rig.mode is Mode.HOLDING
+    assert rig.control.homed
+    settled(rig)
+    assert isinstance(rig.goal("g1", 0.02, 0.01, 0.1), Accepted)
+
+
+@pytest.mark.parametrize("when", WHEN)
+@pytest.mark.parametrize("cause", ["quick_stop", "emergency", "silent"])
+def test_a_fault_stops_it_at_once_and_it_can_begin_again(rig: Rig, cause: str, when: int) -> None:
+    rig.enable()
+    begin(rig, when)
+    if cause == "quick_stop":
+        rig.cycle(CommandRequest(7, "ann", "quick_stop"))
+    elif cause == "emergency":
+        rig.drives[1].fail(0x4310)
+    else:
+        rig.drives[2].silent = True
+    rig.until(lambda: rig.mode is Mode.FAULT, 4)
+    words = {m.arbitration_id - frames.RPDO1 for m in rig.sent if m.data[:2] == b"\x02\x00"}
+    assert words == {1, 2, 3}
+    assert not any(m.arbitration_id & 0x780 == frames.RPDO2 for m in rig.sent)
+    rig.cycles(400)  # one that does not hear has stopped by its own watch on SYNC
+    rig.drives[2].silent = False
+    rig.cycles(150)  # it tells its state from time to time
+    assert not any(drive.state is PowerState.OPERATION_ENABLED for drive in rig.drives)
+    assert not any(drive.servo.velocity for drive in rig.drives)
+    assert isinstance(rig.command("reset"), Confirmed)
+    rig.enable()
+    settled(rig)
+    assert isinstance(rig.command("home"), Confirmed)
+    assert rig.control.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+
+
+def test_no_drive_gets_power_in_homing_mode(rig: Rig) -> None:
+    rig.enable()
+    begin(rig, 100)
+    rig.command("quick_stop")
+    rig.command("reset")
+    assert modes(rig) == [6, 8, 8]
+    rig.drives[0].objects.on_write(0x6060, lambda entry, old: None)  # takes no mode any more
+    answer = refusal(rig.command("enable"))
+    assert "drive A: homing: object 6061:00 (Modes of operation display): wanted 8, found 6" in answer.message
+    assert all(drive.state is PowerState.SWITCH_ON_DISABLED for drive in rig.drives)
+
+
+def test_a_missing_switch_is_named() -> None:
+    rig = Rig(incremental(timeout=1.0))
+    rig.enable()
+    rig.drives[1].homing.switch = None
+    answer = refusal(rig.command("home"))
+    assert "drive B: homing: home was not attained within 1 s" in answer.message
+    assert rig.mode is Mode.FAULT
+    rig.bus.shutdown()
+
+
+def test_a_homing_error_is_named(rig: Rig) -> None:
+    rig.enable()
+    begin(rig, 100)
+    rig.drives[0].homing.failed = True
+    rig.drives[0].homing.interrupt()
+    rig.until(lambda: rig.mode is Mode.FAULT, 50)
+    assert "drive A: homing: the drive reports a homing error (statusword" in (rig.control.fault or "")
+
+
+def test_a_slider_that_is_pushed_stops_it(rig: Rig) -> None:
+    rig.enable()
+    begin(rig, 100)
+    rig.drives[2].servo.position += 0.0045 * 1e7
+    rig.until(lambda: rig.mode is Mode.FAULT, 3)
+    assert "slider C: following error" in (rig.control.fault or "")
+
+
+def test_homes_outside_the_limits_are_said() -> None:
+    outside = inverse(geometry(CONFIG.geometry), np.array([0.2, 0.0, 0.0])).position.tolist()
+    rig = Rig(changed(incremental(homes=outside), start=[value + 0.002 for value in outside]))
+    rig.enable()
+    begin(rig)
+    rig.until(lambda: rig.mode is Mode.FAULT)
+    assert "all drives are homed, but the robot stands outside its limits" in (rig.control.fault or "")
+    rig.bus.shutdown()
+
+
+# ---------------------------------------------------------------------- what is refused
+
+
+def test_absolute_encoders_need_none() -> None:
+    rig = Rig()
+    for mode in (Mode.DISABLED, Mode.HOLDING):
+        if mode is Mode.HOLDING:
+            rig.enable()
+        answer = refusal(rig.command("home"))
+        assert (answer.code, answer.message) == ("nothing_to_home", "absolute encoders: there is nothing to home")
+    rig.bus.shutdown()
+
+
+def test_goals_and_homing_in_the_wrong_mode(rig: Rig) -> None:
+    assert refusal(rig.command("home")).code == "not_enabled"
+    rig.enable()
+    assert refusal(rig.goal("g1", 0.0, 0.0, 0.1)).code == "not_homed"
+    begin(rig)
+    assert refusal(rig.goal("g2", 0.0, 0.0, 0.1)).code == "homing"
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    rig.goal("g3", 0.05, 0.0, 0.0)
+    assert refusal(rig.command("home")).code == "moving"
+    assert rig.outcomes()[:2] == [("g1", "rejected"), ("g2", "rejected")]
+
+
+def test_a_robot_that_does_not_know_where_it_is_holds(rig: Rig) -> None:
+    """Its counts may belong to no pose at all."""
+    rig.enable()
+    rig.cycles(500)
+    assert rig.mode is Mode.HOLDING
+    settled(rig)
+    assert np.max(np.ptp(rig.setpoints()[:, 0], axis=0)) < 1e-12
+
+
+# ---------------------------------------------------------------------- by a master that this project did not write
+
+
+class Shared(SimulatedBus):
+    """The simulated bus for a master with a thread of its own."""
+
+    def __init__(self, drives: list[SimulatedDrive]) -> None:
+        self._lock = threading.Lock()
+        super().__init__(drives)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        with self._lock:
+            super().send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        end = time.monotonic() + (timeout or 0.0)
+        while True:
+            with self._lock:
+                message = super().recv(0.0)
+            if message is not None or time.monotonic() >= end:
+                return message
+            time.sleep(0.0005)
+
+
+@pytest.mark.parametrize("method", [19, 37])
+def test_a_stock_canopen_master_homes_the_simulated_drive(method: int) -> None:
+    servo = Servo(0, time_constant=0.0, max_velocity=1e6, max_acceleration=1e8)
+    drive = SimulatedDrive(5, servo, home_switch=2000)
+    network = canopen.Network(Shared([drive]))
+    network.connect()
+    try:
+        node = BaseNode402(5, str(SERVO))  # type: ignore[no-untyped-call]
+        network.add_node(node)
+        node.sdo[0x6098].raw = method
+        node.sdo[0x6099][1].raw = 50_000
+        node.sdo[0x6099][2].raw = 10_000
+        node.sdo[0x609A].raw = 2_000_000
+        node.state = "SWITCH ON DISABLED"
+        assert node.homing(timeout=20)  # type: ignore[no-untyped-call]
+        assert node.sdo[0x6041].raw & 0x3400 == 0x1400
+        assert node.op_mode == "HOMING"
+        assert node.sdo[0x6064].raw <= 0  # behind the edge; how far is up to how often the machine lets it move
+        node.state = "SWITCH ON DISABLED"
+    finally:
+        network.disconnect()
