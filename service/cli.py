@@ -293,6 +293,35 @@ def events(*, service: Service = HERE) -> int:
     return 0
 
 
+@app.command
+def view(
+    file: Path | None = None,
+    /,
+    *,
+    web: Annotated[bool, Flag] = False,
+    records: Annotated[bool, Flag] = False,
+    service: Service = HERE,
+) -> int:
+    """Open the Rerun viewer on the robot as it moves, or on a recording, until it is closed or Ctrl-C.
+
+    Parameters
+    ----------
+    file
+        Recording to open, instead of the live view.
+    web
+        Show it in a browser on this machine, instead of in a window of its own.
+    records
+        Draw it here, from the records that the service publishes; so it is done anyway where --connect names
+        another machine.
+    """
+    from service import view as viewer
+
+    def say(content: dict[str, str], words: str) -> None:
+        _print(service, content, words)
+
+    return viewer.run(file, service.robot, service.connect, web=web, records=records, say=say)
+
+
 app.command(offline.ik)
 app.command(offline.fk)
 app.command(offline.workspace)

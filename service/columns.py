@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,21 +29,29 @@ class Timelines:
         self._rate_hz = rate_hz
         self._wall_offset_ns = wall_offset_ns
 
-    def of(self, records: NDArray[np.void]) -> list[rr.TimeColumn]:
+    def of(self, records: NDArray[np.void]) -> dict[str, pa.Array]:
         """Return the times of records. Steps of `t` are exact if the period is a whole number of nanoseconds."""
         t = records["cycle"] * SECOND // self._rate_hz
-        return _times(t, records["deadline_ns"] + self._wall_offset_ns)
+        return times(t, records["deadline_ns"] + self._wall_offset_ns)
 
 
-def moment(t: float, wall: float) -> list[rr.TimeColumn]:
+def moment(t: float, wall: float) -> dict[str, pa.Array]:
     """Return one nominal time [s] and wall clock [s since 1970]."""
-    return _times(np.array([round(t * SECOND)]), np.array([round(wall * SECOND)]))
+    return times(np.array([round(t * SECOND)]), np.array([round(wall * SECOND)]))
 
 
-def chunks(times: list[rr.TimeColumn], columns: Iterable[Column]) -> list[Chunk]:
+def times(t: NDArray[np.int64], wall: NDArray[np.int64]) -> dict[str, pa.Array]:
+    """Return both times [ns] by the names of their timelines."""
+    return {
+        "t": pa.array(t.astype("timedelta64[ns]")),
+        "wall": pa.array(wall.astype("datetime64[ns]")),
+    }
+
+
+def chunks(times: dict[str, pa.Array], columns: Iterable[Column]) -> list[Chunk]:
     """Return columns that share their times as chunks: one for each entity."""
-    arrays = [time.as_arrow_array() for time in times]
-    fields = [pa.field(time.timeline_name(), array.type) for time, array in zip(times, arrays, strict=True)]
+    arrays = list(times.values())
+    fields = [pa.field(name, array.type) for name, array in times.items()]
     for path, kind, values in columns:
         metadata = {"rerun:entity_path": path, "rerun:component": kind.component}
         if kind.archetype and kind.component_type:
@@ -51,7 +59,7 @@ def chunks(times: list[rr.TimeColumn], columns: Iterable[Column]) -> list[Chunk]
         arrays.append(values)
         fields.append(pa.field(f"{path}:{kind.component}", values.type, metadata=metadata))
     batch = pa.record_batch(arrays, schema=pa.schema(fields))
-    return Chunk.from_record_batch(batch, index=[time.timeline_name() for time in times])
+    return Chunk.from_record_batch(batch, index=list(times))
 
 
 def scalars(values: NDArray[np.float64]) -> pa.ListArray:
@@ -65,10 +73,17 @@ def vectors(values: NDArray[np.float64]) -> pa.ListArray:
 
 
 def strips(values: NDArray[np.float64]) -> pa.ListArray:
-    """Return (N, k, d) as N rows of one line each, through k points in single precision."""
+    """Return (N, m, k, d) as N rows of m lines, each through k points in single precision."""
     points = _vectors(values)
-    kind = pa.list_(pa.field("item", points.type, nullable=False))
-    return _lists(_lists(points, values.shape[1]).cast(kind), 1)
+    return _lists(_lines(points, np.arange(0, len(points) + 1, values.shape[2])), values.shape[1])
+
+
+def ragged(rows: Sequence[Sequence[NDArray[np.float64]]]) -> pa.ListArray:
+    """Return rows of so many lines, each through so many points, (k, 2), in single precision."""
+    lines = [line for row in rows for line in row]
+    points = _vectors(np.concatenate([np.empty((0, 2)), *lines]))
+    ends = np.cumsum([0, *map(len, rows)], dtype=np.int32)
+    return pa.ListArray.from_arrays(ends, _lines(points, np.cumsum([0, *map(len, lines)])))
 
 
 def structs(records: NDArray[np.void]) -> pa.ListArray:
@@ -81,16 +96,14 @@ def structs(records: NDArray[np.void]) -> pa.ListArray:
     return _lists(pa.StructArray.from_arrays(fields, names), 1)
 
 
-def _times(t: NDArray[np.int64], wall: NDArray[np.int64]) -> list[rr.TimeColumn]:
-    return [
-        rr.TimeColumn("t", duration=t.astype("timedelta64[ns]")),
-        rr.TimeColumn("wall", timestamp=wall.astype("datetime64[ns]")),
-    ]
-
-
 def _vectors(values: NDArray[np.float64]) -> pa.FixedSizeListArray:
     kind = pa.list_(pa.field("item", pa.float32(), nullable=False), values.shape[-1])
     return pa.FixedSizeListArray.from_arrays(pa.array(_flat(values.astype(np.float32))), type=kind)
+
+
+def _lines(points: pa.Array, ends: NDArray[np.integer]) -> pa.ListArray:
+    kind = pa.list_(pa.field("item", points.type, nullable=False))
+    return pa.ListArray.from_arrays(ends.astype(np.int32), points, type=kind)
 
 
 def _lists(items: pa.Array, length: int) -> pa.ListArray:

@@ -220,6 +220,15 @@ class Control:
         *stops, run = course.runs
         return run.progress, run.remaining + sum(stop.ends - stop.time for stop in stops)
 
+    @property
+    def target(self) -> Triple | None:
+        """The pose that the running goal leads to; None without one, and for a jog."""
+        last = self._course.last
+        if self.desk.goal is None or self.desk.goal.is_jog or last is None:
+            return None
+        x, y, phi = last.destination(self.commanded.pose)
+        return (x, y, phi)
+
     def trip(self, reason: str) -> None:
         """Stop all three drives in this cycle and latch the reason."""
         if self.state.mode is Mode.FAULT:

@@ -25,6 +25,12 @@ class Course:
         return self._turn is not None
 
     @property
+    def last(self) -> Run | None:
+        """The run at whose end the robot stands, as far as is decided."""
+        runs = self._later or self.runs
+        return runs[-1] if runs else None
+
+    @property
     def remaining(self) -> float:
         """Time until it stands [s]."""
         if self._turn is not None:

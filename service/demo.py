@@ -74,7 +74,7 @@ def run(*, stay: bool, record: Path | None) -> int:
             state = robot.state()
             if stay and all(row.result.outcome == "done" for row in rows):
                 _report(rows, state, recording)
-                _stay(config.telemetry.live_port)
+                _stay()
             robot.disable()
         code = spawned.end(service)
     if not stay:
@@ -93,10 +93,10 @@ def _tour(robot: Robot) -> Iterator[_Row]:
     )
     with Progress(*columns, console=out) as progress:
         task = progress.add_task("the tour", total=len(TOUR), note="")
-        for leg in TOUR:
+        for number, leg in enumerate(TOUR, 1):
             began = time.monotonic()
             try:
-                goal = robot.move_to(x=leg.x, y=leg.y, phi=leg.phi, speed=leg.speed)
+                goal = robot.move_to(x=leg.x, y=leg.y, phi=leg.phi, speed=leg.speed, id=f"tour-{number}")
             except RefusedError as error:
                 result = Result("", "rejected", str(error))
             else:
@@ -130,13 +130,13 @@ def _report(rows: list[_Row], state: State, recording: Path) -> None:
     for lack in loop.lacking:
         out.print(f"[bold yellow]without[/]          {escape(lack)}", soft_wrap=True)
     out.print(f"[bold]recording[/]        {recording}", soft_wrap=True)
-    out.print(f"[bold]look at it[/]       .venv/bin/rerun {recording}", soft_wrap=True)
+    out.print(f"[bold]look at it[/]       .venv/bin/trirail view {recording}", soft_wrap=True)
 
 
-def _stay(live_port: int) -> None:
+def _stay() -> None:
     out.print()
     out.print("The service stays up, enabled. In another terminal: trirail goto 0.03 0.02 0.2 --wait")
-    out.print(f"Live view: .venv/bin/rerun --connect rerun+http://127.0.0.1:{live_port}/proxy", soft_wrap=True)
+    out.print("Live view: trirail view, or in the browser: trirail view --web")
     out.print("Ctrl-C ends it.")
     with contextlib.suppress(KeyboardInterrupt):
         signal.pause()

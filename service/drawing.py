@@ -56,6 +56,21 @@ def still(parts: Mechanism) -> Iterator[tuple[str, rr.AsComponents]]:
     yield "/robot/commanded/outline", _lines(parts.outline, [palette.COMMANDED], 4.5, order=20)
     yield "/robot/platform/arms", _lines(parts.arms, [palette.ARMS], 0.8, order=21)
     yield "/robot/platform/outline", _lines(parts.outline, [palette.PLATFORM], 2.2, order=22)
+    yield "/robot/platform/stops", _lines(parts.edge_stops, [palette.LIMIT], 1.2, order=23)
+    yield (
+        "/robot/workspace",
+        rr.LineStrips2D.from_fields(colors=[palette.WORKSPACE], radii=rr.Radius.ui_points(0.8), draw_order=15),
+    )
+    yield (
+        "/robot/goal",
+        rr.LineStrips2D.from_fields(colors=[palette.GOAL], radii=rr.Radius.ui_points(1.0), draw_order=24),
+    )
+    yield (  # in which the platform's edges slide
+        "/robot/passive",
+        rr.LineStrips2D.from_fields(
+            colors=[palette.dark(c) for c in palette.SLIDERS], radii=rr.Radius.ui_points(5.5), draw_order=25
+        ),
+    )
     yield (
         "/robot/trace",
         rr.LineStrips2D.from_fields(colors=[palette.CENTRE], radii=rr.Radius.ui_points(1.2), draw_order=30),
@@ -74,16 +89,26 @@ def still(parts: Mechanism) -> Iterator[tuple[str, rr.AsComponents]]:
     )
 
 
-def moving(geometry: Geometry, before: NDArray[np.void], records: NDArray[np.void]) -> list[Column]:
+def moving(geometry: Geometry, parts: Mechanism, before: NDArray[np.void], records: NDArray[np.void]) -> list[Column]:
     """Return where the moving parts are in `records`, (N,), and the trace of the centre there from `before`."""
     sliders = mechanism.sliders(geometry, records["position"])
-    steps = np.stack([before["pose"][:, :2], records["pose"][:, :2]], axis=1)
+    sleeves = mechanism.sleeves(geometry, sliders, records["pose"][:, 2], parts.sleeve)
+    steps = np.stack([before["pose"][:, :2], records["pose"][:, :2]], axis=1)[:, None]
     return [
         *_placed("/robot/platform", records["pose"]),
         *_placed("/robot/commanded", records["commanded_pose"]),
         Column("/robot/sliders", POSITIONS, columns.vectors(np.concatenate([sliders, sliders], axis=1))),
+        Column("/robot/passive", STRIPS, columns.strips(sleeves)),
         Column("/robot/trace", STRIPS, columns.strips(steps)),
     ]
+
+
+def goal(parts: Mechanism, pose: Sequence[float] | None) -> Column:
+    """Return the platform where the goal leads it, with a cross at its centre; nothing without a goal."""
+    if pose is None:
+        return Column("/robot/goal", STRIPS, columns.ragged([[]]))
+    cross = [axis * ORIGIN * np.ptp(parts.bounds) for axis in _CROSS]
+    return Column("/robot/goal", STRIPS, columns.ragged([mechanism.placed([*parts.outline, *cross], pose)]))
 
 
 def _lines(lines: list[Points], colours: Sequence[Colour], radius: float, *, order: float) -> rr.LineStrips2D:

@@ -200,10 +200,12 @@ class Loop:
             self._kept.append(packet)
             self._recorder.send(packet)
         desk.happenings.clear()
-        situation = message(Situation(desk.goal.id if desk.goal else None, control.override, control.fault))
+        goal_id = desk.goal.id if desk.goal else None
+        situation = message(Situation(goal_id, control.override, control.fault, control.target))
         if situation != self._situation:
             self._situation = situation
             self._gateway.send(situation)
+            self._recorder.send(situation)
         self._send_events()
         for answer in desk.answers:
             self._gateway.send(message(answer))

@@ -6,6 +6,7 @@ Fixed parts are in the base frame. Those of the platform are in its own frame, w
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,8 @@ from service.geometry import PARALLEL, Geometry, Leg
 Points = NDArray[np.float64]
 STOP = 0.022
 """Length of an end stop's mark, as a share of the longest rail."""
+SLEEVE = 0.035
+"""Half the length of the sleeve in which an edge of the platform slides, likewise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,10 +35,14 @@ class Mechanism:
     """Marks across both ends of each travel."""
     outline: list[Points]
     """The platform's edges: one closed triangle, or three separate edges if two of them are parallel."""
+    edge_stops: list[Points]
+    """Marks across both ends of the passive joints' travel along the edges."""
     arms: list[Points]
     """From the platform's centre to its corners."""
     names: Points
     """(3, 2): beside the middle of each rail, outside."""
+    sleeve: float
+    """Half the length of a passive joint's sleeve [m]."""
     bounds: Points
     """(2, 2): lowest and highest x and y of everything at the pose (0, 0, 0)."""
 
@@ -59,8 +66,10 @@ class Mechanism:
             travel=[_on_rail(leg, low, high) for leg in legs],
             stops=[_across(leg, position, STOP * longest) for leg in legs for position in (low, high)],
             outline=outline,
+            edge_stops=[_across_edge(leg, at, STOP * longest) for leg in legs for at in limits.passive],
             arms=[np.array([np.zeros(2), end]) for end in ends],
             names=middles + 0.07 * longest * np.array(away),
+            sleeve=SLEEVE * longest,
             bounds=np.array([everything.min(axis=0), everything.max(axis=0)]),
         )
 
@@ -71,6 +80,20 @@ def sliders(geometry: Geometry, position: Points) -> Points:
     for k, leg in enumerate(geometry.legs):
         at[:, k] = np.array(leg.anchor) + np.outer(leg.home + position[:, k], _u(leg.rail_angle))
     return at
+
+
+def sleeves(geometry: Geometry, centres: Points, phi: Points, half: float) -> Points:
+    """Return the sleeves of the passive joints as lines, (N, 3, 2, 2), around sliders (N, 3, 2) for angles (N,)."""
+    angles = phi[:, None] + [leg.edge_angle for leg in geometry.legs]
+    along = half * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    return np.stack([centres - along, centres + along], axis=2)
+
+
+def placed(lines: list[Points], pose: Sequence[float]) -> list[Points]:
+    """Return lines of the platform's frame in the base frame, for the platform at a pose."""
+    x, y, phi = pose
+    c, s = math.cos(phi), math.sin(phi)
+    return [line @ np.array([[c, s], [-s, c]]) + [x, y] for line in lines]
 
 
 def _on_rail(leg: Leg, *positions: float) -> Points:
@@ -84,6 +107,12 @@ def _on_edge(leg: Leg, *positions: float) -> Points:
 def _across(leg: Leg, position: float, length: float) -> Points:
     across = length / 2.0 * _u(leg.rail_angle + math.pi / 2.0)
     (middle,) = _on_rail(leg, position)
+    return np.array([middle - across, middle + across])
+
+
+def _across_edge(leg: Leg, position: float, length: float) -> Points:
+    across = length / 2.0 * _u(leg.edge_angle + math.pi / 2.0)
+    (middle,) = _on_edge(leg, position)
     return np.array([middle - across, middle + across])
 
 

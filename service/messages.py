@@ -214,6 +214,8 @@ class GoalState(Struct, frozen=True):
     id: str
     progress: float
     remaining: float
+    target: Triple | None = None
+    """The pose that it leads to; None for a jog."""
 
 
 class Percentiles(Struct, frozen=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 from ruckig import Trajectory
 
 from service.algebra import Array
-from service.paths import FOR_EVER, Path, advance, reached, value
+from service.paths import FOR_EVER, Path, advance, constant, reached, value
 
 STILL = (0.0, 0.0, 0.0)
 SAME_TIME = 1e-9
@@ -108,6 +109,13 @@ class Run:
         """Share that is over of the time of the goal under way."""
         end = self.seams[0].s if self.seams else self.path.duration
         return max(0.0, min(1.0, (self.at.s - self._begun) / (end - self._begun))) if end > self._begun else 1.0
+
+    def destination(self, near: Sequence[float]) -> Sequence[float]:
+        """Return the pose at the end of the path, on the branch of the pose `near`."""
+        self._near[:] = near
+        duration = self.path.duration
+        code = advance(self._legs, *self.path, *constant(1.0)[:2], duration, self._near, self._out)
+        return [math.nan] * 3 if code else self._out[0].tolist()
 
     def copy(self) -> Run:
         """Return the same motion, to be changed by itself."""

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct, msgpack
 
-from service.messages import Event, Goal
+from service.messages import Event, Goal, Triple
 
 
 class Kind(IntEnum):
@@ -100,6 +100,8 @@ class Situation(Struct, frozen=True, tag=True):
     goal: str | None
     override: float
     fault: Annotated[str, Meta(max_length=512)] | None
+    target: Triple | None = None
+    """The pose that the goal leads to; None for a jog."""
 
 
 Request = GoalRequest | CommandRequest | RefusedRequest

@@ -14,6 +14,8 @@ PLATFORM: Colour = (236, 238, 242)
 COMMANDED: Colour = (250, 176, 64, 90)
 PIN: Colour = (20, 21, 24)
 CENTRE: Colour = (76, 208, 224)
+GOAL: Colour = (118, 226, 140, 170)
+WORKSPACE: Colour = (120, 132, 168, 150)
 FRAME: Colour = (74, 80, 92)
 ANCHORS: Colour = (122, 130, 144)
 ARMS: Colour = (92, 98, 110)
@@ -22,8 +24,11 @@ X: Colour = CENTRE
 Y: Colour = (166, 126, 255)
 PHI: Colour = (250, 176, 64)
 
+SINGULARITY: Colour = (232, 110, 190)
+
 LATENESS: Colour = (140, 210, 120)
 CYCLE: Colour = (150, 160, 176)
+BUS: Colour = (92, 132, 186)
 BUDGET: Colour = (226, 82, 82)
 LIMIT: Colour = (196, 148, 64)
 

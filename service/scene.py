@@ -7,8 +7,7 @@ error, lateness and cycle time show their worst, the rest their newest value.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -16,43 +15,37 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from service import columns, config, drawing, palette
+from service import columns, curves, drawing, palette
 from service.columns import Column
-from service.config import Config
-from service.geometry import LEGS
 from service.mechanism import Mechanism
 from service.messages import Level
 from service.modes import MODES
-from service.palette import Colour
+from service.outlook import Outlook
+from service.subject import Subject
 
 DRAWN_HZ = 100
 """Samples a second of what is drawn."""
+OUTLINES_HZ = 10
+"""Outlines of the workspace a second, at most."""
 
 FIELDS = rr.ComponentDescriptor("fields")
 SCALARS = rr.Scalars.descriptor_scalars()
+TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
 STATE = rr.StateChange.descriptor_state()
 LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
 
-class Lines(NamedTuple):
-    """The lines of one plot: what moves, then the constant limits."""
-
-    names: tuple[str, ...]
-    colours: tuple[Colour, ...]
-    limits: tuple[float, ...] = ()
-    limit_names: tuple[str, ...] = ("min", "max")
-    limit_colour: Colour = palette.LIMIT
-
-
 class Scene:
-    """A configured robot as Rerun is to show it."""
+    """A robot as Rerun is to show it. `wall_offset_ns` is the wall clock less the monotonic one."""
 
-    def __init__(self, settings: Config, wall_offset_ns: int) -> None:
-        self._rate_hz = settings.loop.rate_hz
+    def __init__(self, subject: Subject, wall_offset_ns: int) -> None:
+        self._rate_hz = subject.rate_hz
+        self._wall_offset_ns = wall_offset_ns
         self._timelines = columns.Timelines(self._rate_hz, wall_offset_ns)
-        self._geometry = config.geometry(settings.geometry)
-        self._parts = Mechanism.of(self._geometry, settings.limits.slider)
-        self._plots = _plots(settings)
+        self._geometry = subject.geometry
+        self._parts = Mechanism.of(subject.geometry, subject.limits.slider)
+        self._outlook = Outlook(subject.geometry, subject.limits)
+        self._plots = curves.plots(subject)
         self.bounds = self._parts.bounds
         """Where the robot lies, (2, 2): lowest and highest x and y [m]."""
 
@@ -60,15 +53,7 @@ class Scene:
         """Yield what is logged once, as static: entity path and archetype."""
         yield from drawing.still(self._parts)
         for path, lines in self._plots.items():
-            moving, still = len(lines.names), len(lines.limits)
-            yield (
-                path,
-                rr.SeriesLines(
-                    names=[*lines.names, *lines.limit_names[:still]],
-                    colors=[*lines.colours, *[lines.limit_colour] * still],
-                    widths=[1.5] * moving + [1.0] * still,
-                ),
-            )
+            yield path, _series(lines)
         yield (
             "/mode",
             rr.StateConfiguration(
@@ -78,6 +63,11 @@ class Scene:
             ),
         )
 
+    def bus_load(self, share: float) -> Iterator[tuple[str, rr.AsComponents]]:
+        """Take the bus load in, 1 for a full bus; yield what is logged as static from then on."""
+        self._plots[curves.TIMING] = lines = curves.timing(self._rate_hz, share)
+        yield curves.TIMING, _series(lines)
+
     def complete(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return records as they are."""
         return columns.chunks(self._timelines.of(records), [Column("/record", FIELDS, columns.structs(records))])
@@ -86,22 +76,41 @@ class Scene:
         """Return records as people see them: one at least, in order."""
         starts, ends = _groups(records["cycle"], self._rate_hz // DRAWN_HZ)
         newest = records[ends]
-        parts = drawing.moving(self._geometry, records[starts], newest)
-        for path, values in _curves(records, newest, starts).items():
-            parts.append(Column(path, SCALARS, columns.scalars(_beside(values, self._plots[path].limits))))
-        return columns.chunks(self._timelines.of(newest), parts) + self._modes(records)
+        parts = drawing.moving(self._geometry, self._parts, records[starts], newest)
+        distance = self._outlook.distance(newest["pose"])
+        for path, values in curves.values(records, newest, starts, distance).items():
+            table = curves.with_limits(values, self._plots[path])
+            parts.append(Column(path, SCALARS, columns.scalars(table)))
+        chunks = columns.chunks(self._timelines.of(newest), parts)
+        return chunks + self._situation(records)
 
-    def _modes(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return the mode at the first record and wherever it changes."""
-        entered = records[np.diff(records["mode"], prepend=len(MODES)) != 0]
-        modes = pa.array([[MODES[mode]] for mode in entered["mode"]])
-        return columns.chunks(self._timelines.of(entered), [Column("/mode", STATE, modes)])
+    def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
+        """Return the pose that the goal leads to from the time of `record` on; None for no goal."""
+        return columns.chunks(self._timelines.of(record.reshape(1)), [drawing.goal(self._parts, pose)])
+
+    def remark(self, record: np.void, level: Level, message: str) -> Chunk:
+        """Return a line of the log at the time of `record`."""
+        wall_ns = int(record["deadline_ns"]) + self._wall_offset_ns
+        return remark(float(record["cycle"]) / self._rate_hz, wall_ns * 1e-9, level, message)
+
+    def _situation(self, records: NDArray[np.void]) -> list[Chunk]:
+        """Return mode and outline of the workspace at the first record, where the mode changes, and as φ changes."""
+        changed = np.diff(records["mode"], prepend=len(MODES)) != 0
+        some = np.arange(0, len(records), max(1, self._rate_hz // OUTLINES_HZ))
+        steps = self._outlook.steps(records["pose"][some, 2])
+        changed[some] |= np.diff(steps, prepend=steps[0]) != 0
+        at = records[changed]
+        modes = pa.array([[MODES[mode]] for mode in at["mode"]])
+        outlines = columns.ragged([[self._outlook.outline(step)] for step in self._outlook.steps(at["pose"][:, 2])])
+        parts = [Column("/mode", STATE, modes), Column("/robot/workspace", drawing.STRIPS, outlines)]
+        return columns.chunks(self._timelines.of(at), parts)
 
 
 def remark(t: float, wall: float, level: Level, message: str) -> Chunk:
     """Return a line of the log at nominal time `t` [s] and wall clock `wall` [s since 1970]."""
-    line = rr.TextLog.columns(text=[message], level=[LEVELS[level]])
-    return Chunk.from_columns("/events", columns.moment(t, wall), line)
+    line = [Column("/events", TEXT, pa.array([[message]])), Column("/events", LEVEL, pa.array([[LEVELS[level]]]))]
+    (chunk,) = columns.chunks(columns.moment(t, wall), line)
+    return chunk
 
 
 def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -110,53 +119,10 @@ def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDA
     return np.concatenate([[0], changes]), np.concatenate([changes, [len(cycles)]]) - 1
 
 
-def _curves(
-    records: NDArray[np.void], newest: NDArray[np.void], starts: NDArray[np.intp]
-) -> dict[str, NDArray[np.float64]]:
-    """Return the values of curves, (N, lines), for N groups of records that begin at `starts`."""
-    error = records["following_error"]
-    highest, lowest = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
-    timing = np.stack([records["parts_ns"].sum(axis=1), records["lateness_ns"]], axis=1)
-    return {
-        "/sliders/position": newest["position"] * 1e3,  # [mm]
-        "/sliders/velocity": newest["velocity"] * 1e3,  # [mm/s]
-        "/sliders/acceleration": newest["commanded_acceleration"],  # [m/s²]
-        "/sliders/following_error": np.where(highest > -lowest, highest, lowest) * 1e6,  # [µm]
-        "/pose/centre": newest["pose"][:, :2] * 1e3,  # [mm]
-        "/pose/phi": np.degrees(newest["pose"][:, 2:]),  # [°]
-        "/loop/timing": np.maximum.reduceat(timing, starts) * 1e-3,  # [µs]
-    }
-
-
-def _beside(values: NDArray[np.float64], constants: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return values (N, k) with columns of constants to their right."""
-    rows, lines = values.shape
-    table = np.empty((rows, lines + len(constants)))
-    table[:, :lines] = values
-    table[:, lines:] = constants
-    return table
-
-
-def _plots(settings: Config) -> dict[str, Lines]:
-    """Return what is plotted, by entity, in the units of the curves."""
-    slider = settings.limits.slider
-    budget = Lines(
-        ("cycle", "lateness"),
-        (palette.CYCLE, palette.LATENESS),
-        (settings.period * 1e6,),
-        ("budget",),
-        palette.BUDGET,
+def _series(lines: curves.Lines) -> rr.SeriesLines:
+    moving, still = len(lines.moving), len(lines.still)
+    return rr.SeriesLines(
+        names=[*(line.name for line in lines.moving), *(limit.name for limit in lines.still)],
+        colors=[*(line.colour for line in lines.moving), *(limit.colour for limit in lines.still)],
+        widths=[1.5] * moving + [1.0] * still,
     )
-    return {
-        "/sliders/position": _sliders(*(limit * 1e3 for limit in slider.position)),
-        "/sliders/velocity": _sliders(-slider.velocity * 1e3, slider.velocity * 1e3),
-        "/sliders/acceleration": _sliders(-slider.acceleration, slider.acceleration),
-        "/sliders/following_error": _sliders(),
-        "/pose/centre": Lines(("x", "y"), (palette.X, palette.Y)),
-        "/pose/phi": Lines(("φ",), (palette.PHI,)),
-        "/loop/timing": budget,
-    }
-
-
-def _sliders(*limits: float) -> Lines:
-    return Lines(tuple(LEGS), palette.SLIDERS, limits)

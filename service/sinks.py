@@ -109,6 +109,14 @@ class Relay:
             return self._waiting.popleft() if self._waiting else None
 
 
+def free_port() -> int:
+    """Return a port of the loopback that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
 def live_server(port: int) -> rr.GrpcServerSink:
     """Return a server for viewers on this machine. ServiceError if the port is taken."""
     with socket.socket() as probe:  # the sink would only log it, and discard all that it is sent

@@ -89,7 +89,9 @@ class StateMaker:
                 following_error_max=_triple(self._error_max),
                 status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
             ),
-            goal=GoalState(goal, float(row["progress"]), float(row["remaining"])) if goal else None,
+            goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._situation.target)
+            if goal
+            else None,
             override=self._situation.override,
             lease=None,
             faults=(self._situation.fault,) if self._situation.fault else (),

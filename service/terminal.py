@@ -60,7 +60,7 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
     out.print(f"[bold green]up[/]  robot [bold]{config.robot.name}[/] at {config.loop.rate_hz} Hz")
     out.print(f"    goals      {', '.join(config.zenoh.listen)}", soft_wrap=True)
     if recorder["live"]:
-        out.print(f"    live view  rerun --connect {recorder['live']}", soft_wrap=True)
+        out.print(f"    live view  trirail view  ({recorder['live']})", soft_wrap=True)
     out.print(f"    recording  {recorder['recording']}", soft_wrap=True)
     out.print(f"    bus load   {loop['bus_load']:.0%}")
     if loop["bus_load"] > 0.8:

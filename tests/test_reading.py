@@ -23,6 +23,7 @@ from service.reading import read
 from service.recorder import Recorder
 from service.records import DTYPE
 from service.scene import FIELDS, Scene
+from service.subject import Subject
 
 WALL_NS = 1_795_245_300_000_000_000
 BATCH = 40
@@ -95,7 +96,7 @@ def test_texts_that_hold_for_the_whole_session_come_by_entity(tmp_path: Path) ->
     stream.save(path)
     stream.log("config", rr.TextDocument("[robot]\nname = 'x'"), static=True)
     stream.log("passing", rr.TextDocument("not for the whole session"))
-    stream.send_chunks(Scene(load(SIM), 0).complete(made.records(0.1)))
+    stream.send_chunks(Scene(Subject.configured(load(SIM)), 0).complete(made.records(0.1)))
     stream.disconnect()
     recording = read(path)
     assert recording.texts == {"/config": "[robot]\nname = 'x'"}

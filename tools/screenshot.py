@@ -37,7 +37,7 @@ def main() -> int:
         parser.error(f"{arguments.recording} is not a file")
     width, height = (int(number) for number in arguments.size.split("x"))
     port = _free_port()
-    command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen"]
+    command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1"]
     command += ["--window-size", f"{width}x{height + TITLE_BAR}", "--port", str(port), str(arguments.recording)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
