@@ -78,7 +78,6 @@ def test_the_name_is_the_sessions(tmp_path: Path) -> None:
     written(tmp_path / "other.rrd", made.records(0.1))
     recording = read(tmp_path / "other.rrd")
     assert re.fullmatch(r"demo-2026112\d-\d{6}", recording.name)
-    assert recording.texts == {}
 
 
 def test_a_gap_stays_a_gap_and_batches_are_put_in_order(tmp_path: Path) -> None:
