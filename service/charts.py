@@ -1,4 +1,4 @@
-"""A session drawn: modes and goals, sliders, following error and the loop's timing over the same time. Needs matplotlib."""
+"""A session drawn: modes, goals, sliders, following error and the loop's timing over time. Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from service import palette
 from service.modes import MODES
 from service.reading import Recording
 from service.summary import POWERED, GoalSummary, Summary
