@@ -16,13 +16,15 @@ from service.errors import ServiceError
 from service.messages import Event
 from service.packets import Input
 from service.recorder import Recorder
-from service.records import unpack
+from service.records import last_cycle
 from service.shelf import BLACK_BOX
 
 BEFORE = 60.0
 """How much of what came before the fault is kept [s]."""
 AFTER = 2.0
 """How long it is waited for what comes after it [s]."""
+SPARE = 1.0
+"""Kept beyond both, for batches that begin or end in between [s]."""
 
 Fill = Callable[[Recorder], None]
 
@@ -42,9 +44,9 @@ class BlackBox:
 
     def records(self, batch: bytes) -> None:
         """Take packed records; write the file when those after a fault are there."""
-        self._t = float(unpack(batch)[-1]["cycle"]) / self._rate_hz
+        self._t = last_cycle(batch) / self._rate_hz
         self._keep(methodcaller("records", batch))
-        while self._kept and self._kept[0][0] < self._t - BEFORE - AFTER:
+        while self._kept and self._kept[0][0] < self._t - BEFORE - AFTER - SPARE:
             _, lasting, fill = self._kept.popleft()
             if lasting:
                 self._standing[lasting] = fill
@@ -92,4 +94,4 @@ class BlackBox:
             fill(recorder)
         recorder.close()
         if recorder.lost:
-            self._say(f"the last minute before the fault is not whole in {recorder.path}: {recorder.trouble}")
+            self._say(f"the last minute before the fault is not whole in {recorder.path}: {recorder.cause}")

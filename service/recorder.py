@@ -17,7 +17,7 @@ from service.config import Config
 from service.errors import ServiceError
 from service.messages import Event
 from service.packets import Input
-from service.records import unpack
+from service.records import LAYOUT, last_cycle
 from service.show import LIVE_HZ, REPORT_EVERY, Batches, Show
 from service.sinks import RESERVE, Relay, live_relay, live_server
 from service.subject import Subject
@@ -27,6 +27,8 @@ RECORDS_HZ = 10
 """Batches of whole records a second to the file: a killed process loses the newest one."""
 DRAWING_HZ = 1
 """Batches of what is drawn a second to the file: fewer are smaller, and records are enough to draw it again."""
+LOOKS_HZ = 5
+"""How often a second it is looked whether files, folder or log want something."""
 TIDY_EVERY = 10.0
 """How often the folder is looked at [s]."""
 MB = 1e6
@@ -87,6 +89,7 @@ class Recorder:
         self._last: int | None = None
         self._absent = 0
         self._reported = (0, 0, 0)
+        self._next_look = 0
         self._next_report = 0.0
         self._next_tidy = 0.0
         self._untidy = ""
@@ -102,9 +105,9 @@ class Recorder:
         return self._volumes.lost + (self._frames.failures if self._frames else 0)
 
     @property
-    def trouble(self) -> str:
-        """Why the disk does not take the newest batch; empty if it does."""
-        return self._volumes.trouble
+    def cause(self) -> str:
+        """Why the disk did not take the newest of them; empty if none is lost."""
+        return self._volumes.cause
 
     @property
     def skipped(self) -> int:
@@ -113,13 +116,15 @@ class Recorder:
 
     def records(self, batch: bytes) -> None:
         """Take packed records."""
-        cycles = unpack(batch)["cycle"]
+        last = last_cycle(batch)
         if self._last is not None:
-            self._absent += int(cycles[0]) - self._last - 1 + int((np.diff(cycles) - 1).sum())
-        self._last = int(cycles[-1])
+            self._absent += last - self._last - len(batch) // LAYOUT.size
+        self._last = last
+        if last >= self._next_look:
+            self._next_look = last + self._config.loop.rate_hz // LOOKS_HZ
+            self._look_after()
         self._records.add(batch)
         self._show.records(batch)
-        self._look_after()
 
     def event(self, event: Event) -> None:
         """Take an event."""
@@ -170,20 +175,23 @@ class Recorder:
 
     def _look_after(self) -> None:
         """Rotate the file, tidy the folder and say what is missing, where it is time to."""
-        telemetry, t = self._config.telemetry, self._show.t
-        if not self._is_black_box and not self._volumes.trouble and self._is_full(telemetry.rotate_minutes * 60.0):
-            self._flush()
-            self._volumes.turn()
-            self._next_tidy = t
+        t = self._show.t
+        if not self._is_black_box:
+            self._rotate()
         if self._own_folder is not None and t >= self._next_tidy:
             self._next_tidy = t + TIDY_EVERY
-            self._tidy(self._own_folder, telemetry.keep_mb * MB)
+            self._tidy(self._own_folder, self._config.telemetry.keep_mb * MB)
         if t >= self._next_report and (words := self._missing()):
             self._next_report = t + REPORT_EVERY
             self._warn(words)
 
-    def _is_full(self, age: float) -> bool:
-        return self._volumes.age >= age or self._volumes.size >= self._config.telemetry.rotate_mb * MB
+    def _rotate(self) -> None:
+        """Go on in another file where it is time to; not where the disk is full, for that has no room for it."""
+        telemetry, volumes = self._config.telemetry, self._volumes
+        full = volumes.age >= telemetry.rotate_minutes * 60.0 or volumes.size >= telemetry.rotate_mb * MB
+        if full and not volumes.trouble:
+            self._flush()
+            volumes.turn()
 
     def _tidy(self, folder: Path, at_most: float) -> None:
         try:
@@ -200,7 +208,7 @@ class Recorder:
         if missing == self._reported:
             return ""
         self._reported = missing
-        because = f" ({self.trouble})" if self.trouble else ""
+        because = f" ({self.cause})" if self.cause else ""
         return (
             f"missing so far: {self.lost} batches in the file{because}, {self.skipped} in the live view, "
             f"{self._absent} cycles that the recorder was too slow for"

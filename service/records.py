@@ -47,6 +47,11 @@ LAYOUT = struct.Struct("<" + "".join(f"{n}{code}" for _, code, n in FIELDS))
 """The same layout as DTYPE, for packing one record: as many values as the fields have, in their order."""
 
 
+def last_cycle(batch: bytes) -> int:
+    """Return the cycle of the last of packed records."""
+    return int.from_bytes(batch[-LAYOUT.size :][:8], "little")
+
+
 def unpack(batch: bytes | memoryview) -> NDArray[np.void]:
     """View a batch of packed records as an array with the fields of DTYPE, shape (n,)."""
     return np.frombuffer(batch, DTYPE)

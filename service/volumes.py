@@ -24,6 +24,8 @@ class Volumes:
     def __init__(self, path: Path, begin: Open, end: Close, reserve: int, clock: Callable[[], float]) -> None:
         self.path = path
         """The newest file."""
+        self.cause = ""
+        """Why the newest of the lost batches was lost."""
         self._first = path
         self._begin = begin
         self._end = end
@@ -61,6 +63,7 @@ class Volumes:
     def send(self, chunks: list[Chunk]) -> None:
         """Write a batch, or count it as lost. Waits for the disk, but not for long."""
         self._archive.send(chunks)
+        self.cause = self.trouble or self.cause
         if self._archive.stuck and self._clock() >= self._retry:
             self._retry = self._clock() + RETRY
             self.turn()

@@ -26,7 +26,7 @@ from service.scene import FIELDS, Scene
 from service.subject import Subject
 
 WALL_NS = 1_795_245_300_000_000_000
-BATCH = 40
+BATCH = 50
 
 
 def written(path: Path, sent: NDArray[np.void], events: tuple[Event, ...] = (), close: bool = True) -> Recorder:
