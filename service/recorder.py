@@ -23,8 +23,8 @@ from service.sinks import RESERVE, Relay, live_relay, live_server
 from service.subject import Subject
 from service.volumes import Volumes, claim
 
-RECORDS_HZ = 10
-"""Batches of whole records a second to the file: a killed process loses the newest one."""
+RECORDS_HZ = 5
+"""Batches of whole records a second to the file, at least."""
 DRAWING_HZ = 1
 """Batches of what is drawn a second to the file: fewer are smaller, and records are enough to draw it again."""
 LOOKS_HZ = 5
@@ -107,7 +107,8 @@ class Recorder:
     @property
     def cause(self) -> str:
         """Why the disk did not take the newest of them; empty if none is lost."""
-        return self._volumes.cause
+        frames = "the log of CAN frames takes no more" if self._frames and self._frames.failures else ""
+        return self._volumes.cause or frames
 
     @property
     def skipped(self) -> int:
@@ -125,6 +126,10 @@ class Recorder:
             self._look_after()
         self._records.add(batch)
         self._show.records(batch)
+
+    def save(self) -> None:
+        """Write all records that have been taken: they outlive this process."""
+        self._records.flush()
 
     def event(self, event: Event) -> None:
         """Take an event."""

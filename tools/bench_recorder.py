@@ -1,7 +1,7 @@
 """The recorder's price: its share of a processor and of the disk, while a service keeps a robot moving.
 
-The service runs on simulated drives, without a live view: that is to come on top. What is printed is what the recorder's
-process takes, beside the limits that it is to keep, and per cycle of the loop in the same seconds.
+The service runs on simulated drives, without a live view: that is to come on top. What is printed is what the
+recorder's process takes, beside the limits that it is to keep, and per cycle of the loop in the same seconds.
 """
 
 from __future__ import annotations
@@ -99,14 +99,11 @@ def main(seconds: float, json: bool = False) -> None:
     if json:
         print(json_format.dumps(measured))
         return
-    rate, wanted = measured["rate"], measured["rate_to_wanted"]
-    print(f"the loop turned at {rate:.0f} Hz for {measured['seconds']:.0f} s, {wanted:.0%} of what it is to")
-    of_core, of_limit = measured["cpu"], measured["cpu_to_limit"]
+    of = measured.__getitem__
+    print(f"the loop turned at {of('rate'):.0f} Hz for {of('seconds'):.0f} s, {of('rate_to_wanted'):.0%} of its rate")
+    print(f"processor  {of('cpu'):7.2%} of a core, {of('cpu_to_limit'):.2f} of the limit")
+    print(f"           {of('cpu_per_cycle_us'):7.1f} µs a cycle, {of('cpu_to_loop'):.2f} of the loop's")
     print(
-        f"processor  {of_core:7.2%} of a core, {of_limit:.2f} of the limit; {measured['cpu_per_cycle_us']:.1f} µs a cycle"
+        f"disk       {of('bytes_per_second') / 1e6:7.3f} MB/s, at the full rate {of('disk_to_limit'):.2f} of the limit"
     )
-    print(f"           {measured['cpu_to_loop']:7.2f} of what the loop takes")
-    written, share = measured["bytes_per_second"] / 1e6, measured["disk_to_limit"]
-    print(
-        f"disk       {written:7.3f} MB/s, {share:.2f} of the limit at full rate; {measured['bytes_per_cycle']:.0f} B a cycle"
-    )
+    print(f"           {of('bytes_per_cycle'):7.0f} bytes a cycle")
