@@ -62,8 +62,9 @@ def draw(file: Path, recording: Recording, summed: Summary) -> None:
         for incident in summed.faults:
             panel.axvline(incident.t, color=RED, linewidth=1.0, zorder=9)
     for incident in summed.faults:
-        text = f" {incident.message}"
-        position.text(incident.t, 0.97, text, color=RED, fontsize=8, va="top", transform=_over(position), zorder=10)
+        side = "left" if incident.t < (t[0] + t[-1]) / 2.0 else "right"  # where there is room
+        style = {"color": RED, "fontsize": 8, "va": "top", "ha": side, "zorder": 10}
+        position.text(incident.t, 0.97, f" {incident.message} ", transform=position.get_xaxis_transform(), **style)
     panels[-1].set_xlabel("nominal time since the loop's start [s]", color=GREY, fontsize=9)
     panels[-1].set_xlim(t[0], max(t[-1], t[0] + 1e-3))
     figure.savefig(file)
@@ -123,9 +124,7 @@ def _timing(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], budg
         Line2D([], [], color=RED, linestyle=(0, (4, 3)), label="period"),
     ]
     if len(missed):
-        handles.append(
-            Line2D([], [], color=RED, marker="|", linestyle="", label=f"ticks missed at {len(missed)} times")
-        )
+        handles.append(Line2D([], [], color=RED, marker="|", linestyle="", label=f"missed ticks, {len(missed)} times"))
     _legend(panel, handles)
 
 
@@ -155,10 +154,6 @@ def _legend(panel: Axes, handles: list[Line2D]) -> None:
         fontsize=8,
         labelcolor=INK,
     )
-
-
-def _over(panel: Axes) -> object:
-    return panel.get_xaxis_transform()
 
 
 def _quiet(axes: Axes) -> None:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from rich.markup import escape
-from rich.table import Table
 from rich.text import Text
 
 from service import terminal
@@ -150,7 +149,7 @@ def _print_summary(summed: Summary) -> None:
     lines.add("goals", counts or "none")
     lines.show()
     if summed.goals:
-        terminal.out.print(_goals(summed.goals))
+        _print_goals(summed.goals)
     for title, colour, incidents in (("faults", "bold red", summed.faults), ("warnings", "yellow", summed.warnings)):
         if incidents:
             terminal.out.print(f"\n[{colour}]{title}[/]")
@@ -158,18 +157,16 @@ def _print_summary(summed: Summary) -> None:
             terminal.out.print(f"  {incident.t:9.3f} s  {escape(incident.message)}", soft_wrap=True)
 
 
-def _goals(goals: list[GoalSummary]) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2), header_style="bold", title=None)
-    for name, justify in (("given", "right"), ("took", "right"), ("outcome", "left"), ("goal", "left")):
-        table.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
-    table.add_column("")
+def _print_goals(goals: list[GoalSummary]) -> None:
+    """Print a goal on a line, none of them cut where the terminal is narrow."""
+    longest = max(len(goal.id) for goal in goals)
     for goal in goals:
         took = "" if goal.ended is None else f"{goal.ended - goal.given:.3f} s"
         colour = OUTCOMES.get(goal.outcome, "cyan")
-        words = "" if goal.outcome == "done" else escape(goal.message)
-        what = f"{escape(goal.id)}  [dim]{goal.kind} of {escape(goal.user)}[/]"
-        table.add_row(f"  {goal.given:.3f} s", took, f"[{colour}]{goal.outcome}[/]", what, words)
-    return table
+        name = escape(f"{goal.id:{longest}}")
+        words = "" if goal.outcome == "done" else f": {escape(goal.message)}"
+        line = f"  {goal.given:9.3f} s  {took:>9}  [{colour}]{goal.outcome:9}[/]  {name}  {goal.kind} of "
+        terminal.out.print(f"{line}{escape(goal.user)}{words}", soft_wrap=True)
 
 
 class _Lines:

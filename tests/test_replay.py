@@ -58,14 +58,14 @@ def session(folder: Path) -> Path:
     config, locator = spawned.private(folder)
     choice = random.Random(6)
     with spawned.service(config, recording) as service, Robot("demo", locator, user="ann") as robot:
-        for begin in (robot.enable, robot.quick_stop):
+        for then in (robot.stop, robot.quick_stop):
             robot.enable()
             for _ in range(STEPS):
                 with contextlib.suppress(RefusedError):
                     act(robot, choice)
                 for _, _ in zip(range(choice.randrange(12)), robot.states(5.0), strict=False):
                     pass  # some 20 ms for each state
-            begin()
+            then()
         while True:  # the drives take their time to stand
             with contextlib.suppress(RefusedError):
                 robot.reset()
