@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +12,10 @@ from rerun.chunk import Chunk
 
 from service.sinks import Archive
 
-RETRY = 10.0
-"""How often another file is tried where one has failed [s]."""
+SOON, RETRY = 1.0, 10.0
+"""How long after a file has failed another one is tried, and how often from then on [s]."""
+TRIAL = 1 << 19
+"""What a new file must take before it is trusted [bytes]: more than it begins with, whose writing is not watched."""
 
 Open = Callable[[Path], rr.RecordingStream]
 Close = Callable[[rr.RecordingStream], None]
@@ -34,7 +37,7 @@ class Volumes:
         self._number = 1
         self._lost_before = 0
         self._failed: list[tuple[rr.RecordingStream, Archive]] = []  # to destroy them would wait for their disk
-        self._retry = 0.0
+        self._retry: float | None = None
         self._open()
 
     @property
@@ -64,8 +67,13 @@ class Volumes:
         """Write a batch, or count it as lost. Waits for the disk, but not for long."""
         self._archive.send(chunks)
         self.cause = self.trouble or self.cause
-        if self._archive.stuck and self._clock() >= self._retry:
-            self._retry = self._clock() + RETRY
+        now = self._clock()
+        if not self._archive.stuck:
+            self._retry = None
+        elif self._retry is None:
+            self._retry = now + SOON
+        elif now >= self._retry:
+            self._retry = now + RETRY
             self.turn()
 
     def turn(self) -> bool:
@@ -118,6 +126,7 @@ def claim(directory: Path, name: str) -> Path:
 
 def _try(descriptor: int) -> None:
     """See whether what is written to a file gets to the disk: an empty file can be made on one that is full."""
-    os.write(descriptor, bytes(4096))
+    if os.write(descriptor, bytes(TRIAL)) < TRIAL:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     os.fsync(descriptor)
     os.ftruncate(descriptor, 0)
