@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 from cyclopts import App, CycloptsError, Parameter
 
-from service import __version__, offline, terminal
+from service import __version__, offline, sessions, terminal
 from service.errors import TrirailError
 from service.session import DEFAULT_LOCATOR
 
@@ -356,6 +356,8 @@ def view(
 app.command(offline.ik)
 app.command(offline.fk)
 app.command(offline.workspace)
+app.command(sessions.replay)
+app.command(sessions.report)
 
 
 def _command(name: str, service: Service) -> int:

@@ -122,6 +122,12 @@ class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     """Loopback port of the live Rerun server; 0 for none."""
     capture_can: bool = False
     """Write every CAN frame of the session beside the recording, in candump's log format."""
+    rotate_minutes: Positive = 30.0
+    """A recording goes on in another file after so long."""
+    rotate_mb: Annotated[float, Meta(ge=1.0)] = 1000.0
+    """A recording goes on in another file where this one is so large [1e6 bytes]."""
+    keep_mb: Annotated[float, Meta(ge=1.0)] = 20_000.0
+    """How much the recordings in the folder may take together [1e6 bytes]; beyond that the oldest are deleted."""
 
 
 class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):

@@ -257,9 +257,10 @@ class Control:
     @property
     def target(self) -> Triple | None:
         """The pose that the running goal leads to; None without one, and for a jog."""
-        if self.desk.goal is None or self.desk.goal.is_jog or not self._course.runs:
+        last = self._course.last
+        if self.desk.goal is None or self.desk.goal.is_jog or last is None:
             return None
-        x, y, phi = self._course.last.destination(self.commanded.pose)
+        x, y, phi = last.destination(self.commanded.pose)
         return (x, y, phi)
 
     def trip(self, reason: str) -> None:

@@ -25,9 +25,10 @@ class Course:
         return self._turn is not None
 
     @property
-    def last(self) -> Run:
-        """The motion that leads to the goal; there has to be one."""
-        return self._later[-1] if self._later else self.runs[-1]
+    def last(self) -> Run | None:
+        """The run at whose end the robot stands, as far as is decided."""
+        runs = self._later or self.runs
+        return runs[-1] if runs else None
 
     @property
     def remaining(self) -> float:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-import platform
 import select
 import signal
 import time
 import uuid
 from collections import deque
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +36,7 @@ from service.packets import (
     decode_answer,
     message,
 )
+from service.provenance import versions
 from service.records import unpack
 from service.state import StateMaker
 
@@ -339,7 +338,6 @@ def _info(config: Config) -> Info:
     legs: list[dict[str, Any]] = []
     for name, leg in zip("ABC", geometry(config.geometry).legs, strict=True):
         legs.append({"name": name} | {field: getattr(leg, field) for field in leg.__slots__})
-    libraries = ("eclipse-zenoh", "ruckig", "rerun-sdk", "python-can", "canopen", "numpy", "numba")
     return Info(
         robot=config.robot.name,
         version=__version__,
@@ -349,7 +347,7 @@ def _info(config: Config) -> Info:
         state_hz=config.telemetry.state_hz,
         recordings=str(Path(config.telemetry.directory).resolve()),
         live=f"rerun+http://127.0.0.1:{live}/proxy" if live else "",
-        versions={"python": platform.python_version()} | {name: version(name) for name in libraries},
+        versions=versions(),
     )
 
 

@@ -8,9 +8,11 @@ from collections import deque
 from collections.abc import Callable
 from types import FrameType
 
+import msgspec
+
 from drivers.bus import connect
 from drivers.capture import Capture
-from drivers.interface import Drives
+from drivers.interface import DriveFault, Drives
 from service import packets, realtime
 from service.clock import Tick, Ticker
 from service.config import Config
@@ -19,13 +21,15 @@ from service.kinematics import warm_up
 from service.links import Port
 from service.messages import Event
 from service.modes import MODES, Mode
-from service.modes import Event as Mishap
-from service.packets import Happened, Kind, Situation, Welcome, message
+from service.modes import Event as ModeEvent
+from service.packets import DrivesFault, Happened, Input, Kind, Mishap, Request, Situation, Welcome, message
 from service.records import LAYOUT
 
 BATCHES_PER_SECOND = 50
 EVENTS_KEPT = 1000
 """Events kept for a gateway that comes anew: the one before may have died with some that it had not published."""
+OLDEST = 255
+"""No feedback is recorded as older [SYNCs]."""
 SHUTDOWN = 3.0
 """How long a controlled stop may take before the drives are left to their own quick stop [s]."""
 
@@ -62,6 +66,9 @@ class Loop:
         self._events = 0
         self._kept: deque[bytes] = deque(maxlen=EVENTS_KEPT)
         self._told = 0
+        self._inputs = 0
+        self._given: list[Input] = []
+        self._fault: DriveFault | None = None
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
         self._batch = bytearray(1 + self._batch_size * LAYOUT.size)
         self._batch[0] = Kind.RECORDS
@@ -70,6 +77,7 @@ class Loop:
 
     def run(self, ticker: Ticker) -> None:
         """Run cycles until told to end and the robot stands without power."""
+        self._meet()  # so that a recorder that is there has every cycle from the first
         self._drives.sync()
         self.control.start(self._drives.read())
         while not self._over():
@@ -86,12 +94,14 @@ class Loop:
         feedback = self._drives.read()
         read = now()
         control.observe(feedback)
-        self._watch(tick)
+        self._watch(tick, feedback.fault)
         decided = moved = now()
         try:
             request = self._gateway.receive() if control.ready else None
             if request is not None:
-                control.handle(packets.decode_request(memoryview(request)[1:]), tick.deadline_ns + tick.lateness_ns)
+                decoded = packets.decode_request(memoryview(request)[1:])
+                self._note(tick, decoded)
+                control.handle(decoded, tick.deadline_ns + tick.lateness_ns)
             decided = now()
             control.advance()
             moved = now()
@@ -112,22 +122,34 @@ class Loop:
         self._record(tick, parts)
         self._record_ns = now() - written
 
-    def _watch(self, tick: Tick) -> None:
-        """Count what the ticker missed, notice a lost gateway and a wish to end."""
-        control = self.control
+    def _watch(self, tick: Tick, fault: DriveFault | None) -> None:
+        """Count what the ticker missed, notice a fault, a lost gateway and a wish to end."""
+        if fault is not self._fault:
+            self._fault = fault
+            self._note(tick, DrivesFault(fault.message if fault else None))
         if tick.missed:
             self._overruns += tick.missed
             self._late_streak += tick.missed
             if self._late_streak > self._max_overruns:
-                control.happen(Mishap.LATE, f"{self._late_streak} ticks missed in a row: the machine is too busy")
+                text = f"{self._late_streak} ticks missed in a row: the machine is too busy"
+                self._happen(tick, ModeEvent.LATE, text)
                 self._late_streak = 0
         else:
             self._late_streak = 0
         if self._gateway.take_lost():
-            control.happen(Mishap.GATEWAY_LOST, "the gateway is gone: controlled stop")
+            self._happen(tick, ModeEvent.GATEWAY_LOST, "the gateway is gone: controlled stop")
         if self.ending and self._ending_since is None:
-            self._ending_since = control.cycle
-            control.happen(Mishap.SHUTDOWN, "the service is ending: controlled stop, drives disabled")
+            self._ending_since = self.control.cycle
+            self._happen(tick, ModeEvent.SHUTDOWN, "the service is ending: controlled stop, drives disabled")
+
+    def _happen(self, tick: Tick, event: ModeEvent, reason: str) -> None:
+        self._note(tick, Mishap(event.name, reason))
+        self.control.happen(event, reason)
+
+    def _note(self, tick: Tick, given: Request | Mishap | DrivesFault) -> None:
+        """Keep what the control is given in this cycle, for the recorder."""
+        self._inputs += 1
+        self._given.append(Input(self._inputs, self.control.cycle, tick.deadline_ns + tick.lateness_ns, given))
 
     def _over(self) -> bool:
         if self._ending_since is None:
@@ -152,6 +174,10 @@ class Loop:
             self._overruns,
             MODES.index(control.state.mode),
             *feedback.state,
+            *(min(age, OLDEST) for age in feedback.age),
+            *feedback.follows,
+            *feedback.homed,
+            feedback.homing,
             *control.pose,
             *control.commanded.pose,
             *control.commanded.velocity,
@@ -168,11 +194,11 @@ class Loop:
         self._batched += 1
         if self._batched == self._batch_size:
             self._flush()
-        if control.desk.answers or control.desk.happenings:
+        if control.desk.answers or control.desk.happenings or self._given:
             self._speak()
 
     def _flush(self) -> None:
-        """Send the batch, take new peers, and what was kept for them."""
+        """Send the batch, take new peers, and what was kept for them; listen to the recorder."""
         if self._batched:
             batch = bytes(self._batch[: 1 + self._batched * LAYOUT.size])
             self._batched = 0
@@ -181,17 +207,37 @@ class Loop:
         if self._capture is not None and self._recorder.connected:
             for frames in self._capture.take():
                 self._recorder.send(bytes((Kind.FRAMES,)) + frames)
+        self._listen()
+        self._meet()
+        self._send_events()
+
+    def _listen(self) -> None:
+        """Tell everyone what the recorder has to say."""
+        packet = self._recorder.receive()
+        if packet is None:
+            return
+        try:
+            remark = packets.decode_remark(memoryview(packet)[1:])
+        except msgspec.DecodeError as error:  # the recorder must not be able to stop the robot
+            self.control.desk.tell("service", "warning", f"the recorder said something unreadable: {error}")
+        else:
+            self.control.desk.tell("service", remark.level, remark.message)
+
+    def _meet(self) -> None:
+        """Take new peers."""
         for port in (self._gateway, self._recorder):
             if port.accept():
                 port.send(self._welcome)
                 port.send(self._situation)
                 if port is self._gateway:
                     self._told = 0
-        self._send_events()
 
     def _speak(self) -> None:
-        """Answer requests and number what has happened."""
+        """Answer requests, number what has happened, and pass on what the control was given."""
         control, desk = self.control, self.control.desk
+        for given in self._given:
+            self._recorder.send(message(given))
+        self._given.clear()
         for happening in desk.happenings:
             self._events += 1
             t = control.cycle * self._period

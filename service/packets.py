@@ -7,7 +7,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct, msgpack
 
-from service.messages import Event, Goal, Triple
+from service.messages import Event, Goal, Level, Triple
 
 
 class Kind(IntEnum):
@@ -104,14 +104,51 @@ class Situation(Struct, frozen=True, tag=True):
     """The pose that the goal leads to; None for a jog."""
 
 
+class Mishap(Struct, frozen=True, tag=True):
+    """Something that nobody asked for, as Control.happen takes it."""
+
+    event: str
+    """Name of the service.modes.Event."""
+    reason: str
+
+
+class DrivesFault(Struct, frozen=True, tag=True):
+    """What the drives say is wrong from this cycle on."""
+
+    message: str | None
+    """None when nothing is any more."""
+
+
+class Input(Struct, frozen=True, tag=True):
+    """Loop to recorder: what the control was given in a cycle, beside the feedback that is in its record.
+
+    Together they are all that setpoints depend on.
+    """
+
+    seq: int
+    """Numbered without gaps from 1."""
+    cycle: int
+    now_ns: int
+    """The monotonic clock then: how old a goal was."""
+    given: GoalRequest | CommandRequest | RefusedRequest | Mishap | DrivesFault
+
+
+class Remark(Struct, frozen=True, tag=True):
+    """Recorder to loop: something that everyone is to know."""
+
+    level: Level
+    message: str
+
+
 Request = GoalRequest | CommandRequest | RefusedRequest
-Answer = Accepted | Confirmed | Refused | Welcome | Happened | Situation
+Answer = Accepted | Confirmed | Refused | Welcome | Happened | Situation | Input
 
 encode = msgpack.Encoder().encode
 decode_request = msgpack.Decoder(Request).decode
 decode_answer = msgpack.Decoder(Answer).decode
+decode_remark = msgpack.Decoder(Remark).decode
 
 
-def message(content: Request | Answer) -> bytes:
+def message(content: Request | Answer | Remark) -> bytes:
     """Pack a message."""
     return bytes((Kind.MESSAGE,)) + encode(content)

@@ -3,6 +3,7 @@
 from service.reading import read
 recording = read(Path("recordings/demo-20260101-120000.rrd"))
 error = recording.records["following_error"]      # (N, 3) [m]; the fields are those of service.records
+session = join([read(path) for path in parts])    # of a session whose recording was rotated, in any order
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ import shutil
 import struct
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import rerun as rr
@@ -26,6 +28,9 @@ from rerun.error_utils import RerunWarning
 
 from service.columns import SECOND, structs
 from service.errors import ServiceError
+from service.journal import EVENTS, JSON, REQUESTS
+from service.messages import Event
+from service.packets import Input
 from service.records import DTYPE
 from service.scene import FIELDS
 
@@ -40,6 +45,7 @@ _END = 0
 
 _TEXT, _LEVEL = rr.TextLog.descriptor_text().component, rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
+_KEPT = ("/record", EVENTS, REQUESTS)
 _LAYOUT = structs(np.zeros(1, DTYPE)).type.value_type
 """The records' fields, as they are in a file."""
 
@@ -53,6 +59,8 @@ class Line(NamedTuple):
     level: str
     """INFO, WARN or ERROR."""
     text: str
+    event: Event | None = None
+    """The event itself; None for what the recorder had to say."""
 
 
 class Recording(NamedTuple):
@@ -69,7 +77,9 @@ class Recording(NamedTuple):
     events: list[Line]
     """The log, in order."""
     texts: dict[str, str]
-    """Text documents that hold for the whole session, by entity path."""
+    """Text documents that hold for the whole session, by entity path: /configuration, /software."""
+    requests: tuple[Input, ...] = ()
+    """What the control was given, in order: goals and commands, each with the cycle that took it, and mishaps."""
 
 
 def read(path: Path) -> Recording:
@@ -85,8 +95,27 @@ def read(path: Path) -> Recording:
         records=records,
         t=t,
         wall=wall,
-        events=_events([chunk for chunk in chunks if chunk.entity_path == "/events"]),
+        events=_events([chunk for chunk in chunks if chunk.entity_path == EVENTS]),
         texts=_static(chunks, _DOCUMENT),
+        requests=_requests([chunk for chunk in chunks if chunk.entity_path == REQUESTS], path),
+    )
+
+
+def join(parts: Sequence[Recording]) -> Recording:
+    """Put the parts of a session together, in any order. Raises ServiceError if they are of different sessions."""
+    first, *others = sorted(parts, key=lambda part: int(part.records["cycle"][0]))
+    for other in others:
+        if (other.name, other.texts) != (first.name, first.texts):
+            raise ServiceError(f"{other.name!r} is not of the same session as {first.name!r}: give the parts of one")
+    _, rows = np.unique(np.concatenate([part.records["cycle"] for part in parts]), return_index=True)
+    return Recording(
+        name=first.name,
+        records=np.concatenate([part.records for part in parts])[rows],
+        t=np.concatenate([part.t for part in parts])[rows],
+        wall=np.concatenate([part.wall for part in parts])[rows],
+        events=sorted((line for part in parts for line in part.events), key=lambda line: line.t),
+        texts=first.texts,
+        requests=tuple(sorted((given for part in parts for given in part.requests), key=lambda given: given.seq)),
     )
 
 
@@ -134,7 +163,7 @@ def _chunks(whole: Path, path: Path) -> list[Chunk]:
             reader = RrdReader(whole)
         if not reader.recordings():
             raise ServiceError(f"{path}: holds no recording")
-        return [chunk for chunk in reader.stream() if chunk.is_static or chunk.entity_path in ("/record", "/events")]
+        return [chunk for chunk in reader.stream() if chunk.is_static or chunk.entity_path in _KEPT]
     except (RuntimeError, ValueError) as error:
         raise ServiceError(f"{path}: cannot be read as a recording: {error}") from error
 
@@ -164,8 +193,19 @@ def _events(chunks: list[Chunk]) -> list[Line]:
         t = batch.column("t").to_numpy().astype(np.int64) / SECOND
         wall = batch.column("wall").to_numpy()
         levels, texts = (batch.column(name).flatten().to_pylist() for name in (_LEVEL, _TEXT))
-        lines += map(Line, t.tolist(), wall, levels, texts)
+        spoken = batch.column(JSON.component).to_pylist() if JSON.component in batch.schema.names else [None] * len(t)
+        events = [msgspec.json.decode(content[0], type=Event) if content else None for content in spoken]
+        lines += map(Line, t.tolist(), wall, levels, texts, events)
     return sorted(lines, key=lambda line: line.t)
+
+
+def _requests(chunks: list[Chunk], path: Path) -> tuple[Input, ...]:
+    rows = [text for chunk in chunks for text in chunk.to_record_batch().column(JSON.component).flatten().to_pylist()]
+    try:
+        found = [msgspec.json.decode(row, type=Input) for row in rows]
+    except msgspec.DecodeError as error:
+        raise ServiceError(f"{path}: written by another version: its requests cannot be read: {error}") from error
+    return tuple(sorted(found, key=lambda given: given.seq))
 
 
 def _static(chunks: list[Chunk], component: str) -> dict[str, str]:

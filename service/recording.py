@@ -1,26 +1,84 @@
-"""The recorder's process: takes what the loop sends and gives it to the recorder."""
+"""The recorder's process: takes what the loop sends and gives it to the recorder and to the black box."""
 
 from __future__ import annotations
 
+import contextlib
 import select
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+from service.blackbox import BlackBox
 from service.config import Config
 from service.links import Closed, Link
-from service.packets import Happened, Kind, Situation, Welcome, decode_answer
+from service.packets import Answer, Happened, Input, Kind, Remark, Situation, Welcome, decode_answer, message
 from service.recorder import Recorder
 
-GATHER = 0.05
-"""How long to let packets gather before they are taken: to wake for each costs more than what is in it [s]."""
+GATHER = 0.14
+"""How long to let packets gather before they are taken: to wake for each costs more than what is in it [s].
+
+A killed recorder loses what it has not written: that much, and the batch that the loop holds. It is less than 0.2 s.
+"""
+
+
+class Intake:
+    """Takes the loop's packets to the recorder and the black box, and tells the loop what it should know."""
+
+    def __init__(self, config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> None:
+        self._link = link
+        self._ready = ready
+        path = Path(record) if record else None
+        self.recorder = recorder = Recorder(config, Path(config.telemetry.directory), path=path, warn=self._warn)
+        folder = recorder.path.parent
+        self._box = BlackBox(
+            config.loop.rate_hz, lambda name: Recorder(config, folder, name=name, live=False), self._warn
+        )
+
+    def take(self, packet: bytes) -> None:
+        """Take a packet."""
+        content = packet[1:]
+        if packet[0] == Kind.RECORDS:
+            self.recorder.records(content)
+            self._box.records(content)
+        elif packet[0] == Kind.FRAMES:
+            self.recorder.frames(content)
+        else:
+            self._hear(decode_answer(content))
+
+    def close(self) -> None:
+        """Complete all files."""
+        self.recorder.close()
+        self._box.close()
+
+    def _hear(self, said: Answer) -> None:
+        recorder, box = self.recorder, self._box
+        match said:
+            case Happened(event):
+                recorder.event(event)
+                box.event(event)
+            case Input():
+                recorder.given(said)
+                box.given(said)
+            case Situation():
+                recorder.target(said.target)
+                box.stands("target", said.target)
+            case Welcome():
+                recorder.bus_load(said.bus_load)
+                box.stands("bus_load", said.bus_load)
+                self._ready({"recording": str(recorder.path), "live": recorder.live_url})
+
+    def _warn(self, words: str) -> None:
+        """Say it in the service's log, and through the loop to everyone."""
+        print(f"trirail: recorder: {words}", file=sys.stderr, flush=True)  # noqa: T201 - the log
+        with contextlib.suppress(Closed):  # then nobody is left to be told
+            self._link.send(message(Remark("warning", words)))
 
 
 def main(config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> int:
     """Record until the loop has gone or the process is told to end."""
-    path = Path(record) if record else None
-    recorder = Recorder(config, Path(config.telemetry.directory), path=path)
+    intake = Intake(config, record, link, ready)
     ending = False
 
     def end(_signal: int, _frame: object) -> None:
@@ -35,22 +93,10 @@ def main(config: Config, record: str | None, link: Link, ready: Callable[[object
             poll.poll(500)
             time.sleep(GATHER)
             while (packet := link.receive()) is not None:
-                content = packet[1:]
-                if packet[0] == Kind.RECORDS:
-                    recorder.records(content)
-                elif packet[0] == Kind.FRAMES:
-                    recorder.frames(content)
-                else:
-                    said = decode_answer(content)
-                    if isinstance(said, Happened):
-                        recorder.event(said.event)
-                    elif isinstance(said, Situation):
-                        recorder.target(said.target)
-                    elif isinstance(said, Welcome):
-                        recorder.bus_load(said.bus_load)
-                        ready({"recording": str(recorder.path), "live": recorder.live_url})
+                intake.take(packet)
+            intake.recorder.save()
     except Closed:
         pass
     finally:
-        recorder.close()
+        intake.close()
     return 0

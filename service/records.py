@@ -22,6 +22,10 @@ FIELDS: tuple[tuple[str, str, int], ...] = (
     ("overruns", "q", 1),  # ticks missed since the start
     ("mode", "B", 1),  # index into service.modes.MODES
     ("drive_state", "B", 3),  # drivers.interface.PowerState of A, B, C
+    ("age", "B", 3),  # how many SYNCs ago the positions of A, B, C were sampled; 255 for any more
+    ("follows", "B", 3),  # whether A, B, C follow setpoints: not while they are being homed
+    ("homed", "B", 3),  # whether it is known from where the positions of A, B, C are counted
+    ("homing", "B", 1),  # whether the drives are being homed
     ("pose", "d", 3),  # measured: forward kinematics of the measured sliders; x, y [m], phi [rad]
     ("commanded_pose", "d", 3),
     ("commanded_pose_velocity", "d", 3),
@@ -45,6 +49,11 @@ DTYPE: np.dtype[Any] = np.dtype(
 )
 LAYOUT = struct.Struct("<" + "".join(f"{n}{code}" for _, code, n in FIELDS))
 """The same layout as DTYPE, for packing one record: as many values as the fields have, in their order."""
+
+
+def last_cycle(batch: bytes) -> int:
+    """Return the cycle of the last of packed records."""
+    return int.from_bytes(batch[-LAYOUT.size :][:8], "little")
 
 
 def unpack(batch: bytes | memoryview) -> NDArray[np.void]:

@@ -11,10 +11,11 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from service import blueprint
+from service import blueprint, journal
 from service.messages import Event, Level
+from service.packets import Input
 from service.records import DTYPE, unpack
-from service.scene import Scene, remark
+from service.scene import Scene
 from service.subject import Subject
 
 APPLICATION = "trirail"
@@ -38,6 +39,7 @@ class Show:
         self.scene = Scene(subject, wall_offset_ns)
         self._name = name
         self._rate_hz = subject.rate_hz
+        self._wall_offset_ns = wall_offset_ns
         self._layout = blueprint.layout(subject, self.scene.bounds)
         self._recording = str(uuid.uuid4())
         self._streams: list[rr.RecordingStream] = []
@@ -89,7 +91,19 @@ class Show:
 
     def events(self, events: Sequence[Event]) -> None:
         """Take events, as one batch."""
-        self._send([remark(event.t, event.time, event.level, event.message) for event in events])
+        self._send([journal.said(event) for event in events])
+
+    def given(self, what: Input) -> None:
+        """Take what the control was given."""
+        self._send([journal.given(what, self._rate_hz, self._wall_offset_ns)])
+
+    def begin_anew(self) -> None:
+        """Say with the next records again what else is said only when it changes: a sink has begun a new file."""
+        self._shown = None
+
+    def drop(self, stream: rr.RecordingStream) -> None:
+        """Let go of a stream: it is complete."""
+        self._streams.remove(stream)
 
     def say(self, level: Level, message: str) -> None:
         """Write a line of the log at the time of the newest record."""

@@ -30,33 +30,50 @@ PATIENCE = 2.0
 
 
 class Archive:
-    """A recording file; every batch is handed to the operating system before the next."""
+    """A recording file; every batch is handed to the operating system before the next.
 
-    def __init__(self, stream: rr.RecordingStream, path: Path) -> None:
+    It leaves `reserve` bytes of the disk free.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, path: Path, reserve: int = RESERVE) -> None:
         self.lost = 0
         """Batches that are not in the file."""
+        self.trouble = ""
+        """Why the last batch is not in the file; empty if it is."""
         self._stream = stream
+        self._reserve = reserve
         self._directory = path.parent
         self._stuck = False
 
     def send(self, chunks: list[Chunk]) -> None:
         """Write a batch, or count it as lost. Waits for the disk, but not for long."""
-        written = self._has_room() and (not self._stuck or self._flushed(0.01))
-        if written:
-            self._stream.send_chunks(chunks)
-            written = self._flushed(PATIENCE)
-        self.lost += not written
+        self.trouble = self._write(chunks)
+        self.lost += bool(self.trouble)
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the file takes nothing any more: Rerun's sink does not recover from a disk that has failed it."""
+        return self._stuck
 
     def close(self) -> None:
         """Complete the file, unless the disk is stuck."""
         if self._flushed(PATIENCE):
             self._stream.disconnect()
 
-    def _has_room(self) -> bool:
+    def _write(self, chunks: list[Chunk]) -> str:
+        """Write a batch; return why it could not be, or nothing."""
         try:
-            return shutil.disk_usage(self._directory).free > RESERVE
-        except OSError:
-            return False
+            free = shutil.disk_usage(self._directory).free
+        except OSError as error:
+            return f"{self._directory}: {error.strerror}"
+        if free <= self._reserve:
+            return (
+                f"{self._directory} is full: {free / 1e6:.0f} MB are free, {self._reserve / 1e6:.0f} MB are to stay so"
+            )
+        if not self._stuck or self._flushed(0.01):
+            self._stream.send_chunks(chunks)
+            self._flushed(PATIENCE)
+        return f"{self._directory} takes no more: disk failing or read-only, or a quota" if self._stuck else ""
 
     def _flushed(self, within: float) -> bool:
         try:

@@ -13,7 +13,18 @@ from service.clock import Tick
 from service.links import Link, Port
 from service.loop import BATCHES_PER_SECOND, Loop
 from service.modes import Mode
-from service.packets import CommandRequest, Happened, Kind, Welcome, decode_answer, message
+from service.packets import (
+    CommandRequest,
+    DrivesFault,
+    Happened,
+    Input,
+    Kind,
+    Mishap,
+    Remark,
+    Welcome,
+    decode_answer,
+    message,
+)
 from service.records import unpack
 
 
@@ -24,6 +35,7 @@ class Shell:
         self.rig = rig
         self.ports = Port(links.listen(folder / "gateway")), Port(links.listen(folder / "recorder"))
         self.gateway: Link = links.connect(folder / "gateway")
+        self.recorder: Link = links.connect(folder / "recorder")
         self.loop = Loop(rig.config, rig.driver, *self.ports)
         self.loop.control.start(rig.control.feedback)
 
@@ -39,9 +51,9 @@ class Shell:
         self.cycles(20)
         assert self.loop.control.state.mode is Mode.HOLDING
 
-    def received(self) -> list[bytes]:
+    def received(self, by: Link | None = None) -> list[bytes]:
         packets = []
-        while (packet := self.gateway.receive()) is not None:
+        while (packet := (by or self.gateway).receive()) is not None:
             packets.append(packet)
         return packets
 
@@ -51,6 +63,7 @@ def shell(rig: Rig, tmp_path: Path) -> Iterator[Shell]:
     made = Shell(rig, tmp_path)
     yield made
     made.gateway.close()
+    made.recorder.close()
     for port in made.ports:
         port.close()
 
@@ -116,3 +129,35 @@ def test_it_ends_when_the_robot_has_no_power(shell: Shell) -> None:
     assert not shell.loop._over()  # the drives have not said so yet
     shell.cycles(5)
     assert shell.loop._over()
+
+
+def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) -> None:
+    shell.enabled()
+    shell.rig.drives[1].fail(0x4310)
+    shell.cycles(3)
+    shell.gateway.close()
+    shell.cycles(2)
+    shell.loop.ending = True
+    shell.cycles(2)
+    said = [decode_answer(packet[1:]) for packet in shell.received(shell.recorder) if packet[0] == Kind.MESSAGE]
+    given = [answer for answer in said if isinstance(answer, Input)]
+    assert [type(what.given) for what in given] == [CommandRequest, DrivesFault, Mishap, Mishap]
+    assert [what.seq for what in given] == [1, 2, 3, 4]
+    assert [what.given.event for what in given if isinstance(what.given, Mishap)] == ["GATEWAY_LOST", "SHUTDOWN"]
+    events = {answer.event.kind: answer.event for answer in said if isinstance(answer, Happened)}
+    assert isinstance(given[1].given, DrivesFault)
+    assert given[1].given.message == events["fault"].message
+    assert given[1].cycle == events["fault"].cycle
+
+
+def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
+    shell.enabled()
+    shell.recorder.send(message(Remark("warning", "the disk is full")))
+    shell.recorder.send(b"\x02nonsense")
+    shell.cycles(60)
+    said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
+    told = [(answer.event.level, answer.event.message) for answer in said if isinstance(answer, Happened)][2:]
+    assert told[0] == ("warning", "the disk is full")
+    assert told[1][1].startswith("the recorder said something unreadable")
+    assert len(told) == 2
+    assert shell.loop.control.state.mode is Mode.HOLDING

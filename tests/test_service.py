@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import resource
 import selectors
 import signal
 import socket
@@ -24,10 +25,12 @@ import zenoh
 from can import CanutilsLogReader
 
 from drivers import frames
+from service import provenance
 from service.client import Robot
-from service.config import SIM
+from service.config import SIM, load
 from service.errors import RefusedError, ServiceError
 from service.messages import GoalReply, OwnLimits, State
+from service.reading import read
 from service.remote import RemoteView
 from service.session import open_client
 
@@ -422,6 +425,31 @@ def test_a_killed_recorder_does_not_matter(service: Service) -> None:
     assert service.end() == 0
     assert "the recorder has died (killed by SIGKILL)" in service.log.read_text()
     assert len(list((service.folder / "recordings").glob("*.rrd"))) == 2
+
+
+def test_a_fault_is_kept_apart(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        robot.quick_stop()
+    assert service.end() == 0
+    (box,) = (service.folder / "recordings").glob("fault-*.rrd")
+    kept = read(box)
+    assert [line.text for line in kept.events if line.event and line.event.kind == "fault"] == ["quick_stop by ann"]
+    assert kept.records["cycle"][0] == 1
+    assert not kept.records["commanded_velocity"][-1].any()  # the stop is in it
+    assert provenance.configuration(kept.texts) == load(service.folder / "robot.toml")
+
+
+def test_a_recording_that_suffers_is_told_to_everyone(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        recorder = service.child("recorder")
+        resource.prlimit(recorder, resource.RLIMIT_FSIZE, (1000, 1000))
+        told = (event for event in robot.events(history=True, timeout=10.0) if event.level == "warning")
+        assert "takes no more" in next(told).message
+        assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)
+    service.end()
+    assert "trirail: recorder: missing so far" in service.log.read_text()
 
 
 def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> None:

@@ -1,10 +1,11 @@
-"""Measurements: `python tools/bench.py loop`, `kinematics` or `planning`, with --json for programs."""
+"""Measurements: `python tools/bench.py loop`, `planning`, `recorder` or `kinematics`, with --json for programs."""
 
 from __future__ import annotations
 
 import bench_kinematics
 import bench_loop
 import bench_planning
+import bench_recorder
 from cyclopts import App
 
 app = App(help="Speed, as ratios within one run: the machines this runs on are not alike.")
@@ -14,6 +15,12 @@ app = App(help="Speed, as ratios within one run: the machines this runs on are n
 def loop(*, seconds: float = 30.0, json: bool = False) -> None:
     """Run the whole service on simulated drives and time its loop, beside cyclictest where that is installed."""
     bench_loop.main(seconds, json)
+
+
+@app.command
+def recorder(*, seconds: float = 30.0, json: bool = False) -> None:
+    """Run the whole service on simulated drives, moving, and measure what its recorder takes."""
+    bench_recorder.main(seconds, json)
 
 
 @app.command

@@ -1,0 +1,220 @@
+"""Replays: a session of a real service, given to the control again, comes out the same to the last bit."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from service import provenance, spawned
+from service.client import Robot
+from service.config import Config, load
+from service.errors import RefusedError, ServiceError
+from service.messages import VelocityGoal
+from service.packets import CommandRequest, GoalRequest, Mishap
+from service.reading import Recording, join, read
+from service.replay import again
+from service.summary import summary
+
+pytestmark = pytest.mark.slow
+
+STEPS = 14
+
+
+def act(robot: Robot, choice: random.Random) -> None:
+    """Do one of the things that clients do, whether or not the service agrees."""
+    x, y, phi = (choice.uniform(-span, span) for span in (0.07, 0.07, 0.5))
+    match choice.randrange(8):
+        case 0 | 1:
+            robot.move_to(x=x, y=y, phi=phi, valid_for=5.0)
+        case 2:
+            for blend in (0.01, None):
+                robot.move_to(x=x, y=y, phi=phi, blend=blend)
+                x = -x
+        case 3:
+            robot.move_sliders(x, y, 0.1 * phi)
+        case 4:
+            for _ in range(3):
+                robot.send(lambda name: VelocityGoal(0.1 * x, y, phi, timeout=0.2, id=name), "jog")
+        case 5:
+            robot.override(choice.choice([30.0, 100.0, 150.0]))
+        case 6:
+            robot.pause()
+            robot.resume()
+        case _:
+            robot.stop()
+
+
+def session(folder: Path) -> Path:
+    """Run a random session on a service of its own; return its recording."""
+    recording = folder / "session.rrd"
+    config, locator = spawned.private(folder)
+    choice = random.Random(6)
+    with spawned.service(config, recording) as service, Robot("demo", locator, user="ann") as robot:
+        for then in (robot.stop, robot.quick_stop):
+            robot.enable()
+            for _ in range(STEPS):
+                with contextlib.suppress(RefusedError):
+                    act(robot, choice)
+                for _, _ in zip(range(choice.randrange(12)), robot.states(5.0), strict=False):
+                    pass  # some 20 ms for each state
+            then()
+        while True:  # the drives take their time to stand
+            with contextlib.suppress(RefusedError):
+                robot.reset()
+                break
+        robot.enable()
+        robot.move_to(x=0.05, y=0.0, phi=0.0)
+        assert spawned.end(service) == 0  # in motion
+    return recording
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return session(tmp_path_factory.mktemp("session"))
+
+
+@pytest.fixture(scope="module")
+def recording(path: Path) -> Recording:
+    return read(path)
+
+
+@pytest.fixture(scope="module")
+def config(recording: Recording) -> Config:
+    config = provenance.configuration(recording.texts)
+    assert config is not None
+    return config
+
+
+def test_the_recording_is_whole(recording: Recording) -> None:
+    assert np.array_equal(recording.records["cycle"], np.arange(1, len(recording.records) + 1))
+    assert [what.seq for what in recording.requests] == list(range(1, len(recording.requests) + 1))
+    kinds = {type(what.given) for what in recording.requests}
+    assert {GoalRequest, CommandRequest, Mishap} <= kinds
+
+
+def test_it_comes_out_the_same_to_the_last_bit(recording: Recording, config: Config) -> None:
+    compared = again(recording, config, simulated=False)
+    assert compared.cycles == len(recording.records)
+    assert compared.lacking == 0
+    assert (compared.differing, compared.first) == (0, None)
+    assert compared.position == (0.0, 0.0, 0.0)
+
+
+def test_on_simulated_drives_it_comes_out_the_same_too(recording: Recording, config: Config) -> None:
+    assert again(recording, config, simulated=True).differing == 0
+
+
+def test_a_goal_one_cycle_later_is_noticed(recording: Recording, config: Config) -> None:
+    number, what = next(
+        (number, what)
+        for number, what in enumerate(recording.requests)
+        if isinstance(what.given, GoalRequest) and not isinstance(what.given.goal, VelocityGoal)
+    )
+    requests = list(recording.requests)
+    requests[number] = msgspec.structs.replace(what, cycle=what.cycle + 1)
+    compared = again(recording._replace(requests=tuple(requests)), config, simulated=False)
+    assert compared.differing > 0
+    assert compared.first is not None
+    assert what.cycle <= compared.first <= what.cycle + 30
+    assert max(compared.position) > 0.0
+
+
+def test_after_a_gap_nothing_is_compared(recording: Recording, config: Config) -> None:
+    half = len(recording.records) // 2
+    kept = np.delete(recording.records, slice(half, half + 20))
+    compared = again(recording._replace(records=kept), config, simulated=False)
+    assert (compared.cycles, compared.differing) == (half, 0)
+    assert compared.lacking == len(kept) - half
+
+
+def test_after_a_request_that_lacks_nothing_is_compared(recording: Recording, config: Config) -> None:
+    requests = recording.requests[:5] + recording.requests[6:]
+    compared = again(recording._replace(requests=requests), config, simulated=False)
+    assert compared.cycles == recording.requests[4].cycle
+    assert compared.differing == 0
+
+
+def test_what_begins_in_motion_is_refused(recording: Recording, config: Config) -> None:
+    moving = int(np.flatnonzero(np.any(recording.records["commanded_velocity"] != 0.0, axis=1))[0])
+    late = recording._replace(records=recording.records[moving:])
+    with pytest.raises(ServiceError, match="in mode moving, and what led there is not in it"):
+        again(late, config, simulated=False)
+
+
+def test_another_rate_is_refused(recording: Recording, config: Config) -> None:
+    slower = msgspec.structs.replace(config, loop=msgspec.structs.replace(config.loop, rate_hz=500))
+    with pytest.raises(ServiceError, match="500: the recording has 1000 cycles a second"):
+        again(recording, slower, simulated=True)
+
+
+def test_parts_are_put_together(recording: Recording) -> None:
+    half = len(recording.records) // 2
+    first = recording._replace(
+        records=recording.records[:half], t=recording.t[:half], wall=recording.wall[:half], events=[], requests=()
+    )
+    second = recording._replace(
+        records=recording.records[half - 10 :], t=recording.t[half - 10 :], wall=recording.wall[half - 10 :]
+    )
+    whole = join([second, first])
+    assert whole.records.tobytes() == recording.records.tobytes()
+    assert np.array_equal(whole.t, recording.t)
+    assert (whole.requests, whole.events) == (recording.requests, recording.events)
+    with pytest.raises(ServiceError, match="is not of the same session as"):
+        join([first, second._replace(name="other")])
+
+
+# ---------------------------------------------------------------------- what it comes to
+
+
+def test_every_goal_has_the_outcome_that_was_said(recording: Recording) -> None:
+    summed = summary(recording)
+    said = {line.event.id: line.event.outcome for line in reversed(recording.events) if line.event and line.event.id}
+    assert {goal.id: goal.outcome for goal in summed.goals} == said
+    assert all(goal.ended is not None and goal.ended >= goal.given for goal in summed.goals)
+    assert {goal.kind for goal in summed.goals} >= {"pose", "sliders"}
+
+
+def test_the_quick_stop_is_the_fault(recording: Recording) -> None:
+    (fault,) = summary(recording).faults
+    assert fault.message == "quick_stop by ann"
+
+
+def test_errors_are_those_of_enabled_drives(recording: Recording) -> None:
+    summed = summary(recording)
+    assert all(0.0 < each.rms <= each.max < 0.004 for each in summed.tracking)
+    assert sum(summed.modes.values()) == pytest.approx(summed.cycles / summed.rate_hz)
+
+
+def trirail(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "service", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_the_commands(path: Path, tmp_path: Path) -> None:
+    replayed = trirail("replay", path)
+    assert replayed.returncode == 0, replayed.stderr
+    assert "the same to the last bit" in replayed.stdout
+    picture = tmp_path / "report.png"
+    reported = trirail("report", path, "--plot", picture, "--json")
+    assert reported.returncode == 0, reported.stderr
+    assert json.loads(reported.stdout)["faults"][0]["message"] == "quick_stop by ann"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_another_configuration_is_tried_on_simulated_drives(path: Path, tmp_path: Path) -> None:
+    config, _ = spawned.private(tmp_path)
+    config.write_text(config.read_text().replace("velocity = [0.25, 0.25, 1.5]", "velocity = [0.1, 0.1, 1.0]"))
+    assert load(config).limits.platform.velocity == (0.1, 0.1, 1.0)
+    replayed = trirail("replay", path, "--config", config, "--json")
+    assert replayed.returncode == 0, replayed.stderr
+    compared = json.loads(replayed.stdout)
+    assert compared["differing"] > 0
+    assert compared["simulated_drives"]

@@ -1,0 +1,311 @@
+"""Recordings over time: rotated, tidied, cut off by failing disks and kills, and kept apart on a fault."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections import namedtuple
+from pathlib import Path
+from typing import Any
+
+import made
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from service import provenance, shelf
+from service.blackbox import AFTER, BEFORE, BlackBox
+from service.config import SIM, Config, load, parse
+from service.loop import BATCHES_PER_SECOND
+from service.messages import Event, PoseGoal
+from service.modes import Mode
+from service.packets import GoalRequest, Input
+from service.reading import Recording, join, read
+from service.recorder import Recorder
+from service.recording import GATHER
+
+WALL_NS = 1_795_245_300_000_000_000
+BATCH = 20
+Usage = namedtuple("Usage", "free")
+
+
+class Time:
+    """Clocks that go with the records."""
+
+    def __init__(self) -> None:
+        self.ns = made.MONOTONIC_NS
+
+    def monotonic(self) -> int:
+        return self.ns
+
+    def wall(self) -> int:
+        return WALL_NS + self.ns - made.MONOTONIC_NS
+
+
+def configured(**telemetry: Any) -> Config:
+    config = load(SIM)
+    return msgspec.structs.replace(config, telemetry=msgspec.structs.replace(config.telemetry, **telemetry))
+
+
+def recorder(directory: Path, time: Time, config: Config, **more: Any) -> Recorder:
+    return Recorder(config, directory, live=False, wall_ns=time.wall, monotonic_ns=time.monotonic, **more)
+
+
+def feed(to: Recorder | BlackBox, records: NDArray[np.void], time: Time) -> None:
+    for start in range(0, len(records), BATCH):
+        batch = records[start : start + BATCH]
+        time.ns = int(batch["deadline_ns"][-1])
+        to.records(batch.tobytes())
+
+
+def goal(cycle: int) -> Input:
+    request = GoalRequest(7, "ann", "g-1", PoseGoal(0.01, 0.0, 0.1), made.MONOTONIC_NS)
+    return Input(1, cycle, made.MONOTONIC_NS + cycle * 1_000_000, request)
+
+
+def parts(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.rrd"), key=lambda path: (len(path.name), path.name))
+
+
+# ---------------------------------------------------------------------- what a file says of itself
+
+
+@pytest.mark.parametrize("path", sorted((SIM.parent).glob("*.toml")), ids=lambda path: path.name)
+def test_a_configuration_is_written_as_what_can_be_read(path: Path) -> None:
+    config = load(path)
+    assert parse(provenance.toml(config)) == config
+
+
+def test_a_configuration_with_measured_legs_is_too() -> None:
+    text = SIM.read_text()
+    legs = ["anchor = [0.1, 0.2]\nrail_angle = 0.1\nhome = -0.3\nedge_point = [1e-3, 0.1]\nedge_angle = 2.5\n"] * 3
+    turned = [leg.replace("0.1\nhome", f"{0.1 + 2.0 * number}\nhome") for number, leg in enumerate(legs)]
+    text = text.replace("l0 = 0.3", "\n".join(f"[[geometry.leg]]\n{leg}" for leg in turned))
+    config = msgspec.toml.decode(text, type=Config)  # no robot could be built like this: only the form is at stake
+    assert msgspec.toml.decode(provenance.toml(config), type=Config) == config
+
+
+# ---------------------------------------------------------------------- rotation
+
+
+def by_time(folder: Path) -> tuple[NDArray[np.void], list[Path]]:
+    sent, time = made.records(3.0), Time()
+    recording = recorder(folder, time, configured(rotate_minutes=1.0 / 60.0))
+    feed(recording, sent, time)
+    recording.close()
+    return sent, parts(folder)
+
+
+def test_a_recording_goes_on_in_another_file_after_its_time(tmp_path: Path) -> None:
+    sent, files = by_time(tmp_path)
+    assert [path.stem.partition("-part")[2] for path in files] == ["", "2", "3"]
+    read_back = [read(path) for path in files]
+    assert [len(part.records) for part in read_back] == pytest.approx([1000] * 3, abs=2 * BATCH)
+    assert join(read_back).records.tobytes() == sent.tobytes()
+
+
+def test_every_file_is_complete_in_itself(tmp_path: Path) -> None:
+    _, files = by_time(tmp_path)
+    found = []
+    for path in files:
+        reader = RrdReader(path)
+        assert len(reader.blueprints()) == 1
+        still = {chunk.entity_path for chunk in reader.stream() if chunk.is_static}
+        moving = {chunk.entity_path for chunk in reader.stream() if not chunk.is_static}
+        texts = read(path).texts
+        assert provenance.configuration(texts) == configured(rotate_minutes=1.0 / 60.0)
+        assert provenance.recorded_by(texts) == provenance.software()
+        found.append((still, moving, read(path).name, reader.recordings()[0].recording_id))
+    assert found[1:] == found[:-1]
+    assert {"/robot/rails", "/sliders/velocity", "/mode"} <= found[0][0]
+
+
+def test_a_recording_goes_on_in_another_file_beyond_its_size(tmp_path: Path) -> None:
+    sent, time = made.records(12.0), Time()
+    recording = recorder(tmp_path, time, configured(rotate_mb=1.0))
+    feed(recording, sent, time)
+    recording.close()
+    sizes = [path.stat().st_size for path in parts(tmp_path)]
+    assert len(sizes) > 2
+    assert all(1e6 < size < 2e6 for size in sizes[:-1])
+    assert join([read(path) for path in parts(tmp_path)]).records.tobytes() == sent.tobytes()
+
+
+# ---------------------------------------------------------------------- the folder
+
+
+def kept(folder: Path, name: str, megabytes: float, age: float) -> Path:
+    path = folder / name
+    path.write_bytes(b"")
+    os.truncate(path, round(megabytes * 1e6))
+    os.utime(path, (1e9 - age, 1e9 - age))
+    return path
+
+
+def test_the_oldest_recordings_go_and_black_boxes_last(tmp_path: Path) -> None:
+    box = kept(tmp_path, "fault-20260101-100000.rrd", 4, 5000)
+    old = kept(tmp_path, "demo-20260101-110000.rrd", 4, 4000)
+    log = kept(tmp_path, "demo-20260101-110000.log", 2, 4000)
+    part = kept(tmp_path, "demo-20260101-120000-part2.rrd", 4, 3000)
+    mine = kept(tmp_path, "my-best.rrd", 50, 9000)
+    live = kept(tmp_path, "other-20260101-130000.rrd", 4, 1)
+    assert shelf.tidy(tmp_path, 18e6, now=1e9) == []
+    assert shelf.tidy(tmp_path, 17e6, now=1e9) == [old]
+    assert not log.exists()
+    assert shelf.tidy(tmp_path, 8e6, now=1e9) == [part]
+    assert shelf.tidy(tmp_path, 7e6, now=1e9) == [box]
+    assert shelf.tidy(tmp_path, 1e6, now=1e9) == []  # what is being written stays
+    assert mine.exists()
+    assert live.exists()
+
+
+def test_the_recorder_tidies_its_folder(tmp_path: Path) -> None:
+    old = kept(tmp_path, "demo-20010101-110000.rrd", 4, 4000)
+    time = Time()
+    recording = recorder(tmp_path, time, configured(keep_mb=2.0))
+    feed(recording, made.records(0.1), time)
+    recording.close()
+    assert parts(tmp_path) == [recording.path]
+    assert not old.exists()
+
+
+# ---------------------------------------------------------------------- disks that fail, and kills
+
+
+def test_a_full_disk_is_told_of_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    time, sent = Time(), made.records(2.0)
+    recording = recorder(tmp_path, time, configured(), warn=told.append)
+    with monkeypatch.context() as full:
+        full.setattr("shutil.disk_usage", lambda _: Usage(free=10_000_000))
+        feed(recording, sent[:1000], time)
+    feed(recording, sent[1000:], time)
+    recording.close()
+    assert len(told) == 1  # and not again within ten seconds
+    assert "batches in the file" in told[0]
+    assert f"{tmp_path} is full: 10 MB are free" in told[0]
+    assert read(recording.path).records["cycle"].tolist() == list(range(1000, 2000))
+
+
+LIMITED = """
+import os, resource, sys
+from pathlib import Path
+import made, test_volumes as here
+from service.volumes import RETRY
+told, time = [], here.Time()
+config = here.configured()
+recording = here.recorder(Path(sys.argv[1]), time, config, warn=told.append)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))
+sent = made.records(4.0)
+here.feed(recording, sent[:3900], time)
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+late = sent[3900:].copy()
+late["deadline_ns"] += int((RETRY + 10.0) * 1e9)
+here.feed(recording, late, time)
+recording.close()
+assert "takes no more" in told[0], (told, os._exit(1))
+print(recording.path, flush=True)
+os._exit(0)
+"""
+
+
+def test_after_a_disk_that_failed_the_recording_goes_on_in_another_file(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", LIMITED, str(tmp_path)]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    first, *others = parts(tmp_path)
+    assert first.stat().st_size <= 1_000_000
+    assert str(others[-1]) == done.stdout.strip()
+    assert len(read(first).records) > 500
+    assert read(others[-1]).records["cycle"][-1] == 3999
+
+
+def test_a_killed_recorder_leaves_all_that_was_saved(tmp_path: Path) -> None:
+    script = (
+        "import os, signal, sys; from pathlib import Path; import made, test_volumes as here\n"
+        "time = here.Time(); kept = here.recorder(Path(sys.argv[1]), time, here.configured())\n"
+        "sent = made.records(1.98); here.feed(kept, sent[:1940], time); kept.save()\n"
+        "here.feed(kept, sent[1940:], time)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    assert subprocess.run(command, cwd=Path(__file__).parent, check=False).returncode == -9
+    (path,) = parts(tmp_path)
+    records = read(path).records
+    assert records.tobytes() == made.records(1.98)[:1940].tobytes()
+
+
+def test_what_is_not_saved_yet_is_younger_than_a_fifth_of_a_second() -> None:
+    assert GATHER + 1.0 / BATCHES_PER_SECOND < 0.2
+
+
+def test_records_that_never_came_are_told_of(tmp_path: Path) -> None:
+    told: list[str] = []
+    time, sent = Time(), made.records(1.0)
+    recording = recorder(tmp_path, time, configured(), warn=told.append)
+    feed(recording, np.delete(sent, slice(400, 460)), time)
+    recording.close()
+    assert len(told) == 1
+    assert told[0].endswith("60 cycles that the recorder was too slow for")
+
+
+# ---------------------------------------------------------------------- the black box
+
+
+def faulted(folder: Path, seconds: float, at: float, after: float) -> tuple[list[Recording], list[str]]:
+    """Let the drives fault at a time, and go on for another; return the black boxes."""
+    time, told = Time(), list[str]()
+    config = configured(rotate_mb=1.0, capture_can=True)
+    box = BlackBox(1000, lambda name: recorder(folder, time, config, name=name), told.append)
+    sent = made.records(seconds)
+    cycle = round(at * 1000)
+    box.stands("target", (0.01, 0.02, 0.1))
+    feed(box, sent[: cycle - 500], time)
+    box.given(goal(cycle - 500))
+    feed(box, sent[cycle - 500 : cycle], time)
+    wall = (WALL_NS + cycle * 1_000_000) * 1e-9
+    box.event(Event(1, at, cycle, wall, "fault", "error", "drive B: emergency 4310"))
+    box.event(Event(2, at, cycle, wall, "mode", "info", "fault: drive B: emergency 4310", mode=Mode.FAULT))
+    feed(box, sent[cycle : cycle + round(after * 1000)], time)
+    box.close()
+    return [read(path) for path in parts(folder)], told
+
+
+def test_a_fault_keeps_the_minute_before_and_the_stop(tmp_path: Path) -> None:
+    (box,), told = faulted(tmp_path, 70.0, at=65.0, after=4.0)
+    (path,) = parts(tmp_path)
+    assert path.name == f"{box.name}.rrd"
+    assert path.name.startswith("fault-2026112")
+    cycles = box.records["cycle"]
+    assert np.all(np.diff(cycles) == 1)
+    assert cycles[0] <= 65_000 - BEFORE * 1000
+    assert cycles[-1] >= 65_000 + AFTER * 1000 - 1
+    assert [line.text for line in box.events] == ["drive B: emergency 4310", "fault: drive B: emergency 4310"]
+    assert box.requests == (goal(64_500),)
+    assert provenance.configuration(box.texts) == configured(rotate_mb=1.0, capture_can=True)
+    assert provenance.recorded_by(box.texts) == provenance.software()
+    assert told == []
+
+
+def test_a_service_that_ends_right_after_a_fault_keeps_it_too(tmp_path: Path) -> None:
+    (box,), _ = faulted(tmp_path, 3.0, at=1.5, after=0.3)
+    assert box.records["cycle"].tolist() == list(range(1800))
+
+
+def test_without_a_fault_there_is_no_black_box(tmp_path: Path) -> None:
+    time = Time()
+    box = BlackBox(1000, lambda name: recorder(tmp_path, time, configured(), name=name), print)
+    feed(box, made.records(1.0), time)
+    box.event(Event(1, 0.5, 500, WALL_NS * 1e-9, "mode", "info", "holding: enable by ann", mode="holding"))
+    box.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_black_box_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    _, told = faulted(blocked / "x", 1.0, at=0.6, after=0.2)
+    assert told[0].startswith("the last minute before the fault is not kept: cannot write a recording to")

@@ -1,0 +1,109 @@
+"""The recorder's price: its share of a processor and of the disk, while a service keeps a robot moving.
+
+The service runs on simulated drives, without a live view: that is to come on top. What is printed is what the
+recorder's process takes, beside the limits that it is to keep, and per cycle of the loop in the same seconds.
+"""
+
+from __future__ import annotations
+
+import json as json_format
+import os
+import random
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from service import spawned
+from service.client import Robot
+from service.config import load
+from service.errors import RefusedError, TrirailError
+
+CPU_LIMIT = 0.03
+"""Share of one processor."""
+DISK_LIMIT = 0.5e6
+"""Bytes a second."""
+_TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def measure(seconds: float) -> dict[str, Any]:
+    """Run a service for so many seconds, moving; return what its recorder took."""
+    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+        config, locator = spawned.private(Path(folder))
+        rate = load(config).loop.rate_hz
+        recording = Path(folder) / "bench.rrd"
+        with spawned.service(config, recording) as service, Robot("demo", locator, user="bench") as robot:
+            recorder, loop = (_child(service.pid, name) for name in ("recorder", "loop"))
+            robot.enable()
+            _move(robot, 3.0)  # until all that happens once has happened
+            before = _state(recorder, loop, recording, robot)
+            _move(robot, seconds)
+            after = _state(recorder, loop, recording, robot)
+            robot.disable()
+    spent, cpu, loop_cpu, written, cycles = (b - a for a, b in zip(before, after, strict=True))
+    return {
+        "seconds": spent,
+        "cycles": cycles,
+        "rate": cycles / spent,
+        "rate_to_wanted": cycles / spent / rate,
+        "cpu": cpu / spent,
+        "cpu_to_limit": cpu / spent / CPU_LIMIT,
+        "cpu_per_cycle_us": cpu / cycles * 1e6,
+        "cpu_to_loop": cpu / loop_cpu,
+        "bytes_per_second": written / spent,
+        "bytes_per_cycle": written / cycles,
+        # A busy machine's loop misses ticks: the limit is for the full rate.
+        "disk_to_limit": written / cycles * rate / DISK_LIMIT,
+    }
+
+
+def _state(recorder: int, loop: int, recording: Path, robot: Robot) -> tuple[float, ...]:
+    """Return time, processor time of recorder and loop [s], bytes and cycles so far."""
+    cycles = robot.state().loop.cycles
+    return time.monotonic(), _cpu(recorder), _cpu(loop), float(recording.stat().st_size), float(cycles)
+
+
+def _move(robot: Robot, seconds: float) -> None:
+    """Keep the robot moving, and its sliders with it."""
+    choice = random.Random(1)
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0.0:
+        print(f"\r{left:4.0f} s left ", end="", file=sys.stderr, flush=True)
+        x, y, phi = (choice.uniform(-span, span) for span in (0.05, 0.05, 0.4))
+        try:
+            robot.move_to(x=x, y=y, phi=phi)
+        except RefusedError as error:
+            print(error, file=sys.stderr)
+        time.sleep(0.3)
+    print("\r", end="", file=sys.stderr)
+
+
+def _child(service: int, name: str) -> int:
+    """Return the process id of one of a service's processes."""
+    for child in Path(f"/proc/{service}/task/{service}/children").read_text(encoding="ascii").split():
+        if Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")[3] == name.encode():
+            return int(child)
+    raise TrirailError(f"the service has no process {name}")
+
+
+def _cpu(process: int) -> float:
+    """Return the processor time that a process has taken, in the kernel too [s] (proc(5), stat)."""
+    fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / _TICKS
+
+
+def main(seconds: float, json: bool = False) -> None:
+    """Print the measurements as lines, or as one JSON object."""
+    measured = measure(seconds)
+    if json:
+        print(json_format.dumps(measured))
+        return
+    of = measured.__getitem__
+    print(f"the loop turned at {of('rate'):.0f} Hz for {of('seconds'):.0f} s, {of('rate_to_wanted'):.0%} of its rate")
+    print(f"processor  {of('cpu'):7.2%} of a core, {of('cpu_to_limit'):.2f} of the limit")
+    print(f"           {of('cpu_per_cycle_us'):7.1f} µs a cycle, {of('cpu_to_loop'):.2f} of the loop's")
+    print(
+        f"disk       {of('bytes_per_second') / 1e6:7.3f} MB/s, at the full rate {of('disk_to_limit'):.2f} of the limit"
+    )
+    print(f"           {of('bytes_per_cycle'):7.0f} bytes a cycle")
