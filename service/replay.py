@@ -153,13 +153,12 @@ class _Recorded:
     bus_load = 0.0
 
     def __init__(self, records: NDArray[np.void]) -> None:
-        positions, states = records["position"].tolist(), records["drive_state"].tolist()
-        flags = [map(tuple, records[name].astype(kind).tolist()) for name, kind in _FLAGS]
+        positions: list[Any] = records["position"].tolist()
+        flags: list[Any] = [map(tuple, records[name].astype(kind).tolist()) for name, kind in _FLAGS]
         homing = records["homing"].astype(bool).tolist()
+        states: list[Any] = [tuple(map(PowerState, state)) for state in records["drive_state"].tolist()]
         self._said = [
-            Feedback(
-                tuple(position), tuple(map(PowerState, state)), None, age=age, follows=follows, homed=homed, homing=now
-            )
+            Feedback(tuple(position), state, None, age=age, follows=follows, homed=homed, homing=now)
             for position, state, age, follows, homed, now in zip(positions, states, *flags, homing, strict=True)
         ]
         self._row = -1
