@@ -16,23 +16,24 @@ from drivers.interface import NAMES, Drives, Feedback, PowerState
 from service.config import Config, geometry
 from service.course import Course
 from service.desk import Desk
+from service.dispatch import Dispatch
 from service.errors import RefusedError
 from service.goals import Goals
-from service.kinematics import forward_into, inverse_into
+from service.kinematics import inverse_into
 from service.limits import EDGE, Bounds
+from service.measured import Measured
 from service.messages import Outcome, PoseGoal, SlidersGoal
 from service.modes import DISABLED, HOLDING, MOVING, Action, Event, Mode, Refusal, State, step
 from service.motion import STILL, MotionState, Run, rest
 from service.packets import CommandRequest, GoalRequest, Request
 from service.pilot import Pilot
 from service.steps import finish
+from service.verdicts import still_powered, verdict
 
 Triple = tuple[float, float, float]
 
 SETTLE = 0.1
 """How long the drives may take to leave their fault state after a reset [s]."""
-OLDEST = 3
-"""The greatest age of a position that is looked at, in SYNCs: at the next one the drive is silent."""
 
 _COMMANDS = {
     "enable": Event.ENABLE,
@@ -48,8 +49,6 @@ _OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.FAULT: "fault
 """How a goal ends on an event after which it is not under way; else it is stopped."""
 _GO_ON = (Event.GOAL, Event.STANDSTILL, Event.POWERED, Event.PAUSE, Event.RESUME, Event.ENABLE, Event.RESET)
 """Events that leave alone what has been sent but not begun."""
-_POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
-_FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 
 
 class Control:
@@ -62,11 +61,12 @@ class Control:
         self._legs = robot.packed()
         self._bounds = Bounds(config.limits, config.period, EDGE)
         self._goals = Goals(robot, config.limits, config.period)
+        self._step = config.limits.slider.velocity * config.period
         self._course = Course(rest(STILL), config.period)
         self._pilot = Pilot(self._goals, self._course, config.period)
-        self._queue_depth = config.motion.queue
-        self._waiting: deque[GoalRequest] = deque()
-        self._step = config.limits.slider.velocity * config.period
+        self.desk = Desk()
+        self.dispatch = Dispatch(self.desk, self._pilot, self._course, config.motion.queue, config.period)
+        self.measured = Measured(self._legs, config.period, self._step)
         self._can_home = any(drive.homing is not None for drive in config.drives.each)
         self._following_error_limit = config.limits.slider.following_error
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
@@ -74,55 +74,33 @@ class Control:
 
         self._motion = np.zeros((3, 3))
         self._sliders = np.zeros((6, 3))
-        self._pose = np.zeros(3)
-        self._measured = np.zeros(3)
 
         self.cycle = 0
         self.state: State = DISABLED
         self.fault: str | None = None
-        self.desk = Desk()
-        self.feedback = Feedback(STILL, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
-        self.velocity: Triple = STILL
-        self.pose: Triple = STILL
         self.rows: list[list[float]] = self._sliders.tolist()
         """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 of the setpoints."""
-        self.following_error: Triple = STILL
-        self._jumps = False, False, False
-        """Which sliders were measured where none can be so soon: what they say is not followed."""
-        self._written: deque[Triple] = deque([STILL] * (2 + OLDEST), maxlen=2 + OLDEST)
-        """The setpoints of the last cycles, the newest at the right."""
         self._entered = 0
-        self._now_ns = 0
 
     # ------------------------------------------------------------------ the cycle, in its order
 
     def start(self, feedback: Feedback) -> None:
         """Take the measured sliders for the commanded ones, before the first cycle."""
-        self.feedback = feedback
-        self._written.extend([feedback.position] * (2 + OLDEST))
+        self.measured.start(feedback)
         self.rows[0] = list(feedback.position)
         self._follow_measured()
         # What runs for the first time is slow: plan and check a motion now, not in a cycle.
-        nearby = Course(rest([value + 1e-3 for value in self.pose]), self._period)
-        for goal in (PoseGoal(*self.pose), SlidersGoal(feedback.position)):
+        nearby = Course(rest([value + 1e-3 for value in self.measured.pose]), self._period)
+        for goal in (PoseGoal(*self.measured.pose), SlidersGoal(feedback.position)):
             with contextlib.suppress(RefusedError):
                 nearby.take(finish(self._goals.plan(goal, nearby, 1.0)).runs)
-                finish(self._goals.laws.try_change(nearby.runs[0], 0.0, self.pose))
+                finish(self._goals.laws.try_change(nearby.runs[0], 0.0, self.measured.pose))
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
         self.cycle += 1
-        before, self.feedback = self.feedback, feedback
-        self._compare(before)
-        self._measured[:] = feedback.position
-        a, b, c = self.velocity
-        most = 2.0 * self._step / self._period  # the age may be one off, and makes a step a double one
-        self._jumps = abs(a) > most, abs(b) > most, abs(c) > most
-        if not any(self._jumps) and forward_into(self._legs, self._measured, self._pose, self._pose) == 0:
-            x, y, phi = self._pose.tolist()
-            self.pose = (x, y, phi)
-        else:
-            self._pose[:] = self.pose  # the search for the next one begins where the robot was
+        before = self.measured.feedback
+        self.measured.take(feedback)
         for warning in feedback.warnings:
             self.desk.tell("service", "warning", warning)
         mode = self.state.mode
@@ -133,7 +111,7 @@ class Control:
         elif mode is Mode.ENABLING:
             self._power_up()
         elif mode in (Mode.HOMING, Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
-            for name, error in zip(NAMES, self.following_error, strict=True):
+            for name, error in zip(NAMES, self.measured.following_error, strict=True):
                 if not abs(error) <= self._following_error_limit:
                     self.trip(
                         f"slider {name}: following error {error * 1e3:.3f} mm is beyond its limit "
@@ -145,28 +123,11 @@ class Control:
                     self._homing_over()
         self.desk.settle(self._verdict, self.state.mode)
 
-    def _compare(self, before: Feedback) -> None:
-        """Work out velocities and following errors, for the SYNC at which each position was sampled."""
-        velocity, error = list(self.velocity), [0.0, 0.0, 0.0]
-        follows = self.feedback.follows
-        for n, (now, age, last, last_age) in enumerate(
-            zip(self.feedback.position, self.feedback.age, before.position, before.age, strict=True)
-        ):
-            cycles = 1 + last_age - age
-            if cycles > 0:  # else there is no newer position
-                velocity[n] = (now - last) / (cycles * self._period)
-            # A drive reaches at a SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
-            if follows[n]:
-                error[n] = self._written[-2 - min(age, OLDEST)][n] - now
-        self.velocity = (velocity[0], velocity[1], velocity[2])
-        self.following_error = (error[0], error[1], error[2])
-
     def handle(self, request: Request, now_ns: int) -> None:
         """Take one request at a time of the monotonic clock: goals wait until those before them are planned."""
         try:
             if isinstance(request, GoalRequest):
-                self._now_ns = now_ns
-                self._waiting.append(request)
+                self.dispatch.take(request, now_ns)
             elif isinstance(request, CommandRequest):
                 self._take_command(request)
             else:
@@ -185,14 +146,16 @@ class Control:
 
     def advance(self) -> None:
         """Plan one step further, and move the commanded state on by one period."""
-        self._think()
+        beginning = self.dispatch.think(self.cycle, self._admit)
+        if beginning is not None:
+            self._go(Event.GOAL, f"goal {beginning.id} of {beginning.user}")
         for _ in range(self._course.advance()):
             self.desk.pass_on()
-        self._expire()
+        self.dispatch.expire(self.cycle)
 
     def solve(self) -> None:
         """Solve the sliders for the commanded state, by the paper's recursion; pass the last gate, or trip."""
-        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.homed:
+        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed:
             self._follow_measured()
             return
         for row, values in enumerate(self.commanded):
@@ -202,7 +165,7 @@ class Control:
             self.trip(f"slider {NAMES[singular - 1]}: no setpoint, the commanded pose is singular or not a number")
             return
         rows = self._sliders.tolist()
-        violation = self._bounds.setpoint(rows, self._written[-1]) or self._bounds.pose(self.commanded.pose)
+        violation = self._bounds.setpoint(rows, self.measured.last_written) or self._bounds.pose(self.commanded.pose)
         if violation:
             self.trip(f"setpoint refused: {violation}")
             return
@@ -215,20 +178,10 @@ class Control:
         """Send the setpoints."""
         position, velocity = self.rows[0], self.rows[1]
         setpoint = (position[0], position[1], position[2])
-        self._written.append(setpoint)
+        self.measured.note(setpoint)
         self._drives.write(setpoint, (velocity[0], velocity[1], velocity[2]))
 
     # ------------------------------------------------------------------ what others ask of it
-
-    @property
-    def powered(self) -> bool:
-        """Whether any drive can still move its slider."""
-        return any(state in _POWERED for state in self.feedback.state)
-
-    @property
-    def ready(self) -> bool:
-        """Whether another request can be taken: no goal waits for another one to be planned."""
-        return not self._waiting
 
     @property
     def commanded(self) -> MotionState:
@@ -239,11 +192,6 @@ class Control:
     def override(self) -> float:
         """The rate at which motions are to run."""
         return self._pilot.override
-
-    @property
-    def homed(self) -> bool:
-        """Whether it is known where the sliders are."""
-        return all(self.feedback.homed)
 
     @property
     def progress(self) -> tuple[float, float]:
@@ -274,74 +222,19 @@ class Control:
 
     # ------------------------------------------------------------------ requests
 
-    def _think(self) -> None:
-        """Begin with the next goal if none is being planned, and take one step."""
-        pilot = self._pilot
-        if not pilot.busy and self._waiting:
-            self._planned = self._waiting.popleft()
-            try:
-                self._consider(self._planned)
-            except RefusedError as refusal:
-                self.desk.refuse(self._planned, refusal)
-        try:
-            taken = pilot.think()
-        except RefusedError as refusal:
-            self.desk.refuse(self._planned, refusal)
-            return
-        if taken is not None:
-            request = self._planned
-            valid = request.goal.valid_for
-            expires = self.cycle + valid / self._period if valid is not None else math.inf
-            self.desk.begin(request, taken, expires)
-            self._go(Event.GOAL, f"goal {request.id} of {request.user}")
-
-    def _consider(self, request: GoalRequest) -> None:
-        """Begin to plan a goal, or refuse it."""
-        self.desk.check_id(request)
-        if request.withdrawn is not None:
-            self.desk.withdraw(request, "stopped", request.withdrawn)
-            return
+    def _admit(self) -> bool:
+        """Whether the robot is moving to a goal; RefusedError where it takes none."""
         decided = step(self.state, Event.GOAL)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
-        if not self.homed:
+        if not self.measured.homed:
             raise RefusedError("not_homed", "it is not known where the sliders are: send home first")
-        goal = request.goal
-        if goal.valid_for is not None and self._now_ns - request.received_ns > goal.valid_for * 1e9:
-            raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")
-        blend = None
-        if self.state.mode is Mode.MOVING and self.desk.goals and isinstance(goal, PoseGoal):
-            blend = self.desk.goals[-1].blend
-        if blend is not None and len(self.desk.goals) > self._queue_depth:
-            text = f"{self._queue_depth} goals are waiting already (motion.queue): send it when one has ended"
-            raise RefusedError("queue_full", text, value=len(self.desk.goals), limit=self._queue_depth)
-        self._pilot.plan(goal, blend)
+        return self.state.mode is Mode.MOVING
 
     def _withdraw(self, event: Event, reason: str) -> None:
         """End what has been sent but not begun, where the robot is to stand."""
-        if event in _GO_ON:
-            return
-        outcome: Outcome = "faulted" if event is Event.FAULT else "stopped"
-        requests = [self._planned, *self._waiting] if self._pilot.busy else [*self._waiting]
-        self._pilot.give_up()
-        self._waiting.clear()
-        for request in requests:
-            self.desk.withdraw(request, outcome, reason)
-
-    def _expire(self) -> None:
-        """Let go of waiting goals that can no more begin in time, and of those behind them."""
-        for number, goal in enumerate(self.desk.goals):
-            if number and self.cycle > goal.expires:
-                self._drop(number, goal.id, "expired", "it has not begun in time")
-                return
-
-    def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: str) -> None:
-        """End a goal that waits, and those behind it."""
-        self.desk.end("stopped", f"goal {goal_id} before it {outcome}", but=number + 1)
-        self.desk.end(outcome, reason, but=number)
-        run = self._course.runs[-1]
-        run.drop(number - 1)
-        self._pilot.run_at(self.override)
+        if event not in _GO_ON:
+            self.dispatch.withdraw("faulted" if event is Event.FAULT else "stopped", reason)
 
     def _take_command(self, request: CommandRequest) -> None:
         if request.name == "override":
@@ -350,7 +243,7 @@ class Control:
         event = _COMMANDS[request.name]
         if event is Event.HOME and not self._can_home:
             raise RefusedError("nothing_to_home", "absolute encoders: there is nothing to home")
-        if request.goal is not None and self._stops_only(request.goal, f"{request.name} by {request.user}"):
+        if request.goal is not None and self.dispatch.stop_alone(request.goal, f"{request.name} by {request.user}"):
             self.desk.undertake(request, self.cycle)
             return
         decided = step(self.state, event)
@@ -358,10 +251,10 @@ class Control:
             raise RefusedError(decided.code, self._because(decided))
         if decided.action is Action.POWER_UP:
             self._check_rest()
-            if self.homed:
+            if self.measured.homed:
                 self._check_start()
-        if decided.action is Action.CLEAR and self.powered:
-            raise RefusedError("stopping", self._still_powered())
+        if decided.action is Action.CLEAR and self.measured.powered:
+            raise RefusedError("stopping", still_powered(self.measured, self.fault))
         reason = f"{request.name} by {request.user}"
         if event is Event.QUICK_STOP:
             self.trip(reason)
@@ -369,20 +262,6 @@ class Control:
             self._withdraw(event, reason)
             self._go(event, reason)
         self.desk.undertake(request, self.cycle)
-
-    def _stops_only(self, goal_id: str, reason: str) -> bool:
-        """Stop a goal that has not begun; whether that was all. Raises RefusedError if it is not under way at all."""
-        if self.desk.goal is not None and self.desk.goal.id == goal_id:
-            return False
-        for number, goal in enumerate(self.desk.goals):
-            if goal.id == goal_id:
-                self._drop(number, goal_id, "stopped", reason)
-                return True
-        if self._pilot.busy and self._planned.id == goal_id:
-            self._pilot.give_up()
-            self.desk.withdraw(self._planned, "stopped", reason)
-            return True
-        raise RefusedError("no_goal", f"goal {goal_id!r} is not under way: it has ended, or never was")
 
     def _take_override(self, request: CommandRequest) -> None:
         """Let this motion and those to come run at another rate."""
@@ -395,15 +274,9 @@ class Control:
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
 
-    def _still_powered(self) -> str:
-        """Tell which drives, by what they said last, can still move."""
-        states = zip(NAMES, self.feedback.state, strict=True)
-        said = ", ".join(f"drive {name} is {state}" for name, state in states if state in _POWERED)
-        return f"{said} by what it said last: send reset again when the drives stand (fault: {self.fault})"
-
     def _check_rest(self) -> None:
         """Refuse to enable while a setpoint is on its way to where its slider is."""
-        for name, setpoint, measured in zip(NAMES, self.rows[0], self.feedback.position, strict=True):
+        for name, setpoint, measured in zip(NAMES, self.rows[0], self.measured.feedback.position, strict=True):
             if not abs(setpoint - measured) <= self._step:
                 raise RefusedError(
                     "not_at_rest", f"slider {name} moves too fast for its setpoint to follow: enable when it stands"
@@ -411,15 +284,13 @@ class Control:
 
     def _check_start(self) -> None:
         """Refuse to enable where the robot stands outside what it may do."""
-        position = self.feedback.position
-        self._measured[:] = position
-        self._pose[:] = self.pose
-        unreachable = forward_into(self._legs, self._measured, self._pose, self._pose)
+        position = self.measured.feedback.position
+        pose = self.measured.pose_of(position)
         self._motion[:] = 0.0
-        self._motion[0] = self._pose
-        if unreachable or inverse_into(self._legs, self._motion, self._sliders):
+        self._motion[0] = pose or math.nan
+        if pose is None or inverse_into(self._legs, self._motion, self._sliders):
             raise RefusedError("singular", "the measured sliders belong to no pose: move them by hand, then enable")
-        violation = self._bounds.pose(self._pose.tolist()) or self._bounds.setpoint(self._sliders.tolist(), position)
+        violation = self._bounds.pose(pose) or self._bounds.setpoint(self._sliders.tolist(), position)
         if violation:
             raise RefusedError(
                 "out_of_workspace",
@@ -429,33 +300,9 @@ class Control:
             )
 
     def _verdict(self, name: str, since: int) -> str | None:
-        """Return "" when the command is carried out, None while it is not, else why it never will be."""
-        mode = self.state.mode
-        fault = self.feedback.fault
-        if name in ("disable", "quick_stop") and fault is not None and fault.cause == "timeout":
-            return fault.message
-        match name:
-            case "enable":
-                if mode is Mode.ENABLING:
-                    return None
-                return "" if mode not in (Mode.FAULT, Mode.DISABLED) else self.fault or "disabled while powering up"
-            case "disable":
-                return None if mode is Mode.STOPPING or self.powered else ""
-            case "stop" | "pause":
-                return None if mode is Mode.STOPPING else ""
-            case "home":
-                if mode in (Mode.HOMING, Mode.STOPPING):
-                    return None
-                return "" if self.homed else self.fault or "stopped before every drive was homed"
-            case "resume" | "override":
-                return ""
-            case "reset":
-                if mode is Mode.FAULT:
-                    return f"the cause is still there: {self.fault}"
-                settled = self.cycle - since >= self._settle_cycles
-                return "" if settled and not any(state in _FAULTY for state in self.feedback.state) else None
-            case _:
-                return None if self.powered else ""
+        """Say what has become of a command that came in a cycle: service.verdicts.verdict."""
+        settled = self.cycle - since >= self._settle_cycles
+        return verdict(name, self.state.mode, self.fault, self.measured, settled=settled)
 
     # ------------------------------------------------------------------ from state to state
 
@@ -517,15 +364,15 @@ class Control:
 
     def _power_up(self) -> None:
         """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""
-        if all(state is PowerState.OPERATION_ENABLED for state in self.feedback.state):
-            if not self.homed:
+        if all(state is PowerState.OPERATION_ENABLED for state in self.measured.feedback.state):
+            if not self.measured.homed:
                 self._go(Event.POWERED, "all drives are enabled; where the sliders are is not known: send home")
             elif self._rest_at_setpoints():
                 self._go(Event.POWERED, "all drives are enabled")
         elif self.cycle - self._entered > self._enable_cycles:
             waiting = [
                 f"drive {name} is {state}"
-                for name, state in zip(NAMES, self.feedback.state, strict=True)
+                for name, state in zip(NAMES, self.measured.feedback.state, strict=True)
                 if state is not PowerState.OPERATION_ENABLED
             ]
             seconds = self._enable_cycles * self._period
@@ -535,7 +382,7 @@ class Control:
         """Hold where homing has ended, or was stopped."""
         if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self._course.runs:
             return  # no homing has been under way
-        if self.homed:
+        if self.measured.homed:
             try:
                 self._check_start()
             except RefusedError as refusal:
@@ -550,11 +397,12 @@ class Control:
 
     def _rest_at_setpoints(self) -> bool:
         """Command the pose that belongs to the setpoints, at rest; trip where there is none."""
-        self._measured[:] = self.rows[0]
-        if forward_into(self._legs, self._measured, self._pose, self._pose):
+        a, b, c = self.rows[0]
+        pose = self.measured.pose_of((a, b, c))
+        if pose is None:
             self.trip("the measured sliders belong to no pose")
             return False
-        self._course.commanded = rest(self._pose.tolist())
+        self._course.commanded = rest(pose)
         return True
 
     def _follow_measured(self) -> None:
@@ -569,10 +417,10 @@ class Control:
         position = []
         for last, measured, jumps, state, follows in zip(
             self.rows[0],
-            self.feedback.position,
-            self._jumps,
-            self.feedback.state,
-            self.feedback.follows,
+            self.measured.feedback.position,
+            self.measured.jumps,
+            self.measured.feedback.state,
+            self.measured.feedback.follows,
             strict=True,
         ):
             if not follows:
@@ -581,9 +429,9 @@ class Control:
                 position.append(last)
             else:
                 position.append(last + max(-self._step, min(measured - last, self._step)))
-        self._course.commanded = rest(self.pose)
+        self._course.commanded = rest(self.measured.pose)
         self._motion[:] = 0.0
-        self._motion[0] = self.pose
+        self._motion[0] = self.measured.pose
         if inverse_into(self._legs, self._motion, self._sliders) == 0:
             self.rows = self._sliders.tolist()
         self.rows[0] = position

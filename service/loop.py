@@ -97,7 +97,7 @@ class Loop:
         self._watch(tick, feedback.fault)
         decided = moved = now()
         try:
-            request = self._gateway.receive() if control.ready else None
+            request = self._gateway.receive() if control.dispatch.ready else None
             if request is not None:
                 decoded = packets.decode_request(memoryview(request)[1:])
                 self._note(tick, decoded)
@@ -155,13 +155,13 @@ class Loop:
         if self._ending_since is None:
             return False
         control = self.control
-        stands = control.state.mode in (Mode.DISABLED, Mode.FAULT) and not control.powered
+        stands = control.state.mode in (Mode.DISABLED, Mode.FAULT) and not control.measured.powered
         return stands or (control.cycle - self._ending_since) * self._period > SHUTDOWN
 
     def _record(self, tick: Tick, parts: tuple[int, ...]) -> None:
         """Append this cycle's record; pass batch, answers and events on."""
         control = self.control
-        feedback = control.feedback
+        feedback = control.measured.feedback
         rows = control.rows
         LAYOUT.pack_into(
             self._batch,
@@ -178,17 +178,17 @@ class Loop:
             *feedback.follows,
             *feedback.homed,
             feedback.homing,
-            *control.pose,
+            *control.measured.pose,
             *control.commanded.pose,
             *control.commanded.velocity,
             *control.commanded.acceleration,
             *feedback.position,
-            *control.velocity,
+            *control.measured.velocity,
             *rows[0],
             *rows[1],
             *rows[2],
             *rows[3],
-            *control.following_error,
+            *control.measured.following_error,
             *control.progress,
         )
         self._batched += 1

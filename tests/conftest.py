@@ -117,7 +117,7 @@ class Rig:
         control.observe(self.driver.read())
         if request is not None:
             self._posted.append(request)
-        if control.ready and self._posted:
+        if control.dispatch.ready and self._posted:
             control.handle(self._posted.popleft(), round(self.now * 1e9))
         control.advance()
         control.solve()

@@ -79,7 +79,7 @@ def test_nothing_moves_on_enable() -> None:
     assert [drive.servo.position for drive in rig.drives] == [round(value * 1e7) for value in start]
     assert np.max(np.ptp(rig.setpoints()[:, 0], axis=0)) < 1e-12
     assert rig.control.commanded.pose == pytest.approx(forward(ROBOT, np.array(start)).tolist(), abs=1e-12)
-    assert max(map(abs, rig.control.following_error)) < 1e-7
+    assert max(map(abs, rig.control.measured.following_error)) < 1e-7
     rig.bus.shutdown()
 
 
@@ -125,7 +125,7 @@ def test_a_goal_arrives_and_ends_once(rig: Rig) -> None:
     rig.cycles(50)
     assert rig.outcomes() == [("g1", "done")]
     assert rig.control.commanded.pose == pytest.approx((0.05, -0.02, 0.3), abs=1e-9)
-    assert rig.control.pose == pytest.approx((0.05, -0.02, 0.3), abs=1e-6)
+    assert rig.control.measured.pose == pytest.approx((0.05, -0.02, 0.3), abs=1e-6)
     assert_within_limits(rig)
 
 
@@ -323,8 +323,8 @@ def jogged(delay: Delay | None) -> tuple[Rig, NDArray[np.float64], NDArray[np.fl
             rig.send("j1" if n < 300 else "j2", VelocityGoal(0.2 if n < 300 else -0.2, 0.0, 0.0, timeout=0.2))
         else:
             rig.cycle()
-        errors.append(rig.control.following_error)
-        velocities.append(rig.control.velocity)
+        errors.append(rig.control.measured.following_error)
+        velocities.append(rig.control.measured.velocity)
     rig.bus.shutdown()
     return rig, np.array(errors), np.array(velocities)
 
@@ -354,13 +354,13 @@ def test_a_lost_answer_is_no_step_in_error_or_velocity(late: float) -> None:
     rig.enable()
     rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=2.0))
     rig.cycles(300)
-    velocity = rig.control.velocity
+    velocity = rig.control.measured.velocity
     for number in (1, 2):
         lost += [math.inf] * number
         for _ in range(6):
             rig.cycle()
-            assert max(map(abs, rig.control.following_error)) < 1e-4
-            assert rig.control.velocity == pytest.approx(velocity, rel=0.01, abs=1e-4)
+            assert max(map(abs, rig.control.measured.following_error)) < 1e-4
+            assert rig.control.measured.velocity == pytest.approx(velocity, rel=0.01, abs=1e-4)
         assert not lost
     assert rig.mode is Mode.MOVING
     rig.bus.shutdown()

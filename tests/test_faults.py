@@ -77,7 +77,7 @@ def moving(rig: FaultRig) -> None:
     rig.goal("g1", 0.08, 0.08, 0.3)
     rig.cycles(150)
     assert rig.mode is Mode.MOVING
-    assert min(abs(velocity) for velocity in rig.control.velocity) > 0.2
+    assert min(abs(velocity) for velocity in rig.control.measured.velocity) > 0.2
 
 
 def stopping(rig: FaultRig) -> None:
@@ -91,7 +91,7 @@ def homing(rig: FaultRig) -> None:
     rig.cycle(CommandRequest(0, "ann", "home"))
     rig.cycles(100)
     assert rig.mode is Mode.HOMING
-    assert rig.control.feedback.follows == (False, True, True)
+    assert rig.control.measured.feedback.follows == (False, True, True)
     assert rig.drives[0].servo.velocity != 0.0
 
 
@@ -233,7 +233,7 @@ def test_a_fault_stops_all_three_drives(rig: FaultRig, case: Case, mode: str) ->
     assert rig.stands()
     if case.curable:
         rig.enable()
-        if not rig.control.homed:
+        if not rig.control.measured.homed:
             assert isinstance(rig.command("home"), Confirmed)
         rig.goal("g3", 0.01, 0.0, 0.0)
         rig.until(lambda: rig.mode is Mode.HOLDING)
@@ -284,7 +284,7 @@ def test_what_does_not_stop_the_robot(rig: FaultRig, line: str, mode: str) -> No
     rig.cycles(800)
     rig.until(rig.holds)
     assert [said.message for said in rig.happenings if said.kind == "fault"] == []
-    assert rig.control.homed
+    assert rig.control.measured.homed
     assert tuple(rig.outcomes()) == begun.otherwise
     assert_no_jump(rig)
 
@@ -304,7 +304,7 @@ def test_a_position_that_jumps_for_a_cycle_moves_no_setpoint(rig: FaultRig) -> N
     by_hand(rig, 0, -0.1)
     rig.cycles(3)
     assert {target for target, _ in rig.targets[1]} == {0}
-    assert rig.control.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+    assert rig.control.measured.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
 def test_a_slider_moved_by_hand_is_followed_without_a_jump_before_it_is_enabled(rig: FaultRig) -> None:
@@ -318,7 +318,7 @@ def test_a_slider_moved_by_hand_is_followed_without_a_jump_before_it_is_enabled(
     rig.cycles(30)
     rig.enable()
     rig.cycles(10)
-    assert rig.control.feedback.position == pytest.approx((0.02, 0.02, 0.02), abs=1e-6)
+    assert rig.control.measured.feedback.position == pytest.approx((0.02, 0.02, 0.02), abs=1e-6)
     assert_no_jump(rig)
 
 
@@ -328,7 +328,7 @@ def test_the_pose_is_found_again_after_sliders_that_belong_to_none(rig: FaultRig
             by_hand(rig, index, step)
         rig.cycle()
     rig.cycles(3)
-    assert rig.control.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert rig.control.measured.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
 def test_a_drive_that_does_not_leave_its_fault_is_not_reset(rig: FaultRig) -> None:

@@ -78,7 +78,7 @@ def begin(rig: Rig, cycles: int = 0) -> None:
 def settled(rig: Rig) -> None:
     """Every drive follows setpoints and stands, and goes on standing."""
     assert modes(rig) == [8, 8, 8]
-    assert rig.control.feedback.follows == (True, True, True)
+    assert rig.control.measured.feedback.follows == (True, True, True)
     before = true_positions(rig)
     rig.cycles(200)
     assert true_positions(rig) == pytest.approx(before, abs=2e-7)
@@ -92,17 +92,17 @@ def settled(rig: Rig) -> None:
 def test_afterwards_positions_are_true(method: int, start: tuple[float, float, float]) -> None:
     rig = Rig(changed(incremental(method), start=start))
     rig.enable()
-    assert rig.control.feedback.position == HOMES  # what counts of 0 stand for: not where they are
+    assert rig.control.measured.feedback.position == HOMES  # what counts of 0 stand for: not where they are
     answer = rig.command("home")
     assert isinstance(answer, Confirmed)
     assert answer.mode == "holding"
-    assert rig.control.feedback.homed == (True, True, True)
-    assert rig.control.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+    assert rig.control.measured.feedback.homed == (True, True, True)
+    assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
     assert true_positions(rig) == pytest.approx(HOMES, abs=1e-4)  # it brakes behind the edge
     settled(rig)
     assert isinstance(rig.goal("g1", 0.02, 0.01, 0.1), Accepted)
     rig.until(lambda: rig.mode is Mode.HOLDING)
-    assert rig.control.pose == pytest.approx((0.02, 0.01, 0.1), abs=1e-6)
+    assert rig.control.measured.pose == pytest.approx((0.02, 0.01, 0.1), abs=1e-6)
     rig.bus.shutdown()
 
 
@@ -111,8 +111,8 @@ def test_home_is_where_it_stands(method: int) -> None:
     rig = Rig(incremental(method))
     rig.enable()
     rig.command("home")
-    assert rig.control.feedback.homed == (True, True, True)
-    assert rig.control.feedback.position == pytest.approx(HOMES, abs=2e-7)
+    assert rig.control.measured.feedback.homed == (True, True, True)
+    assert rig.control.measured.feedback.position == pytest.approx(HOMES, abs=2e-7)
     assert true_positions(rig) == pytest.approx(START)
     settled(rig)
     rig.bus.shutdown()
@@ -121,7 +121,7 @@ def test_home_is_where_it_stands(method: int) -> None:
 def test_only_what_is_not_absolute_is_homed() -> None:
     drives = msgspec.structs.replace(incremental().drives, B=CONFIG.drives.B)
     rig = Rig(msgspec.structs.replace(incremental(), drives=drives))
-    assert rig.control.feedback.homed == (False, True, False)
+    assert rig.control.measured.feedback.homed == (False, True, False)
     rig.enable()
     seen = set()
     rig.cycle(CommandRequest(99, "ann", "home"))
@@ -129,7 +129,7 @@ def test_only_what_is_not_absolute_is_homed() -> None:
         seen.add(tuple(modes(rig)))
         rig.cycle()
     assert seen == {(8, 8, 8), (6, 8, 8), (8, 8, 6)}
-    assert rig.control.feedback.homed == (True, True, True)
+    assert rig.control.measured.feedback.homed == (True, True, True)
     rig.bus.shutdown()
 
 
@@ -190,7 +190,7 @@ def test_the_frames_of_one_drive(rig: Rig) -> None:
     begin(rig)
     said: list[str] = []
     word = frames.ENABLE_OPERATION
-    while rig.control.feedback.homing is False or not rig.control.feedback.homed[0]:
+    while rig.control.measured.feedback.homing is False or not rig.control.measured.feedback.homed[0]:
         rig.cycle()
         for message in rig.sent:
             if message.arbitration_id == frames.SDO_REQUEST + 1 and message.data[0] == 0x2F:
@@ -224,7 +224,7 @@ def test_a_controlword_that_gets_lost_is_sent_again(rig: Rig, monkeypatch: pytes
     assert lost
     settled(rig)
     assert isinstance(rig.command("home"), Confirmed)
-    assert rig.control.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+    assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
 
 
 def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,7 +242,7 @@ def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pyte
     begin(rig, 1)
     moved = 0.0
     before = true_positions(rig)[0]
-    while not rig.control.feedback.homed[0]:
+    while not rig.control.measured.feedback.homed[0]:
         rig.cycle()
         moved = max(moved, abs(true_positions(rig)[0] - before))
     assert moved > 5e-5
@@ -278,14 +278,14 @@ def test_a_stop_halts_it_and_it_can_begin_again(event: str | Event, end: Mode, w
         assert isinstance(rig.command(event), Confirmed)
     assert rig.mode is end
     assert rig.control.fault is None
-    assert not all(rig.control.feedback.homed)
+    assert not all(rig.control.measured.feedback.homed)
     assert refusal(next(a for a in rig.answers if getattr(a, "ticket", None) == 99)).code == "failed"
     settled(rig)
     if end is Mode.DISABLED:
         rig.enable()
     assert refusal(rig.goal("g1", 0.0, 0.0, 0.1)).code == "not_homed"
     assert isinstance(rig.command("home"), Confirmed)
-    assert rig.control.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+    assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
     rig.bus.shutdown()
 
 
@@ -295,7 +295,7 @@ def test_a_stop_when_the_last_drive_is_home_comes_too_late(rig: Rig) -> None:
     rig.until(lambda: rig.drives[2].homing.attained)
     assert isinstance(rig.command("stop"), Confirmed)
     assert rig.mode is Mode.HOLDING
-    assert rig.control.homed
+    assert rig.control.measured.homed
     settled(rig)
     assert isinstance(rig.goal("g1", 0.02, 0.01, 0.1), Accepted)
 
@@ -324,7 +324,7 @@ def test_a_fault_stops_it_at_once_and_it_can_begin_again(rig: Rig, cause: str, w
     rig.enable()
     settled(rig)
     assert isinstance(rig.command("home"), Confirmed)
-    assert rig.control.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+    assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
 
 
 def test_no_drive_gets_power_in_homing_mode(rig: Rig) -> None:

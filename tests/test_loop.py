@@ -37,7 +37,7 @@ class Shell:
         self.gateway: Link = links.connect(folder / "gateway")
         self.recorder: Link = links.connect(folder / "recorder")
         self.loop = Loop(rig.config, rig.driver, *self.ports)
-        self.loop.control.start(rig.control.feedback)
+        self.loop.control.start(rig.control.measured.feedback)
 
     def cycles(self, number: int, missed: int = 0) -> None:
         for _ in range(number):

@@ -78,12 +78,12 @@ def test_the_cycle_that_takes_the_goal_is_one_period_into_it(rig: conftest.Rig, 
     first = len(rig.rows) - 1
     assert rig.control.progress[0] == pytest.approx(PERIOD / DURATION)
     moving = 1
-    measured, error = [rig.control.feedback.position], [rig.control.following_error]
+    measured, error = [rig.control.measured.feedback.position], [rig.control.measured.following_error]
     for _ in range(round(DURATION / PERIOD) + REACHED):
         rig.cycle()
         moving += rig.mode is Mode.MOVING
-        measured.append(rig.control.feedback.position)
-        error.append(rig.control.following_error)
+        measured.append(rig.control.measured.feedback.position)
+        error.append(rig.control.measured.following_error)
     assert moving == round(DURATION / PERIOD)
     setpoints = rig.setpoints()[first : first + moving]
     _, *exact = computed(example, np.arange(1.0, moving + 1.0) * PERIOD)
