@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from drivers.config import Can, Drives, Positive
+from drivers.interface import NAMES
 from service.errors import ConfigError
 from service.geometry import Geometry, Leg, singular_angles
 
@@ -273,3 +274,19 @@ def _check(config: Config) -> None:
             f"loop.rate_hz = {config.loop.rate_hz}: a cycle must be a whole number of microseconds, "
             "as with 100, 200, 250, 400, 500, 800, 1000"
         )
+    if config.drives.protocol == "odrive":
+        _check_feed_forward(config)
+
+
+def _check_feed_forward(config: Config) -> None:
+    """CANSimple has 16 bits for the velocity feed-forward; without it an ODrive lags out of its window."""
+    from drivers.odrive_frames import MAX_FEED_FORWARD
+
+    for name, drive in zip(NAMES, config.drives.each, strict=True):
+        turns = config.limits.slider.velocity * drive.counts_per_metre
+        if turns > MAX_FEED_FORWARD:
+            raise ConfigError(
+                f"limits.slider.velocity = {config.limits.slider.velocity:g}: with drives.{name}.counts_per_metre = "
+                f"{drive.counts_per_metre:g} that is {turns:g} turns/s, and an ODrive's feed-forward ends at "
+                f"{MAX_FEED_FORWARD:g}; lower the velocity, or use a longer lead"
+            )

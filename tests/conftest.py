@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable, Iterator
+from typing import cast
 
 import can
 import msgspec
@@ -13,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 
-from drivers.cia402 import Cia402
+from drivers.bus import PROTOCOLS
 from drivers.simulated import SimulatedDrive, simulated_bus
 from service.config import SIM, Config, load
 from service.control import Control
@@ -51,7 +52,7 @@ class Rig:
         self.sent: list[can.Message] = []
         self._send = self.bus.send
         self.bus.send = self._note  # type: ignore[assignment,method-assign]
-        self.driver = Cia402(self.bus, config.can.bitrate, config.drives, lambda: self.now)
+        self.driver = PROTOCOLS[config.drives.protocol](self.bus, config.can.bitrate, config.drives, lambda: self.now)
         self.driver.configure(config.period)
         self.control = Control(config, self.driver)
         self.driver.sync()
@@ -67,7 +68,7 @@ class Rig:
 
     @property
     def drives(self) -> tuple[SimulatedDrive, ...]:
-        return tuple(self.bus.drives)
+        return cast(tuple[SimulatedDrive, ...], self.bus.drives)  # tests with another protocol take rig.bus.drives
 
     @property
     def mode(self) -> Mode:

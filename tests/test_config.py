@@ -39,7 +39,12 @@ def test_shipped_configurations_load(path: Path) -> None:
         (
             'protocol = "cia402"',
             'protocol = "ethercat"',
-            "drives.protocol = 'ethercat': allowed are 'cia402'",
+            "drives.protocol = 'ethercat': allowed are 'cia402', 'odrive'",
+        ),
+        (
+            'protocol = "cia402"',
+            'protocol = "odrive"',
+            "with drives.A.counts_per_metre = 1e+07 that is 1e+07 turns/s, and an ODrive's feed-forward ends at 32.767",
         ),
         ('realtime = "prefer"', 'realtime = "yes"', "allowed are 'off', 'prefer', 'enforce'"),
         ("l0 = 0.3", "l0 = nan", "geometry.l0 = nan: it must be a finite number"),
