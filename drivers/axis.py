@@ -54,7 +54,7 @@ class Axis:
     def silence(self, now: float) -> DriveFault | None:
         """The fault that the drive is not heard any more, at time `now`."""
         if self.unanswered >= MISSED_ANSWERS:
-            return self.made("silent", 0, f"no position for {self.unanswered} SYNCs in a row")
+            return self.made("silent", 0, f"no position for {self.unanswered} cycles in a row")
         if now - self.heard > self._heartbeat_timeout:
             return self.made("heartbeat", 0, f"no heartbeat for {now - self.heard:.3g} s")
         return None

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 
-from drivers import frames
+from drivers import axis, frames
 from drivers.interface import DriveFault, PowerState
 from drivers.scaling import Scale
 
-MISSED_SYNCS = 3
-MISSED_HEARTBEATS = 3
 RESET_TIME = 2 * frames.STATUS_PERIOD
 """How long a drive may take to leave fault after a fault reset, in which it tells its state twice [s]."""
 
@@ -17,54 +15,32 @@ _NMT_STATES = {frames.STOPPED: "stopped", frames.PRE_OPERATIONAL: "pre-operation
 _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
 
 
-class Axis:
+class Axis(axis.Axis):
     """One drive's newest feedback; the `on_` methods take a frame's data or raise struct.error."""
 
     __slots__ = (
-        "_heartbeat_timeout",
         "_operational",
         "_restarted",
         "controlword",
         "error_code",
-        "event",
-        "heard",
         "left_operational",
-        "name",
-        "node",
-        "position",
-        "powered_up",
         "reset_until",
-        "scale",
         "state",
-        "unanswered",
     )
 
     def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
-        self.name = name
-        self.node = node
-        self.scale = scale
-        self.position = math.nan
-        """Actual position [m]."""
+        super().__init__(name, node, scale, heartbeat)
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
-        self.powered_up = False
-        """It has reached operation enabled since that was asked for."""
         self.controlword = frames.DISABLE_VOLTAGE
         """The last one sent."""
         self.error_code = 0
         """What the drive last gave as the reason of its fault; 0 once it said that is over."""
-        self.event: DriveFault | None = None
-        """A fault that a frame told of, rather than a state that lasts."""
-        self.unanswered = 0
-        """SYNCs since the last position."""
-        self.heard = math.inf
-        """Time of the last heartbeat [s]."""
         self.reset_until = -math.inf
         """Until when a fault reset is under way [s]."""
         self.left_operational = False
         """It said that it is operational no more, and was not started again since."""
         self._operational = False
         self._restarted = False
-        self._heartbeat_timeout = MISSED_HEARTBEATS * heartbeat
 
     def on_position(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
         """TPDO2: the position sampled at a SYNC."""
@@ -107,7 +83,7 @@ class Axis:
         elif state == frames.BOOT_UP:
             self._restarted = True
             # Takes the place of an earlier event, for it is the one that a reset cannot help.
-            self.event = self._fault("state", 0, "has restarted and lost its set-up; restart the service")
+            self.event = self.made("state", 0, "has restarted and lost its set-up; restart the service")
         elif self._operational:  # before that, it is a heartbeat from before the drive was started
             self._operational = False
             self.left_operational = True
@@ -123,11 +99,6 @@ class Axis:
             self.left_operational = False
             self.unanswered = 0
 
-    def tell(self, cause: str, code: int, text: str) -> None:
-        """Keep the first event since faults were last reset."""
-        if self.event is None:
-            self.event = self._fault(cause, code, text)
-
     def fault(self, now: float, wanted: frames.Wanted) -> DriveFault | None:
         """What is wrong with the drive at time `now`, given what it was asked for."""
         if self.event is not None:
@@ -135,18 +106,13 @@ class Axis:
         if self.state in _IN_FAULT:
             if now >= self.reset_until:
                 reason = f", error {self.error_code:04X}" if self.error_code else ""
-                return self._fault("fault", self.error_code, f"{self.state}{reason}")
-        elif self.unanswered >= MISSED_SYNCS:
-            return self._fault("silent", 0, f"no position for {self.unanswered} SYNCs in a row")
-        elif now - self.heard > self._heartbeat_timeout:
-            return self._fault("heartbeat", 0, f"no heartbeat for {now - self.heard:.3g} s")
+                return self.made("fault", self.error_code, f"{self.state}{reason}")
+        elif silent := self.silence(now):
+            return silent
         elif (
             self.powered_up
             and wanted is PowerState.OPERATION_ENABLED
             and self.state is not PowerState.OPERATION_ENABLED
         ):
-            return self._fault("state", 0, f"left operation enabled unasked: {self.state}")
+            return self.made("state", 0, f"left operation enabled unasked: {self.state}")
         return None
-
-    def _fault(self, cause: str, code: int, text: str) -> DriveFault:
-        return DriveFault(self.name, cause, code, f"drive {self.name}: {text}")

@@ -18,16 +18,12 @@ from drivers.axis402 import Axis
 from drivers.errors import BusError
 from drivers.interface import NAMES, DriveFault, Feedback, PowerState, Triple
 from drivers.scaling import scale_of
+from drivers.wire import Wire
 
-MOST_FRAMES = 1000
-"""Frames taken in by one `read` at most, so that a chattering bus cannot hold it."""
 STOPPING_TIME = 1.0
 """How long `close` waits for powered drives to come down their quick-stop ramp [s]."""
-BUS_OFF = 0x040
-"""Error class of a SocketCAN error frame: the controller has left the bus (linux/can/error.h)."""
 
 Clock = Callable[[], float]
-Handler = Callable[[bytearray, float], None]
 
 
 class Cia402:
@@ -45,7 +41,7 @@ class Cia402:
         clock: Clock = time.monotonic,
     ) -> None:
         self.bus_load = 0.0
-        self._bus = bus
+        self._wire = Wire(bus, self._stop)
         self._bitrate = bitrate
         self._drives = drives
         self._clock = clock
@@ -53,12 +49,11 @@ class Cia402:
             Axis(name, drive.node, scale_of(name, drive), drives.heartbeat)
             for name, drive in zip(NAMES, drives.each, strict=True)
         )
-        self._handlers: dict[int, tuple[Axis, Handler]] = {}
         for axis in self._axes:
-            self._handlers[frames.TPDO1 + axis.node] = axis, axis.on_status
-            self._handlers[frames.TPDO2 + axis.node] = axis, axis.on_position
-            self._handlers[frames.EMCY + axis.node] = axis, axis.on_emergency
-            self._handlers[frames.HEARTBEAT + axis.node] = axis, axis.on_heartbeat
+            self._wire.listen(frames.TPDO1 + axis.node, axis, axis.on_status)
+            self._wire.listen(frames.TPDO2 + axis.node, axis, axis.on_position)
+            self._wire.listen(frames.EMCY + axis.node, axis, axis.on_emergency)
+            self._wire.listen(frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
         self._sync = frames.message(frames.SYNC, b"")
         self._heartbeat = frames.message(
             frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL)
@@ -66,7 +61,6 @@ class Cia402:
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
-        self._fault: DriveFault | None = None
         self._closed = False
 
     def configure(self, period: float) -> None:
@@ -84,7 +78,7 @@ class Cia402:
                 f"the highest rate that fits is {fits:.0f} Hz"
             )
         scales = tuple(axis.scale for axis in self._axes)
-        starts = setup402.configure(self._bus, self._drives, scales, period, self._clock)
+        starts = setup402.configure(self._wire.bus, self._drives, scales, period, self._clock)
         for axis, start in zip(self._axes, starts, strict=True):
             axis.position = axis.scale.metres(start.counts)
             axis.error_code = start.error_code
@@ -93,7 +87,7 @@ class Cia402:
 
     def sync(self) -> None:
         """Send SYNC: the drives take up the setpoints written since the last one and sample positions."""
-        self._send(self._sync)
+        self._wire.send(self._sync)
         now = self._clock()
         if self._heartbeat_due is None:
             # The drives' watchdogs and ours begin with the first cycle, however long ago the set-up was.
@@ -102,7 +96,7 @@ class Cia402:
                 axis.heard = now
         if now >= self._heartbeat_due:
             self._heartbeat_due = now + self._drives.heartbeat
-            self._send(self._heartbeat)
+            self._wire.send(self._heartbeat)
         self._stopped_in_this_cycle = False
         for axis in self._axes:
             axis.unanswered += 1
@@ -110,15 +104,15 @@ class Cia402:
     def read(self) -> Feedback:
         """Take in every frame that has arrived."""
         now = self._clock()
-        self._receive(now)
+        self._wire.receive(now)
         a, b, c = self._axes
-        if self._fault is None:
+        if self._wire.fault is None:
             for axis in self._axes:
                 fault = axis.fault(now, self._wanted)
                 if fault is not None:
-                    self._fail(fault)
+                    self._wire.fail(fault)
                     break
-        return Feedback((a.position, b.position, c.position), (a.state, b.state, c.state), self._fault)
+        return Feedback((a.position, b.position, c.position), (a.state, b.state, c.state), self._wire.fault)
 
     def write(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints [m] and velocity feed-forward [m/s], to be taken up at the next SYNC.
@@ -134,11 +128,11 @@ class Cia402:
                 data = frames.SETPOINT.pack(axis.scale.counts(metres), axis.scale.counts_per_second(rate))
             except (ValueError, OverflowError, struct.error):
                 text = f"drive {axis.name}: cannot take setpoint {metres:g} m, {rate:g} m/s"
-                self._fail(DriveFault(axis.name, "setpoint", 0, text))
+                self._wire.fail(DriveFault(axis.name, "setpoint", 0, text))
                 return
             messages.append(frames.message(frames.RPDO2 + axis.node, data))
         for message in messages:
-            self._send(message)
+            self._wire.send(message)
         self._command()
 
     def enable(self) -> None:
@@ -146,7 +140,7 @@ class Cia402:
 
         Does nothing while a fault is latched.
         """
-        if self._fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
+        if self._wire.fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
             return
         self._wanted = PowerState.OPERATION_ENABLED
         for axis in self._axes:
@@ -165,11 +159,11 @@ class Cia402:
 
     def reset(self) -> None:
         """Forget the fault and clear the drives' own; never powers them up. What persists is found again."""
-        self._fault = None
+        self._wire.fault = None
         now = self._clock()
         for axis in self._axes:
             if axis.left_operational:  # its set-up is still there: only a restarted drive needs a new one
-                self._send(frames.nmt(frames.NMT_START, axis.node))
+                self._wire.send(frames.nmt(frames.NMT_START, axis.node))
             axis.forgive(now)
         self._command()
 
@@ -185,36 +179,13 @@ class Cia402:
             self._wait_for_standstill()
         off = frames.CONTROLWORD.pack(frames.DISABLE_VOLTAGE)
         for axis in self._axes:
-            self._send(frames.message(frames.RPDO1 + axis.node, off))
+            self._wire.send(frames.message(frames.RPDO1 + axis.node, off))
             # PDOs are heard in NMT operational only, SDOs in pre-operational too: two bytes for object 6040h.
-            self._send(frames.message(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00"))
+            self._wire.send(frames.message(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00"))
         for axis in self._axes:
-            self._send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
+            self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
         with contextlib.suppress(can.CanError, OSError):
-            self._bus.shutdown()
-
-    def _receive(self, now: float) -> None:
-        try:
-            for _ in range(MOST_FRAMES):
-                message = self._bus.recv(0)
-                if message is None:
-                    return
-                self._take(message, now)
-        except (can.CanError, OSError) as error:
-            self._fail(DriveFault("", "bus", 0, f"CAN bus: cannot receive: {error}"))
-
-    def _take(self, message: can.Message, now: float) -> None:
-        if message.is_error_frame:
-            if message.arbitration_id & BUS_OFF:
-                self._fail(DriveFault("", "bus", 0, "CAN bus: the controller went bus-off"))
-            return
-        if message.is_extended_id or message.is_remote_frame or message.arbitration_id not in self._handlers:
-            return
-        axis, handler = self._handlers[message.arbitration_id]
-        try:
-            handler(message.data, now)
-        except struct.error:
-            axis.tell("frame", 0, f"frame {message.arbitration_id:03X} has wrong length {len(message.data)}")
+            self._wire.bus.shutdown()
 
     def _command(self) -> None:
         """Send the controlwords that differ from the last ones: one transition per drive at a time."""
@@ -224,25 +195,15 @@ class Cia402:
                 word = frames.FAULT_RESET
             else:
                 word = frames.controlword(axis.state, self._wanted)
-            if word != axis.controlword and self._send(
+            if word != axis.controlword and self._wire.send(
                 frames.message(frames.RPDO1 + axis.node, frames.CONTROLWORD.pack(word))
             ):
                 axis.controlword = word
 
-    def _send(self, message: can.Message) -> bool:
-        try:
-            self._bus.send(message, timeout=0)
-        except (can.CanError, OSError) as error:
-            self._fail(DriveFault("", "bus", 0, f"CAN bus: cannot send: {error}"))
-            return False
-        return True
-
-    def _fail(self, fault: DriveFault) -> None:
-        """Latch the first fault; drives that have power, or are getting it, are stopped."""
-        if self._fault is None:
-            self._fault = fault
-            if self._wanted is PowerState.OPERATION_ENABLED:
-                self.quick_stop()
+    def _stop(self) -> None:
+        """Drives that have power, or are getting it, are stopped with the first fault."""
+        if self._wanted is PowerState.OPERATION_ENABLED:
+            self.quick_stop()
 
     def _wait_for_standstill(self) -> None:
         if not self._powered():
@@ -250,10 +211,10 @@ class Cia402:
         self.quick_stop()
         deadline = self._clock() + STOPPING_TIME
         while self._powered() and (left := deadline - self._clock()) > 0:
-            message = self._bus.recv(left)
+            message = self._wire.bus.recv(left)
             if message is None:
                 return
-            self._take(message, self._clock())
+            self._wire.take(message, self._clock())
 
     def _powered(self) -> bool:
         return any(axis.state in setup402.POWERED for axis in self._axes)
