@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 
-from drivers import frames
-from drivers.answers import Answers
-from drivers.interface import Counts, DriveFault, PowerState
+from drivers import axis, frames
+from drivers.interface import DriveFault, PowerState
 from drivers.scaling import Scale
 
-MISSED_SYNCS = 3
-MISSED_HEARTBEATS = 3
 MISSED_STATUSES = 3
 RESET_TIME = 2 * frames.STATUS_PERIOD
 """How long a drive may take to leave fault after a fault reset, in which it tells its state twice [s]."""
@@ -20,57 +17,40 @@ _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
 _WITHOUT_POWER = (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.SWITCH_ON_DISABLED)
 
 
-class Axis:
+class Axis(axis.Axis):
     """One drive's newest feedback; the `on_` methods take a frame's data or raise struct.error."""
 
     __slots__ = (
-        "_heartbeat_timeout",
         "_operational",
         "_restarted",
         "actual",
-        "answers",
         "command_age",
         "controlword",
         "cyclic",
         "error_code",
-        "event",
         "follows",
-        "heard",
         "held",
         "homed",
         "left_operational",
         "mode_bits",
         "mute",
-        "name",
-        "node",
-        "position",
-        "powered_up",
         "reset_until",
-        "scale",
         "sdo_answer",
         "seen_clear",
-        "setpoints_late",
-        "setpoints_lost",
         "state",
         "status_heard",
         "statusword",
     )
 
     def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
-        self.name = name
-        self.node = node
-        self.scale = scale
+        super().__init__(name, node, scale, heartbeat)
         self.actual = 0
         """Actual position [counts]."""
-        self.position = math.nan
-        """Actual position [m]."""
         self.statusword = 0
         """The newest one."""
         self.seen_clear = 0
         """Statusword bits that have been 0 since somebody began to watch."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
-        self.powered_up = False
-        """It has reached operation enabled since that was asked for."""
         self.controlword = frames.DISABLE_VOLTAGE
         """The last one sent."""
         self.command_age = 0
@@ -89,15 +69,8 @@ class Axis:
         """The newest answer about an object."""
         self.error_code = 0
         """What the drive last gave as the reason of its fault; 0 once it said that is over."""
-        self.event: DriveFault | None = None
-        """A fault that a frame told of, rather than a state that lasts."""
-        self.heard = math.inf
-        """Time of the last heartbeat [s]."""
         self.status_heard = math.inf
         """Time of the last statusword [s]."""
-        self.answers = Answers()
-        self.setpoints_late = self.setpoints_lost = 0
-        """Setpoints written after the next SYNC was due, and those that the bus did not take."""
         self.reset_until = -math.inf
         """Until when a fault reset is under way [s]."""
         self.mute = False
@@ -105,12 +78,6 @@ class Axis:
         self.left_operational = False
         """It said that it is operational no more, and was not started again since."""
         self._operational = self._restarted = False
-        self._heartbeat_timeout = MISSED_HEARTBEATS * heartbeat
-
-    @property
-    def counts(self) -> Counts:
-        """What of its cyclic traffic went wrong."""
-        return Counts(self.answers.late, self.answers.lost, self.setpoints_late, self.setpoints_lost)
 
     def on_position(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
         """TPDO2: the position sampled at a SYNC."""
@@ -173,7 +140,7 @@ class Axis:
             self._restarted = True
             self.state = PowerState.NOT_READY_TO_SWITCH_ON
             # Takes the place of an earlier event, for it is the one that a reset cannot help.
-            self.event = self._fault("state", 0, "has restarted and lost its set-up; restart the service")
+            self.event = self.made("state", 0, "has restarted and lost its set-up; restart the service")
         elif self._operational:  # before that, it is a heartbeat from before the drive was started
             self._operational = False
             self.left_operational = True
@@ -193,11 +160,6 @@ class Axis:
             self.answers.forgive()
             self.status_heard = now
 
-    def tell(self, cause: str, code: int, text: str) -> None:
-        """Keep the first event since faults were last reset."""
-        if self.event is None:
-            self.event = self._fault(cause, code, text)
-
     def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
         """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not.
 
@@ -206,7 +168,7 @@ class Axis:
         if self.state in _WITHOUT_POWER or self.state in _IN_FAULT:
             return None
         text = f"is {self.state} {seconds:g} s after {wanted}; switch on disabled was expected"
-        return self._fault("timeout", 0, text)
+        return self.made("timeout", 0, text)
 
     def fault(self, now: float, wanted: frames.Wanted) -> DriveFault | None:
         """What is wrong with the drive at time `now`, given what it was asked for."""
@@ -217,22 +179,17 @@ class Axis:
                 reason = f", error {self.error_code:04X}" if self.error_code else ""
                 if self.reset_until > -math.inf:
                     reason += f", still {RESET_TIME:g} s after a fault reset"
-                return self._fault("fault", self.error_code, f"{self.state}{reason}")
+                return self.made("fault", self.error_code, f"{self.state}{reason}")
         elif self.error_code:  # CiA 301: in force until the drive sends "error reset", code 00xxh
-            return self._fault("emcy", self.error_code, f"emergency {self.error_code:04X} is still in force")
-        elif self.answers.missed >= MISSED_SYNCS:
-            return self._fault("silent", 0, f"no position for {self.answers.missed} SYNCs in a row")
-        elif now - self.heard > self._heartbeat_timeout:
-            return self._fault("heartbeat", 0, f"no heartbeat for {now - self.heard:.3g} s")
+            return self.made("emcy", self.error_code, f"emergency {self.error_code:04X} is still in force")
+        elif silent := self.silence(now):
+            return silent
         elif now - self.status_heard > MISSED_STATUSES * frames.STATUS_PERIOD:
-            return self._fault("silent", 0, f"no statusword for {now - self.status_heard:.3g} s")
+            return self.made("silent", 0, f"no statusword for {now - self.status_heard:.3g} s")
         elif (
             self.powered_up
             and wanted is PowerState.OPERATION_ENABLED
             and self.state is not PowerState.OPERATION_ENABLED
         ):
-            return self._fault("state", 0, f"left operation enabled unasked: {self.state}")
+            return self.made("state", 0, f"left operation enabled unasked: {self.state}")
         return None
-
-    def _fault(self, cause: str, code: int, text: str) -> DriveFault:
-        return DriveFault(self.name, cause, code, f"drive {self.name}: {text}")

@@ -15,12 +15,18 @@ from drivers.capture import Capture, CapturedBus
 from drivers.cia402 import Cia402
 from drivers.errors import BusError, DriveError
 from drivers.interface import Drives
+from drivers.odrive import Odrive
 from drivers.simulated import simulated_bus
 from drivers.unixbus import UnixBus
 
 # What python-can would say of a failure is in the BusError; standard error is for that one line.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
+PROTOCOLS: dict[str, Callable[[can.BusABC, int, config.Drives, Callable[[], float]], Drives]] = {
+    "cia402": Cia402,
+    "odrive": Odrive,
+}
+"""The driver of each protocol that [drives] may name."""
 NETWORK_INTERFACES = Path("/sys/class/net")
 IFF_UP = 0x1
 """Flag of a network interface that is up (linux/if.h)."""
@@ -65,7 +71,7 @@ def connect(
     if capture is not None:
         bus = CapturedBus(bus, capture)
     try:
-        return Cia402(bus, section.bitrate, drives, clock)
+        return PROTOCOLS[drives.protocol](bus, section.bitrate, drives, clock)
     except DriveError:
         bus.shutdown()
         raise

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 import can
 
 FRAME = struct.Struct("<dHB8s")
-"""A captured frame: seconds since 1970, identifier, length, data."""
+"""A captured frame: seconds since 1970, identifier, length, data. The length of a remote frame has REMOTE added."""
+REMOTE = 0x80
 CHUNK = 1024
 """Frames handed over at a time."""
 KEPT = 100_000
@@ -25,7 +26,8 @@ class Capture:
     def note(self, frame: can.Message) -> None:
         """Note a frame, now."""
         if len(self._frames) < KEPT * FRAME.size:
-            self._frames += FRAME.pack(time.time(), frame.arbitration_id, frame.dlc, bytes(frame.data))
+            length = frame.dlc | REMOTE * frame.is_remote_frame
+            self._frames += FRAME.pack(time.time(), frame.arbitration_id, length, bytes(frame.data))
 
     def take(self) -> Iterator[bytes]:
         """Hand over what has been noted, in chunks of at most CHUNK frames."""

@@ -14,21 +14,17 @@ from collections.abc import Callable
 
 import can
 
-from drivers import canerrors, config, frames, setup402
+from drivers import config, frames, setup402
+from drivers.axis import HIGH_LOAD
 from drivers.axis402 import Axis
 from drivers.errors import BusError
 from drivers.homing402 import Homing
 from drivers.interface import NAMES, DriveFault, Feedback, PowerState, Triple
 from drivers.scaling import scale_of
+from drivers.wire import Wire
 
-MOST_FRAMES = 1000
-"""Frames taken in by one `read` at most, so that a chattering bus cannot hold it."""
 REPEAT_AFTER = 3
 """A controlword that a drive does not follow is sent again after so many SYNCs: the frame may be lost."""
-UNSENT_CYCLES = 3
-"""So many cycles in a row with a full transmit queue are a fault."""
-HIGH_LOAD = 0.8
-"""Worst-case share of the bus from which on people are warned: what is not cyclic has to wait."""
 
 _ON_THE_WAY = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON)
 """States from which a drive that is to be enabled goes on by controlwords."""
@@ -36,7 +32,6 @@ _CAN_MOVE_OR_SOON = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, Powe
 """States in which no drive stays that has been told to stop or to lose power."""
 
 Clock = Callable[[], float]
-Handler = Callable[[bytearray, float], None]
 
 
 class Cia402:
@@ -54,7 +49,7 @@ class Cia402:
         clock: Clock = time.monotonic,
     ) -> None:
         self.bus_load = 0.0
-        self._bus = bus
+        self._wire = Wire(bus, self._stop)
         self._bitrate = bitrate
         self._drives = drives
         self._clock = clock
@@ -62,14 +57,13 @@ class Cia402:
             Axis(name, drive.node, scale_of(name, drive), drives.heartbeat)
             for name, drive in zip(NAMES, drives.each, strict=True)
         )
-        self._handlers: dict[int, tuple[Axis, Handler]] = {}
         for axis in self._axes:
-            self._handlers[frames.TPDO1 + axis.node] = axis, axis.on_status
-            self._handlers[frames.TPDO2 + axis.node] = axis, axis.on_position
-            self._handlers[frames.EMCY + axis.node] = axis, axis.on_emergency
-            self._handlers[frames.HEARTBEAT + axis.node] = axis, axis.on_heartbeat
-            self._handlers[frames.SDO_ANSWER + axis.node] = axis, axis.on_sdo
-        self._homing = Homing(self._axes, drives, self._send)
+            self._wire.listen(frames.TPDO1 + axis.node, axis, axis.on_status)
+            self._wire.listen(frames.TPDO2 + axis.node, axis, axis.on_position)
+            self._wire.listen(frames.EMCY + axis.node, axis, axis.on_emergency)
+            self._wire.listen(frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
+            self._wire.listen(frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
+        self._homing = Homing(self._axes, drives, self._wire.send)
         self._sync = frames.message(frames.SYNC, b"")
         self._heartbeat = frames.message(
             frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL)
@@ -81,11 +75,6 @@ class Cia402:
         self._asked = ""
         """By what that was asked for."""
         self._stopped_in_this_cycle = False
-        self._fault: DriveFault | None = None
-        self._warnings: list[str] = []
-        self._warned: set[str] = set()
-        self._unsent = False
-        self._unsent_cycles = 0
         self._period = 0.0
         self._synced = 0.0
         self._closed = False
@@ -105,14 +94,14 @@ class Cia402:
                 f"the highest rate that fits is {fits:.0f} Hz"
             )
         scales = tuple(axis.scale for axis in self._axes)
-        starts = setup402.configure(self._bus, self._drives, scales, period, self._clock)
+        starts = setup402.configure(self._wire.bus, self._drives, scales, period, self._clock)
         for axis, start in zip(self._axes, starts, strict=True):
             axis.take_position(start.counts)
             axis.error_code = start.error_code
             axis.take_status(start.statusword)
         self.bus_load = load
         if load > HIGH_LOAD:
-            self._warn(f"CAN bus: {rate:g} Hz takes {load:.0%} of it at worst; keep below {HIGH_LOAD:.0%}")
+            self._wire.warn(f"CAN bus: {rate:g} Hz takes {load:.0%} of it at worst; keep below {HIGH_LOAD:.0%}")
         self._period = period
 
     def sync(self) -> None:
@@ -120,11 +109,11 @@ class Cia402:
 
         What has arrived is taken in before: positions among it answer the SYNC before.
         """
-        self._unsent_cycles = self._unsent_cycles + 1 if self._unsent else 0
-        self._unsent = self._stopped_in_this_cycle = False
+        self._stopped_in_this_cycle = False
+        self._wire.begin()
         now = self._synced = self._clock()
-        self._receive(now)
-        self._send(self._sync)
+        self._wire.receive(now)
+        self._wire.send(self._sync)
         if self._heartbeat_due is None:
             # The drives' watchdogs and ours begin with the first cycle, however long ago the set-up was.
             self._heartbeat_due = now
@@ -132,7 +121,7 @@ class Cia402:
                 axis.heard = axis.status_heard = now
         if now >= self._heartbeat_due:
             self._heartbeat_due = now + self._drives.heartbeat
-            self._send(self._heartbeat)
+            self._wire.send(self._heartbeat)
         for axis in self._axes:
             axis.answers.sync_sent()
             axis.command_age += 1
@@ -140,30 +129,28 @@ class Cia402:
     def read(self) -> Feedback:
         """Take in every frame that has arrived."""
         now = self._clock()
-        self._receive(now)
+        self._wire.receive(now)
         a, b, c = self._axes
         for axis in self._axes:
             axis.answers.read_over()
             if axis.mute:
                 axis.mute = False
-                self._send(frames.message(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
-            fault = axis.fault(now, self._wanted) if self._fault is None else None
+                self._wire.send(frames.message(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
+            fault = axis.fault(now, self._wanted) if self._wire.fault is None else None
             if fault is not None:
-                self._fail(fault)
+                self._wire.fail(fault)
         if now >= self._off_by:
             self._take_power_off()
-        if self._fault is None:
+        if self._wire.fault is None:
             fault = self._homing.step(now)
             if fault is not None:
-                self._fail(fault)
-        warnings = tuple(self._warnings)
-        self._warnings.clear()
+                self._wire.fail(fault)
         return Feedback(
             (a.position, b.position, c.position),
             (a.state, b.state, c.state),
-            self._fault,
+            self._wire.fault,
             (a.counts, b.counts, c.counts),
-            warnings,
+            self._wire.warnings(),
             (a.answers.age, b.answers.age, c.answers.age),
             self._homing.under_way,
             (a.follows, b.follows, c.follows),
@@ -190,11 +177,11 @@ class Cia402:
                     data = frames.SETPOINT.pack(axis.held, 0)
             except (ValueError, OverflowError, struct.error):
                 text = f"drive {axis.name}: cannot take setpoint {metres:g} m, {rate:g} m/s"
-                self._fail(DriveFault(axis.name, "setpoint", 0, text))
+                self._wire.fail(DriveFault(axis.name, "setpoint", 0, text))
                 return
             messages.append(frames.message(frames.RPDO2 + axis.node, data))
         for axis, message in zip(self._axes, messages, strict=True):
-            if not self._send(message):
+            if not self._wire.send(message):
                 axis.setpoints_lost += 1
             elif late:
                 axis.setpoints_late += 1
@@ -205,7 +192,7 @@ class Cia402:
 
         Does nothing while a fault is latched.
         """
-        if self._fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
+        if self._wire.fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
             return
         self._wanted = PowerState.OPERATION_ENABLED
         self._off_by = math.inf
@@ -218,7 +205,7 @@ class Cia402:
 
         Does nothing unless all drives have power and no fault is latched.
         """
-        if self._fault is None and all(axis.state is PowerState.OPERATION_ENABLED for axis in self._axes):
+        if self._wire.fault is None and all(axis.state is PowerState.OPERATION_ENABLED for axis in self._axes):
             self._homing.start()
 
     def stop_homing(self) -> None:
@@ -242,14 +229,13 @@ class Cia402:
 
     def reset(self) -> None:
         """Forget the fault and clear the drives' own; never powers them up. What persists is found again."""
-        self._fault = None
-        self._warned.clear()
+        self._wire.reset()
         now = self._clock()
         if self._wanted is not PowerState.OPERATION_ENABLED:
             self._give_time_to_stop("reset")
         for axis in self._axes:
             if axis.left_operational:  # its set-up is still there: only a restarted drive needs a new one
-                self._send(frames.nmt(frames.NMT_START, axis.node))
+                self._wire.send(frames.nmt(frames.NMT_START, axis.node))
             axis.forgive(now)
         self._command()
 
@@ -265,41 +251,13 @@ class Cia402:
             self._wait_for_standstill()
         off = frames.CONTROLWORD.pack(frames.DISABLE_VOLTAGE)
         for axis in self._axes:
-            self._send(frames.message(frames.RPDO1 + axis.node, off))
+            self._wire.send(frames.message(frames.RPDO1 + axis.node, off))
             # PDOs are heard in NMT operational only, SDOs in pre-operational too: two bytes for object 6040h.
-            self._send(frames.message(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00"))
+            self._wire.send(frames.message(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00"))
         for axis in self._axes:
-            self._send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
+            self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
         with contextlib.suppress(can.CanError, OSError):
-            self._bus.shutdown()
-
-    def _receive(self, now: float) -> None:
-        try:
-            for _ in range(MOST_FRAMES):
-                message = self._bus.recv(0)
-                if message is None:
-                    return
-                self._take(message, now)
-        except (can.CanError, OSError) as error:
-            self._fail(DriveFault("", "bus", 0, f"CAN bus: cannot receive: {error}"))
-
-    def _take(self, message: can.Message, now: float) -> None:
-        if message.is_error_frame:
-            self._take_error(canerrors.report(message))
-            return
-        if message.is_extended_id or message.is_remote_frame or message.arbitration_id not in self._handlers:
-            return
-        axis, handler = self._handlers[message.arbitration_id]
-        try:
-            handler(message.data, now)
-        except struct.error:
-            axis.tell("frame", 0, f"frame {message.arbitration_id:03X} has wrong length {len(message.data)}")
-
-    def _take_error(self, report: canerrors.Report) -> None:
-        if report.gravity is canerrors.Gravity.FAULT:
-            self._fail(DriveFault("", "bus", 0, f"CAN bus: {report.text}"))
-        elif report.gravity is canerrors.Gravity.WARNING:
-            self._warn(f"CAN bus: {report.text}")
+            self._wire.bus.shutdown()
 
     def _command(self) -> None:
         """Send the controlwords that are due: one transition per drive at a time."""
@@ -307,7 +265,7 @@ class Cia402:
         for axis in self._axes:
             word = self._word(axis, now)
             repeat = axis.command_age >= REPEAT_AFTER and self._is_not_followed(axis, word)
-            if (word != axis.controlword or repeat) and self._send(
+            if (word != axis.controlword or repeat) and self._wire.send(
                 frames.message(frames.RPDO1 + axis.node, frames.CONTROLWORD.pack(word))
             ):
                 axis.controlword = word
@@ -334,26 +292,6 @@ class Cia402:
         """What drives are asked for now: none gets power while one of them may not follow setpoints."""
         return PowerState.QUICK_STOP_ACTIVE if self._homing.restoring else self._wanted
 
-    def _send(self, message: can.Message) -> bool:
-        """Send a frame; one that a full queue does not take is left out and, for a few cycles, no fault."""
-        try:
-            self._bus.send(message, timeout=0)
-        except (can.CanError, OSError) as error:
-            text = f"CAN bus: cannot send: {canerrors.cannot_send(error)}"
-            self._unsent = True
-            if canerrors.queue_is_full(error) and self._unsent_cycles < UNSENT_CYCLES - 1:
-                self._warn(text)
-            else:
-                self._fail(DriveFault("", "bus", 0, text))
-            return False
-        return True
-
-    def _warn(self, text: str) -> None:
-        """Tell something once, until faults are reset."""
-        if text not in self._warned:
-            self._warned.add(text)
-            self._warnings.append(text)
-
     def _power_off(self, wanted: frames.Wanted, asked: str) -> None:
         if self._wanted is not wanted:
             self._give_time_to_stop(asked)
@@ -370,15 +308,13 @@ class Cia402:
         for axis in self._axes:
             fault = axis.late_for(self._asked, self._drives.stop_timeout)
             if fault is not None:
-                self._fault = fault
+                self._wire.fault = fault
                 return
 
-    def _fail(self, fault: DriveFault) -> None:
-        """Latch the first fault; drives that have power, or are getting it, are stopped."""
-        if self._fault is None:
-            self._fault = fault
-            if self._wanted is PowerState.OPERATION_ENABLED:
-                self.quick_stop()
+    def _stop(self) -> None:
+        """Drives that have power, or are getting it, are stopped with the first fault."""
+        if self._wanted is PowerState.OPERATION_ENABLED:
+            self.quick_stop()
 
     def _wait_for_standstill(self) -> None:
         if not self._powered():
@@ -386,10 +322,10 @@ class Cia402:
         self.quick_stop()
         deadline = self._clock() + self._drives.stop_timeout
         while self._powered() and (left := deadline - self._clock()) > 0:
-            message = self._bus.recv(left)
+            message = self._wire.bus.recv(left)
             if message is None:
                 return
-            self._take(message, self._clock())
+            self._wire.take(message, self._clock())
 
     def _powered(self) -> bool:
         return any(axis.state in setup402.POWERED for axis in self._axes)

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 Positive = Annotated[float, Meta(gt=0.0)]
-NodeId = Annotated[int, Meta(ge=1, le=127)]
+NodeId = Annotated[int, Meta(ge=0, le=127)]
+"""CANopen has 1 to 127, ODrive 0 to 62; the driver refuses the rest."""
 
 
 class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
@@ -22,7 +23,7 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
     max_acceleration: Positive = 100.0
     """What the slider can do at most [m/s²]."""
     missed_syncs: Annotated[int, Meta(ge=1)] = 3
-    """So many SYNCs missed in a row make a drive stop by itself."""
+    """So many SYNCs missed in a row make a CiA 402 drive stop by itself; an ODrive has its watchdog."""
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Slider positions at power-on [m]."""
 
@@ -61,6 +62,7 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
 
     node: NodeId
     counts_per_metre: Positive
+    """The drive's own unit of position, per metre of the slider: counts of a CiA 402 drive, turns of an ODrive."""
     direction: Literal[1, -1] = 1
     """-1 where counts fall as the slider position rises."""
     offset: float = 0.0
@@ -74,18 +76,18 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
 class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [drives]: what all three share, and one table for each."""
 
-    protocol: Literal["cia402"]
+    protocol: Literal["cia402", "odrive"]
     A: Drive
     B: Drive
     C: Drive
     master_node: NodeId = 126
-    """The node id of the service itself, for its heartbeat."""
+    """The node id of the service itself, for its heartbeat on CANopen."""
     heartbeat: Positive = 0.1
-    """Period of everyone's heartbeat [s]; three missed ones are a loss."""
+    """Period of everyone's heartbeat [s]; three missed ones are a loss. An ODrive must have been given it."""
     following_error: Positive = 0.005
-    """The drives' own following error window, object 6065h [m]."""
+    """The following error window [m]: the drives' own, object 6065h; for ODrives, which have none, the driver's."""
     quick_stop_deceleration: Positive = 10.0
-    """Object 6085h [m/s²]."""
+    """The quick-stop ramp [m/s²]: the drives' own, object 6085h; for ODrives, which have none, the driver's."""
     stop_timeout: Positive = 1.0
     """How long a drive may take to lose its power, down the quick-stop ramp or when it is disabled [s]."""
     sdo_timeout: Positive = 0.5

@@ -12,7 +12,7 @@ Triple = tuple[float, float, float]
 
 
 class PowerState(IntEnum):
-    """States of the CiA 402 power drive system (CiA 402-2, finite state automaton)."""
+    """States of the CiA 402 power drive system (CiA 402-2, finite state automaton); other drives' are told as these."""
 
     NOT_READY_TO_SWITCH_ON = 0
     SWITCH_ON_DISABLED = 1
@@ -35,7 +35,7 @@ class DriveFault(NamedTuple):
     cause: str
     """One of emcy, fault, silent, heartbeat, state, timeout, homing, frame, setpoint, bus."""
     code: int
-    """The EMCY or 603Fh error code, 0 where there is none."""
+    """The EMCY or 603Fh error code, or an ODrive's error bits; 0 where there is none."""
     message: str
     """One line for people, with drive, cause and code in it."""
 
@@ -76,7 +76,7 @@ class Feedback(NamedTuple):
 
 
 class Drives(Protocol):
-    """Three drives in cyclic synchronous position control.
+    """Three drives that follow a position setpoint every cycle.
 
     `configure` and `close` may block and raise DriveError. All else is for the cycle: it never blocks and never
     raises; what goes wrong is a fault in the next feedback.
@@ -86,10 +86,10 @@ class Drives(Protocol):
     """Worst-case share of the bus that the cyclic traffic takes, with stuffing; 1.0 is full."""
 
     def configure(self, period: float) -> None:
-        """Set the drives up for a cycle of `period` seconds, read every value back, start them without power."""
+        """Set the drives up for a cycle of `period` seconds, check what can be read back, start them without power."""
 
     def sync(self) -> None:
-        """Send SYNC: the drives take up the setpoints written since the last one and sample their positions."""
+        """Begin a cycle: the drives take up the setpoints written in the last one and sample their positions."""
 
     def read(self) -> Feedback:
         """Take in every frame that has arrived."""
@@ -114,7 +114,7 @@ class Drives(Protocol):
         """Take power off; meant for a robot at standstill."""
 
     def quick_stop(self) -> None:
-        """Make every drive stop by its own quick-stop ramp, in this cycle."""
+        """Make every drive stop by its quick-stop ramp, beginning in this cycle."""
 
     def reset(self) -> None:
         """Forget the fault and clear the drives' own; never powers them up."""

@@ -25,13 +25,17 @@ class Scale:
 
     def counts(self, position: float) -> int:
         """Slider position [m] in counts; ValueError or OverflowError if it is not finite."""
-        return round(self.counts_per_metre * (position - self.offset))
+        return round(self.exact(position))
+
+    def exact(self, position: float) -> float:
+        """Slider position [m] in counts that need not be whole: turns."""
+        return self.counts_per_metre * (position - self.offset)
 
     def counts_per_second(self, velocity: float) -> int:
         """Slider velocity [m/s] in counts/s; ValueError or OverflowError if it is not finite."""
         return round(self.counts_per_metre * velocity)
 
-    def metres(self, counts: int) -> float:
+    def metres(self, counts: float) -> float:
         """Slider position [m] of a drive position."""
         return counts / self.counts_per_metre + self.offset
 

@@ -92,6 +92,8 @@ def _check_nodes(drives: Drives) -> None:
     nodes = [drive.node for drive in drives.each] + [drives.master_node]
     if len(set(nodes)) < len(nodes):
         raise DriveError(f"node ids of drives A, B, C and the master must differ, but are {', '.join(map(str, nodes))}")
+    if 0 in nodes:
+        raise DriveError("node id 0 is all nodes' on CANopen; wanted 1 to 127")
 
 
 def _check_is_idle_servo(remote: Remote) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.capture import FRAME
+from drivers.capture import FRAME, REMOTE
 
 
 class CandumpLog:
@@ -19,7 +19,7 @@ class CandumpLog:
     def write(self, batch: bytes) -> None:
         """Append a batch of captured frames."""
         lines = "".join(
-            f"({t:.6f}) {self._channel} {identifier:03X}#{data[:length].hex().upper()}\n"
+            f"({t:.6f}) {self._channel} {identifier:03X}#{'R' if length & REMOTE else data[:length].hex().upper()}\n"
             for t, identifier, length, data in FRAME.iter_unpack(batch)
         )
         try:

@@ -298,3 +298,31 @@ def _check(config: Config) -> None:
             f"loop.rate_hz = {config.loop.rate_hz}: a cycle must be a whole number of microseconds, "
             "as with 100, 200, 250, 400, 500, 800, 1000"
         )
+    if config.drives.protocol == "odrive":
+        _check_canopen_only(config)
+        _check_feed_forward(config)
+
+
+def _check_canopen_only(config: Config) -> None:
+    for name, drive in zip(NAMES, config.drives.each, strict=True):
+        if drive.homing is not None:
+            raise ConfigError(
+                f"drives.{name}.homing: homing is CiA 402's, an ODrive must know its position at power-on; "
+                "leave the table out"
+            )
+        if drive.eds is not None:
+            raise ConfigError(f"drives.{name}.eds = {drive.eds}: an ODrive has no object dictionary; leave it out")
+
+
+def _check_feed_forward(config: Config) -> None:
+    """CANSimple has 16 bits for the velocity feed-forward; without it an ODrive lags out of its window."""
+    from drivers.odrive_frames import MAX_FEED_FORWARD
+
+    for name, drive in zip(NAMES, config.drives.each, strict=True):
+        turns = config.limits.slider.velocity * drive.counts_per_metre
+        if turns > MAX_FEED_FORWARD:
+            raise ConfigError(
+                f"limits.slider.velocity = {config.limits.slider.velocity:g}: with drives.{name}.counts_per_metre = "
+                f"{drive.counts_per_metre:g} that is {turns:g} turns/s, and an ODrive's feed-forward ends at "
+                f"{MAX_FEED_FORWARD:g}; lower the velocity, or use a longer lead"
+            )

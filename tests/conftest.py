@@ -8,6 +8,7 @@ import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterator
+from typing import cast
 
 import can
 import msgspec
@@ -17,7 +18,7 @@ from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 
 from drivers import frames
-from drivers.cia402 import Cia402
+from drivers.bus import PROTOCOLS
 from drivers.simulated import SimulatedDrive, simulated_bus
 from service.config import SIM, Config, load
 from service.control import Control
@@ -78,7 +79,7 @@ class Rig:
         self.sent: list[can.Message] = []
         self._send = self.bus.send
         self.bus.send = self._note  # type: ignore[assignment,method-assign]
-        self.driver = Cia402(self.bus, config.can.bitrate, config.drives, lambda: self.now)
+        self.driver = PROTOCOLS[config.drives.protocol](self.bus, config.can.bitrate, config.drives, lambda: self.now)
         self.driver.configure(config.period)
         if delay is not None:
             delay_answers(self.bus, delay, lambda: self.now)
@@ -98,7 +99,7 @@ class Rig:
 
     @property
     def drives(self) -> tuple[SimulatedDrive, ...]:
-        return tuple(self.bus.drives)
+        return cast(tuple[SimulatedDrive, ...], self.bus.drives)  # tests with another protocol take rig.bus.drives
 
     @property
     def mode(self) -> Mode:

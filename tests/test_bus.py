@@ -6,12 +6,14 @@ import errno
 from pathlib import Path
 
 import can
+import msgspec
 import pytest
 
 from drivers import bus
 from drivers.cia402 import Cia402
 from drivers.config import Can, Drive, Drives
 from drivers.errors import BusError, DriveError
+from drivers.odrive import Odrive
 
 DRIVES = Drives(
     protocol="cia402",
@@ -65,6 +67,17 @@ def test_connect_gives_drives_that_can_be_configured() -> None:
     try:
         drives.configure(0.001)
         assert 0.7 < drives.bus_load < 0.8
+    finally:
+        drives.close()
+
+
+def test_connect_gives_the_drives_of_the_protocol() -> None:
+    section = msgspec.structs.replace(DRIVES, protocol="odrive")
+    drives = bus.connect(Can(interface="simulated"), section)
+    assert isinstance(drives, Odrive)
+    try:
+        drives.configure(0.001)
+        assert drives.read().fault is None
     finally:
         drives.close()
 

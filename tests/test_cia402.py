@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import can
@@ -20,7 +20,7 @@ from drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTime
 from drivers.interface import Feedback, PowerState, Triple
 from drivers.scaling import scale_of
 from drivers.setup402 import _settings, interpolation_period
-from drivers.simulated import Servo, SimulatedBus, SimulatedDrive
+from drivers.simulated import Servo, SimulatedBus, SimulatedDevice, SimulatedDrive
 from drivers.simulated.dictionary import Entry
 
 P = PowerState
@@ -56,7 +56,7 @@ class Clock:
 class Bus(SimulatedBus):
     """The simulated bus, with a record of what the master sends, ways to break it, and waits in no time."""
 
-    def __init__(self, drives: list[SimulatedDrive], clock: Clock) -> None:
+    def __init__(self, drives: Sequence[SimulatedDevice], clock: Clock) -> None:
         self.time = clock
         self.sent: list[tuple[int, bytes]] = []
         self.broken = False
@@ -375,6 +375,11 @@ class TestConfigure:
         bus = Bus([], Clock())
         with pytest.raises(DriveError, match="must differ, but are 1, 1, 9, 126"):
             Cia402(bus, 1_000_000, config).configure(PERIOD)
+
+    def test_node_0_is_no_drives(self) -> None:
+        config = Drives(protocol="cia402", A=Drive(node=0, counts_per_metre=1e6), B=CONFIG.B, C=CONFIG.C)
+        with pytest.raises(DriveError, match="node id 0 is all nodes' on CANopen"):
+            Cia402(Bus([], Clock()), 1_000_000, config).configure(PERIOD)
 
     @pytest.mark.parametrize("heartbeat", [0.0001, 30.0])
     def test_heartbeat_beyond_a_drives_range_is_refused(self, heartbeat: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -39,7 +40,12 @@ def test_shipped_configurations_load(path: Path) -> None:
         (
             'protocol = "cia402"',
             'protocol = "ethercat"',
-            "drives.protocol = 'ethercat': allowed are 'cia402'",
+            "drives.protocol = 'ethercat': allowed are 'cia402', 'odrive'",
+        ),
+        (
+            'protocol = "cia402"',
+            'protocol = "odrive"',
+            "with drives.A.counts_per_metre = 1e+07 that is 1e+07 turns/s, and an ODrive's feed-forward ends at 32.767",
         ),
         ('realtime = "prefer"', 'realtime = "yes"', "allowed are 'off', 'prefer', 'enforce'"),
         ("l0 = 0.3", "l0 = nan", "geometry.l0 = nan: it must be a finite number"),
@@ -113,6 +119,29 @@ def test_homing_that_is_refused(method: int, zero: float, said: str) -> None:
     with pytest.raises(ConfigError) as refused:
         parse(TEXT.replace("[drives.C]\n", HOMING.format(method=method, zero=zero) + "[drives.C]\n"))
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        (
+            HOMING.format(method=19, zero=0.005),
+            "drives.B.homing: homing is CiA 402's, an ODrive must know its position at power-on",
+        ),
+        ('[drives.B]\neds = "maker.eds"\n', "drives.B.eds = maker.eds: an ODrive has no object dictionary"),
+    ],
+)
+def test_what_odrives_do_not_have_is_refused(table: str, said: str) -> None:
+    text = TEXT.replace('protocol = "cia402"', 'protocol = "odrive"').replace(
+        "counts_per_metre = 1e7", "counts_per_metre = 25.0"
+    )
+    text = (
+        text.replace("[drives.B]\n", table)
+        if "[drives.B]" in table
+        else text.replace("[drives.C]\n", table + "[drives.C]\n")
+    )
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        parse(text)
 
 
 def test_an_eds_lies_beside_the_configuration(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ class Rig:
         drives = [SimulatedDrive(node, each) for node, each in enumerate(servo, start=1)]
         self.said: list[str] = []
         self.faults = Faults(drives, [SCALE, -SCALE, SCALE], seed=7, tell=self.said.append)
+        self.drives = drives
         self.bus = SimulatedBus(drives, lambda: self.now, self.faults)
         for drive in drives:
             drive.objects[0x1017, 0].write(10)
@@ -172,7 +173,7 @@ def test_clear_ends_what_is_and_what_is_to_come(rig: Rig) -> None:
     rig.faults.clear()
     assert rig.faults.lines() == []
     assert rig.heartbeats(1.0) == [100, 100, 100]
-    assert not rig.bus.drives[1].errors
+    assert not rig.drives[1].errors
     assert [(d.servo.forced_velocity, d.servo.lag) for d in rig.bus.drives] == [(None, None)] * 3
 
 
@@ -242,7 +243,7 @@ def test_a_rebooting_drive_is_away_and_tells_of_its_return(rig: Rig) -> None:
     rig.wait(0.001)
     assert rig.heartbeats(0.09)[1] == 0
     assert (frames.HEARTBEAT + 2, b"\0") in rig.wait(0.02)
-    assert rig.bus.drives[1].objects[0x1017, 0].value == 0  # its set-up is gone
+    assert rig.drives[1].objects[0x1017, 0].value == 0  # its set-up is gone
     assert rig.bus.drives[1].state is PowerState.SWITCH_ON_DISABLED
 
 
@@ -250,7 +251,7 @@ def test_a_fault_that_lasts_comes_back_after_a_fault_reset(rig: Rig) -> None:
     rig.faults.add("A fault 4310 for 0.1")
     rig.wait(0.01)
     for word in (0x00, 0x80):
-        rig.bus.drives[0].objects[0x6040, 0].write(word)
+        rig.drives[0].objects[0x6040, 0].write(word)
     rig.wait(0.01)
     assert rig.bus.drives[0].state in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
 

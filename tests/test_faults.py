@@ -139,14 +139,14 @@ class Case(NamedTuple):
 
 STOP = [
     # frames that do not come, come late or come wrong
-    Case("A drop tpdo2", 3, r"drive A: no position for 3 SYNCs in a row"),
+    Case("A drop tpdo2", 3, r"drive A: no position for 3 cycles in a row"),
     Case("B drop tpdo1", 400, r"drive B: no statusword for 0\.3\d* s"),
     Case("C drop heartbeat", 400, r"drive C: no heartbeat for 0\.3\d* s"),
-    Case("A drop sync", 4, r"drive A: (no position for 3 SYNCs|emergency 8700)"),
-    Case("all drop sync", 4, r"drive A: (no position for 3 SYNCs|emergency 8700)"),
+    Case("A drop sync", 4, r"drive A: (no position for 3 cycles|emergency 8700)"),
+    Case("all drop sync", 4, r"drive A: (no position for 3 cycles|emergency 8700)"),
     Case("B drop rpdo2", 150, r"slider B: following error", IN_MOTION, lasts=False),
     Case("B drop 0x77E", 400, r"drive B: emergency 8130"),
-    Case("A delay 0.01 tpdo2", 3, r"drive A: no position for 3 SYNCs in a row", lasts=False),
+    Case("A delay 0.01 tpdo2", 3, r"drive A: no position for 3 cycles in a row", lasts=False),
     Case("A delay 0.05 rpdo2", 60, r"slider A: following error", IN_MOTION, lasts=False),
     Case("C corrupt tpdo2", 30, r"slider C: following error", lasts=False),
     Case("C corrupt rpdo2", 60, r"(slider C: following error|drive C: emergency 8611)", lasts=False),
@@ -160,8 +160,8 @@ STOP = [
     Case("B dlc 7 rpdo2", 2, r"drive B: emergency 8210, error register 11"),
     Case("B dlc 1 sync", 1, r"drive B: emergency 8240, error register 11"),
     # drives
-    Case("C silent", 3, r"drive C: no position for 3 SYNCs in a row"),
-    Case("all silent", 3, r"drive A: no position for 3 SYNCs in a row"),
+    Case("C silent", 3, r"drive C: no position for 3 cycles in a row"),
+    Case("all silent", 3, r"drive A: no position for 3 cycles in a row"),
     Case("B emcy 4310 for 5", 1, r"drive B: emergency 4310, error register 09"),
     Case("B fault 2310 for 5", 1, r"drive B: emergency 2310, error register 03"),
     Case("A stuck", 60, r"slider A: following error", IN_MOTION, lasts=False),
@@ -171,7 +171,7 @@ STOP = [
     Case("B reboot", 1, r"drive B: has restarted and lost its set-up; restart the service", curable=False),
     # the bus
     Case("bus-off", 1, r"CAN bus: bus-off"),
-    Case("babble 001", 3, r"drive A: no position for 3 SYNCs in a row"),
+    Case("babble 001", 3, r"drive A: no position for 3 cycles in a row"),
 ]
 STOP_HOMING = [
     Case("A stuck", 5500, r"drive A: homing: home was not attained within 5 s", lasts=False),

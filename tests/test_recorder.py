@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 from rerun.chunk import Chunk, RrdReader
 
-from drivers.capture import FRAME
+from drivers.capture import FRAME, REMOTE
 from service.config import SIM, Config, load
 from service.errors import ServiceError
 from service.messages import Event
@@ -242,13 +242,15 @@ def test_captured_frames_are_a_log_that_python_can_reads(tmp_path: Path) -> None
     recording = recorder(tmp_path, configured(capture_can=True))
     recording.frames(FRAME.pack(1_795_245_300.25, 0x201, 6, bytes([1, 2, 3, 4, 5, 255, 0, 0])))
     recording.frames(FRAME.pack(1_795_245_300.5, 0x080, 0, bytes(8)))
+    recording.frames(FRAME.pack(1_795_245_300.75, 0x029, REMOTE, bytes(8)))
     recording.close()
     with can.CanutilsLogReader(recording.path.with_suffix(".log")) as log:
-        first, second = log
+        first, second, third = log
     assert (first.arbitration_id, bytes(first.data)) == (0x201, bytes([1, 2, 3, 4, 5, 255]))
     assert first.timestamp == pytest.approx(1_795_245_300.25)
     assert first.channel == "simulated"
     assert (second.arbitration_id, second.dlc) == (0x080, 0)
+    assert (third.arbitration_id, third.is_remote_frame, second.is_remote_frame) == (0x029, True, False)
 
 
 def test_frames_are_not_kept_unless_asked_for(tmp_path: Path) -> None:

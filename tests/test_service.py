@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -24,7 +25,7 @@ import pytest
 import zenoh
 from can import CanutilsLogReader
 
-from drivers import frames
+from drivers import frames, odrive_frames
 from service import provenance
 from service.client import Robot
 from service.config import SIM, load
@@ -192,6 +193,28 @@ def test_a_session(service: Service) -> None:
         assert [words.index(word) for word in (0x06, 0x07, 0x0F)] == sorted(words.index(w) for w in (0x06, 0x07, 0x0F))
         assert words[-1] & 0b1111 != 0b1111
     assert_stopped_smoothly(sent)
+
+
+def test_a_session_with_odrives(tmp_path: Path) -> None:
+    changes = {'protocol = "cia402"': 'protocol = "odrive"'}
+    # The feed-forward of an ODrive reaches the 1 m/s of the configuration with at most 32 turns per metre.
+    changes |= {f"node = {n}\ncounts_per_metre = 1e7": f"node = {n}\ncounts_per_metre = 25.0" for n in (1, 2, 3)}
+    service = Service(tmp_path, **changes)
+    service.wait_up()
+    with service.robot() as robot:
+        robot.enable()
+        assert robot.move_to(x=0.02, y=-0.01, phi=0.1).wait(timeout=10.0).outcome == "done"
+        state = until(robot, lambda state: state.mode == "holding")
+        assert state.pose == pytest.approx((0.02, -0.01, 0.1), abs=1e-4)
+        robot.disable()
+        assert robot.state().sliders.status == ("switch on disabled",) * 3
+    assert service.end() == 0
+    sent = service.frames()
+    commands = {0x00, 0x01, 0x03, 0x07, 0x09, 0x0B, 0x0C}
+    assert {identifier for identifier, _ in sent} == {node << 5 | number for node in (1, 2, 3) for number in commands}
+    for node in (1, 2, 3):
+        states = [data[0] for identifier, data in sent if identifier == node << 5 | odrive_frames.SET_AXIS_STATE]
+        assert [state for state, _ in itertools.groupby(states)] == [1, 8, 1]
 
 
 def test_the_commands(service: Service) -> None:

@@ -11,12 +11,17 @@ from functools import partial
 import can
 
 from drivers import config
+from drivers.axis import MISSED_HEARTBEATS
+from drivers.simulated.devices import SimulatedDevice
 from drivers.simulated.drive import SimulatedDrive
 from drivers.simulated.faults import Faults
+from drivers.simulated.odrive import SimulatedOdrive
 from drivers.simulated.servo import Servo
 
 _STEP = 0.0005
 """How long a waiting receiver sleeps before it looks at the drives again [s]."""
+FRICTION = 2.0
+"""How an ODrive's slider slows down that coasts [m/s²]."""
 
 
 class SimulatedBus(can.BusABC):
@@ -24,7 +29,7 @@ class SimulatedBus(can.BusABC):
 
     def __init__(
         self,
-        drives: Sequence[SimulatedDrive],
+        drives: Sequence[SimulatedDevice],
         clock: Callable[[], float] = time.monotonic,
         faults: Faults | None = None,
     ) -> None:
@@ -108,18 +113,45 @@ def simulated_bus(can: config.Can, drives: config.Drives, clock: Callable[[], fl
     A drive that is to be homed does not know where that is: it counts from 0 at power-on, and has its home switch
     at the position that the configuration gives for zero counts.
     """
-    simulated = can.simulated
-    devices, scales = [], []
-    for drive, start in zip(drives.each, simulated.start, strict=True):
-        counts = round(drive.direction * (start - drive.offset) * drive.counts_per_metre)
-        switch = None if drive.homing is None else -counts
-        servo = Servo(
-            counts if switch is None else 0,
-            time_constant=simulated.time_constant,
-            feed_forward_gain=simulated.feed_forward_gain,
-            max_velocity=simulated.max_velocity * drive.counts_per_metre,
-            max_acceleration=simulated.max_acceleration * drive.counts_per_metre,
-        )
-        devices.append(SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch))
-        scales.append(drive.direction * drive.counts_per_metre)
+    make = {"cia402": _servo_drive, "odrive": _odrive}[drives.protocol]
+    starts = zip(drives.each, can.simulated.start, strict=True)
+    devices = [make(can.simulated, drives, drive, start) for drive, start in starts]
+    scales = [drive.direction * drive.counts_per_metre for drive in drives.each]
     return SimulatedBus(devices, clock, Faults(devices, scales))
+
+
+def _servo_drive(
+    simulated: config.Simulated,
+    drives: config.Drives,  # noqa: ARG001  one signature for both
+    drive: config.Drive,
+    start: float,
+) -> SimulatedDevice:
+    counts = round(_counts(drive, start))
+    switch = None if drive.homing is None else -counts
+    servo = _servo(simulated, drive, counts if switch is None else 0)
+    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch)
+
+
+def _odrive(simulated: config.Simulated, drives: config.Drives, drive: config.Drive, start: float) -> SimulatedDevice:
+    return SimulatedOdrive(
+        drive.node,
+        _servo(simulated, drive, _counts(drive, start)),
+        heartbeat=drives.heartbeat,
+        friction=FRICTION * drive.counts_per_metre,
+        # As long as a CiA 402 drive waits for its master: CANSimple has no way to tell a drive.
+        watchdog=MISSED_HEARTBEATS * drives.heartbeat,
+    )
+
+
+def _counts(drive: config.Drive, position: float) -> float:
+    return drive.direction * (position - drive.offset) * drive.counts_per_metre
+
+
+def _servo(simulated: config.Simulated, drive: config.Drive, counts: float) -> Servo:
+    return Servo(
+        counts,
+        time_constant=simulated.time_constant,
+        feed_forward_gain=simulated.feed_forward_gain,
+        max_velocity=simulated.max_velocity * drive.counts_per_metre,
+        max_acceleration=simulated.max_acceleration * drive.counts_per_metre,
+    )

@@ -89,6 +89,11 @@ class SimulatedDrive(Device):
         o.on_write(0x6098, self._method_written)
         o.on_write(0x60C2, self._period_written)
 
+    @property
+    def power(self) -> PowerState:
+        """Its state."""
+        return self.state
+
     def fail(self, code: int) -> None:
         """Break down with EMCY and 603Fh error `code`: transitions 13 and, at standstill, 14."""
         if self.state in _FAULTY:

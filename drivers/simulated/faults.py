@@ -13,8 +13,10 @@ import can
 
 from drivers import canerrors
 from drivers.errors import DriveError
-from drivers.interface import PowerState
+from drivers.interface import NAMES, PowerState
+from drivers.simulated.devices import SimulatedDevice
 from drivers.simulated.drive import SimulatedDrive
+from drivers.simulated.emergency import Emergencies
 from drivers.simulated.faultlines import Condition, Fault, FaultSyntaxError, Frames, parse
 
 MOVING: Final = 1e-3
@@ -59,7 +61,7 @@ class Faults:
 
     def __init__(
         self,
-        drives: Sequence[SimulatedDrive],
+        drives: Sequence[SimulatedDevice],
         counts_per_metre: Sequence[float],
         seed: int = 0,
         tell: Callable[[str], None] = _to_nobody,
@@ -97,9 +99,16 @@ class Faults:
 
     def add(self, line: str) -> None:
         """Take up a line. Raises FaultSyntaxError."""
+        fault = parse(line)
+        if fault.name == "emcy" or any(frames.plus_node for frames in fault.frames):
+            for index in fault.drives:
+                if not isinstance(self._drives[index], SimulatedDrive):
+                    raise FaultSyntaxError(
+                        f"{line}: drive {NAMES[index]} does not speak CANopen; name its frames by their identifiers"
+                    )
         if self.idle:
             self._now = self._clock()
-        self._active.append(_Active(parse(line), self._now))
+        self._active.append(_Active(fault, self._now))
 
     def load(self, path: Path) -> None:
         """Take up a file, one fault a line; # begins a comment. Raises DriveError with file and line."""
@@ -193,13 +202,13 @@ class Faults:
         drive = self._drives[index]
         match state:
             case "enabled":
-                return drive.state is PowerState.OPERATION_ENABLED
+                return drive.power is PowerState.OPERATION_ENABLED
             case "moving":
                 return abs(drive.servo.velocity / self._scales[index]) >= MOVING
             case "stopping":
-                return drive.state in _STOPPING
+                return drive.power in _STOPPING
             case _:
-                return drive.state in _FAULTY
+                return drive.power in _FAULTY
 
     def _begin(self, active: _Active) -> None:
         fault = active.fault
@@ -209,8 +218,8 @@ class Faults:
         self._break_drives()
         match fault.name:
             case "emcy":
-                for index in fault.drives:
-                    self._drives[index].errors.report(round(fault.value))
+                for errors in self._emergencies(fault):
+                    errors.report(round(fault.value))
             case "fault":
                 self._fail(fault)
             case "reboot":
@@ -230,8 +239,8 @@ class Faults:
         self.tell(f"is over: {fault.line}" + (f" ({active.struck} frames)" if self._strikes_frames(fault) else ""))
         match fault.name:
             case "emcy":
-                for index in fault.drives:
-                    self._drives[index].errors.clear(round(fault.value))
+                for errors in self._emergencies(fault):
+                    errors.clear(round(fault.value))
             case "reboot":
                 for index in fault.drives:
                     self._drives[index].restart(self._now)
@@ -257,6 +266,10 @@ class Faults:
             drive.servo.forced_velocity = fault["runaway"].value * scale if "runaway" in fault else None
             if "stuck" in fault:
                 drive.servo.forced_velocity = 0.0
+
+    def _emergencies(self, fault: Fault) -> list[Emergencies]:
+        struck = (self._drives[index] for index in fault.drives)
+        return [drive.errors for drive in struck if isinstance(drive, SimulatedDrive)]
 
     def _fail(self, fault: Fault) -> None:
         for index in fault.drives:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from drivers.ramp import braked
+
 
 class Servo:
     """One axis in counts and seconds: a position loop with velocity feed-forward and a braking ramp.
@@ -77,11 +79,32 @@ class Servo:
         if gap * closing > 0.0:
             closing = max(-brakable, min(closing, brakable))
 
-        wanted = slope + closing
+        self._move(slope + closing, step)
+        self.setpoint, self._feed_forward = target, feed_forward
+
+    def chase(self, target: float, feed_forward: float, step: float) -> None:
+        """Move for `step` seconds towards a `target` [counts] that has jumped there and stays, as does the rest.
+
+        So a drive does that follows each setpoint from its arrival on: dx/dt = w + (r - x) / time_constant with
+        constant r and w, cut to `max_velocity` and to `max_acceleration`.
+        """
+        feed_forward *= self._feed_forward_gain if self.lag is None else 0.0
+        time_constant = self._time_constant if self.lag is None else self.lag
+        gap = target - self.position
+        if time_constant > 0.0:
+            ahead = gap + feed_forward * time_constant
+            wanted = ahead * -math.expm1(-step / time_constant) / step
+        else:
+            wanted = gap / step
+        self._move(wanted, step)
+        self.setpoint, self._feed_forward = target, feed_forward
+
+    def _move(self, wanted: float, step: float) -> None:
+        """Move for `step` seconds with the wanted velocity [counts/s], or what the motor can do of it."""
+        gain = self._max_acceleration * step
         velocity = max(-self._max_velocity, min(wanted, self._max_velocity))
         velocity = max(self.velocity - gain, min(velocity, self.velocity + gain))
         self.limited = velocity != wanted
-        self.setpoint, self._feed_forward = target, feed_forward
         if self.forced_velocity is not None:
             velocity = self.forced_velocity
         self.velocity = velocity
@@ -92,12 +115,8 @@ class Servo:
         if self.forced_velocity is not None:
             self.velocity = self.forced_velocity
             self.coast(step)
-            self.setpoint, self._feed_forward = self.position, 0.0
-            return
-        moving = min(step, abs(self.velocity) / deceleration)
-        lost = math.copysign(deceleration * moving, self.velocity)
-        self.position += (self.velocity - 0.5 * lost) * moving
-        self.velocity = self.velocity - lost if moving == step else 0.0
+        else:
+            self.position, self.velocity = braked(self.position, self.velocity, deceleration, step)
         self.setpoint, self._feed_forward = self.position, 0.0
 
     def run(self, velocity: float, acceleration: float, step: float) -> None:

@@ -1,0 +1,685 @@
+"""The ODrive driver on a bus with simulated ODrives, by a clock that the tests turn."""
+
+from __future__ import annotations
+
+import errno
+import math
+import struct
+from collections.abc import Iterator
+
+import can
+import msgspec
+import numpy as np
+import pytest
+from conftest import CONFIG as ROBOT
+from conftest import Rig as ControlRig
+from conftest import changed
+from numpy.typing import NDArray
+from test_cia402 import Bus, Clock
+
+from drivers import odrive_frames as frames
+from drivers.config import Drive, Drives
+from drivers.errors import BusError, DriveError, DriveTimeout
+from drivers.interface import Feedback, PowerState, Triple
+from drivers.odrive import SETTLING, Odrive
+from drivers.odrive_frames import AxisState, Error, Result
+from drivers.simulated import Servo, SimulatedOdrive
+from drivers.simulated.faultlines import FaultSyntaxError
+from service.config import Config
+from service.modes import Mode
+
+P = PowerState
+PERIOD = 0.001
+START = (0.01, -0.02, 0.03)
+ZERO = (0.0, 0.0, 0.0)
+SPEED = (0.5, 0.4, -0.3)
+CONFIG = Drives(
+    protocol="odrive",
+    A=Drive(node=0, counts_per_metre=25.0),
+    B=Drive(node=7, counts_per_metre=50.0, direction=-1, offset=0.1),
+    C=Drive(node=62, counts_per_metre=25.0),
+    sdo_timeout=0.01,
+)
+COMMANDS = {frames.SET_AXIS_STATE, frames.SET_CONTROLLER_MODE, frames.CLEAR_ERRORS, frames.ESTOP}
+
+
+class Rig:
+    """Three simulated ODrives, the driver, and a loop that holds position."""
+
+    def __init__(self, config: Drives = CONFIG, watchdog: float = 0.02) -> None:
+        self.config = config
+        self.clock = Clock()
+        self.devices = [
+            SimulatedOdrive(
+                drive.node,
+                Servo(
+                    drive.direction * (start - drive.offset) * drive.counts_per_metre,
+                    time_constant=0.0,
+                    max_velocity=2.0 * drive.counts_per_metre,
+                    max_acceleration=1000.0 * drive.counts_per_metre,
+                ),
+                heartbeat=0.1,
+                friction=2.0 * drive.counts_per_metre,
+                watchdog=watchdog,
+            )
+            for drive, start in zip(config.each, START, strict=True)
+        ]
+        self.bus = Bus(self.devices, self.clock)
+        self.drives = Odrive(self.bus, 1_000_000, config, self.clock)
+        self.target = START
+
+    def cycle(self, position: Triple | None = None, velocity: Triple = ZERO) -> Feedback:
+        self.clock.now += PERIOD
+        self.drives.sync()
+        feedback = self.drives.read()
+        self.drives.write(feedback.position if position is None else position, velocity)
+        return feedback
+
+    def cycles(self, number: int) -> Feedback:
+        for _ in range(number - 1):
+            self.cycle()
+        return self.cycle()
+
+    def enable(self) -> None:
+        self.drives.enable()
+        for _ in range(150):
+            if self.cycle().state == (P.OPERATION_ENABLED,) * 3:
+                return
+        raise AssertionError(self.drives.read())
+
+    def move(self, cycles: int = 100) -> Feedback:
+        """Move on with constant speed; stop looking when there is a fault."""
+        for _ in range(cycles):
+            a, b, c = (place + speed * PERIOD for place, speed in zip(self.target, SPEED, strict=True))
+            self.target = a, b, c
+            feedback = self.cycle(self.target, SPEED)
+            if feedback.fault is not None:
+                break
+        return feedback
+
+    def found(self, cause: str, within: int) -> Feedback:
+        """Cycle until there is a fault, and see that it has this cause."""
+        for _ in range(within):
+            feedback = self.cycle()
+            if feedback.fault is not None:
+                assert feedback.fault.cause == cause
+                return feedback
+        raise AssertionError(f"no fault: {feedback}")
+
+    def commands(self) -> list[list[tuple[int, int]]]:
+        """What each drive was told: number and first byte of each command, without setpoints and requests."""
+        sent = [(divmod(can_id, 32), data) for can_id, data in self.bus.sent]
+        return [
+            [(number, data[0] if data else 0) for (node, number), data in sent if node == d.node and number in COMMANDS]
+            for d in self.devices
+        ]
+
+    def setpoints(self) -> NDArray[np.float64]:
+        """Every setpoint sent, in metres and m/s: (3, messages, 2)."""
+        rows = []
+        for drive in self.config.each:
+            scale = drive.direction * drive.counts_per_metre
+            said = [
+                struct.unpack("<fhh", data)
+                for can_id, data in self.bus.sent
+                if can_id == frames.identifier(drive.node, frames.SET_INPUT_POS)
+            ]
+            rows.append([(turns / scale + drive.offset, velocity * 0.001 / scale) for turns, velocity, _ in said])
+        return np.array(rows)
+
+
+@pytest.fixture
+def new() -> Iterator[Rig]:
+    """Drives that were just switched on."""
+    rig = Rig()
+    yield rig
+    rig.drives.close()
+
+
+@pytest.fixture
+def ready(new: Rig) -> Rig:
+    """Drives that were found, without power."""
+    new.drives.configure(PERIOD)
+    new.bus.sent.clear()
+    return new
+
+
+@pytest.fixture
+def enabled(ready: Rig) -> Rig:
+    """Drives with power, holding their position."""
+    ready.enable()
+    ready.bus.sent.clear()
+    return ready
+
+
+IDLE = (frames.SET_AXIS_STATE, AxisState.IDLE)
+MODE = (frames.SET_CONTROLLER_MODE, frames.POSITION_CONTROL)
+CLOSED_LOOP = (frames.SET_AXIS_STATE, AxisState.CLOSED_LOOP_CONTROL)
+
+
+class TestConfigure:
+    def test_first_feedback_is_true_before_any_cycle(self, ready: Rig) -> None:
+        feedback = ready.drives.read()
+        assert feedback.position == pytest.approx(START, abs=1e-7)
+        assert feedback.state == (P.SWITCH_ON_DISABLED,) * 3
+        assert feedback.fault is None
+        assert 0.99 < ready.drives.bus_load < 1.0
+
+    def test_takes_power_off_that_was_left_on(self, new: Rig) -> None:
+        new.devices[1].axis_state = AxisState.CLOSED_LOOP_CONTROL
+        new.drives.configure(PERIOD)
+        assert new.devices[1].axis_state is AxisState.IDLE
+
+    def test_drive_that_keeps_its_power(self, new: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+        new.devices[1].axis_state = AxisState.CLOSED_LOOP_CONTROL
+        new.devices[1]._watchdog = math.inf
+        monkeypatch.setitem(new.devices[1]._handlers, frames.SET_AXIS_STATE, lambda data: None)
+        with pytest.raises(DriveError, match=r"drive B: keeps its power on .*closed loop control"):
+            new.drives.configure(PERIOD)
+
+    def test_missing_drive(self) -> None:
+        rig = Rig()
+        rig.devices[2].silent = True
+        with pytest.raises(DriveTimeout, match=r"drive C: no answer to Get_Version within 0\.01 s"):
+            rig.drives.configure(PERIOD)
+        rig.drives.close()
+
+    def test_drive_without_heartbeat(self, new: Rig) -> None:
+        new.devices[0]._heartbeat_due = math.inf
+        with pytest.raises(DriveTimeout, match=r"drive A: no heartbeat .*within 0\.3"):
+            new.drives.configure(PERIOD)
+
+    def test_firmware_of_another_layout(self, new: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("drivers.simulated.odrive.FIRMWARE", (0, 5, 6))
+        with pytest.raises(DriveError, match=r"drive A: its firmware is 0\.5\.6; wanted 0\.6\.0"):
+            new.drives.configure(PERIOD)
+
+    def test_drive_that_does_not_know_where_it_is(self, new: Rig) -> None:
+        new.devices[2].servo.position = math.nan
+        with pytest.raises(DriveError, match=r"drive C: position estimate is nan"):
+            new.drives.configure(PERIOD)
+
+    def test_drive_with_errors_is_no_failure(self, new: Rig) -> None:
+        new.devices[1].fail(Error.DC_BUS_UNDER_VOLTAGE)
+        new.drives.configure(PERIOD)
+        fault = new.cycle().fault
+        assert fault is not None
+        assert fault == ("B", "fault", 0x200, "drive B: DC_BUS_UNDER_VOLTAGE")
+
+    @pytest.mark.parametrize("bitrate", [500_000, 1_000])
+    def test_full_bus_is_refused_with_the_rate_that_fits(self, new: Rig, bitrate: int) -> None:
+        with pytest.raises(BusError, match=r"1000 Hz takes .*%.* the highest rate that fits is \d+ Hz"):
+            Odrive(new.bus, bitrate, CONFIG, new.clock).configure(PERIOD)
+
+    @pytest.mark.parametrize("node", [7, 63, 100])
+    def test_node_ids_that_cannot_be(self, node: int) -> None:
+        drives = msgspec.structs.replace(CONFIG, C=Drive(node=node, counts_per_metre=25.0))
+        with pytest.raises(DriveError, match=f"must differ and be 0 to 62, but are 0, 7, {node}"):
+            Odrive(Bus([], Clock()), 1_000_000, drives)
+
+    def test_dead_bus(self, new: Rig) -> None:
+        new.bus.broken = True
+        with pytest.raises(BusError, match="cannot send"):
+            new.drives.configure(PERIOD)
+
+
+class TestPower:
+    def test_mode_then_state_after_a_setpoint_and_once(self, ready: Rig) -> None:
+        ready.drives.enable()
+        assert ready.bus.sent == []
+        ready.cycles(2)
+        numbers = [can_id % 32 for can_id, _ in ready.bus.sent]
+        assert max(i for i, n in enumerate(numbers[:9]) if n == frames.SET_INPUT_POS) < numbers.index(
+            frames.SET_CONTROLLER_MODE
+        )
+        ready.cycles(300)
+        assert ready.commands() == [[MODE, CLOSED_LOOP]] * 3
+        assert [device.modes for device in ready.devices] == [(frames.POSITION_CONTROL, frames.PASSTHROUGH)] * 3
+
+    def test_no_power_without_a_setpoint(self, ready: Rig) -> None:
+        ready.drives.enable()
+        ready.drives.sync()
+        assert ready.commands() == [[], [], []]
+
+    def test_nothing_moves_on_enabling(self, ready: Rig) -> None:
+        ready.enable()
+        feedback = ready.cycles(50)
+        assert feedback.position == pytest.approx(START, abs=1e-7)
+        assert feedback.fault is None
+
+    def test_refusal_is_named(self, ready: Rig) -> None:
+        ready.devices[2].calibrated = False
+        ready.drives.enable()
+        fault = ready.found("state", within=250).fault
+        assert fault is not None
+        assert fault.message == "drive C: refuses closed loop control: not calibrated"
+        ready.cycles(150)
+        assert {device.axis_state for device in ready.devices} == {AxisState.IDLE}
+
+    def test_heartbeat_from_before_the_request_is_no_refusal(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.drives.enable()
+        ready.cycle()
+        on_its_way = frames.BEAT.pack(0, AxisState.IDLE, Result.NOT_CALIBRATED, 0)
+        ready.bus.inject(frames.identifier(62, frames.HEARTBEAT), on_its_way)
+        for _ in range(250):
+            feedback = ready.cycle()
+            assert feedback.fault is None
+        assert feedback.state == (P.OPERATION_ENABLED,) * 3
+
+    def test_disable(self, enabled: Rig) -> None:
+        enabled.drives.disable()
+        assert enabled.commands() == [[IDLE]] * 3
+        assert enabled.cycles(110).state == (P.SWITCH_ON_DISABLED,) * 3
+
+    def test_drive_that_misses_the_word_is_told_again(self, enabled: Rig) -> None:
+        enabled.devices[0].silent = True
+        enabled.drives.disable()
+        enabled.devices[0].silent = False
+        assert enabled.cycle().state[0] is P.QUICK_STOP_ACTIVE
+        enabled.cycles(250)
+        assert enabled.devices[0].axis_state is AxisState.IDLE
+        assert enabled.commands() == [[IDLE, IDLE], [IDLE], [IDLE]]
+
+
+class TestSetpoints:
+    def test_are_sent_at_the_next_cycle_and_reached_at_the_one_after(self, enabled: Rig) -> None:
+        enabled.cycle()
+        there = (START[0] + 1e-4, START[1] - 1e-4, START[2])
+        enabled.bus.sent.clear()
+        enabled.cycle(there)
+        before, now = enabled.cycle(there).position, enabled.cycle(there).position
+        assert before == pytest.approx(START, abs=1e-7)
+        assert now == pytest.approx(there, abs=1e-7)
+        assert enabled.setpoints()[:, 1, 0] == pytest.approx(there, abs=1e-7)
+
+    def test_are_followed_in_motion(self, enabled: Rig) -> None:
+        feedback = enabled.move(200)
+        assert feedback.fault is None
+        assert feedback.position == pytest.approx(
+            [p - 2 * v * PERIOD for p, v in zip(enabled.target, SPEED, strict=True)]
+        )
+        assert enabled.setpoints()[:, -1, 1] == pytest.approx(SPEED, abs=1e-4)
+
+    @pytest.mark.parametrize(
+        ("position", "velocity"),
+        [(math.nan, 0.0), (math.inf, 0.0), (1e300, 0.0), (0.0, math.nan), (0.0, math.inf), (0.0, 1.4)],
+    )
+    def test_that_no_message_holds_are_a_fault(self, enabled: Rig, position: float, velocity: float) -> None:
+        enabled.cycle()
+        enabled.bus.sent.clear()
+        enabled.cycle((START[0], position, START[2]), (0.0, velocity, 0.0))
+        fault = enabled.cycle().fault
+        assert fault is not None
+        assert fault[:2] == ("B", "setpoint")
+        assert enabled.setpoints()[:, :, 0] == pytest.approx(np.array(START)[:, None] + np.zeros(3), abs=1e-7)
+
+    def test_late_ones_leave_the_last_in_force(self, enabled: Rig) -> None:
+        enabled.drives.sync()
+        enabled.bus.sent.clear()
+        enabled.drives.sync()
+        assert enabled.setpoints()[:, 0, 0] == pytest.approx(START, abs=1e-7)
+
+
+class TestStop:
+    def test_one_drives_error_stops_all_in_the_cycle_it_is_known(self, enabled: Rig) -> None:
+        enabled.move(100)
+        enabled.devices[1].fail(Error.DRV_FAULT)
+        enabled.bus.sent.clear()
+        feedback = enabled.move(40)
+        assert feedback.fault == ("B", "fault", 0x20, "drive B: DRV_FAULT")
+        _, slower = np.abs(enabled.setpoints()[:, -2:, 1]).T
+        assert slower == pytest.approx(np.abs(SPEED) - 10.0 * PERIOD, abs=1e-4)
+        assert enabled.cycles(200).state == (P.SWITCH_ON_DISABLED, P.FAULT, P.SWITCH_ON_DISABLED)
+        assert enabled.commands() == [[IDLE]] * 3
+
+    def test_follows_the_ramp_without_a_step_and_ends_without_power(self, enabled: Rig) -> None:
+        enabled.move(100)
+        enabled.bus.sent.clear()
+        enabled.drives.quick_stop()
+        for _ in range(30):
+            assert enabled.cycle().state == (P.QUICK_STOP_ACTIVE,) * 3
+        enabled.cycles(200)
+        position, velocity = np.moveaxis(enabled.setpoints(), 2, 0)
+        deceleration = CONFIG.quick_stop_deceleration
+        assert np.abs(np.diff(velocity)).max() <= deceleration * PERIOD + 1e-4
+        assert np.abs(np.diff(position)).max() <= max(SPEED) * PERIOD + 1e-7
+        stopping = position[:, -1] - np.array(enabled.target)
+        # The last setpoint written was not sent yet, and the first frame of the stop lowers the velocity in place.
+        slower = np.abs(SPEED) - deceleration * PERIOD
+        ramp = np.sign(SPEED) * slower**2 / (2.0 * deceleration)
+        assert stopping == pytest.approx(ramp - np.array(SPEED) * PERIOD, abs=1e-6)
+        assert enabled.commands() == [[IDLE]] * 3
+        assert {device.axis_state for device in enabled.devices} == {AxisState.IDLE}
+
+    def test_holds_until_the_servos_have_settled(self, enabled: Rig) -> None:
+        enabled.drives.quick_stop()
+        enabled.cycles(round(SETTLING / PERIOD) - 1)
+        assert enabled.commands() == [[], [], []]
+        enabled.cycles(3)
+        assert enabled.commands() == [[IDLE]] * 3
+
+    def test_setpoints_written_meanwhile_are_left_aside(self, enabled: Rig) -> None:
+        enabled.drives.quick_stop()
+        enabled.cycle((9.0, 9.0, 9.0))
+        enabled.cycle((9.0, 9.0, 9.0))
+        assert enabled.setpoints()[:, :, 0].max() < 0.04
+
+    def test_twice_is_once(self, enabled: Rig) -> None:
+        enabled.move(100)
+        enabled.drives.quick_stop()
+        sent = len(enabled.bus.sent)
+        enabled.drives.quick_stop()
+        assert len(enabled.bus.sent) == sent
+
+    def test_without_power_sends_nothing(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.bus.sent.clear()
+        ready.drives.quick_stop()
+        assert ready.bus.sent == []
+
+    def test_a_silent_host_is_stopped_by_the_watchdogs(self, enabled: Rig) -> None:
+        enabled.clock.now += 1.0
+        for device in enabled.devices:
+            device.poll(enabled.clock.now)
+        assert {device.disarm_reason for device in enabled.devices} == {Error.WATCHDOG_TIMER_EXPIRED}
+        assert {device.axis_state for device in enabled.devices} == {AxisState.IDLE}
+
+    def test_cycles_feed_the_watchdogs(self, enabled: Rig) -> None:
+        assert enabled.cycles(100).fault is None
+
+
+class TestFaults:
+    def test_silence_at_the_third_cycle(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.devices[1].silent = True
+        assert ready.cycle().fault is None
+        assert ready.cycle().fault is None
+        fault = ready.cycle().fault
+        assert fault is not None
+        assert fault[:3] == ("B", "silent", 0)
+
+    def test_lost_heartbeat(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.devices[0]._heartbeat_due = math.inf
+        fault = ready.found("heartbeat", within=320).fault
+        assert fault is not None
+        assert fault.drive == "A"
+
+    def test_time_between_set_up_and_first_cycle_is_no_loss(self, ready: Rig) -> None:
+        ready.clock.now += 30.0
+        assert ready.cycles(3).fault is None
+
+    def test_power_lost_unasked(self, enabled: Rig) -> None:
+        enabled.devices[2].axis_state = AxisState.IDLE
+        fault = enabled.found("state", within=110).fault
+        assert fault is not None
+        assert fault.message == "drive C: left closed loop control unasked: idle"
+
+    def test_somebody_else_calibrates(self, ready: Rig) -> None:
+        ready.bus.inject(frames.identifier(7, frames.HEARTBEAT), frames.BEAT.pack(0, 4, Result.BUSY, 0))
+        feedback = ready.found("state", within=1)
+        assert feedback.state[1] is P.SWITCHED_ON
+        assert feedback.fault is not None
+        assert "motor calibration" in feedback.fault.message
+
+    def test_following_error(self, enabled: Rig) -> None:
+        stuck = enabled.devices[0].servo
+        stuck.chase = lambda *_: None  # type: ignore[method-assign]
+        feedback = enabled.move(50)
+        assert feedback.fault is not None
+        assert feedback.fault[:2] == ("A", "fault")
+        assert "following error 5." in feedback.fault.message
+        assert abs(enabled.target[0] - START[0]) == pytest.approx(0.005, abs=2.5 * SPEED[0] * PERIOD)
+
+    def test_restart_is_not_reset_away(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.devices[1].restart(ready.clock.now)
+        ready.found("fault", within=40)  # its errors are told before its heartbeat
+        ready.cycles(110)
+        ready.devices[1].errors, ready.devices[1].axis_state = Error(0), AxisState.IDLE
+        ready.cycles(110)
+        ready.drives.reset()
+        fault = ready.cycle().fault
+        assert fault is not None
+        assert fault[:2] == ("B", "state")
+        assert "restart the service" in fault.message
+
+    @pytest.mark.parametrize("number", [frames.HEARTBEAT, frames.GET_ERROR, frames.GET_ENCODER_ESTIMATES])
+    def test_frame_of_wrong_length(self, ready: Rig, number: int) -> None:
+        ready.cycle()
+        ready.bus.inject(frames.identifier(62, number), b"\0\0\0")
+        fault = ready.drives.read().fault
+        assert fault is not None
+        assert fault[:2] == ("C", "frame")
+
+    def test_position_that_is_no_number(self, enabled: Rig) -> None:
+        enabled.devices[0].servo.position = math.nan
+        feedback = enabled.found("frame", within=1)
+        assert all(map(math.isfinite, feedback.position))
+
+    def test_bus_that_takes_no_frame(self, enabled: Rig) -> None:
+        enabled.bus.broken = True
+        fault = enabled.found("bus", within=3).fault
+        assert fault is not None
+        assert "Transmit buffer full" in fault.message
+
+    def test_bus_that_breaks_in_powering_up_arms_no_drive_after_it(
+        self, ready: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        ready.cycle()
+        ready.drives.enable()
+        send = ready.bus.send
+
+        def fail_once(message: can.Message, timeout: float | None = None) -> None:
+            if message.arbitration_id % 32 == frames.SET_AXIS_STATE:
+                monkeypatch.undo()
+                raise can.CanOperationError("network is down", errno.ENETDOWN)
+            send(message, timeout)
+
+        monkeypatch.setattr(ready.bus, "send", fail_once)
+        ready.found("bus", within=1)
+        ready.cycles(100)
+        assert CLOSED_LOOP not in [command for each in ready.commands() for command in each]
+
+    def test_bus_off(self, enabled: Rig) -> None:
+        enabled.bus.inject(0x040, bytes(8), is_error_frame=True)
+        fault = enabled.found("bus", within=1).fault
+        assert fault is not None
+        assert "bus-off" in fault.message
+
+    def test_frames_of_others_are_no_concern(self, enabled: Rig) -> None:
+        enabled.bus.inject(frames.identifier(20, frames.GET_ENCODER_ESTIMATES), b"\xff")
+        enabled.bus.inject(frames.identifier(0, frames.HEARTBEAT), b"\xff" * 4, is_extended_id=True)
+        feedback = enabled.cycle()
+        assert feedback.fault is None
+        assert feedback.position == pytest.approx(START, abs=1e-7)
+
+    def test_a_full_queue_for_a_cycle_is_a_warning_and_lost_setpoints(self, enabled: Rig) -> None:
+        enabled.bus.broken = True
+        feedback = enabled.cycle()
+        enabled.bus.broken = False
+        assert "transmit queue is full" in feedback.warnings[0]
+        assert [count.setpoints_lost for count in feedback.counts] == [1, 1, 1]
+        assert enabled.cycles(20).fault is None
+        assert enabled.move().fault is None
+
+    def test_error_passive_is_a_warning(self, enabled: Rig) -> None:
+        enabled.bus.faults.add("error-passive")
+        told = [text for _ in range(5) for text in enabled.cycle().warnings]
+        assert len(told) == 1
+        assert "error-passive: 128 transmit errors" in told[0]
+
+    @pytest.mark.parametrize("stop", ["quick stop", "disable"])
+    def test_drive_that_keeps_its_power_is_named_with_its_state(
+        self, enabled: Rig, monkeypatch: pytest.MonkeyPatch, stop: str
+    ) -> None:
+        monkeypatch.setitem(enabled.devices[1]._handlers, frames.SET_AXIS_STATE, lambda data: None)
+        getattr(enabled.drives, stop.replace(" ", "_"))()
+        assert enabled.cycles(round(CONFIG.stop_timeout / PERIOD) - 1).fault is None
+        fault = enabled.found("timeout", within=3).fault
+        assert fault is not None
+        assert fault.message == f"drive B: is in closed loop control 1 s after {stop}; idle was expected"
+
+
+class TestLateAnswers:
+    def test_age_is_told_and_what_comes_late_or_never_is_counted(self, ready: Rig) -> None:
+        estimates = f"0x{frames.identifier(ready.config.B.node, frames.GET_ENCODER_ESTIMATES):X}"
+        ready.cycles(3)
+        ready.bus.faults.add(f"B delay 0.0005 {estimates} for 1 frame")
+        assert ready.cycle().age == (0, 1, 0)
+        feedback = ready.cycle()
+        assert feedback.age == (0, 0, 0)
+        assert [(c.feedback_late, c.feedback_lost) for c in feedback.counts] == [(0, 0), (1, 0), (0, 0)]
+        ready.bus.faults.add(f"B drop {estimates} for 2 frames")
+        assert [ready.cycle().age for _ in range(3)] == [(0, 1, 0), (0, 2, 0), (0, 0, 0)]
+        assert ready.cycle().counts[1][:2] == (1, 2)
+
+    def test_following_error_is_that_of_the_cycle_the_position_is_from(self, enabled: Rig) -> None:
+        """At 0.5 m/s a cycle is 0.5 mm."""
+        drives = msgspec.structs.replace(CONFIG, following_error=3e-4)
+        enabled.drives._drives = drives
+        enabled.bus.faults.add(f"A delay 0.0005 0x{frames.GET_ENCODER_ESTIMATES:X}")
+        assert enabled.move().fault is None
+
+    def test_setpoints_after_the_next_tick_are_counted_as_late(self, ready: Rig) -> None:
+        ready.drives.sync()
+        position = ready.drives.read().position
+        ready.clock.now += 1.5 * PERIOD
+        ready.drives.write(position, ZERO)
+        assert [count.setpoints_late for count in ready.cycle().counts] == [1, 1, 1]
+
+
+class TestFaultsOnDemand:
+    @pytest.mark.parametrize("line", ["A emcy 4310", "B drop tpdo2"])
+    def test_those_of_canopen_are_refused(self, ready: Rig, line: str) -> None:
+        with pytest.raises(FaultSyntaxError, match="does not speak CANopen"):
+            ready.bus.faults.add(line)
+
+    @pytest.mark.parametrize(("line", "cause"), [("C silent", "silent"), ("A stuck", "fault"), ("A lag 0.1", "fault")])
+    def test_those_of_drives_are_found(self, enabled: Rig, line: str, cause: str) -> None:
+        enabled.bus.faults.add(line)
+        fault = enabled.move(300).fault
+        assert fault is not None
+        assert (fault.drive, fault.cause) == (line[0], cause)
+
+
+class TestReset:
+    def test_clears_the_drives_errors_and_gives_no_power(self, enabled: Rig) -> None:
+        enabled.devices[2].fail(Error.CURRENT_LIMIT_VIOLATION)
+        enabled.found("fault", within=40)
+        enabled.cycles(200)
+        enabled.bus.sent.clear()
+        enabled.drives.reset()
+        feedback = enabled.cycles(300)
+        assert feedback.fault is None
+        assert feedback.state == (P.SWITCH_ON_DISABLED,) * 3
+        assert enabled.commands() == [[], [], [(frames.CLEAR_ERRORS, 0)]]
+        enabled.enable()
+
+    def test_while_the_cause_lasts_the_fault_comes_back(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.devices[1]._handlers[frames.CLEAR_ERRORS] = lambda data: None
+        ready.devices[1].fail(Error.MOTOR_OVER_TEMP)
+        ready.found("fault", within=40)
+        ready.drives.reset()
+        assert ready.cycle().fault is None
+        ready.found("fault", within=100)
+
+    def test_nothing_is_enabled_while_a_fault_is_latched(self, enabled: Rig) -> None:
+        enabled.devices[0].fail(Error.SPINOUT_DETECTED)
+        enabled.found("fault", within=40)
+        enabled.cycles(200)
+        enabled.bus.sent.clear()
+        enabled.drives.enable()
+        enabled.cycles(200)
+        assert enabled.commands() == [[], [], []]
+
+    def test_without_a_fault_changes_nothing(self, enabled: Rig) -> None:
+        enabled.drives.reset()
+        assert enabled.cycles(3).state == (P.OPERATION_ENABLED,) * 3
+        assert enabled.commands() == [[], [], []]
+
+
+class TestClose:
+    def test_while_moving_brakes_by_the_ramp_first(self, enabled: Rig) -> None:
+        enabled.move(100)
+        enabled.bus.sent.clear()
+        before = enabled.clock.now
+        enabled.drives.close()
+        assert {device.axis_state for device in enabled.devices} == {AxisState.IDLE}
+        assert {device.disarm_reason for device in enabled.devices} == {Error(0)}
+        assert 0.5 / 10.0 + SETTLING <= enabled.clock.now - before < 0.5
+        assert np.abs(np.diff(enabled.setpoints()[:, :, 1])).max() <= 10.0 * PERIOD + 1e-4
+        assert enabled.bus.shutdowns == 1
+
+    def test_twice_is_once(self, enabled: Rig) -> None:
+        enabled.drives.close()
+        enabled.bus.sent.clear()
+        enabled.drives.close()
+        assert enabled.bus.sent == []
+        assert enabled.bus.shutdowns == 1
+
+    def test_on_a_dead_bus(self, enabled: Rig) -> None:
+        enabled.bus.broken = True
+        enabled.drives.close()
+        assert enabled.bus.shutdowns == 1
+
+
+def odrives(config: Config = ROBOT) -> Config:
+    """The simulated robot with ODrives: nothing but the protocol, the node ids and the drives' unit differs."""
+    each = {
+        name: msgspec.structs.replace(getattr(config.drives, name), node=node, counts_per_metre=25.0)
+        for node, name in enumerate("ABC")
+    }
+    drives = msgspec.structs.replace(config.drives, protocol="odrive", **each)
+    return msgspec.structs.replace(config, drives=drives)
+
+
+class TestUnderTheControl:
+    @pytest.fixture
+    def robot(self) -> Iterator[ControlRig]:
+        rig = ControlRig(odrives())
+        yield rig
+        rig.bus.shutdown()
+
+    def test_nothing_moves_on_enable(self) -> None:
+        start = (0.01, -0.02, 0.035)
+        rig = ControlRig(odrives(changed(ROBOT, start=start)))
+        rig.enable()
+        rig.cycles(100)
+        assert [drive.servo.position / 25.0 for drive in rig.drives] == pytest.approx(start, abs=1e-7)
+        rig.bus.shutdown()
+
+    def test_a_goal_arrives(self, robot: ControlRig) -> None:
+        robot.enable()
+        robot.goal("g", 0.05, -0.02, 0.2)
+        robot.until(lambda: bool(robot.outcomes()))
+        assert robot.outcomes() == [("g", "done")]
+        robot.cycles(50)
+        assert robot.control.pose == pytest.approx((0.05, -0.02, 0.2), abs=1e-5)
+
+    def test_following_error_trips(self, robot: ControlRig) -> None:
+        robot.enable()
+        robot.goal("g", 0.1, 0.0, 0.0)
+        robot.cycles(100)
+        robot.drives[1].servo.chase = lambda *_: None  # type: ignore[method-assign]
+        robot.until(lambda: robot.mode is Mode.FAULT, within=200)
+        assert robot.control.fault is not None
+        assert "slider B: following error" in robot.control.fault
+        robot.until(lambda: not robot.control.powered)
+        assert robot.outcomes() == [("g", "faulted")]
+
+    def test_an_error_in_motion_is_named_stopped_and_reset(self, robot: ControlRig) -> None:
+        robot.enable()
+        robot.goal("g", 0.1, 0.0, 0.0)
+        robot.cycles(100)
+        robot.drives[2].fail(Error.DC_BUS_OVER_REGEN_CURRENT)
+        robot.until(lambda: robot.mode is Mode.FAULT, within=40)
+        assert robot.control.fault == "drive C: DC_BUS_OVER_REGEN_CURRENT"
+        robot.until(lambda: not robot.control.powered, within=400)
+        robot.command("reset")
+        assert robot.mode is Mode.DISABLED
+        robot.cycles(200)
+        assert not robot.control.powered
+        robot.enable()
