@@ -8,6 +8,7 @@ simulated drives take their place, on a clock that goes on by one period a cycle
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -16,9 +17,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cia402 import Cia402
+from drivers.bus import connect
 from drivers.interface import DriveFault, Drives, Feedback, PowerState, Triple
-from drivers.simulated import simulated_bus
 from service.config import Config
 from service.control import Control
 from service.errors import ServiceError
@@ -58,10 +58,12 @@ def again(recording: Recording, config: Config, *, simulated: bool) -> Compariso
     """
     records, given = _whole(recording)
     _check(recording, records, config)
-    drives = _simulated(records, config) if simulated else _Recorded(records)
+    clock = _Clock(config.period)
+    drives = _simulated(records, config, clock) if simulated else _Recorded(records)
     try:
-        made, modes = _run(Control(config, drives), drives, records, given)
+        made, modes = _run(Control(config, drives), drives, clock, records, given)
     finally:
+        clock.run()
         drives.close()
     sent = np.stack([records[name] for name in SETPOINTS], axis=1)
     differs = (made.view(np.int64) != sent.view(np.int64)).any(axis=(1, 2)) | (modes != records["mode"])
@@ -78,9 +80,10 @@ def again(recording: Recording, config: Config, *, simulated: bool) -> Compariso
 
 
 def _run(
-    control: Control, drives: Drives, records: NDArray[np.void], given: Sequence[Input]
+    control: Control, drives: Drives, clock: _Clock, records: NDArray[np.void], given: Sequence[Input]
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return what is sent to the drives in each cycle, (N, 2, 3), and the modes, (N,)."""
+    clock.step()
     drives.sync()
     control.start(drives.read())
     control.cycle = int(records["cycle"][0]) - 1
@@ -88,6 +91,7 @@ def _run(
     made = np.zeros((len(records), 2, 3))
     modes = np.zeros(len(records), np.uint8)
     for row in range(len(records)):
+        clock.step()
         drives.sync()
         _cycle(control, drives, list(_due(waiting, control.cycle + 1)))
         made[row] = control.rows[:2]
@@ -204,28 +208,31 @@ class _Recorded:
         """See drivers.interface.Drives."""
 
 
-class _Simulated(Cia402):
-    """The real driver over simulated drives, on a clock that a SYNC moves on by one period."""
+class _Clock:
+    """The simulated drives' time, which a cycle moves on by one period; it runs by itself once that is over."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, period: float) -> None:
         self._now = 0.0
-        self._step = config.period
-        bus = simulated_bus(config.can, config.drives, lambda: self._now)
-        super().__init__(bus, config.can.bitrate, config.drives, lambda: self._now)
-        self.configure(config.period)
+        self._period = period
+        self._over: float | None = None
 
-    def sync(self) -> None:
-        """See drivers.interface.Drives."""
-        self._now += self._step
-        super().sync()
+    def __call__(self) -> float:
+        return self._now if self._over is None else self._now + time.monotonic() - self._over
 
-    def close(self) -> None:
-        """Let go of the drives at once: by their clock they would never come to stand."""
-        self._bus.shutdown()
+    def step(self) -> None:
+        """Go on by a period."""
+        self._now += self._period
+
+    def run(self) -> None:
+        """Run from now on: drives that are let go of have to come to stand."""
+        self._over = time.monotonic()
 
 
-def _simulated(records: NDArray[np.void], config: Config) -> Drives:
+def _simulated(records: NDArray[np.void], config: Config, clock: _Clock) -> Drives:
     """Return simulated drives that stand where the recorded ones stood."""
     start: Any = tuple(records["position"][0].tolist())
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)
-    return _Simulated(msgspec.structs.replace(config, can=msgspec.structs.replace(config.can, simulated=behaviour)))
+    can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives
+    drives = connect(can, config.drives, clock)
+    drives.configure(config.period)
+    return drives

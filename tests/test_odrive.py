@@ -657,7 +657,7 @@ class TestUnderTheControl:
         robot.until(lambda: bool(robot.outcomes()))
         assert robot.outcomes() == [("g", "done")]
         robot.cycles(50)
-        assert robot.control.pose == pytest.approx((0.05, -0.02, 0.2), abs=1e-5)
+        assert robot.control.measured.pose == pytest.approx((0.05, -0.02, 0.2), abs=1e-5)
 
     def test_following_error_trips(self, robot: ControlRig) -> None:
         robot.enable()
@@ -667,7 +667,7 @@ class TestUnderTheControl:
         robot.until(lambda: robot.mode is Mode.FAULT, within=200)
         assert robot.control.fault is not None
         assert "slider B: following error" in robot.control.fault
-        robot.until(lambda: not robot.control.powered)
+        robot.until(lambda: not robot.control.measured.powered)
         assert robot.outcomes() == [("g", "faulted")]
 
     def test_an_error_in_motion_is_named_stopped_and_reset(self, robot: ControlRig) -> None:
@@ -677,9 +677,9 @@ class TestUnderTheControl:
         robot.drives[2].fail(Error.DC_BUS_OVER_REGEN_CURRENT)
         robot.until(lambda: robot.mode is Mode.FAULT, within=40)
         assert robot.control.fault == "drive C: DC_BUS_OVER_REGEN_CURRENT"
-        robot.until(lambda: not robot.control.powered, within=400)
+        robot.until(lambda: not robot.control.measured.powered, within=400)
         robot.command("reset")
         assert robot.mode is Mode.DISABLED
         robot.cycles(200)
-        assert not robot.control.powered
+        assert not robot.control.measured.powered
         robot.enable()
