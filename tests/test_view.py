@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,14 +21,12 @@ import pytest
 import screenshot
 from chromium import chromium
 from PIL import Image
-from rerun.chunk import RrdReader
+from rerun.chunk import Chunk, RrdReader
 
-from service import columns, view
-from service.columns import Column
+from service import view
 from service.config import SIM, load
 from service.recorder import Recorder
-from service.scene import SCALARS
-from service.sinks import Relay, free_port
+from service.sinks import free_port
 
 VIEWS = {
     "demo: 3-PRP planar robot",
@@ -153,46 +152,29 @@ def test_which_locators_stay_on_this_machine(locator: str, local: bool) -> None:
 
 
 def test_a_frozen_viewer_is_skipped_counted_and_does_not_stop_the_file(tmp_path: Path) -> None:
+    """The server holds its sender up when a viewer takes nothing more, after some 400 MB: here from the beginning."""
     config = load(SIM)
     config = msgspec.structs.replace(config, telemetry=msgspec.structs.replace(config.telemetry, live_port=free_port()))
     recorder = Recorder(config, tmp_path)
-    relay = recorder._live
+    relay, thawed = recorder._live, threading.Event()
     assert relay is not None
-    copy = tmp_path / "viewer.rrd"
-    command = [sys.executable, "-m", "rerun_cli", "--save", str(copy), recorder.live_url]
-    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+
+    def hold(_chunks: list[Chunk]) -> None:
+        thawed.wait()
+
+    relay._deliver = hold
+    records = made.records(20.0)
     try:
-        records = made.records(20.0)
-        until(lambda: copy.exists() and copy.stat().st_size > 0, "the viewer has connected")
-        os.killpg(viewer.pid, signal.SIGSTOP)
-        noise = np.random.default_rng(0).normal(size=(1, 1_000_000))
-        for _ in range(200):  # 8 MB each; what is between server and viewer holds some 400 MB
-            relay.send(columns.chunks(columns.moment(0.0, 0.0), [Column("/bulk", SCALARS, columns.scalars(noise))]))
-            if not drained(relay):
-                break
-        else:
-            raise AssertionError("the frozen viewer holds nothing up")
         for start in range(0, len(records), 20):
             recorder.records(records[start : start + 20].tobytes())
         skipped = recorder.skipped
         assert skipped > 0
     finally:
-        os.killpg(viewer.pid, signal.SIGKILL)
-        viewer.wait()
+        thawed.set()
         recorder.close()
     chunks = list(RrdReader(recorder.path).stream())
     assert sum(chunk.num_rows for chunk in chunks if chunk.entity_path == "/record") == len(records)
     assert recorder.lost == 0
     said = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == "/events"]
     texts = [text for batch in said for (text,) in batch.column("TextLog:text").to_pylist()]
-    assert f"0 batches in the file, {skipped} in the live view" in texts[-1]
-
-
-def drained(relay: Relay) -> bool:
-    """Return whether all that waits is handed on within a few seconds."""
-    deadline = time.monotonic() + 5.0
-    while relay._waiting:
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.01)
-    return True
+    assert any(f"0 batches in the file, {skipped} in the live view" in text for text in texts), texts
