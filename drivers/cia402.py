@@ -79,6 +79,11 @@ class Cia402:
         self._synced = 0.0
         self._closed = False
 
+    @property
+    def traffic(self) -> int:
+        """Bits of all frames on the bus since the start, each with worst-case stuffing."""
+        return self._wire.traffic
+
     def configure(self, period: float) -> None:
         """Set the drives up for a cycle of `period` seconds, read every value back, start them without power.
 

@@ -85,6 +85,10 @@ class Drives(Protocol):
     bus_load: float
     """Worst-case share of the bus that the cyclic traffic takes, with stuffing; 1.0 is full."""
 
+    @property
+    def traffic(self) -> int:
+        """Bits of all frames on the bus since the start, each with worst-case stuffing."""
+
     def configure(self, period: float) -> None:
         """Set the drives up for a cycle of `period` seconds, check what can be read back, start them without power."""
 

@@ -90,6 +90,11 @@ class Odrive:
         self._synced = 0.0
         self._closed = False
 
+    @property
+    def traffic(self) -> int:
+        """Bits of all frames on the bus since the start, each with worst-case stuffing."""
+        return self._wire.traffic
+
     def configure(self, period: float) -> None:
         """Find the drives and leave them without power, for a cycle of `period` seconds.
 

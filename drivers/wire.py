@@ -9,12 +9,15 @@ from typing import Protocol
 import can
 
 from drivers import canerrors
+from drivers.frames import frame_bits
 from drivers.interface import DriveFault
 
 MOST_FRAMES = 1000
 """Frames taken in by one `receive` at most, so that a chattering bus cannot hold it."""
 UNSENT_CYCLES = 3
 """So many cycles in a row with a full transmit queue are a fault."""
+
+_BITS = tuple(frame_bits(n) for n in range(9))
 
 Handler = Callable[[bytearray, float], None]
 """Takes a frame's data and the time; struct.error if the length is wrong."""
@@ -35,6 +38,8 @@ class Wire:
 
     def __init__(self, bus: can.BusABC, stop: Callable[[], None]) -> None:
         self.bus = bus
+        self.traffic = 0
+        """Bits of all frames sent and received so far, each with worst-case stuffing."""
         self.fault: DriveFault | None = None
         self._stop = stop
         self._handlers: dict[int, tuple[Listener, Handler]] = {}
@@ -82,6 +87,7 @@ class Wire:
         """
         try:
             self.bus.send(message, timeout=0)
+            self.traffic += _BITS[min(len(message.data), 8)]
         except (can.CanError, OSError) as error:
             text = f"CAN bus: cannot send: {canerrors.cannot_send(error)}"
             self._unsent = True
@@ -99,6 +105,7 @@ class Wire:
                 message = self.bus.recv(0)
                 if message is None:
                     return
+                self.traffic += _BITS[min(len(message.data), 8)]
                 self.take(message, now)
         except (can.CanError, OSError) as error:
             self.fail(DriveFault("", "bus", 0, f"CAN bus: cannot receive: {error}"))

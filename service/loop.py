@@ -56,6 +56,10 @@ class Loop:
         self._epoch = time.time()
         self._welcome = message(Welcome(lacking, drives.bus_load, self._epoch))
         self._situation = message(Situation(None, 1.0, None))
+        self._bitrate = config.can.bitrate
+        self._bus_load = 0.0
+        self._bits = drives.traffic
+        self._weighed_at = 0
 
         self.control = Control(config, drives)
         self.ending = False
@@ -207,9 +211,19 @@ class Loop:
         if self._capture is not None and self._recorder.connected:
             for frames in self._capture.take():
                 self._recorder.send(bytes((Kind.FRAMES,)) + frames)
+        self._weigh()
+        self._situate()
         self._listen()
         self._meet()
         self._send_events()
+
+    def _weigh(self) -> None:
+        """Once a second, work out how much of the bus is in use."""
+        cycles = self.control.cycle - self._weighed_at
+        if cycles * self._period >= 1.0:
+            bits, self._bits = self._drives.traffic - self._bits, self._drives.traffic
+            self._bus_load = round(bits / (cycles * self._period * self._bitrate), 3)
+            self._weighed_at += cycles
 
     def _listen(self) -> None:
         """Tell everyone what the recorder has to say."""
@@ -246,16 +260,21 @@ class Loop:
             self._kept.append(packet)
             self._recorder.send(packet)
         desk.happenings.clear()
-        goal_id = desk.goal.id if desk.goal else None
-        situation = message(Situation(goal_id, control.override, control.fault, control.target))
-        if situation != self._situation:
-            self._situation = situation
-            self._gateway.send(situation)
-            self._recorder.send(situation)
+        self._situate()
         self._send_events()
         for answer in desk.answers:
             self._gateway.send(message(answer))
         desk.answers.clear()
+
+    def _situate(self) -> None:
+        """Tell what records do not say, where that has changed."""
+        control, goal = self.control, self.control.desk.goal
+        goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
+        situation = message(Situation(goal_id, control.override, control.fault, control.target, self._bus_load, counts))
+        if situation != self._situation:
+            self._situation = situation
+            self._gateway.send(situation)
+            self._recorder.send(situation)
 
     def _send_events(self) -> None:
         """Tell the gateway of every event that is kept and that it does not know."""

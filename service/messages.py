@@ -197,6 +197,15 @@ class Commanded(Struct, frozen=True):
     acceleration: Triple
 
 
+class Traffic(Struct, frozen=True):
+    """What of a drive's cyclic frames went wrong since the service started; none of it is a fault by itself."""
+
+    feedback_late: int
+    feedback_lost: int
+    setpoints_late: int
+    setpoints_lost: int
+
+
 class Sliders(Struct, frozen=True):
     """What the drives say."""
 
@@ -206,6 +215,7 @@ class Sliders(Struct, frozen=True):
     following_error_max: Triple
     """Greatest since the service started, while enabled."""
     status: tuple[str, str, str]
+    traffic: tuple[Traffic, Traffic, Traffic]
 
 
 class GoalState(Struct, frozen=True):
@@ -236,6 +246,9 @@ class LoopState(Struct, frozen=True):
     lateness_us: Percentiles
     cycle_us: Percentiles
     bus_load: float
+    """Worst-case share of the bus that the cycle takes, as computed at the start."""
+    bus_load_measured: float
+    """Share of the bus that was in use in the last second, frames counted with worst-case stuffing."""
     lacking: tuple[str, ...]
     """What the loop runs without: real-time rights and the like, each with its remedy."""
 

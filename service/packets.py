@@ -7,6 +7,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct, msgpack
 
+from drivers.interface import Counts
 from service.messages import Event, Goal, Level, Triple
 
 
@@ -102,6 +103,9 @@ class Situation(Struct, frozen=True, tag=True):
     fault: Annotated[str, Meta(max_length=512)] | None
     target: Triple | None = None
     """The pose that the goal leads to; None for a jog."""
+    bus_load: float = 0.0
+    """Share of the bus that was in use in the last second."""
+    counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
 
 
 class Mishap(Struct, frozen=True, tag=True):

@@ -155,6 +155,7 @@ class _Recorded:
     """Drives that say what they said in the recording, and take anything: drivers.interface.Drives."""
 
     bus_load = 0.0
+    traffic = 0
 
     def __init__(self, records: NDArray[np.void]) -> None:
         positions: list[Any] = records["position"].tolist()

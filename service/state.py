@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drivers.interface import PowerState
 from service.config import Config
-from service.messages import Commanded, GoalState, LoopState, Percentiles, Sliders, State, Triple
+from service.messages import Commanded, GoalState, LoopState, Percentiles, Sliders, State, Traffic, Triple
 from service.modes import MODES, Mode
 from service.packets import Situation, Welcome
 
@@ -67,6 +67,7 @@ class StateMaker:
         row = self._newest
         lateness, cycle = self._statistics
         goal = self._situation.goal
+        a, b, c = self._situation.counts
         return State(
             seq=int(row["cycle"]),
             t=round(int(row["cycle"]) * self._period, 9),
@@ -88,6 +89,7 @@ class StateMaker:
                 following_error=_triple(row["following_error"]),
                 following_error_max=_triple(self._error_max),
                 status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
+                traffic=(Traffic(*a), Traffic(*b), Traffic(*c)),
             ),
             goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._situation.target)
             if goal
@@ -102,6 +104,7 @@ class StateMaker:
                 lateness_us=lateness,
                 cycle_us=cycle,
                 bus_load=self._welcome.bus_load,
+                bus_load_measured=self._situation.bus_load,
                 lacking=self._welcome.lacking,
             ),
         )

@@ -164,8 +164,13 @@ def _table(state: State, robot: str) -> Table:
             f"{sliders.position[index] * 1e3:9.3f} mm {sliders.velocity[index] * 1e3:8.2f} mm/s "
             f"{sliders.following_error[index] * 1e6:7.1f} µm error  {sliders.status[index]}",
         )
+        if said := [
+            f"{name.replace('_', ' ')} {n}" for name, n in msgspec.to_builtins(sliders.traffic[index]).items() if n
+        ]:
+            grid.add_row("", f"[yellow]{', '.join(said)}[/]")
     loop = state.loop
-    grid.add_row("loop", f"{loop.rate_hz} Hz, {loop.cycles} cycles, {loop.overruns} missed, bus {loop.bus_load:.0%}")
+    words = f"{loop.rate_hz} Hz, {loop.cycles} cycles, {loop.overruns} missed"
+    grid.add_row("loop", f"{words}, bus {loop.bus_load_measured:.0%} of at most {loop.bus_load:.0%}")
     grid.add_row("lateness", percentiles(loop.lateness_us))
     grid.add_row("cycle", percentiles(loop.cycle_us))
     for lack in loop.lacking:

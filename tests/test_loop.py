@@ -21,6 +21,7 @@ from service.packets import (
     Kind,
     Mishap,
     Remark,
+    Situation,
     Welcome,
     decode_answer,
     message,
@@ -91,6 +92,14 @@ def test_a_program_that_is_wrong_stops_the_robot_in_that_cycle(shell: Shell, mon
     assert "a bug" in (shell.loop.control.fault or "")
     quick = {frame.arbitration_id - 0x200 for frame in shell.rig.sent if frame.data and frame.data[0] & 0b110 == 0b010}
     assert {1, 2, 3} <= quick
+
+
+def test_the_bus_load_is_measured(shell: Shell) -> None:
+    shell.enabled()
+    shell.cycles(2100)
+    said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
+    measured = [answer.bus_load for answer in said if isinstance(answer, Situation)][-1]
+    assert measured == pytest.approx(shell.rig.driver.bus_load, rel=0.05)
 
 
 def test_missed_ticks_are_counted(shell: Shell) -> None:

@@ -475,6 +475,23 @@ def test_a_recording_that_suffers_is_told_to_everyone(service: Service) -> None:
     assert "trirail: recorder: missing so far" in service.log.read_text()
 
 
+def test_a_frozen_recorder_does_not_matter(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        recorder = service.child("recorder")
+        os.kill(recorder, signal.SIGSTOP)
+        try:
+            state = until(robot, lambda state: state.mode == "holding")
+            assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
+        finally:
+            os.kill(recorder, signal.SIGCONT)
+        assert state.pose[0] == pytest.approx(0.1, abs=1e-5)
+    assert service.end() == 0
+    (file,) = (service.folder / "recordings").glob("*.rrd")
+    cycles = read(file).records["cycle"]
+    assert np.array_equal(np.diff(cycles), np.ones(len(cycles) - 1))  # what waited for it is in the file
+
+
 def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> None:
     bus = f"{tmp_path}/bus"
     root = Path(__file__).parents[1]

@@ -38,6 +38,12 @@ class Report:
         self._axes = list(zip(NAMES, drives.each, bus.drives, strict=True))
         self._said: dict[str, str] = {}
 
+    def once(self, text: str) -> None:
+        """Say something, the first time only."""
+        if text not in self._said:
+            self._said[text] = text
+            say(text)
+
     def update(self) -> None:
         """Say what has changed."""
         for name, axis, drive in self._axes:
@@ -94,7 +100,10 @@ def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report, console: Cons
                 drives.send(frame)
         while (answer := drives.recv(0.0)) is not None:
             if not answer.is_error_frame or _carries_error_frames(wire):
-                wire.send(answer)
+                try:
+                    wire.send(answer)
+                except can.CanOperationError as error:  # a full queue or a bus that is down: drives go on without
+                    report.once(f"cannot send: {error}")
         report.update()
 
 
