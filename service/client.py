@@ -330,6 +330,10 @@ class Robot:
                     last = event.seq, event.time
                     yield event
 
+    def records(self, take: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
+        """Have every batch of records taken as it comes, until the context ends; service.records.unpack reads them."""
+        return self._session.declare_subscriber(self._key("records"), lambda sample: take(sample.payload.to_bytes()))
+
     # ------------------------------------------------------------------ inside
 
     def _key(self, *parts: str) -> str:

@@ -25,11 +25,18 @@ Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative=""
 OUTCOMES = {"done": "green", "rejected": "yellow", "expired": "yellow", "faulted": "bold red", "unknown": "dim"}
 
 
-def replay(*file: Path, config: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
+def replay(
+    *file: Path,
+    config: Path | None = None,
+    to: str | None = None,
+    robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT")] = "demo",
+    json: Annotated[bool, Flag] = False,
+) -> int:
     """Give a recorded session to the control once more, cycle by cycle, and compare the setpoints.
 
     With the recorded configuration and the recorded answers of the drives they come out the same to the last
-    bit: exit 1 if they do not, and the software is the same.
+    bit: exit 1 if they do not, and the software is the same. With --to, its goals and commands are sent to a
+    running service instead, which moves that robot.
 
     Parameters
     ----------
@@ -37,6 +44,10 @@ def replay(*file: Path, config: Path | None = None, json: Annotated[bool, Flag] 
         Recording, or all files of one that was rotated.
     config
         Configuration to try instead of the recorded one; the drives are then simulated ones.
+    to
+        Zenoh locator of a service to send the session to.
+    robot
+        Name of its robot.
     json
         Print one JSON object instead of words.
     """
@@ -45,6 +56,8 @@ def replay(*file: Path, config: Path | None = None, json: Annotated[bool, Flag] 
     from service.replay import again
 
     recording = _read(file)
+    if to is not None:
+        return _resend(recording, robot, to, json)
     settings = load(config) if config else provenance.configuration(recording.texts)
     if settings is None:
         raise ServiceError(f"{file[0]}: its configuration is not in it: was it made by an older version? Use --config")
@@ -82,6 +95,24 @@ def report(*file: Path, plot: Path | None = None, json: Annotated[bool, Flag] = 
     _print_summary(summed)
     if plot:
         terminal.say(f"\ndrawn to {plot}")
+    return 0
+
+
+def _resend(recording: Recording, name: str, locator: str, json: bool) -> int:
+    from service.client import Robot
+    from service.resend import resend
+
+    with Robot(name, locator) as robot:
+        motions = resend(recording, robot, (lambda _: None) if json else terminal.say)
+    if json:
+        terminal.json([motion._asdict() for motion in motions])
+        return 0
+    lines = _Lines()
+    for motion in motions:
+        longer = f", one is {motion.lacking} cycles longer" if motion.lacking else ""
+        lines.add(escape(motion.id), f"{motion.outcome}, {motion.cycles} cycles compared{longer}")
+        lines.add("  differ at most", _each(motion.position, 1e6, "µm"))
+    lines.show()
     return 0
 
 

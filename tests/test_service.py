@@ -528,6 +528,37 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> N
         drives.stdout.close()
 
 
+def test_a_session_is_sent_again(tmp_path: Path) -> None:
+    files: list[Path] = []
+    for number in range(2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        service = Service(folder)
+        service.wait_up()
+        with service.robot() as robot:
+            if number == 0:
+                robot.enable()
+                robot.move_to(x=0.05, y=0.01, phi=0.2, id="out").wait(10.0)
+                until(robot, lambda state: state.mode == "holding")
+                robot.move_sliders(0.0, 0.0, 0.0, id="back").wait(10.0)
+                until(robot, lambda state: state.mode == "holding")
+            else:
+                again = trirail("replay", files[0], "--to", service.locator, "--json")
+                assert again.returncode == 0, again.stderr
+                once_more = trirail("replay", files[0], "--to", service.locator)
+                state = robot.state()
+        assert service.end() == 0
+        files += list((folder / "recordings").glob("*.rrd"))
+    motions = json.loads(again.stdout)
+    assert [(motion["id"], motion["outcome"]) for motion in motions] == [("out", "done"), ("back", "done")]
+    for motion in motions:
+        assert motion["cycles"] > 100
+        assert motion["lacking"] == 0
+        assert max(motion["position"]) < 1e-9
+    assert once_more.returncode == 0, once_more.stderr  # for it stands where the session began
+    assert state.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-5)
+
+
 # ---------------------------------------------------------------------- what cannot start
 
 
