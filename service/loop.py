@@ -212,18 +212,18 @@ class Loop:
             for frames in self._capture.take():
                 self._recorder.send(bytes((Kind.FRAMES,)) + frames)
         self._weigh()
-        self._situate()
         self._listen()
         self._meet()
         self._send_events()
 
     def _weigh(self) -> None:
-        """Once a second, work out how much of the bus is in use."""
+        """Once a second, work out how much of the bus is in use, and tell it."""
         cycles = self.control.cycle - self._weighed_at
         if cycles * self._period >= 1.0:
             bits, self._bits = self._drives.traffic - self._bits, self._drives.traffic
             self._bus_load = round(bits / (cycles * self._period * self._bitrate), 3)
             self._weighed_at += cycles
+            self._situate()
 
     def _listen(self) -> None:
         """Tell everyone what the recorder has to say."""

@@ -65,14 +65,14 @@ def end(process: Process) -> int:
     return process.wait(END_WITHIN)
 
 
-def private(folder: Path) -> tuple[Path, str]:
-    """Write the configuration of the simulated robot for a service that nobody else can reach or look at.
+def private(folder: Path, live_port: int = 0) -> tuple[Path, str]:
+    """Write the configuration of the simulated robot for a service that nobody else can reach, nor see without a port.
 
     Returns the file, in `folder`, and the locator to connect to.
     """
     locator = f"unixsock-stream/{folder}/zenoh"
     text = SIM.read_text(encoding="utf-8")
-    for key, value in {"listen": f'["{locator}"]', "live_port": "0"}.items():
+    for key, value in {"listen": f'["{locator}"]', "live_port": str(live_port)}.items():
         text, found = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
         if found != 1:
             raise ServiceError(f"{SIM}: {key} was expected once, it is there {found} times")

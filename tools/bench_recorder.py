@@ -1,7 +1,7 @@
 """The recorder's price: its share of a processor and of the disk, while a service keeps a robot moving.
 
-The service runs on simulated drives, without a live view: that is to come on top. What is printed is what the
-recorder's process takes, beside the limits that it is to keep, and per cycle of the loop in the same seconds.
+The service runs on simulated drives, with a live view that no viewer is attached to, or without. What is printed is
+what the recorder's process takes, beside the limits that it is to keep, and per cycle of the loop in the same seconds.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from service import spawned
 from service.client import Robot
 from service.config import load
 from service.errors import RefusedError, TrirailError
+from service.sinks import free_port
 
 CPU_LIMIT = 0.03
 """Share of one processor."""
@@ -27,10 +28,10 @@ DISK_LIMIT = 0.5e6
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
-def measure(seconds: float) -> dict[str, Any]:
+def measure(seconds: float, live: bool) -> dict[str, Any]:
     """Run a service for so many seconds, moving; return what its recorder took."""
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
-        config, locator = spawned.private(Path(folder))
+        config, locator = spawned.private(Path(folder), free_port() if live else 0)
         rate = load(config).loop.rate_hz
         recording = Path(folder) / "bench.rrd"
         with spawned.service(config, recording) as service, Robot("demo", locator, user="bench") as robot:
@@ -93,9 +94,9 @@ def _cpu(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / _TICKS
 
 
-def main(seconds: float, json: bool = False) -> None:
+def main(seconds: float, live: bool = False, json: bool = False) -> None:
     """Print the measurements as lines, or as one JSON object."""
-    measured = measure(seconds)
+    measured = measure(seconds, live)
     if json:
         print(json_format.dumps(measured))
         return
