@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import zenoh
-from zenoh.ext import CacheConfig, MissDetectionConfig, declare_advanced_publisher
+from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_advanced_publisher
 
 from service import __version__, session
 from service.config import Config, geometry
@@ -52,6 +52,9 @@ STOPPING = ("stop", "disable", "quick_stop")
 EVENTS_KEPT = 1000
 REPLY_WITHIN = 15.0
 """A command that the loop has not carried out by then is answered with an error [s]."""
+_PAST = RepliesConfig(
+    priority=zenoh.Priority.BACKGROUND, congestion_control=zenoh.CongestionControl.BLOCK, express=False
+)
 REFUSALS_PER_SECOND = 10
 """Unreadable goals that are told to everyone; the others only get their error reply."""
 
@@ -109,7 +112,8 @@ class Gateway:
             opened,
             self._key("event"),
             encoding=session.JSON,
-            cache=CacheConfig(max_samples=EVENTS_KEPT),
+            # The past goes out in one burst, whole, in a queue of its own: who is slow to take it delays nothing else.
+            cache=CacheConfig(max_samples=EVENTS_KEPT, replies_config=_PAST),
             sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
             publisher_detection=True,
         )

@@ -19,7 +19,7 @@ from service.messages import Event
 from service.packets import Input
 from service.records import LAYOUT, last_cycle
 from service.show import LIVE_HZ, REPORT_EVERY, Batches, Show
-from service.sinks import RESERVE, Relay, live_relay, live_server
+from service.sinks import RESERVE, Relay, is_watched, live_relay, live_server
 from service.subject import Subject
 from service.volumes import Volumes, claim
 
@@ -27,6 +27,8 @@ RECORDS_HZ = 5
 """Batches of whole records a second to the file, at least."""
 DRAWING_HZ = 1
 """Batches of what is drawn a second to the file: fewer are smaller, and records are enough to draw it again."""
+WATCH_EVERY = 1.0
+"""How often it is seen whether the live view is watched: to ask costs milliseconds [s]."""
 LOOKS_HZ = 5
 """How often a second it is looked whether files, folder or log want something."""
 TIDY_EVERY = 10.0
@@ -84,7 +86,7 @@ class Recorder:
         """Where viewers connect; empty without a live view."""
         if server:
             self._live = live_relay(show.open(server))
-            show.attach(self._live, LIVE_HZ)
+            self._live_batches = show.attach(self._live, LIVE_HZ)
             self.live_url = server.uri
         self._last: int | None = None
         self._absent = 0
@@ -92,6 +94,7 @@ class Recorder:
         self._next_look = 0
         self._next_report = 0.0
         self._next_tidy = 0.0
+        self._next_watch = 0.0
         self._untidy = ""
 
     @property
@@ -183,6 +186,10 @@ class Recorder:
         t = self._show.t
         if not self._is_black_box:
             self._rotate()
+        if self._live and t >= self._next_watch:  # its history is the same in few batches, where nobody watches
+            self._next_watch = t + WATCH_EVERY
+            hz = LIVE_HZ if is_watched(self._config.telemetry.live_port) else DRAWING_HZ
+            self._live_batches.resize(self._config.loop.rate_hz // hz)
         if self._own_folder is not None and t >= self._next_tidy:
             self._next_tidy = t + TIDY_EVERY
             self._tidy(self._own_folder, self._config.telemetry.keep_mb * MB)

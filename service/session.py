@@ -37,10 +37,8 @@ def open_service(robot: str, listen: Sequence[str]) -> zenoh.Session:
             "listen/endpoints": list(listen),
             "connect/endpoints": [],
             "timestamping/enabled": True,  # advanced publishers order their history by it
-            # Long enough for the history of events, which goes out in a burst; short enough for a frozen subscriber.
-            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 3000,  # µs
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
             "transport/link/tx/queue/size/data_high": 16,
-            "transport/link/tx/queue/size/data": 16,
             "low_pass_filter": [
                 {
                     "id": "requests",

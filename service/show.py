@@ -59,11 +59,12 @@ class Show:
         self._streams.append(stream)
         return stream
 
-    def attach(self, sink: Sink, drawing_hz: int) -> None:
-        """Give a sink everything that is said, and so many batches of drawings a second."""
+    def attach(self, sink: Sink, drawing_hz: int) -> Batches:
+        """Give a sink everything that is said, and so many batches of drawings a second; return these."""
         self._sinks.append(sink)
         draw = Batches(self._rate_hz // drawing_hz, lambda records: sink.send(self.scene.drawn(records)))
         self._batches.append(draw)
+        return draw
 
     @property
     def t(self) -> float:
@@ -151,9 +152,13 @@ class Batches:
     """Records, put together until there are enough to be worth passing on."""
 
     def __init__(self, size: int, take: Callable[[NDArray[np.void]], None]) -> None:
-        self._enough = max(1, size) * DTYPE.itemsize
         self._take = take
         self._pending = bytearray()
+        self.resize(size)
+
+    def resize(self, size: int) -> None:
+        """Let so many records be enough from now on."""
+        self._enough = max(1, size) * DTYPE.itemsize
 
     def add(self, batch: bytes) -> None:
         """Add packed records; pass all on if that makes enough."""

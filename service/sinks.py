@@ -19,6 +19,8 @@ from rerun.chunk import Chunk
 from service.errors import ServiceError
 
 HOST = "127.0.0.1"
+ESTABLISHED = "01"
+"""State of a connection in net/tcp."""
 LIVE_MEMORY = "256MiB"
 """History that the live server keeps for viewers that connect late."""
 BACKLOG = 20
@@ -132,6 +134,16 @@ def free_port() -> int:
         probe.bind((HOST, 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def is_watched(port: int) -> bool:
+    """Whether anyone is connected to a port of this machine (proc(5), net/tcp); not known, it is."""
+    try:
+        lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]
+    except OSError:
+        return True
+    local = (line.split(None, 4) for line in lines)
+    return any(place.endswith(f":{port:04X}") and state == ESTABLISHED for _, place, _, state, *_ in local)
 
 
 def live_server(port: int) -> rr.GrpcServerSink:

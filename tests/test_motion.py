@@ -421,3 +421,23 @@ def test_a_goal_that_came_before_a_stop_but_waits_is_stopped(rig: Rig) -> None:
     assert rig.outcomes() == [("late", "stopped")]
     rig.cycles(20)
     assert rig.control.commanded.at_rest
+
+
+def test_a_goal_that_waits_for_its_turn_is_not_done_where_another_would_have_begun() -> None:
+    """A waiting goal's seam is passed between the acceptance of a goal that preempts it and that goal's turn."""
+    for before in range(1, 40, 3):
+        rig = Rig(SLOW)
+        rig.enable()
+        rig.send("q0", PoseGoal(0.05, 0.02, 0.3, blend=0.01))
+        rig.send("q1", PoseGoal(-0.05, 0.05, -0.3))
+        run = rig.control._course.runs[0]
+        while run.at.s <= run.seams[0].s - before * PERIOD:
+            rig.cycle()
+        answer = accepted(rig.goal("g2", 0.0, -0.05, 0.4))
+        rig.until(rig.holds)
+        assert rig.outcomes()[-1] == ("g2", "done")
+        assert Counter(rig.outcomes()).most_common(1)[0][1] == 1
+        assert {goal_id for goal_id, _ in rig.outcomes()} == {"q0", "q1", "g2"}
+        assert rig.control.commanded.pose == pytest.approx((0.0, -0.05, 0.4), abs=1e-9)
+        assert answer.duration > 0.0
+        rig.bus.shutdown()

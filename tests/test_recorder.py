@@ -23,7 +23,7 @@ from service.errors import ServiceError
 from service.messages import Event
 from service.recorder import Recorder
 from service.records import DTYPE
-from service.sinks import BACKLOG, Archive, Relay
+from service.sinks import BACKLOG, Archive, Relay, free_port
 
 WALL_NS = 1_795_245_300_000_000_000
 
@@ -236,6 +236,32 @@ def test_a_slow_viewer_is_skipped_to_the_newest() -> None:
     assert finished.is_set()
     assert relay.skipped == 2 * BACKLOG
     assert delivered == [batches[0], *batches[2 * BACKLOG + 1 :]]
+
+
+def test_a_live_view_that_nobody_watches_is_given_the_same_in_fewer_batches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = free_port()
+    recording = recorder(tmp_path, configured(live_port=port), live=True)
+    given: list[int] = []
+    relay = recording._live
+    assert relay is not None
+    monkeypatch.setattr(relay, "send", lambda chunks: given.append(len(chunks)))
+
+    records = made.records(6.0)
+
+    def batches(begin: int, end: int) -> int:
+        given.clear()
+        for start in range(begin, end, 20):
+            recording.records(records[start : start + 20].tobytes())
+        return len(given)
+
+    alone = batches(0, 3000)
+    with socket.create_connection(("127.0.0.1", port)):
+        watched = batches(3000, 6000)
+    assert alone <= 5
+    assert watched >= 8
+    recording.close()
 
 
 def test_captured_frames_are_a_log_that_python_can_reads(tmp_path: Path) -> None:
