@@ -363,7 +363,7 @@ def test_a_flood_of_goals_ends_one_by_one_and_a_stop_overtakes_it(service: Servi
     assert [name for name, _ in outcomes] == ids
     assert {outcome for _, outcome in outcomes[:-1]} <= {"preempted", "stopped"}
     assert outcomes[-1][1] == "stopped"
-    assert service.end() == 0
+    assert service.end() == 0, service.log.read_text()
     assert_stopped_smoothly(service.frames())
 
 
