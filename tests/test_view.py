@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -165,8 +166,9 @@ def test_a_frozen_viewer_is_skipped_counted_and_does_not_stop_the_file(tmp_path:
     relay._deliver = hold
     records = made.records(20.0)
     try:
-        for start in range(0, len(records), 20):
-            recorder.records(records[start : start + 20].tobytes())
+        with socket.create_connection(("127.0.0.1", config.telemetry.live_port)):
+            for start in range(0, len(records), 20):
+                recorder.records(records[start : start + 20].tobytes())
         skipped = recorder.skipped
         assert skipped > 0
     finally:
