@@ -22,6 +22,7 @@ from service.limits import LEGS
 from service.messages import Goal, OwnLimits, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from service.modes import Mode
 from service.packets import Accepted, Answer, CommandRequest, GoalRequest
+from service.quintic import Point, quintic
 
 DIRECTIONS = [np.array(d) * (0.15, 0.15, 0.85) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
 
@@ -124,10 +125,17 @@ def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(rig: Rig) -> None:
     """Both ends inside, and by how much the middle is outside is less than what lies between two looks."""
     rig.enable()
     low = CONFIG.limits.platform.x[1]
-    for number, peak in enumerate((low - 1e-5, low + 1e-5)):
-        at = TrajectoryPoint(1.5, peak, 0.0, 0.0, velocity=(0.0, 0.0, 0.0), acceleration=(-0.4, 0.0, 0.0))
-        ends = TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(3.0, 0.0, 0.0, 0.0)
-        answer = rig.send(f"g{number}", TrajectoryGoal((ends[0], at, ends[1])))
+    ends = TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(3.0, 0.0, 0.0, 0.0)
+
+    def through(x: float) -> tuple[TrajectoryPoint, ...]:
+        at = TrajectoryPoint(1.4, x, 0.0, 0.0, velocity=(0.3 * x, 0.0, 0.0), acceleration=(-2.0 * x, 0.0, 0.0))
+        return ends[0], at, ends[1]
+
+    points = [Point(p.t, (p.x, p.y, p.phi), p.velocity, p.acceleration) for p in through(1.0)]
+    path, t = quintic(points, (0.0, 0.0, 0.0)), np.linspace(0.0, 1.6, 200_001)
+    highest = float((path.pieces[1, 0] @ t ** np.arange(6.0)[:, None]).max())  # a while after the point
+    for number, peak in enumerate((low - 2e-6, low + 2e-6)):
+        answer = rig.send(f"g{number}", TrajectoryGoal(through(peak / highest)))
         if peak < low:
             accepted(answer)
             rig.until(rig.holds)
