@@ -13,16 +13,23 @@ import pytest
 from conftest import CONFIG, Rig
 from numpy.typing import NDArray
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
-from test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal
+from test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal, slower
 
 from service.config import Config
+from service.course import Course
 from service.errors import KinematicsError
+from service.goals import LEAD, Goals, Motion
 from service.kinematics import forward, inverse
 from service.limits import LEGS
 from service.messages import Goal, OwnLimits, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from service.modes import Mode
 from service.packets import Accepted, Answer, CommandRequest, GoalRequest
+from service.planning import TOO_FAST_IN_MOTION
 from service.quintic import Point, quintic
+from service.steps import Steps
+
+MEDIUM = slower(CONFIG, velocity=0.3, acceleration=4.5, jerk=120.0)
+"""Sliders for which the platform's motions are a little too fast."""
 
 DIRECTIONS = [np.array(d) * (0.15, 0.15, 0.85) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
 
@@ -121,26 +128,24 @@ def test_the_very_end_of_a_sliders_travel(rig: Rig, leg: int, beyond: float) -> 
         assert "platform" in refusal(answer).message or "passive" in refusal(answer).message
 
 
-def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(rig: Rig) -> None:
+@pytest.mark.parametrize("at", [1.38, 1.40, 1.42, 1.44])  # of these at most one peak can be where it is looked anyway
+def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(rig: Rig, at: float) -> None:
     """Both ends inside, and by how much the middle is outside is less than what lies between two looks."""
     rig.enable()
     low = CONFIG.limits.platform.x[1]
     ends = TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(3.0, 0.0, 0.0, 0.0)
 
     def through(x: float) -> tuple[TrajectoryPoint, ...]:
-        at = TrajectoryPoint(1.4, x, 0.0, 0.0, velocity=(0.3 * x, 0.0, 0.0), acceleration=(-2.0 * x, 0.0, 0.0))
-        return ends[0], at, ends[1]
+        middle = TrajectoryPoint(at, x, 0.0, 0.0, velocity=(0.3 * x, 0.0, 0.0), acceleration=(-2.0 * x, 0.0, 0.0))
+        return ends[0], middle, ends[1]
 
     points = [Point(p.t, (p.x, p.y, p.phi), p.velocity, p.acceleration) for p in through(1.0)]
-    path, t = quintic(points, (0.0, 0.0, 0.0)), np.linspace(0.0, 1.6, 200_001)
+    path, t = quintic(points, (0.0, 0.0, 0.0)), np.linspace(0.0, 3.0 - at, 200_001)
     highest = float((path.pieces[1, 0] @ t ** np.arange(6.0)[:, None]).max())  # a while after the point
-    for number, peak in enumerate((low - 2e-6, low + 2e-6)):
-        answer = rig.send(f"g{number}", TrajectoryGoal(through(peak / highest)))
-        if peak < low:
-            accepted(answer)
-            rig.until(rig.holds)
-        else:
-            assert "platform x: position" in refusal(answer).message
+    beyond = refusal(rig.send("g1", TrajectoryGoal(through((low + 2e-6) / highest))))
+    assert (beyond.code, "platform x: position" in beyond.message) == ("out_of_workspace", True)
+    accepted(rig.send("g2", TrajectoryGoal(through((low - 2e-6) / highest))))
+    rig.until(rig.holds)
     assert rig.control.fault is None
 
 
@@ -385,25 +390,59 @@ def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
     rig.bus.shutdown()
 
 
-def test_of_two_ways_the_sooner_is_taken() -> None:
-    """Planned from the same motion, with lower limits and after a stop: the reply's duration is the lesser."""
-    durations: dict[bool, list[float]] = {False: [], True: []}
-    for wait in range(150, 900, 50):
-        rig = Rig(SLOW)
+@pytest.mark.parametrize(
+    ("config", "first", "second"),
+    [
+        (SLOW, (0.08, 0.02, 0.3), (-0.05, 0.05, -0.3)),  # in motion too fast for these sliders: it stops first
+        (MEDIUM, (0.063, 0.068, -0.238), (-0.047, 0.06, -0.507)),
+        (MEDIUM, (-0.064, 0.034, -0.46), (0.054, -0.018, -0.191)),
+    ],
+)
+def test_of_two_ways_the_sooner_is_taken(
+    monkeypatch: pytest.MonkeyPatch, config: Config, first: tuple[float, ...], second: tuple[float, ...]
+) -> None:
+    """From the same motion, with lower limits or after a stop: each where the other is not to be had, and then both."""
+    plain_set_out, plain_stop_first = Goals._set_out, Goals._stop_first
+
+    def no_lower_limits(goals: Goals, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
+        if not course.commanded.at_rest:
+            raise TOO_FAST_IN_MOTION
+        return (yield from plain_set_out(goals, goal, course, rate))
+
+    def no_stop(goals: Goals, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
+        raise TOO_FAST_IN_MOTION
+        yield
+
+    def asked(wait: int, way: str) -> tuple[Rig, Answer]:
+        monkeypatch.setattr(Goals, "_set_out", no_lower_limits if way == "stop" else plain_set_out)
+        monkeypatch.setattr(Goals, "_stop_first", no_stop if way == "lower" else plain_stop_first)
+        rig = Rig(config)
         rig.enable()
-        rig.goal("g1", 0.08, 0.02, 0.3)
+        rig.goal("g1", *first)
         rig.cycles(wait)
-        if rig.mode is not Mode.MOVING:
-            break
+        return rig, rig.goal("g2", *second)
+
+    thought = LEAD * PERIOD  # durations count from the answer on; to think of both ways takes more of it
+    differing = 0
+    for wait in range(150, 500, 50):
+        durations = {False: math.inf, True: math.inf}
+        for way in ("lower", "stop"):
+            rig, answer = asked(wait, way)
+            if isinstance(answer, Accepted):
+                durations[way == "stop"] = answer.duration
+            rig.bus.shutdown()
+        rig, free = asked(wait, "either")
         began = len(rig.rows)
-        answer = accepted(rig.goal("g2", -0.05, 0.05, -0.3))
-        durations[answer.stops_first].append(answer.duration)
+        answer = accepted(free)
+        assert answer.duration == pytest.approx(durations[answer.stops_first], abs=thought)
+        assert answer.duration < min(durations.values()) + thought
+        differing += min(durations.values()) + thought < max(durations.values())
         rig.until(rig.holds)
         assert (len(rig.rows) - began) * PERIOD == pytest.approx(answer.duration, abs=0.03)
         assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
         assert_within_limits(rig)
         rig.bus.shutdown()
-    assert durations[True] or durations[False]
+    assert differing >= 3
 
 
 def test_a_renewed_goal_request_is_held_until_the_one_before_is_planned() -> None:
