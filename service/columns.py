@@ -35,11 +35,6 @@ class Timelines:
         return times(t, records["deadline_ns"] + self._wall_offset_ns)
 
 
-def moment(t: float, wall: float) -> dict[str, pa.Array]:
-    """Return one nominal time [s] and wall clock [s since 1970]."""
-    return times(np.array([round(t * SECOND)]), np.array([round(wall * SECOND)]))
-
-
 def times(t: NDArray[np.int64], wall: NDArray[np.int64]) -> dict[str, pa.Array]:
     """Return both times [ns] by the names of their timelines."""
     return {

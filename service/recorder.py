@@ -27,10 +27,8 @@ RECORDS_HZ = 5
 """Batches of whole records a second to the file, at least."""
 DRAWING_HZ = 1
 """Batches of what is drawn a second to the file: fewer are smaller, and records are enough to draw it again."""
-WATCH_EVERY = 1.0
-"""How often it is seen whether the live view is watched: to ask costs milliseconds [s]."""
-LOOKS_HZ = 5
-"""How often a second it is looked whether files, folder or log want something."""
+LOOKS_HZ = 1
+"""How often a second it is looked whether files, folder, log or live view want something."""
 TIDY_EVERY = 10.0
 """How often the folder is looked at [s]."""
 MB = 1e6
@@ -86,7 +84,7 @@ class Recorder:
         """Where viewers connect; empty without a live view."""
         if server:
             self._live = live_relay(show.open(server))
-            self._live_batches = show.attach(self._live, LIVE_HZ)
+            show.attach(self._live, LIVE_HZ)
             self.live_url = server.uri
         self._last: int | None = None
         self._absent = 0
@@ -94,7 +92,6 @@ class Recorder:
         self._next_look = 0
         self._next_report = 0.0
         self._next_tidy = 0.0
-        self._next_watch = 0.0
         self._untidy = ""
 
     @property
@@ -131,12 +128,13 @@ class Recorder:
         self._show.records(batch)
 
     def save(self) -> None:
-        """Write all records that have been taken: they outlive this process."""
+        """Write all records that have been taken, and what was said: they outlive this process."""
         self._records.flush()
+        self._show.save()
 
     def event(self, event: Event) -> None:
         """Take an event."""
-        self._show.events([event])
+        self._show.event(event)
 
     def given(self, what: Input) -> None:
         """Take what the control was given."""
@@ -160,6 +158,7 @@ class Recorder:
         self._flush()
         if words := self._missing():
             self._show.say("warning", words)
+            self._show.save()
         self._volumes.close()
         if self._frames:
             self._frames.close()
@@ -186,10 +185,8 @@ class Recorder:
         t = self._show.t
         if not self._is_black_box:
             self._rotate()
-        if self._live and t >= self._next_watch:  # its history is the same in few batches, where nobody watches
-            self._next_watch = t + WATCH_EVERY
-            hz = LIVE_HZ if is_watched(self._config.telemetry.live_port) else DRAWING_HZ
-            self._live_batches.resize(self._config.loop.rate_hz // hz)
+        if self._live:  # where nobody watches, it shares the file's drawings
+            self._show.attach(self._live, LIVE_HZ if is_watched(self._config.telemetry.live_port) else DRAWING_HZ)
         if self._own_folder is not None and t >= self._next_tidy:
             self._next_tidy = t + TIDY_EVERY
             self._tidy(self._own_folder, self._config.telemetry.keep_mb * MB)

@@ -35,7 +35,6 @@ class RemoteView:
         self._lost = 0
         self._cycle: int | None = None
         self._bus_load: float | None = None
-        self._events: list[Event] = []
         self._session = session.open_client(connect)
         try:
             self._subscribe(info.robot)
@@ -109,7 +108,7 @@ class RemoteView:
             if kind == "records":
                 self._records(payload)
             elif kind == "event":
-                self._events.append(msgspec.json.decode(payload, type=Event))
+                self._show.event(msgspec.json.decode(payload, type=Event))
             else:
                 self._state(msgspec.json.decode(payload, type=State))
 
@@ -118,11 +117,9 @@ class RemoteView:
         if self._cycle is not None and cycles[0] > self._cycle:
             self._lost += int(cycles[0]) - self._cycle - 1
         self._cycle = int(cycles[-1])
-        if self._events:  # together: those of the past come in one go, and each alone would be a batch to skip
-            self._show.events(self._events)
-            self._events.clear()
         self._show.records(batch)
         self._missing.check()
+        self._show.save()  # those of the past come in one go: each alone would be a batch to skip
 
     def _state(self, state: State) -> None:
         self._show.target(state.goal.target if state.goal else None)

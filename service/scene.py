@@ -18,7 +18,6 @@ from rerun.chunk import Chunk
 from service import columns, curves, drawing, palette
 from service.columns import Column
 from service.mechanism import Mechanism
-from service.messages import Level
 from service.modes import MODES
 from service.outlook import Outlook
 from service.subject import Subject
@@ -30,9 +29,7 @@ OUTLINES_HZ = 10
 
 FIELDS = rr.ComponentDescriptor("fields")
 SCALARS = rr.Scalars.descriptor_scalars()
-TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
 STATE = rr.StateChange.descriptor_state()
-LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
 
 class Scene:
@@ -40,7 +37,6 @@ class Scene:
 
     def __init__(self, subject: Subject, wall_offset_ns: int) -> None:
         self._rate_hz = subject.rate_hz
-        self._wall_offset_ns = wall_offset_ns
         self._timelines = columns.Timelines(self._rate_hz, wall_offset_ns)
         self._geometry = subject.geometry
         self._parts = Mechanism.of(subject.geometry, subject.limits.slider)
@@ -88,11 +84,6 @@ class Scene:
         """Return the pose that the goal leads to from the time of `record` on; None for no goal."""
         return columns.chunks(self._timelines.of(record.reshape(1)), [drawing.goal(self._parts, pose)])
 
-    def remark(self, record: np.void, level: Level, message: str) -> Chunk:
-        """Return a line of the log at the time of `record`."""
-        wall_ns = int(record["deadline_ns"]) + self._wall_offset_ns
-        return remark(float(record["cycle"]) / self._rate_hz, wall_ns * 1e-9, level, message)
-
     def _situation(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return mode and outline of the workspace at the first record, where the mode changes, and as φ changes."""
         changed = np.diff(records["mode"], prepend=len(MODES)) != 0
@@ -104,13 +95,6 @@ class Scene:
         outlines = columns.ragged([[self._outlook.outline(step)] for step in self._outlook.steps(at["pose"][:, 2])])
         parts = [Column("/mode", STATE, modes), Column("/robot/workspace", drawing.STRIPS, outlines)]
         return columns.chunks(self._timelines.of(at), parts)
-
-
-def remark(t: float, wall: float, level: Level, message: str) -> Chunk:
-    """Return a line of the log at nominal time `t` [s] and wall clock `wall` [s since 1970]."""
-    line = [Column("/events", TEXT, pa.array([[message]])), Column("/events", LEVEL, pa.array([[LEVELS[level]]]))]
-    (chunk,) = columns.chunks(columns.moment(t, wall), line)
-    return chunk
 
 
 def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from service import blueprint, journal
+from service.columns import SECOND
+from service.journal import EVENTS, Entry
 from service.messages import Event, Level
 from service.packets import Input
 from service.records import DTYPE, unpack
@@ -43,8 +46,10 @@ class Show:
         self._layout = blueprint.layout(subject, self.scene.bounds)
         self._recording = str(uuid.uuid4())
         self._streams: list[rr.RecordingStream] = []
-        self._sinks: list[Sink] = []
-        self._batches: list[Batches] = []
+        self._waiting: list[Chunk] = []
+        self._entries: list[Entry] = []
+        self._paces: dict[Sink, int] = {}
+        self._batches: dict[int, Batches] = {}
         self._newest = bytes(DTYPE.itemsize)
         self._target: Sequence[float] | None = None
         self._shown: Sequence[float] | None = None
@@ -59,12 +64,16 @@ class Show:
         self._streams.append(stream)
         return stream
 
-    def attach(self, sink: Sink, drawing_hz: int) -> Batches:
-        """Give a sink everything that is said, and so many batches of drawings a second; return these."""
-        self._sinks.append(sink)
-        draw = Batches(self._rate_hz // drawing_hz, lambda records: sink.send(self.scene.drawn(records)))
-        self._batches.append(draw)
-        return draw
+    def attach(self, sink: Sink, drawing_hz: int) -> None:
+        """Give a sink everything that is said from now on, and so many batches of drawings a second.
+
+        Called anew, it changes how many. Sinks of the same pace share their drawings: to draw costs the most.
+        """
+        if self._paces.get(sink) == drawing_hz:
+            return
+        self.flush()
+        self._paces[sink] = drawing_hz
+        self._batches = {hz: Batches(self._rate_hz // hz, partial(self._draw, hz)) for hz in set(self._paces.values())}
 
     @property
     def t(self) -> float:
@@ -75,8 +84,8 @@ class Show:
         """Take packed records."""
         if self._target != self._shown:
             self._shown = self._target
-            self._send(self.scene.goal(unpack(batch)[0], self._target))
-        for batches in self._batches:
+            self._waiting += self.scene.goal(unpack(batch)[0], self._target)
+        for batches in self._batches.values():
             batches.add(batch)
         self._newest = batch[-DTYPE.itemsize :]
 
@@ -90,13 +99,18 @@ class Show:
             for stream in self._streams:
                 stream.log(path, archetype, static=True)
 
-    def events(self, events: Sequence[Event]) -> None:
-        """Take events, as one batch."""
-        self._send([journal.said(event) for event in events])
+    def event(self, event: Event) -> None:
+        """Take an event."""
+        self._entries.append(journal.said(event))
 
     def given(self, what: Input) -> None:
         """Take what the control was given."""
-        self._send([journal.given(what, self._rate_hz, self._wall_offset_ns)])
+        self._entries.append(journal.given(what, self._rate_hz, self._wall_offset_ns))
+
+    def say(self, level: Level, message: str) -> None:
+        """Write a line of the log at the time of the newest record."""
+        wall = (int(self._record["deadline_ns"]) + self._wall_offset_ns) / SECOND
+        self._entries.append(Entry(EVENTS, self.t, wall, message, level))
 
     def begin_anew(self) -> None:
         """Say with the next records again what else is said only when it changes: a sink has begun a new file."""
@@ -106,13 +120,18 @@ class Show:
         """Let go of a stream: it is complete."""
         self._streams.remove(stream)
 
-    def say(self, level: Level, message: str) -> None:
-        """Write a line of the log at the time of the newest record."""
-        self._send([self.scene.remark(self._record, level, message)])
+    def save(self) -> None:
+        """Pass on what was said: together, for a batch costs about the same with one line or ten."""
+        chunks = self._waiting + journal.chunks(self._entries)
+        self._waiting, self._entries = [], []
+        if chunks:
+            for sink in self._paces:
+                sink.send(chunks)
 
     def flush(self) -> None:
-        """Pass on what there is."""
-        for batches in self._batches:
+        """Pass on all there is."""
+        self.save()
+        for batches in self._batches.values():
             batches.flush()
 
     @property
@@ -120,9 +139,11 @@ class Show:
         newest: np.void = unpack(self._newest)[0]
         return newest
 
-    def _send(self, chunks: list[Chunk]) -> None:
-        for sink in self._sinks:
-            sink.send(chunks)
+    def _draw(self, hz: int, records: NDArray[np.void]) -> None:
+        chunks = self.scene.drawn(records)
+        for sink, pace in self._paces.items():
+            if pace == hz:
+                sink.send(chunks)
 
 
 class Shortfall:
@@ -152,13 +173,9 @@ class Batches:
     """Records, put together until there are enough to be worth passing on."""
 
     def __init__(self, size: int, take: Callable[[NDArray[np.void]], None]) -> None:
+        self._enough = max(1, size) * DTYPE.itemsize
         self._take = take
         self._pending = bytearray()
-        self.resize(size)
-
-    def resize(self, size: int) -> None:
-        """Let so many records be enough from now on."""
-        self._enough = max(1, size) * DTYPE.itemsize
 
     def add(self, batch: bytes) -> None:
         """Add packed records; pass all on if that makes enough."""

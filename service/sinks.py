@@ -6,8 +6,10 @@ Here each is kept from that, and what it does not get is counted.
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket
+import stat
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -19,8 +21,6 @@ from rerun.chunk import Chunk
 from service.errors import ServiceError
 
 HOST = "127.0.0.1"
-ESTABLISHED = "01"
-"""State of a connection in net/tcp."""
 LIVE_MEMORY = "256MiB"
 """History that the live server keeps for viewers that connect late."""
 BACKLOG = 20
@@ -137,13 +137,20 @@ def free_port() -> int:
 
 
 def is_watched(port: int) -> bool:
-    """Whether anyone is connected to a port of this machine (proc(5), net/tcp); not known, it is."""
+    """Whether anyone is connected to a port that this process listens on."""
+    return any(_serves(int(name), port) for name in os.listdir("/dev/fd"))
+
+
+def _serves(descriptor: int, port: int) -> bool:
+    """Whether a descriptor is a connection to a port of this process."""
     try:
-        lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]
-    except OSError:
-        return True
-    local = (line.split(None, 4) for line in lines)
-    return any(place.endswith(f":{port:04X}") and state == ESTABLISHED for _, place, _, state, *_ in local)
+        if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+            return False
+        with socket.socket(fileno=os.dup(descriptor)) as connection:
+            connection.getpeername()  # the one that listens has none
+            return connection.family == socket.AF_INET and connection.getsockname()[1] == port
+    except OSError:  # closed meanwhile
+        return False
 
 
 def live_server(port: int) -> rr.GrpcServerSink:

@@ -153,6 +153,7 @@ def test_every_length_of_the_last_message_is_survived(tmp_path: Path) -> None:
     recorder = written(tmp_path / "a.rrd", made.records(0.2), close=False)
     before = (tmp_path / "a.rrd").read_bytes()
     recorder.event(Event(1, 0.2, 200, WALL_NS * 1e-9, "mode", "info", "the last line", mode="holding"))
+    recorder.save()
     after = (tmp_path / "a.rrd").read_bytes()
     recorder.close()
     for length in {len(before), len(before) + 1, len(before) + 15, len(before) + 16, len(after) - 1, len(after)}:

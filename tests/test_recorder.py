@@ -23,7 +23,9 @@ from service.errors import ServiceError
 from service.messages import Event
 from service.recorder import Recorder
 from service.records import DTYPE
+from service.show import Show
 from service.sinks import BACKLOG, Archive, Relay, free_port
+from service.subject import Subject
 
 WALL_NS = 1_795_245_300_000_000_000
 
@@ -238,29 +240,72 @@ def test_a_slow_viewer_is_skipped_to_the_newest() -> None:
     assert delivered == [batches[0], *batches[2 * BACKLOG + 1 :]]
 
 
-def test_a_live_view_that_nobody_watches_is_given_the_same_in_fewer_batches(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    port = free_port()
-    recording = recorder(tmp_path, configured(live_port=port), live=True)
-    given: list[int] = []
-    relay = recording._live
-    assert relay is not None
-    monkeypatch.setattr(relay, "send", lambda chunks: given.append(len(chunks)))
+class Kept:
+    """A sink that keeps the batches of drawings it is given."""
 
+    def __init__(self) -> None:
+        self.drawn: list[list[Chunk]] = []
+
+    def send(self, chunks: list[Chunk]) -> None:
+        if any(chunk.entity_path == PLATFORM for chunk in chunks):
+            self.drawn.append(chunks)
+
+    def cycles(self) -> list[int]:
+        platform = [chunk for chunks in self.drawn for chunk in chunks if chunk.entity_path == PLATFORM]
+        return [int(t) // 1_000_000 for chunk in platform for t in chunk.to_record_batch().column("t").cast("int64")]
+
+
+PLATFORM = "/robot/platform"
+
+
+def test_sinks_of_one_pace_share_their_drawings_and_a_change_of_pace_loses_none() -> None:
+    show = Show(Subject.configured(configured()), "shown", 0)
+    file, live = Kept(), Kept()
+    show.attach(file, 1)
     records = made.records(6.0)
 
-    def batches(begin: int, end: int) -> int:
-        given.clear()
+    def pass_by(begin: int, end: int) -> tuple[list[list[Chunk]], list[list[Chunk]]]:
+        file.drawn, live.drawn = [], []
         for start in range(begin, end, 20):
-            recording.records(records[start : start + 20].tobytes())
-        return len(given)
+            show.records(records[start : start + 20].tobytes())
+        return file.drawn, live.drawn
 
-    alone = batches(0, 3000)
+    everything: list[int] = []
+    for begin, end, pace in ((0, 1500, 1), (1500, 3300, 5), (3300, 6000, 1)):
+        show.attach(live, pace)
+        everything += live.cycles() if begin else []  # what the change of pace has flushed
+        to_file, to_live = pass_by(begin, end)
+        if pace == 1:
+            assert len(to_file) in (1, 2)
+            assert [id(chunks) for chunks in to_live] == [id(chunks) for chunks in to_file]
+        else:
+            assert (len(to_file), len(to_live)) == (1, 9)
+        everything += live.cycles()
+        live.drawn = []
+    show.flush()
+    everything += live.cycles()
+    assert everything == sorted(set(everything))
+    assert set(everything) >= set(range(9, 6000, 10))
+
+
+def test_a_live_view_is_drawn_for_only_while_somebody_watches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = free_port()
+    recording = recorder(tmp_path, configured(live_port=port), live=True)
+    drawn: list[int] = []
+    draw = recording._show.scene.drawn
+
+    def counted(records: NDArray[np.void]) -> list[Chunk]:
+        drawn.append(len(records))
+        return draw(records)
+
+    monkeypatch.setattr(recording._show.scene, "drawn", counted)
+    records = made.records(10.0)
+    feed(recording, records[:5000])
+    assert sum(drawn) <= 5000
+    drawn.clear()
     with socket.create_connection(("127.0.0.1", port)):
-        watched = batches(3000, 6000)
-    assert alone <= 5
-    assert watched >= 8
+        feed(recording, records[5000:])
+    assert sum(drawn) > 7000
     recording.close()
 
 

@@ -20,7 +20,7 @@ from service.messages import Info
 from service.modes import MODES, Mode
 from service.outlook import Outlook
 from service.records import DTYPE
-from service.scene import Scene, remark
+from service.scene import Scene
 from service.singularity import distance_to_singularity
 from service.subject import Subject
 
@@ -154,15 +154,6 @@ def test_modes_are_said_when_they_change_and_at_the_start_of_a_batch(scene: Scen
     assert values(mode, "StateChange:state").tolist() == [["moving"], ["stopping"]]
     t = mode.to_record_batch().column("t").to_numpy().astype(int)
     assert np.array_equal(t, [0, 40_000_000])
-
-
-def test_a_remark_has_its_time_and_level() -> None:
-    line = remark(1.25, 1_700_000_000.5, "warning", "a word")
-    batch = line.to_record_batch()
-    assert batch.column("TextLog:text").to_pylist() == [["a word"]]
-    assert batch.column("TextLog:level").to_pylist() == [["WARN"]]
-    assert batch.column("t").to_numpy().astype(int).tolist() == [1_250_000_000]
-    assert batch.column("wall").to_numpy().astype(int).tolist() == [1_700_000_000_500_000_000]
 
 
 def test_what_is_still_is_there_once(scene: Scene) -> None:

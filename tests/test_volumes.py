@@ -244,7 +244,7 @@ def test_what_is_not_saved_yet_is_younger_than_a_fifth_of_a_second() -> None:
 
 def test_records_that_never_came_are_told_of(tmp_path: Path) -> None:
     told: list[str] = []
-    time, sent = Time(), made.records(1.0)
+    time, sent = Time(), made.records(2.0)
     recording = recorder(tmp_path, time, configured(), warn=told.append)
     feed(recording, np.delete(sent, slice(400, 460)), time)
     recording.close()

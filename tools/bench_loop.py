@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json as json_format
 import os
-import random
 import shutil
 import signal
 import subprocess
@@ -20,11 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from moving import keep_moving
 from numpy.typing import NDArray
 
 from service.client import Robot
 from service.config import SIM, load
-from service.errors import ServiceError, TrirailError
+from service.errors import ServiceError
 from service.records import PARTS, unpack
 
 QUANTILES = (50.0, 99.0, 99.9, 100.0)
@@ -84,21 +84,8 @@ def _connect(name: str, locator: str, service: subprocess.Popen[bytes]) -> Robot
 def _collect(robot: Robot, seconds: float) -> NDArray[np.void]:
     """Keep the robot moving, and its records."""
     batches: list[bytes] = []
-    session = robot._session  # records are for remote recorders; the client does not hand them out yet
-    choice = random.Random(1)
-    with session.declare_subscriber(
-        f"trirail/{robot.name}/records", lambda sample: batches.append(sample.payload.to_bytes())
-    ):
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            print(f"\r{left:4.0f} s left ", end="", file=sys.stderr, flush=True)
-            try:
-                x, y, phi = (choice.uniform(-span, span) for span in (0.05, 0.05, 0.4))
-                robot.move_to(x=x, y=y, phi=phi)
-            except TrirailError as error:
-                print(error, file=sys.stderr)
-            time.sleep(0.3)
-    print("\r", end="", file=sys.stderr)
+    with robot.records(batches.append):
+        keep_moving(robot, seconds)
     return np.concatenate([unpack(batch) for batch in batches])
 
 

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import json as json_format
 import os
-import random
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
+from moving import keep_moving
+
 from service import spawned
 from service.client import Robot
 from service.config import load
-from service.errors import RefusedError, TrirailError
+from service.errors import TrirailError
 from service.sinks import free_port
 
 CPU_LIMIT = 0.03
@@ -37,9 +37,9 @@ def measure(seconds: float, live: bool) -> dict[str, Any]:
         with spawned.service(config, recording) as service, Robot("demo", locator, user="bench") as robot:
             recorder, loop = (_child(service.pid, name) for name in ("recorder", "loop"))
             robot.enable()
-            _move(robot, 3.0)  # until all that happens once has happened
+            keep_moving(robot, 3.0)  # until all that happens once has happened
             before = _state(recorder, loop, recording, robot)
-            _move(robot, seconds)
+            keep_moving(robot, seconds)
             after = _state(recorder, loop, recording, robot)
             robot.disable()
     spent, cpu, loop_cpu, written, cycles = (b - a for a, b in zip(before, after, strict=True))
@@ -63,21 +63,6 @@ def _state(recorder: int, loop: int, recording: Path, robot: Robot) -> tuple[flo
     """Return time, processor time of recorder and loop [s], bytes and cycles so far."""
     cycles = robot.state().loop.cycles
     return time.monotonic(), _cpu(recorder), _cpu(loop), float(recording.stat().st_size), float(cycles)
-
-
-def _move(robot: Robot, seconds: float) -> None:
-    """Keep the robot moving, and its sliders with it."""
-    choice = random.Random(1)
-    end = time.monotonic() + seconds
-    while (left := end - time.monotonic()) > 0.0:
-        print(f"\r{left:4.0f} s left ", end="", file=sys.stderr, flush=True)
-        x, y, phi = (choice.uniform(-span, span) for span in (0.05, 0.05, 0.4))
-        try:
-            robot.move_to(x=x, y=y, phi=phi)
-        except RefusedError as error:
-            print(error, file=sys.stderr)
-        time.sleep(0.3)
-    print("\r", end="", file=sys.stderr)
 
 
 def _child(service: int, name: str) -> int:
