@@ -23,10 +23,11 @@ hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; install
 ci-packages:  ## the system's packages for the tests of the viewers; those tests are skipped without
 	.ci/packages
 
-bench: $(READY)  ## the loop and the kinematics, measured
+bench: $(READY)  ## the loop, the kinematics, planning and the recorder, measured
 	$(VENV)/bin/python tools/bench.py loop
 	$(VENV)/bin/python tools/bench.py kinematics
 	$(VENV)/bin/python tools/bench.py planning
+	$(VENV)/bin/python tools/bench.py recorder
 
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "trirail needs Python 3.11 or newer: make PYTHON=python3.12 …")'

@@ -18,9 +18,9 @@ def loop(*, seconds: float = 30.0, json: bool = False) -> None:
 
 
 @app.command
-def recorder(*, seconds: float = 30.0, live: bool = False, json: bool = False) -> None:
-    """Run the whole service on simulated drives, moving, and measure what its recorder takes; `live`: with its view."""
-    bench_recorder.main(seconds, live, json)
+def recorder(*, seconds: float = 60.0, json: bool = False) -> None:
+    """Run the whole service on simulated drives, moving, and measure what its recorder takes, watched and not."""
+    bench_recorder.main(seconds, json)
 
 
 @app.command

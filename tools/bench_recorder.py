@@ -1,17 +1,18 @@
 """The recorder's price: its share of a processor and of the disk, while a service keeps a robot moving.
 
-The service runs on simulated drives, with a live view that no viewer is attached to, or without. What is printed is
-what the recorder's process takes, beside the limits that it is to keep, and per cycle of the loop in the same seconds.
+The service runs on simulated drives, as a user runs it: first with a live view that nobody watches, then with somebody
+connected to it. What is printed is what the recorder's process takes, beside the limits that it is to keep, and per
+cycle of the loop in the same seconds.
 """
 
 from __future__ import annotations
 
 import json as json_format
 import os
+import socket
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 from moving import keep_moving
 
@@ -19,7 +20,7 @@ from service import spawned
 from service.client import Robot
 from service.config import load
 from service.errors import TrirailError
-from service.sinks import free_port
+from service.sinks import HOST, free_port
 
 CPU_LIMIT = 0.03
 """Share of one processor."""
@@ -28,21 +29,33 @@ DISK_LIMIT = 0.5e6
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
-def measure(seconds: float, live: bool) -> dict[str, Any]:
-    """Run a service for so many seconds, moving; return what its recorder took."""
+def measure(seconds: float) -> dict[str, dict[str, float]]:
+    """Run a service for so many seconds, moving; return what its recorder took, unwatched and watched."""
+    port = free_port()
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
-        config, locator = spawned.private(Path(folder), free_port() if live else 0)
+        config, locator = spawned.private(Path(folder), port)
         rate = load(config).loop.rate_hz
         recording = Path(folder) / "bench.rrd"
         with spawned.service(config, recording) as service, Robot("demo", locator, user="bench") as robot:
             recorder, loop = (_child(service.pid, name) for name in ("recorder", "loop"))
+
+            def taken() -> dict[str, float]:
+                keep_moving(robot, 3.0)  # until all that happens once has happened
+                before = _state(recorder, loop, recording, robot)
+                keep_moving(robot, seconds / 2.0)
+                after = _state(recorder, loop, recording, robot)
+                return _rates([b - a for a, b in zip(before, after, strict=True)], rate)
+
             robot.enable()
-            keep_moving(robot, 3.0)  # until all that happens once has happened
-            before = _state(recorder, loop, recording, robot)
-            keep_moving(robot, seconds)
-            after = _state(recorder, loop, recording, robot)
+            unwatched = taken()
+            with socket.create_connection((HOST, port)):
+                watched = taken()
             robot.disable()
-    spent, cpu, loop_cpu, written, cycles = (b - a for a, b in zip(before, after, strict=True))
+    return {"unwatched": unwatched, "watched": watched}
+
+
+def _rates(taken: list[float], rate: int) -> dict[str, float]:
+    spent, cpu, loop_cpu, written, cycles = taken
     return {
         "seconds": spent,
         "cycles": cycles,
@@ -79,17 +92,23 @@ def _cpu(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / _TICKS
 
 
-def main(seconds: float, live: bool = False, json: bool = False) -> None:
+def main(seconds: float, json: bool = False) -> None:
     """Print the measurements as lines, or as one JSON object."""
-    measured = measure(seconds, live)
+    measured = measure(seconds)
     if json:
         print(json_format.dumps(measured))
         return
-    of = measured.__getitem__
-    print(f"the loop turned at {of('rate'):.0f} Hz for {of('seconds'):.0f} s, {of('rate_to_wanted'):.0%} of its rate")
-    print(f"processor  {of('cpu'):7.2%} of a core, {of('cpu_to_limit'):.2f} of the limit")
-    print(f"           {of('cpu_per_cycle_us'):7.1f} µs a cycle, {of('cpu_to_loop'):.2f} of the loop's")
-    print(
-        f"disk       {of('bytes_per_second') / 1e6:7.3f} MB/s, at the full rate {of('disk_to_limit'):.2f} of the limit"
-    )
-    print(f"           {of('bytes_per_cycle'):7.0f} bytes a cycle")
+    for situation, found in measured.items():
+        of = found.__getitem__
+        print(
+            f"{situation}: the loop turned at {of('rate'):.0f} Hz for {of('seconds'):.0f} s, "
+            f"{of('rate_to_wanted'):.0%} of its rate"
+        )
+        print(
+            f"  processor {of('cpu'):7.2%} of a core, {of('cpu_to_limit'):.2f} of the limit; "
+            f"{of('cpu_per_cycle_us'):.1f} µs a cycle, {of('cpu_to_loop'):.2f} of the loop's"
+        )
+        print(
+            f"  disk    {of('bytes_per_second') / 1e6:7.3f} MB/s, at the full rate {of('disk_to_limit'):.2f} of the "
+            f"limit; {of('bytes_per_cycle'):.0f} bytes a cycle"
+        )
