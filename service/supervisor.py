@@ -85,6 +85,7 @@ class Supervisor:
         self._restarts: dict[str, list[float]] = {name: [] for name in CHILDREN}
         self._ending = False
         self._failed = False
+        self._turned = False
 
     def run(self, up: Callable[[dict[str, dict[str, Any]]], None]) -> int:
         """Run until a signal or a process that must not be missing ends it; return the exit code.
@@ -141,6 +142,7 @@ class Supervisor:
         said_why = child.process.returncode == os.EX_CONFIG
         name, restarts = child.name, self._restarts[child.name]
         if name == "loop":
+            self._turned = child.ready_with is not None
             self._fail(
                 "" if said_why else f"the loop is dead ({child.how}): the drives stop by their own watchdogs; ending"
             )
@@ -174,8 +176,10 @@ class Supervisor:
         if loop := self._children.get("loop"):
             loop.process.send_signal(signal.SIGTERM)
             loop.wait(time.monotonic() + END_WITHIN)
-        # The others end by themselves once the loop has gone and what it said is published and on disk.
-        by_itself = time.monotonic() + END_WITHIN
+            self._turned = self._turned or loop.ready_with is not None
+        # The others end by themselves once the loop has gone and what it said is published and on disk; one that has
+        # never turned has said nothing.
+        by_itself = time.monotonic() + (END_WITHIN if self._turned else 0.0)
         asked = by_itself + END_WITHIN
         for child in list(self._children.values()):
             if not child.wait(by_itself):
