@@ -7,10 +7,7 @@ sliders, and `write` the setpoints behind the last gate. What is to be said of i
 from __future__ import annotations
 
 import contextlib
-import math
 from collections import deque
-
-import numpy as np
 
 from drivers.interface import NAMES, Drives, Feedback, PowerState
 from service.config import Config, geometry
@@ -19,7 +16,6 @@ from service.desk import Desk
 from service.dispatch import Dispatch
 from service.errors import RefusedError
 from service.goals import Goals
-from service.kinematics import inverse_into
 from service.limits import EDGE, Bounds
 from service.measured import Measured
 from service.messages import Outcome, PoseGoal, SlidersGoal
@@ -27,6 +23,7 @@ from service.modes import DISABLED, HOLDING, MOVING, Action, Event, Mode, Refusa
 from service.motion import STILL, MotionState, Run, rest
 from service.packets import CommandRequest, GoalRequest, Request
 from service.pilot import Pilot
+from service.setpoints import Setpoints
 from service.steps import finish
 from service.verdicts import still_powered, verdict
 
@@ -58,28 +55,22 @@ class Control:
         robot = geometry(config.geometry)
         self._drives = drives
         self._period = config.period
-        self._legs = robot.packed()
-        self._bounds = Bounds(config.limits, config.period, EDGE)
         self._goals = Goals(robot, config.limits, config.period)
-        self._step = config.limits.slider.velocity * config.period
         self._course = Course(rest(STILL), config.period)
         self._pilot = Pilot(self._goals, self._course, config.period)
         self.desk = Desk()
         self.dispatch = Dispatch(self.desk, self._pilot, self._course, config.motion.queue, config.period)
-        self.measured = Measured(self._legs, config.period, self._step)
+        legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
+        self.measured = Measured(legs, config.period, step_length)
+        self.setpoints = Setpoints(legs, Bounds(config.limits, config.period, EDGE), self.measured, step_length)
         self._can_home = any(drive.homing is not None for drive in config.drives.each)
         self._following_error_limit = config.limits.slider.following_error
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._settle_cycles = max(3, round(SETTLE / config.period))
 
-        self._motion = np.zeros((3, 3))
-        self._sliders = np.zeros((6, 3))
-
         self.cycle = 0
         self.state: State = DISABLED
         self.fault: str | None = None
-        self.rows: list[list[float]] = self._sliders.tolist()
-        """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 of the setpoints."""
         self._entered = 0
 
     # ------------------------------------------------------------------ the cycle, in its order
@@ -87,7 +78,7 @@ class Control:
     def start(self, feedback: Feedback) -> None:
         """Take the measured sliders for the commanded ones, before the first cycle."""
         self.measured.start(feedback)
-        self.rows[0] = list(feedback.position)
+        self.setpoints.start()
         self._follow_measured()
         # What runs for the first time is slow: plan and check a motion now, not in a cycle.
         nearby = Course(rest([value + 1e-3 for value in self.measured.pose]), self._period)
@@ -158,25 +149,17 @@ class Control:
         if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed:
             self._follow_measured()
             return
-        for row, values in enumerate(self.commanded):
-            self._motion[row] = values
-        singular = inverse_into(self._legs, self._motion, self._sliders)
-        if singular:
-            self.trip(f"slider {NAMES[singular - 1]}: no setpoint, the commanded pose is singular or not a number")
+        refused = self.setpoints.solve(self.commanded)
+        if refused:
+            self.trip(refused)
             return
-        rows = self._sliders.tolist()
-        violation = self._bounds.setpoint(rows, self.measured.last_written) or self._bounds.pose(self.commanded.pose)
-        if violation:
-            self.trip(f"setpoint refused: {violation}")
-            return
-        self.rows = rows
         course = self._course
         if self.state.mode in (Mode.MOVING, Mode.STOPPING) and course.runs[0].stands and not course.turning:
             self._stand(course.runs[0])
 
     def write(self) -> None:
         """Send the setpoints."""
-        position, velocity = self.rows[0], self.rows[1]
+        position, velocity, *_ = self.setpoints.rows
         setpoint = (position[0], position[1], position[2])
         self.measured.note(setpoint)
         self._drives.write(setpoint, (velocity[0], velocity[1], velocity[2]))
@@ -250,9 +233,9 @@ class Control:
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
         if decided.action is Action.POWER_UP:
-            self._check_rest()
+            self.setpoints.check_rest()
             if self.measured.homed:
-                self._check_start()
+                self.setpoints.check_start()
         if decided.action is Action.CLEAR and self.measured.powered:
             raise RefusedError("stopping", still_powered(self.measured, self.fault))
         reason = f"{request.name} by {request.user}"
@@ -273,31 +256,6 @@ class Control:
 
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
-
-    def _check_rest(self) -> None:
-        """Refuse to enable while a setpoint is on its way to where its slider is."""
-        for name, setpoint, measured in zip(NAMES, self.rows[0], self.measured.feedback.position, strict=True):
-            if not abs(setpoint - measured) <= self._step:
-                raise RefusedError(
-                    "not_at_rest", f"slider {name} moves too fast for its setpoint to follow: enable when it stands"
-                )
-
-    def _check_start(self) -> None:
-        """Refuse to enable where the robot stands outside what it may do."""
-        position = self.measured.feedback.position
-        pose = self.measured.pose_of(position)
-        self._motion[:] = 0.0
-        self._motion[0] = pose or math.nan
-        if pose is None or inverse_into(self._legs, self._motion, self._sliders):
-            raise RefusedError("singular", "the measured sliders belong to no pose: move them by hand, then enable")
-        violation = self._bounds.pose(pose) or self._bounds.setpoint(self._sliders.tolist(), position)
-        if violation:
-            raise RefusedError(
-                "out_of_workspace",
-                f"the robot stands outside its limits: {violation}; move it inside by hand, then enable",
-                value=violation.value,
-                limit=violation.limit,
-            )
 
     def _verdict(self, name: str, since: int) -> str | None:
         """Say what has become of a command that came in a cycle: service.verdicts.verdict."""
@@ -384,7 +342,7 @@ class Control:
             return  # no homing has been under way
         if self.measured.homed:
             try:
-                self._check_start()
+                self.setpoints.check_start()
             except RefusedError as refusal:
                 self.trip(f"all drives are homed, but {refusal}")
                 return
@@ -397,7 +355,7 @@ class Control:
 
     def _rest_at_setpoints(self) -> bool:
         """Command the pose that belongs to the setpoints, at rest; trip where there is none."""
-        a, b, c = self.rows[0]
+        a, b, c = self.setpoints.rows[0]
         pose = self.measured.pose_of((a, b, c))
         if pose is None:
             self.trip("the measured sliders belong to no pose")
@@ -406,33 +364,7 @@ class Control:
         return True
 
     def _follow_measured(self) -> None:
-        """Make the setpoint of every drive that none holds the position that it measures: nothing moves on enable.
-
-        Where that is not where the slider was commanded to be, the setpoint goes there at the slider's speed: a drive
-        that missed the command to stop must not jump either. A position that jumps is not followed. A drive that
-        moves by itself, to be homed, gets no setpoint: what is meant for it is its position at once.
-        """
-        stopped_now = self.state.mode is Mode.FAULT and self._entered == self.cycle  # no setpoint is sent then
-        held = self.state.mode not in (Mode.DISABLED, Mode.FAULT)
-        position = []
-        for last, measured, jumps, state, follows in zip(
-            self.rows[0],
-            self.measured.feedback.position,
-            self.measured.jumps,
-            self.measured.feedback.state,
-            self.measured.feedback.follows,
-            strict=True,
-        ):
-            if not follows:
-                position.append(measured)
-            elif stopped_now or jumps or (held and state is PowerState.OPERATION_ENABLED):
-                position.append(last)
-            else:
-                position.append(last + max(-self._step, min(measured - last, self._step)))
+        """Command the pose that is measured, and the sliders to where they are."""
+        stopped_now = self.state.mode is Mode.FAULT and self._entered == self.cycle
         self._course.commanded = rest(self.measured.pose)
-        self._motion[:] = 0.0
-        self._motion[0] = self.measured.pose
-        if inverse_into(self._legs, self._motion, self._sliders) == 0:
-            self.rows = self._sliders.tolist()
-        self.rows[0] = position
-        self.rows[1] = self.rows[2] = [0.0, 0.0, 0.0]
+        self.setpoints.follow(held=self.state.mode not in (Mode.DISABLED, Mode.FAULT), stopped_now=stopped_now)

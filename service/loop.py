@@ -166,7 +166,7 @@ class Loop:
         """Append this cycle's record; pass batch, answers and events on."""
         control = self.control
         feedback = control.measured.feedback
-        rows = control.rows
+        rows = control.setpoints.rows
         LAYOUT.pack_into(
             self._batch,
             1 + self._batched * LAYOUT.size,

@@ -94,7 +94,7 @@ def _run(
         clock.step()
         drives.sync()
         _cycle(control, drives, list(_due(waiting, control.cycle + 1)))
-        made[row] = control.rows[:2]
+        made[row] = control.setpoints.rows[:2]
         modes[row] = MODES.index(control.state.mode)
     return made, modes
 

@@ -123,7 +123,7 @@ class Rig:
         control.advance()
         control.solve()
         control.write()
-        self.rows.append(control.rows)
+        self.rows.append(control.setpoints.rows)
         self.seen.append([frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6])
         desk = control.desk
         self.answers += desk.answers

@@ -502,7 +502,7 @@ def test_a_jog_brakes_before_a_limit(rig: Rig, velocity: tuple[float, float, flo
     rig.until(lambda: rig.mode is Mode.HOLDING)
     assert rig.control.fault is None
     assert rig.control.commanded.at_rest
-    assert rig.control._bounds.pose(rig.control.commanded.pose) is None
+    assert rig.control.setpoints._bounds.pose(rig.control.commanded.pose) is None
     assert max(map(abs, rig.control.commanded.pose)) > 0.05  # it did go there
     assert_within_limits(rig)
 
