@@ -78,6 +78,7 @@ class Loop:
         self._batch[0] = Kind.RECORDS
         self._batched = 0
         self._record_ns = 0
+        self._recorded = False
 
     def run(self, ticker: Ticker) -> None:
         """Run cycles until told to end and the robot stands without power."""
@@ -226,10 +227,14 @@ class Loop:
             self._situate()
 
     def _listen(self) -> None:
-        """Tell everyone what the recorder has to say."""
+        """Tell everyone what the recorder has to say, and if it has gone."""
         packet = self._recorder.receive()
+        if self._recorder.take_lost() and self._recorded:
+            self._recorded = False
+            self.control.desk.tell("service", "warning", "the recorder has gone: nothing is recorded until it is back")
         if packet is None:
             return
+        self._recorded = True
         try:
             remark = packets.decode_remark(memoryview(packet)[1:])
         except msgspec.DecodeError as error:  # the recorder must not be able to stop the robot

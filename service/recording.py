@@ -13,6 +13,7 @@ from pathlib import Path
 from service.blackbox import BlackBox
 from service.config import Config
 from service.links import Closed, Link
+from service.messages import Level
 from service.packets import Answer, Happened, Input, Kind, Remark, Situation, Welcome, decode_answer, message
 from service.recorder import Recorder
 
@@ -67,13 +68,18 @@ class Intake:
             case Welcome():
                 recorder.bus_load(said.bus_load)
                 box.stands("bus_load", said.bus_load)
+                self._tell("info", f"recording to {recorder.path}")
                 self._ready({"recording": str(recorder.path), "live": recorder.live_url})
 
     def _warn(self, words: str) -> None:
-        """Say it in the service's log, and through the loop to everyone."""
+        """Say it in the service's log, and to everyone."""
         print(f"trirail: recorder: {words}", file=sys.stderr, flush=True)  # noqa: T201 - the log
+        self._tell("warning", words)
+
+    def _tell(self, level: Level, words: str) -> None:
+        """Have the loop tell everyone."""
         with contextlib.suppress(Closed):  # then nobody is left to be told
-            self._link.send(message(Remark("warning", words)))
+            self._link.send(message(Remark(level, words)))
 
 
 def main(config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> int:

@@ -29,8 +29,10 @@ START_WITHIN = 120.0
 """How long the processes may take to come up; the very first start compiles the kinematics [s]."""
 END_WITHIN = 6.0
 """How long they may take to end before they are killed [s]."""
-RESTARTS = 5
-"""So many restarts of one process within a minute are tried."""
+RESTARTS = 3
+"""So many restarts of one process within a minute come at once."""
+RETRY = 10.0
+"""How long it is waited before any more, for a recorder; the gateway's are the service's end [s]."""
 
 
 class _Child:
@@ -83,6 +85,7 @@ class Supervisor:
         self._children: dict[str, _Child] = {}
         self._selector = selectors.DefaultSelector()
         self._restarts: dict[str, list[float]] = {name: [] for name in CHILDREN}
+        self._due: dict[str, float] = {}
         self._ending = False
         self._failed = False
         self._turned = False
@@ -124,7 +127,10 @@ class Supervisor:
                     self._ending = True
                 elif not child.listen():
                     self._on_end(child)
-            if is_up or self._ending:
+            if self._ending:
+                continue
+            self._start_due()
+            if is_up:
                 continue
             ready = {name: child.ready_with for name, child in self._children.items() if child.ready_with is not None}
             if len(ready) == len(CHILDREN):
@@ -152,13 +158,21 @@ class Supervisor:
             return
         now = time.monotonic()
         restarts[:] = [moment for moment in restarts if now - moment < 60.0] + [now]
-        if len(restarts) > RESTARTS:
-            self._fail(f"the {name} keeps dying ({child.how}): ending the service")
+        wait = 0.0 if len(restarts) <= RESTARTS else RETRY
+        if wait and name == "gateway":
+            self._fail(f"the gateway keeps dying ({child.how}): ending the service")
             return
         consequence = "the loop stops the robot and holds" if name == "gateway" else "the robot is not affected"
-        self._say(f"the {name} has died ({child.how}): {consequence}; starting it again")
+        when = f" in {wait:g} s" if wait else ""
+        self._say(f"the {name} has died ({child.how}): {consequence}; starting it again{when}")
         self._orders[name] = structs.replace(self._orders[name], record=None)  # never over the first recording
-        self._start(name)
+        self._due[name] = now + wait
+
+    def _start_due(self) -> None:
+        """Start again what is due."""
+        for name in [name for name, due in self._due.items() if due <= time.monotonic()]:
+            del self._due[name]
+            self._start(name)
 
     def _fail(self, reason: str) -> None:
         self._failed = self._ending = True

@@ -65,8 +65,12 @@ class Service:
 
     def wait_up(self) -> None:
         """Wait until it says that it is up."""
+        self.wait_said("up  robot")
+
+    def wait_said(self, words: str) -> None:
+        """Wait until its log has these words."""
         deadline = time.monotonic() + UP_WITHIN
-        while "up  robot" not in self.log.read_text():
+        while words not in self.log.read_text():
             if self.process.poll() is not None or time.monotonic() > deadline:
                 raise AssertionError(self.log.read_text())
             wait_readable(self.process, 0.1)
@@ -486,6 +490,28 @@ def test_a_recording_that_suffers_is_told_to_everyone(service: Service) -> None:
         assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)
     service.end()
     assert "trirail: recorder: missing so far" in service.log.read_text()
+
+
+def test_a_recorder_that_cannot_begin_again_never_ends_the_service(service: Service) -> None:
+    """Its folder has gone, so that every restart fails; when that is back, so is the recording."""
+    folder, aside = service.folder / "recordings", service.folder / "aside"
+    with service.robot() as robot:
+        in_motion(robot)
+        folder.rename(aside)
+        folder.write_bytes(b"")
+        os.kill(service.child("recorder"), signal.SIGKILL)
+        assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)
+        service.wait_said("the recorder has died (exit code 78): the robot is not affected; starting it again in 10 s")
+        folder.unlink()
+        assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
+        told = (event.message for event in robot.events(history=True, timeout=20.0) if "record" in event.message)
+        begun, gone, back = itertools.islice(told, 3)
+    assert gone == "the recorder has gone: nothing is recorded until it is back"
+    assert begun.startswith(f"recording to {folder}/")
+    assert back.startswith(f"recording to {folder}/")
+    assert service.end() == 0
+    (file,) = folder.glob("*.rrd")
+    assert len(read(file).records) > 0
 
 
 def test_a_frozen_recorder_does_not_matter(service: Service) -> None:
