@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import hil
+import hil_machine
+import hil_needs
 import pytest
+from hil_needs import Failed
 
 
 def test_the_newest_kernel_with_the_cards_driver_is_taken(tmp_path: Path) -> None:
@@ -13,19 +16,22 @@ def test_the_newest_kernel_with_the_cards_driver_is_taken(tmp_path: Path) -> Non
     boot.mkdir()
     for release, has_driver in {"6.1.0-9-amd64": True, "6.1.0-56-amd64": True, "6.1.0-99-cloud": False}.items():
         (boot / f"vmlinuz-{release}").touch()
-        driver = modules / release / f"{hil.CARD}.xz"
+        driver = modules / release / f"{hil_needs.CARD}.xz"
         driver.parent.mkdir(parents=True)
         if has_driver:
             driver.touch()
-    assert [kernel.name for kernel in hil.kernels(boot, modules)] == ["vmlinuz-6.1.0-9-amd64", "vmlinuz-6.1.0-56-amd64"]
+    assert [kernel.name for kernel in hil_needs.kernels(boot, modules)] == [
+        "vmlinuz-6.1.0-9-amd64",
+        "vmlinuz-6.1.0-56-amd64",
+    ]
 
 
 def test_what_is_missing_is_named_in_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hil, "SEARCH", "/nowhere")
-    monkeypatch.setattr(hil, "kernels", list)
-    with pytest.raises(hil.Failed) as failed:
-        hil.requirements()
-    for package in (*hil.PROGRAMS.values(), "linux-image"):
+    monkeypatch.setattr(hil_needs, "SEARCH", "/nowhere")
+    monkeypatch.setattr(hil_needs, "kernels", list)
+    with pytest.raises(Failed) as failed:
+        hil_needs.requirements()
+    for package in (*hil_needs.PROGRAMS.values(), "linux-image"):
         assert package in str(failed.value)
     assert "\n" not in str(failed.value)
 
@@ -43,7 +49,7 @@ def test_the_time_limit_says_what_was_heard_last() -> None:
 
     lines: queue.Queue[str | None] = queue.Queue()
     lines.put("the machine is up")
-    heard = hil._until(lines, 0.0)
+    heard = hil_machine.heard(lines, 0.0)
     assert next(heard) == "the machine is up"
-    with pytest.raises(hil.Failed, match="the machine is up"):
+    with pytest.raises(Failed, match="the machine is up"):
         next(heard)

@@ -1,0 +1,155 @@
+"""The emulated machine: Debian's kernel in QEMU with two CAN cards on one bus, and Python with its packages in it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import sys
+import sysconfig
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from hil_needs import BIN, SEARCH, Failed, last
+
+ROOT = Path(__file__).parents[1]
+PRECEDENCE = "-10"
+"""Nice value of the machine's session, where this may be set."""
+PORTABLE = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+"""Compiled code for any x86-64: the emulated processor has not what this one has, and compiles for minutes."""
+
+
+def prepare(folder: Path) -> None:
+    """Compile the kinematics here, for the machine to load."""
+    done = subprocess.run(
+        (sys.executable, "-c", "import service.loop, service.gateway, service.recording, service.client"),
+        cwd=ROOT,
+        env=os.environ | PORTABLE | {"NUMBA_CACHE_DIR": str(folder / "numba")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        raise Failed(f"cannot compile the kinematics:\n{last(done.stderr)}")
+
+
+def pack(folder: Path) -> tuple[Path, ...]:
+    """Write what Python itself and its packages consist of into an image; return the folders that are in it.
+
+    Our own modules stay on the host: numba takes compiled code for old where a file's time differs, and an image
+    keeps whole seconds.
+    """
+    library, packages = (Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib"))
+    done = subprocess.run(
+        (
+            *("mksquashfs", library, packages, folder / "python.img"),
+            *("-no-strip", "-noappend", "-no-progress", "-quiet", "-noI", "-noD", "-noF", "-noX"),
+            *("-wildcards", "-e", str(library / "site-packages").lstrip("/"), *(f"... {name}" for name in UNUSED)),
+        ),
+        cwd=ROOT,
+        env=os.environ | {"PATH": SEARCH},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        raise Failed(f"mksquashfs failed:\n{last(done.stdout + done.stderr)}")
+    return library, packages
+
+
+UNUSED = ("test", "rerun_cli", "scipy", "scipy.libs", "matplotlib", "mypy", "*__mypyc.*", "fontTools", "sympy", "ruff")
+"""Large folders and files of Python's that nothing in the machine imports."""
+
+
+def script(folder: Path, packed: tuple[Path, ...]) -> str:
+    """What the machine runs, as root."""
+    # The tree that virtme-ng mounts asks the host for every file at every import, which takes a minute for the
+    # service; an image, whose blocks stay in memory, takes a third of that.
+    binds = "\n".join(f"mount --bind /run/python{path} {path}" for path in packed)
+    return f"""set -e
+echo 'the machine is up'
+modprobe -a kvaser_pci can-raw vcan virtio_blk squashfs
+mkdir /run/python
+mount -t squashfs -o ro /dev/vda /run/python
+{binds}
+cd {ROOT}
+export PATH={BIN}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
+export PYTHONDONTWRITEBYTECODE=1 TMPDIR=/dev/shm NUMBA_CACHE_DIR=/dev/shm/numba
+export {" ".join(f"{name}='{value}'" for name, value in PORTABLE.items())}
+cp -r {folder}/numba /dev/shm/numba
+for interface in can0 can1; do
+    ip link set $interface txqueuelen 100
+    ip link set $interface up type can bitrate 1000000
+done
+set +e
+{sys.executable} tools/hil_guest.py {folder}
+{sys.executable} -m pytest -m vcan -rA --tb=short tests/test_socketcan.py 2>&1 | tee {folder}/vcan.log
+echo ${{PIPESTATUS[0]}} > {folder}/vcan.code
+"""
+
+
+@contextlib.contextmanager
+def machine(folder: Path, kernel: Path, packed: tuple[Path, ...]) -> Iterator[queue.Queue[str | None]]:
+    """Boot the machine; give the lines that it prints, None at its end. It is gone when the context is left."""
+    (folder / "machine.sh").write_text(script(folder, packed))
+    devices = (
+        f"-drive file={folder}/python.img,format=raw,if=virtio,readonly=on",
+        "-cpu Nehalem",  # what Python's packages need and no more: emulating AVX halves the speed
+        "-object can-bus,id=bus -device kvaser_pci,canbus=bus -device kvaser_pci,canbus=bus",
+    )
+    command = [
+        *(str(BIN / "vng"), "--run", str(kernel), "--user", "root", "--cpus", "2", "--memory", "2G"),
+        # Emulated on purpose: the same everywhere, also where KVM is not to be had or hangs.
+        *("--disable-kvm", "--disable-microvm", "--force-9p", "--force-initramfs"),
+        *("--append", "mitigations=off", "--rwdir", str(folder), f"--qemu-opts={' '.join(devices)}"),
+        *("--", f"bash {folder}/machine.sh"),
+    ]
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,  # so that all of it can be ended: virtme-ng, its shell, QEMU
+        env=os.environ | {"PATH": f"{BIN}:{SEARCH}"},
+    )
+    # The machine keeps real time: as root it goes before what else runs here. Linux shares the processors out
+    # among sessions first, and only then among the processes of one: sched(7), the autogroup feature.
+    with contextlib.suppress(OSError):
+        Path(f"/proc/{process.pid}/autogroup").write_text(PRECEDENCE)
+    lines: queue.Queue[str | None] = queue.Queue()
+    reader = threading.Thread(target=_read, args=(process, lines), daemon=True)
+    reader.start()
+    try:
+        yield lines
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # an emulated machine has nothing to save
+        process.wait()
+        reader.join()
+
+
+def _read(process: subprocess.Popen[bytes], lines: queue.Queue[str | None]) -> None:
+    if process.stdout is not None:
+        with process.stdout:
+            for line in process.stdout:
+                lines.put(line.decode(errors="replace").rstrip())
+    lines.put(None)
+
+
+def heard(lines: queue.Queue[str | None], deadline: float) -> Iterator[str]:
+    """Yield the machine's lines until it ends. Raises Failed at the deadline."""
+    newest = "nothing"
+    while True:
+        try:
+            line = lines.get(timeout=max(0.0, deadline - time.monotonic()))
+        except queue.Empty:
+            raise Failed(f"the time limit is over (--timeout); the last that was heard: {newest}") from None
+        if line is None:
+            return
+        if line:
+            newest = line
+            yield line
