@@ -442,6 +442,18 @@ def test_the_last_gate(rig: Rig, monkeypatch: pytest.MonkeyPatch, commanded: Mot
     assert np.abs(rig.setpoints()[-1, 0] - sent).max() < 1e-3  # what it would send is where the robot is
 
 
+def test_the_last_gate_knows_the_platforms_limits(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig.enable()
+    rig.goal("there", 0.1498, 0.0, 0.0)
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    rig.goal("g1", 0.1499, 0.0, 0.0)
+    rig.cycle()
+    monkeypatch.setattr(rig.control._course.runs[0], "state", lambda *_: rest((0.1502, 0.0, 0.0)))
+    rig.cycle()
+    assert "setpoint refused: platform x: position 0.1502 m is beyond its limit 0.15 m" in (rig.control.fault or "")
+    assert quick_stops(rig) == {1, 2, 3}
+
+
 def test_quick_stop_is_latched_like_a_fault(rig: Rig) -> None:
     moving(rig)
     answer = rig.command("quick_stop")
