@@ -524,14 +524,13 @@ class TestFaults:
 
 class TestLateAnswers:
     def test_age_is_told_and_what_comes_late_or_never_is_counted(self, ready: Rig) -> None:
-        estimates = f"0x{frames.identifier(ready.config.B.node, frames.GET_ENCODER_ESTIMATES):X}"
         ready.cycles(3)
-        ready.bus.faults.add(f"B delay 0.0005 {estimates} for 1 frame")
+        ready.bus.faults.add("B delay 0.0005 get_encoder_estimates for 1 frame")
         assert ready.cycle().age == (0, 1, 0)
         feedback = ready.cycle()
         assert feedback.age == (0, 0, 0)
         assert [(c.feedback_late, c.feedback_lost) for c in feedback.counts] == [(0, 0), (1, 0), (0, 0)]
-        ready.bus.faults.add(f"B drop {estimates} for 2 frames")
+        ready.bus.faults.add("B drop get_encoder_estimates for 2 frames")
         assert [ready.cycle().age for _ in range(3)] == [(0, 1, 0), (0, 2, 0), (0, 0, 0)]
         assert ready.cycle().counts[1][:2] == (1, 2)
 
@@ -539,7 +538,7 @@ class TestLateAnswers:
         """At 0.5 m/s a cycle is 0.5 mm."""
         drives = msgspec.structs.replace(CONFIG, following_error=3e-4)
         enabled.drives._drives = drives
-        enabled.bus.faults.add(f"A delay 0.0005 0x{frames.GET_ENCODER_ESTIMATES:X}")
+        enabled.bus.faults.add("A delay 0.0005 get_encoder_estimates")
         assert enabled.move().fault is None
 
     def test_setpoints_after_the_next_tick_are_counted_as_late(self, ready: Rig) -> None:
@@ -551,10 +550,19 @@ class TestLateAnswers:
 
 
 class TestFaultsOnDemand:
-    @pytest.mark.parametrize("line", ["A emcy 4310", "B drop tpdo2"])
-    def test_those_of_canopen_are_refused(self, ready: Rig, line: str) -> None:
-        with pytest.raises(FaultSyntaxError, match="does not speak CANopen"):
+    @pytest.mark.parametrize(
+        ("line", "right"),
+        [("A emcy 4310", "drive A has no EMCY; as in: A fault 200"), ("B drop tpdo2", "known are set_axis_state, ")],
+    )
+    def test_those_of_canopen_are_refused(self, ready: Rig, line: str, right: str) -> None:
+        with pytest.raises(FaultSyntaxError, match=right):
             ready.bus.faults.add(line)
+
+    def test_a_request_can_be_lost(self, ready: Rig) -> None:
+        ready.cycles(3)
+        ready.bus.faults.add("B drop position-request for 2 frames")
+        assert [ready.cycle().age for _ in range(3)] == [(0, 1, 0), (0, 2, 0), (0, 0, 0)]
+        assert ready.bus.faults.idle
 
     @pytest.mark.parametrize(("line", "cause"), [("C silent", "silent"), ("A stuck", "fault"), ("A lag 0.1", "fault")])
     def test_those_of_drives_are_found(self, enabled: Rig, line: str, cause: str) -> None:
