@@ -436,9 +436,8 @@ class TestFaults:
         ready.cycle()
         ready.devices[1].restart(ready.clock.now)
         ready.found("fault", within=40)  # its errors are told before its heartbeat
-        ready.cycles(110)
-        ready.devices[1].errors, ready.devices[1].axis_state = Error(0), AxisState.IDLE
-        ready.cycles(110)
+        ready.cycles(400)
+        assert ready.devices[1].axis_state is AxisState.IDLE
         ready.drives.reset()
         fault = ready.cycle().fault
         assert fault is not None
@@ -570,6 +569,27 @@ class TestFaultsOnDemand:
         fault = enabled.move(300).fault
         assert fault is not None
         assert (fault.drive, fault.cause) == (line[0], cause)
+
+    @pytest.mark.parametrize("name", ["set_input_pos", "set_axis_state", "set_controller_mode", "clear_errors"])
+    def test_frames_of_wrong_length_do_nothing_to_a_drive(self, enabled: Rig, name: str) -> None:
+        device = enabled.devices[0]
+        device.disarm_reason = Error.SPINOUT_DETECTED
+        before = device.axis_state, device.modes, device._input, device.disarm_reason
+        enabled.bus.send(frames.command(0, getattr(frames, name.upper()), bytes(3)))
+        assert (device.axis_state, device.modes, device._input, device.disarm_reason) == before
+
+    def test_a_setpoint_that_is_no_number_disarms_a_drive(self, enabled: Rig) -> None:
+        data = frames.INPUT_POS.pack(math.nan, 0, 0)
+        enabled.bus.send(frames.command(0, frames.SET_INPUT_POS, data))
+        assert enabled.devices[0].disarm_reason is Error.MISSING_INPUT
+
+    def test_a_slider_that_runs_away_rolls_out_without_power(self, enabled: Rig) -> None:
+        enabled.bus.faults.add("A runaway 2.5")
+        enabled.cycles(10)
+        assert enabled.devices[0].servo.velocity == 2.5
+        enabled.drives.disable()
+        enabled.cycles(60)
+        assert enabled.devices[0].servo.velocity == 0.0
 
 
 class TestReset:
