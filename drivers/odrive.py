@@ -81,6 +81,7 @@ class Odrive:
         self._next: tuple[Triple, Triple] | None = None
         """Setpoints [m], [m/s] to be sent at the next SYNC."""
         self._sent: tuple[Triple, Triple] | None = None
+        """Setpoints sent last; None where no drive has been sent any since enabling."""
         self._due: deque[Triple | None] = deque([None] * MISSED_ANSWERS, maxlen=MISSED_ANSWERS)
         """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
         self._off_by = math.inf
@@ -132,7 +133,8 @@ class Odrive:
         self._due.append(self._sent[0] if self._sent is not None else None)
         if self._braking is not None:
             self._brake()
-        if self._next is not None:
+        # Without power none is sent: a drive that has missed losing it is to stay where the ramp has ended.
+        if self._next is not None and (self._enabled or self._braking is not None):
             self._set(*self._next)
         self._command()
         for axis, request in zip(self._axes, self._requests, strict=True):
@@ -166,7 +168,7 @@ class Odrive:
         )
 
     def write(self, position: Triple, velocity: Triple) -> None:
-        """Take setpoints [m] and velocity feed-forward [m/s], to be sent at the next SYNC; no power without any.
+        """Take setpoints [m] and velocity feed-forward [m/s], to be sent at the next SYNC once enabled.
 
         Setpoints that are not finite, or beyond what a message holds, are not sent but a fault of cause "setpoint".
         During a quick stop they are left aside.
@@ -191,7 +193,7 @@ class Odrive:
         if self._wire.fault is not None or self._enabled:
             return
         self._enabled = True
-        self._braking = None
+        self._braking = self._sent = None
         self._off_by = math.inf
         for axis in self._axes:
             axis.powered_up = False

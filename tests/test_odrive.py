@@ -365,6 +365,28 @@ class TestStop:
         enabled.cycle((9.0, 9.0, 9.0))
         assert enabled.setpoints()[:, :, 0].max() < 0.04
 
+    def test_a_drive_that_misses_being_told_off_stays_where_the_ramp_has_ended(self, enabled: Rig) -> None:
+        enabled.move(100)
+        enabled.bus.faults.add("A drop set_axis_state")
+        enabled.drives.quick_stop()
+        enabled.cycles(200)
+        end = enabled.setpoints()[0, -1, 0]
+        for _ in range(100):
+            enabled.cycle((9.0, 9.0, 9.0))
+        assert enabled.devices[0].axis_state is AxisState.CLOSED_LOOP_CONTROL
+        assert enabled.devices[0].servo.position / 25.0 == pytest.approx(end, abs=1e-6)
+        assert enabled.setpoints()[0, -1].tolist() == [end, 0.0]
+
+    def test_between_enabling_and_the_first_setpoint_sends_none(self, ready: Rig) -> None:
+        ready.enable()
+        ready.drives.disable()
+        ready.cycles(200)
+        ready.bus.sent.clear()
+        ready.drives.enable()
+        ready.drives.quick_stop()
+        assert ready.commands() == [[IDLE]] * 3
+        assert ready.setpoints().size == 0
+
     def test_twice_is_once(self, enabled: Rig) -> None:
         enabled.move(100)
         enabled.drives.quick_stop()
