@@ -306,11 +306,13 @@ class Odrive:
 
     def _set(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints; each is in force when it arrives."""
-        self._sent = position, velocity
+        self._sent = sent = position, velocity
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             data = frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
             if not self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
                 axis.setpoints_lost += 1
+            if self._sent is not sent:
+                return  # what could not be sent has begun a quick stop, whose setpoints are newer
 
     def _command(self) -> None:
         """Ask drives for the state they should be in, once, and again where a heartbeat shows another."""

@@ -503,6 +503,22 @@ class TestFaults:
         ready.cycles(100)
         assert CLOSED_LOOP not in [command for each in ready.commands() for command in each]
 
+    def test_bus_that_breaks_at_a_setpoint_leads_all_down_the_ramp(
+        self, enabled: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        enabled.move(100)
+        enabled.bus.sent.clear()
+
+        def fail_once(message: can.Message, timeout: float | None = None) -> None:
+            monkeypatch.undo()
+            raise can.CanOperationError("network is down", errno.ENETDOWN)
+
+        monkeypatch.setattr(enabled.bus, "send", fail_once)
+        assert enabled.move(1).fault is not None
+        slower = np.sign(SPEED) * (np.abs(SPEED) - 10.0 * PERIOD)
+        for velocity in enabled.setpoints()[:, :, 1].T:
+            assert velocity == pytest.approx(slower, abs=1e-4)
+
     def test_bus_off(self, enabled: Rig) -> None:
         enabled.bus.inject(0x040, bytes(8), is_error_frame=True)
         fault = enabled.found("bus", within=1).fault
