@@ -454,10 +454,18 @@ class TestFaults:
         assert "following error 5." in feedback.fault.message
         assert abs(enabled.target[0] - START[0]) == pytest.approx(0.005, abs=2.5 * SPEED[0] * PERIOD)
 
+    def test_restart_is_the_first_reason_whichever_message_tells_of_it(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.devices[1].restart(ready.clock.now)
+        ready.bus.faults.add("B drop heartbeat")
+        fault = ready.found("state", within=40).fault
+        assert fault is not None
+        assert "drive B: has restarted" in fault.message
+
     def test_restart_is_not_reset_away(self, ready: Rig) -> None:
         ready.cycle()
         ready.devices[1].restart(ready.clock.now)
-        ready.found("fault", within=40)  # its errors are told before its heartbeat
+        ready.found("state", within=40)
         ready.cycles(400)
         assert ready.devices[1].axis_state is AxisState.IDLE
         ready.drives.reset()
