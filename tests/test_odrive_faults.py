@@ -6,9 +6,11 @@ import errno
 import itertools
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import can
+import numpy as np
 import pytest
 from test_faults import (
     IN_MOTION,
@@ -29,6 +31,7 @@ from drivers.odrive import SETTLING
 from drivers.odrive_frames import AxisState
 from drivers.ramp import braked
 from drivers.simulated import SimulatedOdrive
+from drivers.wire import UNSENT_CYCLES
 from service.config import Config
 from service.modes import Mode
 from service.packets import Confirmed, Refused, Request
@@ -55,6 +58,8 @@ class Setpoint(NamedTuple):
     position: float
     velocity: float
     armed: bool
+    taken: bool = True
+    """By the bus."""
 
 
 class OdriveRig(FaultRig):
@@ -94,13 +99,15 @@ class OdriveRig(FaultRig):
             turns, velocity, _ = frames.INPUT_POS.unpack(message.data)
             metres = turns / TURNS, velocity * frames.VELOCITY_STEP / TURNS
             armed = self.bus.drives[node].power is PowerState.OPERATION_ENABLED
-            self.setpoints_of[node].append(Setpoint(len(self.rows), *metres, armed))
+            self.setpoints_of[node].append(Setpoint(len(self.rows), *metres, armed, taken=False))
         elif number == frames.SET_AXIS_STATE:
             self.states_of[node].append((len(self.rows), frames.AXIS_STATE.unpack(message.data)[0]))
         error = self.refuse()
         if error is not None:
             raise error
         super()._note(message, timeout)
+        if number == frames.SET_INPUT_POS:
+            self.setpoints_of[node][-1] = self.setpoints_of[node][-1]._replace(taken=True)
 
     def cycle(self, request: Request | None = None) -> None:
         before = self.mode
@@ -111,13 +118,18 @@ class OdriveRig(FaultRig):
             self.resets.append(len(self.rows) - 1)
 
     def told_to_stop(self) -> set[int]:
-        """By less velocity where they were to be in this cycle or, where a fault is found first, in the one before."""
+        """By less velocity, from the one of this cycle or, where the fault was found first, of the one before.
+
+        The place is the one of that cycle, or where the bus took no setpoint lately, that of the last one it took.
+        """
         told = set()
         for index, setpoints in enumerate(self.setpoints_of.values()):
             of_cycle = [setpoint for setpoint in setpoints if setpoint.cycle == len(self.rows) - 1]
-            for position, velocity in ((rows[0][index], rows[1][index]) for rows in self.rows[-3:-1]):
-                fast = Setpoint(0, position, velocity, armed=True)
-                if any(abs(slow.position - position) < 1e-7 and is_slower(fast, slow) for slow in of_cycle):
+            places = [rows[0][index] for rows in self.rows[-5:-1]]
+            fast = [Setpoint(0, rows[0][index], rows[1][index], armed=True) for rows in self.rows[-3:-1]]
+            for slow in of_cycle:
+                there = any(abs(slow.position - place) < 1e-7 for place in places)
+                if there and any(is_slower(each, slow) for each in fast):
                     told.add(self.config.drives.each[index].node)
         return told
 
@@ -144,9 +156,12 @@ class OdriveRig(FaultRig):
         limits = self.config.limits.slider
         for setpoints in self.setpoints_of.values():
             assert setpoints
-            for before, after in itertools.pairwise({setpoint.cycle: setpoint for setpoint in setpoints}.values()):
-                if after.cycle > before.cycle + 1:  # there was to be no power in between
-                    assert not after.armed
+            taken = {setpoint.cycle: setpoint for setpoint in setpoints if setpoint.taken}
+            for before, after in itertools.pairwise(taken.values()):
+                cycles = after.cycle - before.cycle
+                if cycles > 1:  # there was to be no power in between, or the queue was full
+                    most = min(cycles, UNSENT_CYCLES) * limits.velocity * PERIOD
+                    assert not after.armed or abs(after.position - before.position) <= most
                     continue
                 step = (after.position - before.position) / PERIOD
                 assert abs(step) <= limits.velocity * 1.001 + ROUNDING
@@ -201,12 +216,11 @@ def no_acknowledgement(rig: OdriveRig) -> None:
     rig.refuse = lambda: can.CanOperationError("No buffer space available", errno.ENOBUFS)
 
 
-def full_queue(rig: OdriveRig) -> None:
-    """The transmit queue is full for two cycles."""
-    last = len(rig.rows) + 1
-    rig.refuse = lambda: (
-        can.CanOperationError("No buffer space available", errno.ENOBUFS) if len(rig.rows) <= last else None
-    )
+def full_queue(rig: OdriveRig, cycles: int = 2) -> None:
+    """The transmit queue is full for some cycles."""
+    no_acknowledgement(rig)
+    end, refuse = len(rig.rows) + cycles, rig.refuse
+    rig.refuse = lambda: refuse() if len(rig.rows) < end else None
 
 
 def no_number(rig: OdriveRig) -> None:
@@ -236,6 +250,7 @@ BY_HAND: dict[str, Callable[[OdriveRig], None]] = {
     "A pushed": push,
     "nobody acknowledges": no_acknowledgement,
     "full queue": full_queue,
+    "queue full for 0.02": partial(full_queue, cycles=20),
     "C no number": no_number,
     "C elsewhere": elsewhere,
     "B short watchdog": short_watchdog,
@@ -380,6 +395,22 @@ def test_drives_whose_service_is_gone_are_disarmed_by_their_watchdogs(rig: Odriv
             drive.poll(rig.now)
     assert rig.stands()
     assert {drive.disarm_reason for drive in rig.odrives} == {frames.Error.WATCHDOG_TIMER_EXPIRED}
+
+
+@pytest.mark.parametrize("mode", IN_MOTION)
+@pytest.mark.parametrize("line", ["bus-off for 0.005", "bus-off for 0.02", "bus-off for 0.06", "queue full for 0.02"])
+def test_a_bus_that_comes_back_within_the_ramp_makes_no_drive_jump(rig: OdriveRig, line: str, mode: str) -> None:
+    """By what the drives have heard, rather than by what was sent."""
+    begin(rig, mode, line)
+    speed = max(abs(drive.servo.velocity) for drive in rig.odrives)
+    heard = [[drive.servo.setpoint for drive in rig.odrives]]
+    for _ in range(200):
+        rig.cycle()
+        heard.append([drive.servo.setpoint for drive in rig.odrives])
+        assert max(abs(drive.servo.velocity) for drive in rig.odrives) <= 1.05 * speed
+    assert rig.faulty()
+    armed = np.array(heard)[: rig.states_of[0][-1][0] - rig.trips[0]]
+    assert np.abs(np.diff(armed, axis=0)).max() <= 1.01 * speed * PERIOD
 
 
 def test_a_reboot_leaves_a_drive_without_power(rig: OdriveRig) -> None:
