@@ -308,9 +308,9 @@ def test_what_does_not_stop_the_robot(rig: Cia402Rig, line: str, mode: str) -> N
     assert_goes_on(rig, begun)
 
 
-def assert_goes_on(rig: FaultRig, begun: Begin) -> None:
-    """What is under way ends as if nothing had happened."""
-    rig.cycles(800)
+def assert_goes_on(rig: FaultRig, begun: Begin, cycles: int = 800) -> None:
+    """What is under way ends as if nothing had happened, and nothing happens in so many cycles."""
+    rig.cycles(cycles)
     rig.until(rig.holds)
     assert [said.message for said in rig.happenings if said.kind == "fault"] == []
     assert rig.control.measured.homed

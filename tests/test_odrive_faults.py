@@ -265,7 +265,6 @@ STOP = [
     Case("B drop position-request", 3, SILENT.format("B")),
     Case("C drop heartbeat", 3 * BEAT + 100, r"drive C: no heartbeat for 0\.3\d* s"),
     Case("A drop to", 3, SILENT.format("A"), stands=DEAF),
-    Case("all drop to", 3, SILENT.format("A"), stands=DEAF),
     Case("B drop set_input_pos", 150, FOLLOWING.format("B"), IN_MOTION, lasts=False),
     Case("A delay 0.01 get_encoder_estimates", 3, SILENT.format("A"), lasts=False),
     Case("A delay 0.05 set_input_pos", 60, FOLLOWING.format("A"), IN_MOTION, lasts=False),
@@ -341,7 +340,6 @@ GO_ON = [
     "all delay 0.0005 position-request",
     "B delay 0.0005 set_input_pos",
     "A delay 0.05 heartbeat",
-    "C delay 0.02 get_error",
     "with 0.1 all delay 0.0005 get_encoder_estimates",
     "with 0.02 all drop set_input_pos",
     "full queue",
@@ -354,7 +352,7 @@ GO_ON = [
 @pytest.mark.parametrize("line", GO_ON)
 def test_what_does_not_stop_the_robot(rig: OdriveRig, line: str, mode: str) -> None:
     begun = begin(rig, mode, line)
-    assert_goes_on(rig, begun)
+    assert_goes_on(rig, begun, 4 * BEAT)
     assert {drive.axis_state for drive in rig.odrives} == {AxisState.CLOSED_LOOP_CONTROL}
     assert {state for states in rig.states_of.values() for _, state in states[1:]} == {AxisState.CLOSED_LOOP_CONTROL}
 
