@@ -81,6 +81,9 @@ class Odrive:
         self._next: tuple[Triple, Triple] | None = None
         """Setpoints [m], [m/s] to be sent at the next SYNC."""
         self._sent: tuple[Triple, Triple] | None = None
+        """Setpoints sent last; None where no drive has been sent any since enabling."""
+        self._in_force: list[float] = []
+        """Positions that the bus has taken last [m]."""
         self._due: deque[Triple | None] = deque([None] * MISSED_ANSWERS, maxlen=MISSED_ANSWERS)
         """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
         self._off_by = math.inf
@@ -132,7 +135,8 @@ class Odrive:
         self._due.append(self._sent[0] if self._sent is not None else None)
         if self._braking is not None:
             self._brake()
-        if self._next is not None:
+        # Without power none is sent: a drive that has missed losing it is to stay where the ramp has ended.
+        if self._next is not None and (self._enabled or self._braking is not None):
             self._set(*self._next)
         self._command()
         for axis, request in zip(self._axes, self._requests, strict=True):
@@ -166,7 +170,7 @@ class Odrive:
         )
 
     def write(self, position: Triple, velocity: Triple) -> None:
-        """Take setpoints [m] and velocity feed-forward [m/s], to be sent at the next SYNC; no power without any.
+        """Take setpoints [m] and velocity feed-forward [m/s], to be sent at the next SYNC once enabled.
 
         Setpoints that are not finite, or beyond what a message holds, are not sent but a fault of cause "setpoint".
         During a quick stop they are left aside.
@@ -191,7 +195,8 @@ class Odrive:
         if self._wire.fault is not None or self._enabled:
             return
         self._enabled = True
-        self._braking = None
+        self._braking = self._sent = None
+        self._in_force = []
         self._off_by = math.inf
         for axis in self._axes:
             axis.powered_up = False
@@ -225,10 +230,10 @@ class Odrive:
             self._command()
             return
         self._braking = 0.0
-        position, velocity = self._sent
         # The position in force stays; what the drives are to run on with is less from now on.
-        _, slower = self._braked(position, velocity)
-        self._set(position, slower)
+        a, b, c = self._in_force
+        _, slower = self._braked(self._sent[1])
+        self._set((a, b, c), slower)
         self._next = None
 
     def reset(self) -> None:
@@ -304,11 +309,16 @@ class Odrive:
 
     def _set(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints; each is in force when it arrives."""
-        self._sent = position, velocity
-        for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
+        self._sent = sent = position, velocity
+        self._in_force = self._in_force or list(position)
+        for number, (axis, metres, rate) in enumerate(zip(self._axes, position, velocity, strict=True)):
             data = frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
-            if not self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
+            if self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
+                self._in_force[number] = metres
+            else:
                 axis.setpoints_lost += 1
+            if self._sent is not sent:
+                return  # what could not be sent has begun a quick stop, whose setpoints are newer
 
     def _command(self) -> None:
         """Ask drives for the state they should be in, once, and again where a heartbeat shows another."""
@@ -330,22 +340,26 @@ class Odrive:
         return AxisState.CLOSED_LOOP_CONTROL if self._sent is not None else None
 
     def _brake(self) -> None:
-        """One period further down the ramp; at its end, power off."""
+        """One period further down the ramp; at its end, power off.
+
+        Where the bus takes no setpoint the time goes on, but the place does not: a drive that hears nothing stands
+        soon, and is not to catch up with the ramp when the bus is back.
+        """
         if self._sent is None or self._braking is None:
             return
-        position, velocity = self._sent
-        self._next = self._braked(position, velocity)
+        _, velocity = self._sent
+        self._next = self._braked(velocity)
         if any(velocity):
             return
         self._braking += self._period
         if self._braking > SETTLING:
             self._braking = None
 
-    def _braked(self, position: Triple, velocity: Triple) -> tuple[Triple, Triple]:
-        """Setpoints one period further down the ramp."""
+    def _braked(self, velocity: Triple) -> tuple[Triple, Triple]:
+        """Setpoints one period further down the ramp from those in force, of this velocity."""
         deceleration, period = self._drives.quick_stop_deceleration, self._period
         (a, da), (b, db), (c, dc) = (
-            braked(place, rate, deceleration, period) for place, rate in zip(position, velocity, strict=True)
+            braked(place, rate, deceleration, period) for place, rate in zip(self._in_force, velocity, strict=True)
         )
         return (a, b, c), (da, db, dc)
 

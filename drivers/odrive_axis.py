@@ -77,7 +77,6 @@ class OdriveAxis(Axis):
         self.heard = now
         self._beats += 1
         self._take_errors(errors)
-        self._watch_restart()
         if self.state == AxisState.CLOSED_LOOP_CONTROL:
             if self.requested is AxisState.CLOSED_LOOP_CONTROL:
                 self.powered_up = True
@@ -147,6 +146,7 @@ class OdriveAxis(Axis):
         self.errors = errors
         if not errors:
             self.reset_until = -math.inf
+        self._watch_restart()
 
     def _watch_restart(self) -> None:
         """A drive that begins anew may have lost count of its turns."""

@@ -17,7 +17,7 @@ from drivers import frames
 from drivers.errors import DriveError
 from drivers.interface import PowerState
 from drivers.simulated import Servo, SimulatedBus, SimulatedDrive
-from drivers.simulated.faultlines import HELP, Condition, FaultSyntaxError, parse
+from drivers.simulated.faultlines import HELP, ODRIVE, Condition, FaultSyntaxError, parse
 from drivers.simulated.faults import Faults
 from drivers.unixbus import UnixBus
 
@@ -82,6 +82,19 @@ def test_a_line_with_everything() -> None:
     assert [each.match(True, 0x07F, 2) for each in fault.frames] == [False, True]
 
 
+def test_frames_of_odrives_have_the_names_of_their_manual() -> None:
+    chosen = parse("B drop set_input_pos heartbeat position-request", ODRIVE).frames
+    sent = [(True, 0xEC), (False, 0xE1), (True, 0xE9), (False, 0xE9), (True, 0xE1), (True, 0x0C)]
+    assert [[each.match(*frame, 7) for each in chosen] for frame in sent] == [
+        [True, False, False],
+        [False, True, False],
+        [False, False, True],
+        *[[False, False, False]] * 3,
+    ]
+    with pytest.raises(FaultSyntaxError, match='unknown frames "tpdo2"; known are set_axis_state, '):
+        parse("B drop tpdo2", ODRIVE)
+
+
 @pytest.mark.parametrize("line", ["B emcy 4310", "B fault 4310", "B reboot"])
 def test_what_happens_in_a_moment_lasts_only_if_told_to(line: str) -> None:
     assert parse(line).duration == 0.0
@@ -131,7 +144,8 @@ def test_a_wrong_line_is_answered_with_what_would_be_right(line: str, right: str
 def test_help_names_every_word() -> None:
     from drivers.simulated import faultlines
 
-    for word in (*faultlines._KINDS, *faultlines.FRAMES, *faultlines.CONDITIONS, "at", "when", "with", "for"):
+    names = (*faultlines.CANOPEN, *faultlines.ODRIVE)
+    for word in (*faultlines._KINDS, *names, *faultlines.CONDITIONS, "at", "when", "with", "for"):
         assert re.search(rf"(?<![\w-]){re.escape(word)}(?![\w-])", HELP), word
 
 

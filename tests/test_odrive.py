@@ -365,6 +365,28 @@ class TestStop:
         enabled.cycle((9.0, 9.0, 9.0))
         assert enabled.setpoints()[:, :, 0].max() < 0.04
 
+    def test_a_drive_that_misses_being_told_off_stays_where_the_ramp_has_ended(self, enabled: Rig) -> None:
+        enabled.move(100)
+        enabled.bus.faults.add("A drop set_axis_state")
+        enabled.drives.quick_stop()
+        enabled.cycles(200)
+        end = enabled.setpoints()[0, -1, 0]
+        for _ in range(100):
+            enabled.cycle((9.0, 9.0, 9.0))
+        assert enabled.devices[0].axis_state is AxisState.CLOSED_LOOP_CONTROL
+        assert enabled.devices[0].servo.position / 25.0 == pytest.approx(end, abs=1e-6)
+        assert enabled.setpoints()[0, -1].tolist() == [end, 0.0]
+
+    def test_between_enabling_and_the_first_setpoint_sends_none(self, ready: Rig) -> None:
+        ready.enable()
+        ready.drives.disable()
+        ready.cycles(200)
+        ready.bus.sent.clear()
+        ready.drives.enable()
+        ready.drives.quick_stop()
+        assert ready.commands() == [[IDLE]] * 3
+        assert ready.setpoints().size == 0
+
     def test_twice_is_once(self, enabled: Rig) -> None:
         enabled.move(100)
         enabled.drives.quick_stop()
@@ -432,13 +454,20 @@ class TestFaults:
         assert "following error 5." in feedback.fault.message
         assert abs(enabled.target[0] - START[0]) == pytest.approx(0.005, abs=2.5 * SPEED[0] * PERIOD)
 
+    def test_restart_is_the_first_reason_whichever_message_tells_of_it(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.devices[1].restart(ready.clock.now)
+        ready.bus.faults.add("B drop heartbeat")
+        fault = ready.found("state", within=40).fault
+        assert fault is not None
+        assert "drive B: has restarted" in fault.message
+
     def test_restart_is_not_reset_away(self, ready: Rig) -> None:
         ready.cycle()
         ready.devices[1].restart(ready.clock.now)
-        ready.found("fault", within=40)  # its errors are told before its heartbeat
-        ready.cycles(110)
-        ready.devices[1].errors, ready.devices[1].axis_state = Error(0), AxisState.IDLE
-        ready.cycles(110)
+        ready.found("state", within=40)
+        ready.cycles(400)
+        assert ready.devices[1].axis_state is AxisState.IDLE
         ready.drives.reset()
         fault = ready.cycle().fault
         assert fault is not None
@@ -482,6 +511,22 @@ class TestFaults:
         ready.cycles(100)
         assert CLOSED_LOOP not in [command for each in ready.commands() for command in each]
 
+    def test_bus_that_breaks_at_a_setpoint_leads_all_down_the_ramp(
+        self, enabled: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        enabled.move(100)
+        enabled.bus.sent.clear()
+
+        def fail_once(message: can.Message, timeout: float | None = None) -> None:
+            monkeypatch.undo()
+            raise can.CanOperationError("network is down", errno.ENETDOWN)
+
+        monkeypatch.setattr(enabled.bus, "send", fail_once)
+        assert enabled.move(1).fault is not None
+        slower = np.sign(SPEED) * (np.abs(SPEED) - 10.0 * PERIOD)
+        for velocity in enabled.setpoints()[:, :, 1].T:
+            assert velocity == pytest.approx(slower, abs=1e-4)
+
     def test_bus_off(self, enabled: Rig) -> None:
         enabled.bus.inject(0x040, bytes(8), is_error_frame=True)
         fault = enabled.found("bus", within=1).fault
@@ -524,14 +569,13 @@ class TestFaults:
 
 class TestLateAnswers:
     def test_age_is_told_and_what_comes_late_or_never_is_counted(self, ready: Rig) -> None:
-        estimates = f"0x{frames.identifier(ready.config.B.node, frames.GET_ENCODER_ESTIMATES):X}"
         ready.cycles(3)
-        ready.bus.faults.add(f"B delay 0.0005 {estimates} for 1 frame")
+        ready.bus.faults.add("B delay 0.0005 get_encoder_estimates for 1 frame")
         assert ready.cycle().age == (0, 1, 0)
         feedback = ready.cycle()
         assert feedback.age == (0, 0, 0)
         assert [(c.feedback_late, c.feedback_lost) for c in feedback.counts] == [(0, 0), (1, 0), (0, 0)]
-        ready.bus.faults.add(f"B drop {estimates} for 2 frames")
+        ready.bus.faults.add("B drop get_encoder_estimates for 2 frames")
         assert [ready.cycle().age for _ in range(3)] == [(0, 1, 0), (0, 2, 0), (0, 0, 0)]
         assert ready.cycle().counts[1][:2] == (1, 2)
 
@@ -539,7 +583,7 @@ class TestLateAnswers:
         """At 0.5 m/s a cycle is 0.5 mm."""
         drives = msgspec.structs.replace(CONFIG, following_error=3e-4)
         enabled.drives._drives = drives
-        enabled.bus.faults.add(f"A delay 0.0005 0x{frames.GET_ENCODER_ESTIMATES:X}")
+        enabled.bus.faults.add("A delay 0.0005 get_encoder_estimates")
         assert enabled.move().fault is None
 
     def test_setpoints_after_the_next_tick_are_counted_as_late(self, ready: Rig) -> None:
@@ -551,10 +595,19 @@ class TestLateAnswers:
 
 
 class TestFaultsOnDemand:
-    @pytest.mark.parametrize("line", ["A emcy 4310", "B drop tpdo2"])
-    def test_those_of_canopen_are_refused(self, ready: Rig, line: str) -> None:
-        with pytest.raises(FaultSyntaxError, match="does not speak CANopen"):
+    @pytest.mark.parametrize(
+        ("line", "right"),
+        [("A emcy 4310", "drive A has no EMCY; as in: A fault 200"), ("B drop tpdo2", "known are set_axis_state, ")],
+    )
+    def test_those_of_canopen_are_refused(self, ready: Rig, line: str, right: str) -> None:
+        with pytest.raises(FaultSyntaxError, match=right):
             ready.bus.faults.add(line)
+
+    def test_a_request_can_be_lost(self, ready: Rig) -> None:
+        ready.cycles(3)
+        ready.bus.faults.add("B drop position-request for 2 frames")
+        assert [ready.cycle().age for _ in range(3)] == [(0, 1, 0), (0, 2, 0), (0, 0, 0)]
+        assert ready.bus.faults.idle
 
     @pytest.mark.parametrize(("line", "cause"), [("C silent", "silent"), ("A stuck", "fault"), ("A lag 0.1", "fault")])
     def test_those_of_drives_are_found(self, enabled: Rig, line: str, cause: str) -> None:
@@ -562,6 +615,27 @@ class TestFaultsOnDemand:
         fault = enabled.move(300).fault
         assert fault is not None
         assert (fault.drive, fault.cause) == (line[0], cause)
+
+    @pytest.mark.parametrize("name", ["set_input_pos", "set_axis_state", "set_controller_mode", "clear_errors"])
+    def test_frames_of_wrong_length_do_nothing_to_a_drive(self, enabled: Rig, name: str) -> None:
+        device = enabled.devices[0]
+        device.disarm_reason = Error.SPINOUT_DETECTED
+        before = device.axis_state, device.modes, device._input, device.disarm_reason
+        enabled.bus.send(frames.command(0, getattr(frames, name.upper()), bytes(3)))
+        assert (device.axis_state, device.modes, device._input, device.disarm_reason) == before
+
+    def test_a_setpoint_that_is_no_number_disarms_a_drive(self, enabled: Rig) -> None:
+        data = frames.INPUT_POS.pack(math.nan, 0, 0)
+        enabled.bus.send(frames.command(0, frames.SET_INPUT_POS, data))
+        assert enabled.devices[0].disarm_reason is Error.MISSING_INPUT
+
+    def test_a_slider_that_runs_away_rolls_out_without_power(self, enabled: Rig) -> None:
+        enabled.bus.faults.add("A runaway 2.5")
+        enabled.cycles(10)
+        assert enabled.devices[0].servo.velocity == 2.5
+        enabled.drives.disable()
+        enabled.cycles(60)
+        assert enabled.devices[0].servo.velocity == 0.0
 
 
 class TestReset:

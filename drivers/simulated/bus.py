@@ -61,10 +61,17 @@ class SimulatedBus(can.BusABC):
             if self.faults.bus_off:
                 raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
         if msg.is_remote_frame:
-            for drive in self.drives:
-                drive.receive_remote(msg.arbitration_id, now)
+            self._request(msg.arbitration_id, now)
         else:
             self._to_drives(self._everyone, msg.arbitration_id, bytes(msg.data))
+
+    def _request(self, can_id: int, now: float) -> None:
+        """Bring a remote frame to every drive, unless faults have it otherwise."""
+        for index in self._everyone:
+            if self.faults.idle:
+                self.drives[index].receive_remote(can_id, now)
+            else:
+                self.faults.carry(index, True, can_id, b"", partial(self._hand_request_in, index, can_id))
 
     def _to_drives(self, indices: Sequence[int], can_id: int, data: bytes) -> None:
         """Bring a frame to some drives, unless faults have it otherwise."""
@@ -75,6 +82,9 @@ class SimulatedBus(can.BusABC):
         else:
             for index in indices:
                 self.faults.carry(index, True, can_id, data, partial(self._hand_in, index, can_id))
+
+    def _hand_request_in(self, index: int, can_id: int, _data: bytes) -> None:
+        self.drives[index].receive_remote(can_id, self._clock())
 
     def _hand_in(self, index: int, can_id: int, data: bytes) -> None:
         self.drives[index].receive(can_id, data, self._clock())

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from drivers import frames
+from drivers import frames, odrive_frames
 from drivers.errors import DriveError
 from drivers.interface import NAMES
 
@@ -23,8 +23,9 @@ HELP: Final = """\
 
 faults of frames, to and from a drive (FRAMES: all where none are named):
   drop · duplicate · corrupt (one bit) · delay SECONDS · dlc LENGTH
-  FRAMES  to the drive: nmt sync rpdo1 rpdo2 sdo-request to; from it: emcy tpdo1 tpdo2 sdo-answer heartbeat from;
-          or an identifier: 0x181
+  FRAMES  to the drive: to, nmt sync rpdo1 rpdo2 sdo-request; from it: from, heartbeat, emcy tpdo1 tpdo2 sdo-answer;
+          to an ODrive: set_axis_state set_controller_mode set_input_pos clear_errors position-request;
+          from it: get_version get_error get_encoder_estimates; or an identifier: 0x181
 faults of a drive:
   silent            nothing is heard or sent      emcy CODE     an emergency, without more (hexadecimal)
   fault CODE        breaks down with an EMCY      reboot        loses its supply and its set-up
@@ -49,15 +50,15 @@ class Frames(NamedTuple):
     to_drive: bool | None
     """Direction; None for both."""
     identifier: int | None
-    """None for all."""
-    plus_node: bool = False
-    """Whether the drive's node id is to be added."""
+    """That of node 0; None for all."""
+    per_node: int = 0
+    """What each further node id adds to the identifier; 0 where it is the same for all."""
 
     def match(self, to_drive: bool, identifier: int, node: int) -> bool:
         """Whether a frame to or from the drive `node` is one of them."""
         if self.to_drive is not None and self.to_drive is not to_drive:
             return False
-        return self.identifier is None or identifier == self.identifier + (node if self.plus_node else 0)
+        return self.identifier is None or identifier == self.identifier + self.per_node * node
 
 
 class Condition(NamedTuple):
@@ -89,20 +90,33 @@ class Fault:
     """How many frames it strikes; None for all."""
 
 
-FRAMES: Final = {
+_EITHER: Final = {"to": Frames(True, None), "from": Frames(False, None)}
+CANOPEN: Final = {
     "nmt": Frames(True, frames.NMT),
     "sync": Frames(True, frames.SYNC),
-    "rpdo1": Frames(True, frames.RPDO1, True),
-    "rpdo2": Frames(True, frames.RPDO2, True),
-    "sdo-request": Frames(True, frames.SDO_REQUEST, True),
-    "to": Frames(True, None),
-    "emcy": Frames(False, frames.EMCY, True),
-    "tpdo1": Frames(False, frames.TPDO1, True),
-    "tpdo2": Frames(False, frames.TPDO2, True),
-    "sdo-answer": Frames(False, frames.SDO_ANSWER, True),
-    "heartbeat": Frames(False, frames.HEARTBEAT, True),
-    "from": Frames(False, None),
-}
+    "rpdo1": Frames(True, frames.RPDO1, 1),
+    "rpdo2": Frames(True, frames.RPDO2, 1),
+    "sdo-request": Frames(True, frames.SDO_REQUEST, 1),
+    "emcy": Frames(False, frames.EMCY, 1),
+    "tpdo1": Frames(False, frames.TPDO1, 1),
+    "tpdo2": Frames(False, frames.TPDO2, 1),
+    "sdo-answer": Frames(False, frames.SDO_ANSWER, 1),
+    "heartbeat": Frames(False, frames.HEARTBEAT, 1),
+} | _EITHER
+"""Names of the frames of CANopen drives."""
+_NODE: Final = odrive_frames.identifier(1, 0)
+ODRIVE: Final = {
+    "set_axis_state": Frames(True, odrive_frames.SET_AXIS_STATE, _NODE),
+    "set_controller_mode": Frames(True, odrive_frames.SET_CONTROLLER_MODE, _NODE),
+    "set_input_pos": Frames(True, odrive_frames.SET_INPUT_POS, _NODE),
+    "clear_errors": Frames(True, odrive_frames.CLEAR_ERRORS, _NODE),
+    "position-request": Frames(True, odrive_frames.GET_ENCODER_ESTIMATES, _NODE),
+    "get_version": Frames(False, odrive_frames.GET_VERSION, _NODE),
+    "get_error": Frames(False, odrive_frames.GET_ERROR, _NODE),
+    "get_encoder_estimates": Frames(False, odrive_frames.GET_ENCODER_ESTIMATES, _NODE),
+    "heartbeat": Frames(False, odrive_frames.HEARTBEAT, _NODE),
+} | _EITHER
+"""Names of the frames of ODrives, as their manual has them."""
 CONDITIONS: Final = ("enabled", "moving", "stopping", "fault")
 _DRIVES: Final = {name: (index,) for index, name in enumerate(NAMES)} | {"all": tuple(range(len(NAMES)))}
 
@@ -188,8 +202,8 @@ class _Words:
             raise FaultSyntaxError(f"{after} {word}: after {after} comes {wants}, as in: {example}") from None
 
 
-def parse(line: str) -> Fault:
-    """Read one line. Raises FaultSyntaxError, which says what would be right."""
+def parse(line: str, known_frames: Mapping[str, Frames] = CANOPEN) -> Fault:
+    """Read one line for drives whose frames have these names. Raises FaultSyntaxError, which says what is right."""
     words = _Words(line)
     delay, chance, condition = 0.0, 1.0, None
     while words.next_is("at", "when", "with"):
@@ -218,7 +232,7 @@ def parse(line: str) -> Fault:
         word = words.left.pop(0)
         if name not in _OF_FRAMES:
             raise FaultSyntaxError(f'"{word}" after {name}: only for can follow, as in: {who}{name} for 0.5')
-        chosen.append(_frames(word))
+        chosen.append(_frames(word, known_frames))
     duration, number = _lasting(words, name, kind.momentary)
     return Fault(line, name, drives, value, tuple(chosen), delay, condition, chance, duration, number)
 
@@ -241,15 +255,15 @@ def _condition(words: _Words) -> Condition:
     return Condition(None if drive == "any" else NAMES.index(drive), state)
 
 
-def _frames(word: str) -> Frames:
-    if word in FRAMES:
-        return FRAMES[word]
+def _frames(word: str, known: Mapping[str, Frames]) -> Frames:
+    if word in known:
+        return known[word]
     try:
         identifier = int(word, 16) if word.startswith("0x") else -1
     except ValueError:
         identifier = -1
     if not 0 <= identifier <= 0x7FF:
-        raise FaultSyntaxError(_unknown("frames", word, (*FRAMES, "0x181")))
+        raise FaultSyntaxError(_unknown("frames", word, (*known, "0x181")))
     return Frames(None, identifier)
 
 

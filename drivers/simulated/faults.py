@@ -17,7 +17,8 @@ from drivers.interface import NAMES, PowerState
 from drivers.simulated.devices import SimulatedDevice
 from drivers.simulated.drive import SimulatedDrive
 from drivers.simulated.emergency import Emergencies
-from drivers.simulated.faultlines import Condition, Fault, FaultSyntaxError, Frames, parse
+from drivers.simulated.faultlines import CANOPEN, ODRIVE, Condition, Fault, FaultSyntaxError, Frames, parse
+from drivers.simulated.odrive import SimulatedOdrive
 
 MOVING: Final = 1e-3
 """A slider moves from this speed on [m/s]."""
@@ -69,6 +70,7 @@ class Faults:
         """`counts_per_metre`: negative where counts fall as the slider rises. `tell`: hears what begins and ends."""
         self.tell = tell
         self._drives = drives
+        self._names = ODRIVE if any(isinstance(drive, SimulatedOdrive) for drive in drives) else CANOPEN
         self._scales = counts_per_metre
         self._random = random.Random(seed)
         self._active: list[_Active] = []
@@ -99,13 +101,11 @@ class Faults:
 
     def add(self, line: str) -> None:
         """Take up a line. Raises FaultSyntaxError."""
-        fault = parse(line)
-        if fault.name == "emcy" or any(frames.plus_node for frames in fault.frames):
+        fault = parse(line, self._names)
+        if fault.name == "emcy":
             for index in fault.drives:
                 if not isinstance(self._drives[index], SimulatedDrive):
-                    raise FaultSyntaxError(
-                        f"{line}: drive {NAMES[index]} does not speak CANopen; name its frames by their identifiers"
-                    )
+                    raise FaultSyntaxError(f"{line}: drive {NAMES[index]} has no EMCY; as in: {NAMES[index]} fault 200")
         if self.idle:
             self._now = self._clock()
         self._active.append(_Active(fault, self._now))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
+import struct
 from collections.abc import Callable
 from typing import Final
 
@@ -13,6 +16,8 @@ from drivers.simulated.servo import Servo
 FIRMWARE: Final = (0, 6, 10)
 VELOCITY_CONTROL: Final = 2
 NEVER: Final = float("inf")
+BOOT: Final = 0.25
+"""How long a restarted drive says that it initialises [s]."""
 
 _REQUESTS: Final = (frames.GET_VERSION, frames.GET_ERROR, frames.GET_ENCODER_ESTIMATES)
 
@@ -48,6 +53,7 @@ class SimulatedOdrive:
         self._watchdog = watchdog
         self._friction = friction
         self._fed = self._moved_at = 0.0
+        self._booted = NEVER
         self._heartbeat_due = NEVER
         self._transmit: Callable[[int, bytes], None] = _discard
         self._handlers: dict[int, Callable[[bytes], None]] = {
@@ -77,7 +83,7 @@ class SimulatedOdrive:
         self._moved_at = self._heartbeat_due = now
 
     def receive(self, can_id: int, data: bytes, now: float) -> None:
-        """Take in a data frame at time `now` [s]; an empty one is a request as well."""
+        """Take in a data frame at time `now` [s]; an empty one is a request as well, a wrong length does nothing."""
         node, command = divmod(can_id, 1 << 5)
         if node != self.node or self.silent:
             return
@@ -87,7 +93,8 @@ class SimulatedOdrive:
             if not data:
                 self._answer(command)
         elif command in self._handlers:
-            self._handlers[command](data)
+            with contextlib.suppress(struct.error):
+                self._handlers[command](data)
 
     def receive_remote(self, can_id: int, now: float) -> None:
         """Take in a remote frame at time `now` [s]."""
@@ -98,6 +105,9 @@ class SimulatedOdrive:
         if now > self._moved_at:
             self._move(now - self._moved_at)
             self._moved_at = now
+        if now >= self._booted:
+            self._booted = NEVER
+            self.axis_state, self.errors = AxisState.IDLE, Error(0)
         if self._armed and now >= self._fed + self._watchdog:
             self.fail(Error.WATCHDOG_TIMER_EXPIRED)
         if now >= self._heartbeat_due:
@@ -114,10 +124,11 @@ class SimulatedOdrive:
             self.result = Result.DISARMED
             self.axis_state = AxisState.IDLE
 
-    def restart(self, now: float) -> None:  # noqa: ARG002  one signature for all devices
+    def restart(self, now: float) -> None:
         """Lose power for a moment: it comes back idle, without what it had not saved."""
         self.axis_state, self.modes = AxisState.UNDEFINED, (VELOCITY_CONTROL, frames.PASSTHROUGH)
-        self.errors, self.disarm_reason = Error.INITIALIZING, Error(0)
+        self.errors, self.disarm_reason, self.result = Error.INITIALIZING, Error(0), Result.SUCCESS
+        self._booted = now + BOOT
 
     @property
     def _armed(self) -> bool:
@@ -129,7 +140,7 @@ class SimulatedOdrive:
 
     def _move(self, step: float) -> None:
         if not self._armed:
-            self.servo.brake(self._friction, step)
+            self.servo.roll(self._friction, step)
         elif self.modes == (frames.POSITION_CONTROL, frames.PASSTHROUGH):
             self.servo.chase(*self._input, step)
 
@@ -147,6 +158,8 @@ class SimulatedOdrive:
 
     def _set_state(self, data: bytes) -> None:
         (state,) = frames.AXIS_STATE.unpack(data)
+        if self.axis_state is AxisState.UNDEFINED:
+            return
         if state == AxisState.IDLE:
             self.axis_state = AxisState.IDLE
         elif state == AxisState.CLOSED_LOOP_CONTROL and not self._armed:
@@ -166,10 +179,15 @@ class SimulatedOdrive:
 
     def _set_input(self, data: bytes) -> None:
         position, velocity, _ = frames.INPUT_POS.unpack(data)
-        self._input = position, velocity * frames.VELOCITY_STEP
+        if math.isfinite(position):
+            self._input = position, velocity * frames.VELOCITY_STEP
+        else:
+            self.fail(Error.MISSING_INPUT)
 
-    def _clear(self, _data: bytes) -> None:
-        self.errors = self.disarm_reason = Error(0)
+    def _clear(self, data: bytes) -> None:
+        frames.CLEAR.unpack(data)
+        self.errors &= Error.INITIALIZING
+        self.disarm_reason = Error(0)
 
     def _send(self, command: int, data: bytes) -> None:
         if not self.silent:

@@ -115,8 +115,13 @@ class Servo:
         if self.forced_velocity is not None:
             self.velocity = self.forced_velocity
             self.coast(step)
+            self.setpoint, self._feed_forward = self.position, 0.0
         else:
-            self.position, self.velocity = braked(self.position, self.velocity, deceleration, step)
+            self.roll(deceleration, step)
+
+    def roll(self, deceleration: float, step: float) -> None:
+        """Slow down as `brake` does, but without power: no defect drives it on."""
+        self.position, self.velocity = braked(self.position, self.velocity, deceleration, step)
         self.setpoint, self._feed_forward = self.position, 0.0
 
     def run(self, velocity: float, acceleration: float, step: float) -> None:
