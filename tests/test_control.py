@@ -598,6 +598,21 @@ def test_pause_and_resume_stay_on_the_path(rig: Rig) -> None:
     assert_within_limits(rig)
 
 
+@pytest.mark.parametrize("before", [1, 2, 5])
+def test_a_goal_that_is_paused_too_late_arrives_all_the_same(rig: Rig, before: int) -> None:
+    """There is no room left to stop in: nothing remains to be resumed."""
+    rig.enable()
+    answer = rig.goal("g1", 0.05, 0.0, 0.0)
+    assert isinstance(answer, Accepted)
+    rig.until(lambda: rig.control.progress[1] < (before + 0.5) * PERIOD)
+    rig.command("pause")
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    assert rig.control.commanded.pose == pytest.approx((0.05, 0.0, 0.0), abs=1e-9)
+    assert rig.outcomes() == [("g1", "done")]
+    assert refusal(rig.command("resume")).code == "not_paused"
+    assert isinstance(rig.goal("g2", 0.0, 0.0, 0.0), Accepted)
+
+
 @pytest.mark.parametrize("end", ["stop", "disable"])
 def test_a_paused_goal_can_be_given_up(rig: Rig, end: str) -> None:
     rig.enable()

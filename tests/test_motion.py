@@ -445,6 +445,32 @@ def test_of_two_ways_the_sooner_is_taken(
     assert differing >= 3
 
 
+@pytest.mark.parametrize("later", range(4))
+def test_a_stop_is_kept_though_the_rate_of_the_goal_to_come_is_thought_about(later: int) -> None:
+    """The robot stops for a goal that is then to run at an override; it is told to stop as that is being looked at."""
+    rig = Rig(SLOW)
+    rig.enable()
+    rig.goal("g1", 0.08, 0.02, 0.3)
+    rig.cycles(400)
+    rig.command("override", 0.7)
+    rig.cycles(100)
+    assert accepted(rig.goal("g2", -0.05, 0.05, -0.3)).stops_first
+    rig.command("override", 0.9)
+    course = rig.control._course
+    rig.until(lambda: not course.turning)
+    rig.cycles(later)
+    assert len(course.runs) == 2
+    assert rig.control._pilot._change is not None or later
+    rig.command("stop")
+    rig.until(lambda: rig.mode is Mode.HOLDING, 2000)
+    assert rig.outcomes() == [("g1", "preempted"), ("g2", "stopped")]
+    assert np.linalg.norm(np.array(rig.control.commanded.pose) - (0.08, 0.02, 0.3)) > 0.01
+    rig.cycles(200)
+    assert rig.control.commanded.at_rest
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
 def test_a_renewed_goal_request_is_held_until_the_one_before_is_planned() -> None:
     rig = Rig(SLOW)
     rig.enable()
