@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -30,7 +31,7 @@ INCREMENTAL = changed(incremental(), missed_syncs=3)
 """The same with drives that are to be homed."""
 
 
-class FaultRig(Rig):
+class FaultRig(Rig, ABC):
     """A robot whose faults come and go; how its drives are told depends on what they speak."""
 
     @property
@@ -45,13 +46,13 @@ class FaultRig(Rig):
             drive.power is not PowerState.OPERATION_ENABLED and drive.servo.velocity == 0.0 for drive in self.bus.drives
         )
 
+    @abstractmethod
     def told_to_stop(self) -> set[int]:
         """Nodes that were told in the last cycle to stop at once."""
-        raise NotImplementedError
 
+    @abstractmethod
     def assert_no_jump(self) -> None:
         """No setpoint that was sent is a step."""
-        raise NotImplementedError
 
     def inject(self, line: str) -> None:
         self.bus.faults.add(line)
