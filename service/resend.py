@@ -7,11 +7,12 @@ the logs of both sessions name it; how goals that interrupt each other come out 
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import msgspec
@@ -60,7 +61,7 @@ def resend(recording: Recording, robot: Robot, say: Callable[[str], None]) -> li
     heard = _Heard(robot)
     with heard.listening():
         renamed, goals = _send(recording, robot, say)
-        _await(goals)
+        _await(goals.values())
         time.sleep(HEARD_WITHIN)
     now = heard.records()
     return [
@@ -113,15 +114,23 @@ def _check_start(recording: Recording, robot: Robot) -> None:
 
 
 def _send(recording: Recording, robot: Robot, say: Callable[[str], None]) -> tuple[dict[str, str], dict[str, Goal]]:
-    """Send the requests in their time; return the goals' new names, and those that were taken."""
+    """Send the requests in their time; return the goals' new names, and those that were taken.
+
+    None goes before the goals have ended that had ended before it: a service that misses ticks takes longer for them.
+    """
     cycles, t = recording.records["cycle"], recording.t
     period = float(t[-1] - t[0]) / float(cycles[-1] - cycles[0])
     suffix, begins = uuid.uuid4().hex[:6], time.monotonic()
     renamed: dict[str, str] = {}
     goals: dict[str, Goal] = {}
+    said = [line.event for line in recording.events if line.event is not None and line.event.outcome]
+    ends = {event.id: event.cycle for event in said}
     first = recording.requests[0].cycle if recording.requests else 0
     for what in recording.requests:
-        time.sleep(max(0.0, begins + (what.cycle - first) * period - time.monotonic()))
+        since = (what.cycle - first) * period
+        time.sleep(max(0.0, begins + since - time.monotonic()))
+        _await([goal for name, goal in goals.items() if ends.get(name, math.inf) <= what.cycle])
+        begins = max(begins, time.monotonic() - since)
         given = what.given
         try:
             if isinstance(given, GoalRequest):
@@ -147,9 +156,10 @@ def _content(request: CommandRequest, renamed: dict[str, str]) -> bytes | None:
     return msgspec.json.encode(Stop(renamed.get(request.goal, request.goal))) if request.goal is not None else None
 
 
-def _await(goals: dict[str, Goal]) -> None:
+def _await(goals: Iterable[Goal]) -> None:
+    """Wait for goals to end, but not for ever."""
     deadline = time.monotonic() + END_WITHIN
-    for goal in goals.values():
+    for goal in goals:
         with contextlib.suppress(TimeoutError):
             goal.wait(max(0.0, deadline - time.monotonic()))
 
