@@ -1,0 +1,65 @@
+"""Requests of a recorded session, sent again: in their order, and none before what had ended by then."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+from made import records
+
+from service.client import Goal, Result, Robot
+from service.messages import Event, PoseGoal
+from service.packets import CommandRequest, GoalRequest, Input, Request
+from service.reading import Line, Recording
+from service.resend import _send
+
+
+class Heard:
+    """A robot's client that notes what it is told, and when it is waited for a goal."""
+
+    def __init__(self) -> None:
+        self.log: list[str] = []
+
+    def send(self, make: Any, name: str) -> Goal:
+        self.log.append(f"send {name[:-7]}")
+        return Ending(name, cast("Robot", self))
+
+    def command(self, name: str, content: bytes | None) -> None:
+        assert content is None
+        self.log.append(name)
+
+
+class Ending(Goal):
+    """A goal that ends as soon as it is waited for."""
+
+    def wait(self, timeout: float | None = None) -> Result:
+        cast("Heard", self._robot).log.append(f"end {self.id[:-7]}")
+        return Result(self.id, "done", "")
+
+
+def goal(seq: int, cycle: int, name: str) -> Input:
+    return Input(seq, cycle, 0, GoalRequest(seq, "ann", name, PoseGoal(0.01, 0.0, 0.0), 0))
+
+
+def ended(cycle: int, name: str, outcome: Any) -> Line:
+    event = Event(cycle, cycle * 1e-3, cycle, 0.0, "goal", "info", "", id=name, outcome=outcome)
+    return Line(event.t, np.datetime64(0, "ns"), "INFO", "", event)
+
+
+def test_none_goes_before_the_goals_that_had_ended() -> None:
+    rows = records(0.2)
+    stop: Request = CommandRequest(3, "ann", "stop")
+    recording = Recording(
+        name="demo",
+        records=rows,
+        t=rows["cycle"] * 1e-3,
+        wall=np.zeros(len(rows), "datetime64[ns]"),
+        events=[ended(50, "first", "done"), ended(90, "second", "stopped")],
+        texts={},
+        requests=(goal(1, 10, "first"), goal(2, 60, "second"), Input(3, 70, 0, stop), goal(4, 100, "third")),
+    )
+    robot = Heard()
+    renamed, goals = _send(recording, cast("Robot", robot), lambda _: None)
+    told = [line for n, line in enumerate(robot.log) if line not in robot.log[:n]]
+    assert told == ["send first", "end first", "send second", "stop", "end second", "send third"]
+    assert renamed.keys() == goals.keys() == {"first", "second", "third"}
