@@ -29,7 +29,7 @@ START_WITHIN = 120.0
 """How long the processes may take to come up; the very first start compiles the kinematics [s]."""
 END_WITHIN = 6.0
 """How long they may take to end before they are killed [s]."""
-RESTARTS = 3
+RESTARTS = 5
 """So many restarts of one process within a minute come at once."""
 RETRY = 10.0
 """How long it is waited before any more, for a recorder; the gateway's are the service's end [s]."""
