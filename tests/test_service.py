@@ -32,6 +32,7 @@ from service.client import Robot
 from service.config import SIM, load
 from service.errors import RefusedError, ServiceError
 from service.messages import Event, GoalReply, OwnLimits, State
+from service.modes import MODES, Mode
 from service.reading import read
 from service.remote import RemoteView
 from service.session import open_client
@@ -426,6 +427,10 @@ def test_a_signal_in_motion_is_a_controlled_stop(service: Service, number: int) 
     for node in (1, 2, 3):
         assert controlwords(sent, node)[-1] & 0b10 == 0  # disable voltage
         assert positions(sent, node)[-1] != positions(sent, node)[0]
+    (file,) = (service.folder / "recordings").glob("*.rrd")
+    recording = read(file)  # to the very end: the recorder is given the time for what the loop said last
+    assert MODES[recording.records["mode"][-1]] is Mode.DISABLED
+    assert [line.event.mode for line in recording.events if line.event and line.event.mode][-1] == "disabled"
     assert "Traceback" not in service.log.read_text()
 
 
