@@ -137,6 +137,8 @@ class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):
     """How long the drives may take to power up [s]."""
     max_overruns: Annotated[int, Meta(ge=1)] = 10
     """So many missed ticks in a row are a controlled stop."""
+    gateway_timeout: Annotated[float, Meta(ge=0.2, le=10.0)] = 0.3
+    """So long without a sign of life from the gateway, which gives 20 a second, is a controlled stop [s]."""
 
 
 class Config(Struct, frozen=True, forbid_unknown_fields=True):

@@ -18,8 +18,11 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_a
 
 from service import __version__, session
 from service.config import Config, geometry
+from service.heartbeats import BEAT_EVERY
+from service.lastwords import LastWords
 from service.links import Closed, Link
 from service.messages import MAX_MESSAGE, CommandReply, ErrorReply, Goal, GoalReply, Info, Override, Stop
+from service.modes import Mode
 from service.packets import (
     Accepted,
     Answer,
@@ -76,11 +79,14 @@ class _Waiting(NamedTuple):
 class Gateway:
     """Takes requests from Zenoh, passes them to the loop, and answers and publishes what the loop says."""
 
-    def __init__(self, config: Config, link: Link, opened: zenoh.Session) -> None:
+    def __init__(self, config: Config, link: Link, beat: Callable[[], None], opened: zenoh.Session) -> None:
         self._robot = config.robot.name
+        self._period = config.period
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
         self._home_within = REPLY_WITHIN + sum(homing)
         self._link = link
+        self._beat = beat
+        self._last_words = LastWords()
         self._session = opened
         self._info = _info(config)
         self._states = StateMaker(config)
@@ -125,9 +131,12 @@ class Gateway:
         poll.register(self._wake, select.POLLIN)
         try:
             while not self._ending:
-                poll.poll(1000)
+                self._beat()
+                poll.poll(BEAT_EVERY * 1e3)
                 self._drain()
                 while (packet := self._link.receive()) is not None:
+                    self._beat()
+                    self._last_words.heard()
                     content = memoryview(packet)[1:]
                     if packet[0] == Kind.RECORDS:
                         self._publish(content)
@@ -139,7 +148,7 @@ class Gateway:
                     self._take(answer)
                 self._give_up_late()
         except Closed:
-            return
+            self._tell_of_its_end()
         finally:
             for incoming in [
                 *(waiting.incoming for waiting in self._waiting.values()),
@@ -184,6 +193,7 @@ class Gateway:
         except BlockingIOError:
             return
         while self._incoming:
+            self._beat()
             incoming = self._incoming.popleft()
             kind, *rest = incoming.key.split("/")[2:]
             if "*" in incoming.key:
@@ -223,6 +233,7 @@ class Gateway:
                 return
             self._backlog.popleft()
             self._ahead.add(request.ticket)
+            self._last_words.take(request)
             self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
 
     def _command(self, incoming: Incoming, user: str, name: str) -> None:
@@ -283,6 +294,7 @@ class Gateway:
     # ------------------------------------------------------------------ loop to Zenoh
 
     def _take(self, answer: Answer) -> None:
+        self._last_words.take(answer)
         match answer:
             case Happened(event):
                 self._event.put(msgspec.json.encode(event))
@@ -303,6 +315,14 @@ class Gateway:
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
             self._state.put(msgspec.json.encode(self._states.newest()))
+
+    def _tell_of_its_end(self) -> None:
+        """The loop has gone: where it has died, tell everyone in its place."""
+        for event in self._last_words.events(self._states.cycle, self._period):
+            self._event.put(msgspec.json.encode(event))
+        if (reason := self._last_words.reason) and self._states.cycle:
+            state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason,))
+            self._state.put(msgspec.json.encode(state))
 
     def _answer(self, ticket: int, content: msgspec.Struct) -> None:
         waiting = self._waiting.pop(ticket, None)
@@ -355,10 +375,10 @@ def _info(config: Config) -> Info:
     )
 
 
-def main(config: Config, link: Link, ready: Callable[[object], None]) -> int:
+def main(config: Config, link: Link, beat: Callable[[], None], ready: Callable[[object], None]) -> int:
     """Run the gateway's process; `ready` is called once it can be reached."""
     with session.open_service(config.robot.name, config.zenoh.listen) as opened:
-        gateway = Gateway(config, link, opened)
+        gateway = Gateway(config, link, beat, opened)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
         gateway.serve(lambda: ready({}))
     return 0

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from service.config import SIM
 from service.errors import RefusedError, ServiceError, TrirailError
+from service.interpreter import python
 
 START_WITHIN = 120.0
 """How long it may take to come up; the very first start compiles the kinematics [s]."""
@@ -40,7 +41,7 @@ def service(config: Path, recording: Path) -> Iterator[Process]:
         ready.bind(f"{folder}/ready")
         ready.settimeout(0.1)
         process = subprocess.Popen(
-            [sys.executable, "-m", "service", "run", str(config), "--record", str(recording)],
+            python("-m", "service", "run", str(config), "--record", str(recording)),
             stdout=log,
             stderr=log,
             start_new_session=True,
