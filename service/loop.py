@@ -22,7 +22,7 @@ from service.links import Port
 from service.messages import Event
 from service.modes import MODES, Mode
 from service.modes import Event as ModeEvent
-from service.packets import DrivesFault, Happened, Input, Kind, Mishap, Request, Situation, Welcome, message
+from service.packets import DrivesFault, Input, Kind, Mishap, Request, Situation, Welcome, message
 from service.records import LAYOUT
 
 BATCHES_PER_SECOND = 50
@@ -261,7 +261,7 @@ class Loop:
             self._events += 1
             t = control.cycle * self._period
             event = Event(self._events, t, control.cycle, time.time(), **happening._asdict())
-            packet = message(Happened(event))
+            packet = packets.told(event)
             self._kept.append(packet)
             self._recorder.send(packet)
         desk.happenings.clear()
