@@ -13,6 +13,7 @@ import queue
 import re
 import threading
 import uuid
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import NamedTuple, Self, TypeVar
@@ -21,8 +22,9 @@ import msgspec
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
-from service import session
+from service import boundary, session
 from service.errors import RefusedError, ServiceError, TrirailError
+from service.listener import Listener
 from service.messages import (
     CommandReply,
     ErrorReply,
@@ -40,6 +42,8 @@ from service.messages import (
     VelocityGoal,
 )
 from service.messages import Goal as _Message
+from service.sizes import MAX_NAME
+from service.text import quoted
 
 REPLY_WITHIN = 20.0
 """How long a command may take to be carried out [s]."""
@@ -140,22 +144,25 @@ class Jog:
 
 
 class Robot:
-    """A connection to one robot's service.
+    """A connection to one robot's service; several threads may share it.
 
     Raises ServiceError where there is no service, RefusedError where it says no.
     """
 
     def __init__(self, name: str = "demo", connect: str = session.DEFAULT_LOCATOR, user: str | None = None) -> None:
-        self.name = name
-        self.user = user or _user()
+        self.name = boundary.check_name(name, "robot")
+        self.user = boundary.check_name(user or _user(), "user")
         self._connect = connect
         self._session = session.open_client(connect)
+        # Also at the end of a program that does not close it: Zenoh's threads must not outlive the interpreter.
+        self._close = weakref.finalize(self, self._session.close)
+        self._listener = Listener()
         self._goals: dict[str, Goal] = {}
         self._goals_lock = threading.Lock()
         self._results = declare_advanced_subscriber(
             self._session,
             self._key("event"),
-            self._on_event,
+            self._listener.messages(Event, self._on_event),
             history=HistoryConfig(detect_late_publishers=True),  # of a gateway that was started again
             recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
@@ -170,7 +177,12 @@ class Robot:
 
     def close(self) -> None:
         """End the connection; goals under way go on."""
-        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
+        self._close()
+
+    @property
+    def skipped(self) -> int:
+        """How often something was published on this robot's keys that was none of its messages."""
+        return self._listener.skipped
 
     # ------------------------------------------------------------------ goals and commands
 
@@ -303,44 +315,47 @@ class Robot:
 
     def states(self, timeout: float | None = None) -> Iterator[State]:
         """Yield states as they come, the newest where this is too slow; end after `timeout` seconds without one."""
-        received: queue.Queue[bytes] = queue.Queue(maxsize=1)
+        received: queue.Queue[State] = queue.Queue(maxsize=1)
 
-        def keep_newest(sample: zenoh.Sample) -> None:
+        def keep_newest(state: State) -> None:
             with contextlib.suppress(queue.Empty):
                 received.get_nowait()
-            received.put_nowait(sample.payload.to_bytes())
+            with contextlib.suppress(queue.Full):
+                received.put_nowait(state)
 
-        with self._session.declare_subscriber(self._key("state"), keep_newest):
-            yield from _decoded(received, State, timeout)
+        with self._session.declare_subscriber(self._key("state"), self._listener.messages(State, keep_newest)):
+            yield from _until_silent(received, timeout)
 
     def events(self, history: bool = False, timeout: float | None = None) -> Iterator[Event]:
         """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
-        received: queue.Queue[bytes] = queue.Queue()
+        received: queue.Queue[Event] = queue.Queue()
         with declare_advanced_subscriber(
             self._session,
             self._key("event"),
-            lambda sample: received.put(sample.payload.to_bytes()),
+            self._listener.messages(Event, received.put),
             history=HistoryConfig(detect_late_publishers=True) if history else None,
             recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
         ):
             last = 0, 0.0
-            for event in _decoded(received, Event, timeout):
+            for event in _until_silent(received, timeout):
                 # A gateway that was started again tells the past once more; a service that was, counts from one.
                 if event.seq > last[0] or event.time > last[1]:
                     last = event.seq, event.time
                     yield event
 
     def records(self, take: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
-        """Have every batch of records taken as it comes, until the context ends; service.records.unpack reads them."""
-        return self._session.declare_subscriber(self._key("records"), lambda sample: take(sample.payload.to_bytes()))
+        """Have every batch of records taken as it comes, until the context ends; service.records.unpack reads them.
+
+        `take` is called by the connection's own thread: it must be quick.
+        """
+        return self._session.declare_subscriber(self._key("records"), self._listener.batches(take))
 
     # ------------------------------------------------------------------ inside
 
     def _key(self, *parts: str) -> str:
         return session.key(self.name, *parts)
 
-    def _on_event(self, sample: zenoh.Sample) -> None:
-        event = msgspec.json.decode(sample.payload.to_bytes(), type=Event)
+    def _on_event(self, event: Event) -> None:
         if event.id is None or event.outcome is None:
             return
         with self._goals_lock:
@@ -349,21 +364,34 @@ class Robot:
             goal._end(Result(event.id, event.outcome, event.message))
 
     def _ask(self, key: str, kind: type[T], payload: bytes | None = None, within: float = REPLY_WITHIN) -> T:
-        """Query and decode the one reply. An empty one means that nobody is there, or may not be asked."""
+        """Query and decode the first reply that can be read. None at all means that nobody is there, or may be asked.
+
+        A reply has the quality of service of its query: one that may be dropped would have an answer that may be.
+        """
+        boundary.check_size(len(payload or b""))
+        unreadable: ServiceError | None = None
         for reply in self._session.get(
             key,
             payload=payload,
-            encoding=session.JSON if payload else None,
+            encoding=boundary.JSON if payload else None,
             timeout=within,
-            congestion_control=zenoh.CongestionControl.DROP,
+            consolidation=zenoh.ConsolidationMode.NONE,  # at once, however many more were asked
+            congestion_control=zenoh.CongestionControl.BLOCK,
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         ):
-            if reply.ok is not None:
-                return msgspec.json.decode(reply.ok.payload.to_bytes(), type=kind)
+            try:
+                if reply.ok is not None:
+                    answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
+                    return answer
+            except RefusedError as error:
+                unreadable = ServiceError(f"somebody answered at {self._connect}, but {error}")
             if reply.err is not None:
-                raise _refusal(reply.err.payload.to_bytes())
-        raise ServiceError(self._nobody())
+                refusal = _refusal(reply.err.payload.to_bytes())
+                if isinstance(refusal, RefusedError):
+                    raise refusal
+                unreadable = refusal
+        raise unreadable or ServiceError(self._nobody())
 
     def _nobody(self) -> str:
         return (
@@ -372,20 +400,19 @@ class Robot:
         )
 
 
-def _decoded(received: queue.Queue[bytes], kind: type[T], timeout: float | None) -> Iterator[T]:
+def _until_silent(received: queue.Queue[T], timeout: float | None) -> Iterator[T]:
     while True:
         try:
-            payload = received.get(timeout=timeout)
+            yield received.get(timeout=timeout)
         except queue.Empty:
             return
-        yield msgspec.json.decode(payload, type=kind)
 
 
 def _refusal(payload: bytes) -> RefusedError | ServiceError:
     try:
-        error = msgspec.json.decode(payload, type=ErrorReply)
-    except msgspec.DecodeError:
-        return ServiceError(f"no answer from the service: {payload.decode(errors='replace')}")
+        error: ErrorReply = boundary.decode(payload, ErrorReply, "not an error reply")
+    except RefusedError:
+        return ServiceError(f"no answer from the service: {quoted(payload.decode(errors='replace'))}")
     return RefusedError(error.code, error.message, slider=error.slider, value=error.value, limit=error.limit)
 
 
@@ -394,4 +421,4 @@ def _user() -> str:
         name = getpass.getuser()
     except (KeyError, OSError):
         return "anonymous"
-    return re.sub(r"[^A-Za-z0-9_-]", "-", name) or "anonymous"
+    return re.sub(r"[^A-Za-z0-9_-]", "-", name)[:MAX_NAME] or "anonymous"

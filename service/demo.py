@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from service import spawned
@@ -18,7 +17,7 @@ from service.client import Result, Robot
 from service.config import SIM, load
 from service.errors import RefusedError
 from service.messages import State
-from service.terminal import out, percentiles
+from service.terminal import out, percentiles, plain
 
 GOAL_WITHIN = 15.0
 
@@ -112,7 +111,7 @@ def _tour(robot: Robot) -> Iterator[_Row]:
             colour = "green" if result.outcome == "done" else "red"
             progress.console.print(
                 f"  [{colour}]{result.outcome:9}[/] {leg.name:28} {seconds:5.2f} s"
-                + ("" if result.outcome == "done" else f"  {escape(result.message)}")
+                + ("" if result.outcome == "done" else f"  {plain(result.message)}")
             )
             yield _Row(leg, result, seconds)
 
@@ -128,9 +127,9 @@ def _report(rows: list[_Row], state: State, recording: Path) -> None:
     out.print(f"[bold]lateness[/]         {percentiles(loop.lateness_us)}")
     out.print(f"[bold]cycle time[/]       {percentiles(loop.cycle_us)}")
     for lack in loop.lacking:
-        out.print(f"[bold yellow]without[/]          {escape(lack)}", soft_wrap=True)
-    out.print(f"[bold]recording[/]        {recording}", soft_wrap=True)
-    out.print(f"[bold]look at it[/]       .venv/bin/trirail view {recording}", soft_wrap=True)
+        out.print(f"[bold yellow]without[/]          {plain(lack)}", soft_wrap=True)
+    out.print(f"[bold]recording[/]        {plain(str(recording))}", soft_wrap=True)
+    out.print(f"[bold]look at it[/]       .venv/bin/trirail view {plain(str(recording))}", soft_wrap=True)
 
 
 def _stay() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import select
 import signal
 import time
@@ -16,12 +15,14 @@ import msgspec
 import zenoh
 from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_advanced_publisher
 
-from service import __version__, session
+from service import __version__, boundary, session
 from service.config import Config, geometry
+from service.errors import RefusedError
 from service.heartbeats import BEAT_EVERY
+from service.inbox import Inbox, Incoming
 from service.lastwords import LastWords
 from service.links import Closed, Link
-from service.messages import MAX_MESSAGE, CommandReply, ErrorReply, Goal, GoalReply, Info, Override, Stop
+from service.messages import CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
 from service.modes import Mode
 from service.packets import (
     Accepted,
@@ -33,7 +34,6 @@ from service.packets import (
     Kind,
     Refused,
     RefusedRequest,
-    Request,
     Situation,
     Welcome,
     decode_answer,
@@ -41,17 +41,27 @@ from service.packets import (
 )
 from service.provenance import versions
 from service.records import unpack
+from service.replies import Replies
+from service.sizes import MAX_UNREAD
 from service.state import StateMaker
+from service.text import is_name, quoted
 
 COMMANDS = ("enable", "disable", "stop", "quick_stop", "reset", "home", "pause", "resume", "override")
-UNREAD = 65_536
-"""Messages from Zenoh that may wait to be read; beyond that the oldest get no answer."""
+CONTENT: dict[str, tuple[Any, str]] = {
+    "override": (Override, 'override takes {"percent": 0, or 1 to 200}'),
+    "stop": (Stop | None, 'stop takes nothing, or {"goal": id}'),
+}
+"""What commands may carry; the others carry nothing."""
+STOPPING = ("stop", "disable", "quick_stop")
+AT_ONCE = 256
+"""Messages from Zenoh that are read before the loop is listened to again."""
 BACKLOG = 20_000
 """Goals that may wait for those before them; beyond that they are refused."""
 AHEAD = 2
 """Goals that the loop has at once, so that it has the next one when it is done with the last. The others wait here:
 a command overtakes them, and what waits when the robot is told to stop does not begin any more."""
-STOPPING = ("stop", "disable", "quick_stop")
+UNDER_WAY = 32
+"""Commands that the loop has at once; beyond that they are refused, but for those that stop the robot."""
 EVENTS_KEPT = 1000
 REPLY_WITHIN = 15.0
 """A command that the loop has not carried out by then is answered with an error [s]."""
@@ -60,15 +70,6 @@ _PAST = RepliesConfig(
 )
 REFUSALS_PER_SECOND = 10
 """Unreadable goals that are told to everyone; the others only get their error reply."""
-
-
-class Incoming(NamedTuple):
-    """A query or a put, as Zenoh handed it over."""
-
-    key: str
-    payload: bytes
-    encoding: str
-    query: zenoh.Query | None
 
 
 class _Waiting(NamedTuple):
@@ -92,11 +93,12 @@ class Gateway:
         self._states = StateMaker(config)
         self._state_every = 1.0 / config.telemetry.state_hz
         self._state_due = 0.0
-        self._goals = msgspec.json.Decoder(Goal), msgspec.msgpack.Decoder(Goal)
-        self._incoming: deque[Incoming] = deque(maxlen=UNREAD)
+        self._replies = Replies(self._robot)
+        self._inbox = Inbox(opened, self._robot, self._too_much)
         self._backlog: deque[tuple[Incoming, GoalRequest]] = deque()
+        self._backlog_bytes = 0
         self._ahead: set[int] = set()
-        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._commands: set[int] = set()
         self._waiting: dict[int, _Waiting] = {}
         self._tickets = 0
         self._refusals = 0
@@ -104,20 +106,20 @@ class Gateway:
         self._ending = False
         self._state = opened.declare_publisher(
             self._key("state"),
-            encoding=session.JSON,
+            encoding=boundary.JSON,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.DATA_HIGH,
         )
         self._records = opened.declare_publisher(
             self._key("records"),
-            encoding=session.BINARY,
+            encoding=boundary.BINARY,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.DATA_LOW,
         )
         self._event = declare_advanced_publisher(
             opened,
             self._key("event"),
-            encoding=session.JSON,
+            encoding=boundary.JSON,
             # The past goes out in one burst, whole, in a queue of its own: who is slow to take it delays nothing else.
             cache=CacheConfig(max_samples=EVENTS_KEPT, replies_config=_PAST),
             sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
@@ -128,24 +130,18 @@ class Gateway:
         """Serve until told to end or the loop has gone; `ready` is called once the loop has said welcome."""
         poll = select.poll()
         poll.register(self._link.fileno(), select.POLLIN)
-        poll.register(self._wake, select.POLLIN)
+        poll.register(self._inbox.fileno(), select.POLLIN)
         try:
             while not self._ending:
                 self._beat()
                 poll.poll(BEAT_EVERY * 1e3)
-                self._drain()
+                for incoming in self._inbox.take(AT_ONCE):
+                    self._beat()
+                    self._handle(incoming)
                 while (packet := self._link.receive()) is not None:
                     self._beat()
                     self._last_words.heard()
-                    content = memoryview(packet)[1:]
-                    if packet[0] == Kind.RECORDS:
-                        self._publish(content)
-                        continue
-                    answer = decode_answer(content)
-                    if isinstance(answer, Welcome):
-                        self._declare()
-                        ready()
-                    self._take(answer)
+                    self._hear(packet, ready)
                 self._give_up_late()
         except Closed:
             self._tell_of_its_end()
@@ -154,75 +150,43 @@ class Gateway:
                 *(waiting.incoming for waiting in self._waiting.values()),
                 *(goal[0] for goal in self._backlog),
             ]:
-                self._reply(incoming, ErrorReply("ended", "the service has ended"))
+                self._replies.send(incoming, ErrorReply("ended", "the service has ended"))
+            self._replies.close()
 
     def end(self) -> None:
         """End soon; safe from a signal handler."""
         self._ending = True
-        os.eventfd_write(self._wake, 1)
+        self._inbox.wake()
 
     # ------------------------------------------------------------------ Zenoh to loop
 
-    def _declare(self) -> None:
-        # Called as messages arrive, by one thread: else a stop could overtake the goals that were put before it.
-        on_query = zenoh.handlers.Callback(self._on_query, indirect=False)
-        on_sample = zenoh.handlers.Callback(self._on_sample, indirect=False)
-        declare = self._session.declare_queryable
-        self._declared = [
-            declare(self._key("goal", "*"), on_query),
-            declare(self._key("cmd", "*", "*"), on_query),
-            declare(self._key("info"), on_query),
-            self._session.declare_subscriber(self._key("goal", "*"), on_sample),
-            self._session.liveliness().declare_token(self._key("alive")),
-        ]
-
-    def _on_query(self, query: zenoh.Query) -> None:
-        payload = query.payload.to_bytes() if query.payload is not None else b""
-        encoding = str(query.encoding) if query.encoding is not None else ""
-        self._incoming.append(Incoming(str(query.key_expr), payload, encoding, query))
-        os.eventfd_write(self._wake, 1)
-
-    def _on_sample(self, sample: zenoh.Sample) -> None:
-        incoming = Incoming(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), None)
-        self._incoming.append(incoming)
-        os.eventfd_write(self._wake, 1)
-
-    def _drain(self) -> None:
+    def _handle(self, incoming: Incoming) -> None:
+        """Take a message; whatever is wrong with it is answered, and told to everyone, since a put has no answer."""
         try:
-            os.eventfd_read(self._wake)
-        except BlockingIOError:
-            return
-        while self._incoming:
-            self._beat()
-            incoming = self._incoming.popleft()
-            kind, *rest = incoming.key.split("/")[2:]
-            if "*" in incoming.key:
-                self._refuse(incoming, "", ErrorReply("wildcard", f"{incoming.key}: name one robot and one user"))
-            elif kind == "info":
-                self._reply(incoming, self._info)
-            elif kind == "goal":
-                self._goal(incoming, *rest)
+            boundary.check_size(incoming.size)
+            if incoming.kind == "info":
+                self._replies.send(incoming, self._info)
+            elif incoming.kind == "goal":
+                self._goal(incoming)
             else:
-                self._command(incoming, *rest)
+                self._command(incoming)
+        except RefusedError as refusal:
+            self._refuse(incoming, refusal)
+        except Closed:
+            raise
+        except Exception as error:  # noqa: BLE001 - a message that is read wrongly must not end the gateway
+            self._refuse(incoming, RefusedError("internal", f"internal error, please report it: {error!r}"))
 
-    def _goal(self, incoming: Incoming, user: str) -> None:
-        if len(incoming.payload) > MAX_MESSAGE:
-            problem = f"the goal has {len(incoming.payload)} bytes: at most {MAX_MESSAGE} are taken"
-            self._refuse(incoming, user, ErrorReply("too_large", problem))
-            return
-        packed = incoming.encoding.startswith(session.MSGPACK)
-        try:
-            goal = self._goals[packed].decode(incoming.payload)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            self._refuse(incoming, user, ErrorReply("malformed", f"not a goal: {_plain(error)}"))
-            return
-        if len(self._backlog) >= BACKLOG:
-            self._refuse(incoming, user, ErrorReply("busy", f"{BACKLOG} goals are waiting already: send fewer"))
-            return
-        goal_id = goal.id or uuid.uuid4().hex[:12]
+    def _goal(self, incoming: Incoming) -> None:
+        (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
+        goal: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
+        if len(self._backlog) >= BACKLOG or self._backlog_bytes + incoming.size > MAX_UNREAD:
+            raise RefusedError("busy", f"{len(self._backlog)} goals are waiting already: send fewer")
         self._tickets += 1
+        goal_id = goal.id or uuid.uuid4().hex[:12]
         request = GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns())
-        self._backlog.append((incoming, request))
+        self._backlog.append((incoming._replace(payload=b""), request))
+        self._backlog_bytes += incoming.size
         self._send_goals()
 
     def _send_goals(self) -> None:
@@ -232,66 +196,82 @@ class Gateway:
             if not self._link.send(message(request)):
                 return
             self._backlog.popleft()
+            self._backlog_bytes -= incoming.size
             self._ahead.add(request.ticket)
             self._last_words.take(request)
             self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
 
-    def _command(self, incoming: Incoming, user: str, name: str) -> None:
+    def _command(self, incoming: Incoming) -> None:
+        user, name = boundary.names(incoming.key, self._key("cmd"), ("user", "command"))
         if name not in COMMANDS:
-            problem = f"{name}: no such command; there are {', '.join(COMMANDS)}"
-            self._refuse(incoming, user, ErrorReply("unknown_command", problem))
-        elif name == "override":
-            try:
-                share = msgspec.json.decode(incoming.payload, type=Override).percent / 100.0
-            except (msgspec.DecodeError, UnicodeDecodeError) as error:
-                problem = f'override takes {{"percent": 0 to 200}}: {_plain(error)}'
-                self._refuse(incoming, user, ErrorReply("malformed", problem))
-                return
-            self._forward(incoming, lambda ticket: CommandRequest(ticket, user, name, share))
-        elif incoming.payload in (b"", b"{}", b"null"):
-            self._forward(incoming, lambda ticket: CommandRequest(ticket, user, name))
-            if name in STOPPING:
-                replace, reason = msgspec.structs.replace, f"{name} by {user}"
-                self._backlog = deque((waiting, replace(goal, withdrawn=reason)) for waiting, goal in self._backlog)
-        elif name == "stop":
-            try:
-                goal = msgspec.json.decode(incoming.payload, type=Stop).goal
-            except (msgspec.DecodeError, UnicodeDecodeError) as error:
-                self._refuse(incoming, user, ErrorReply("malformed", f'stop takes {{"goal": id}}: {_plain(error)}'))
-                return
-            if not self._withdraw(incoming, goal, f"{name} by {user}"):
-                self._forward(incoming, lambda ticket: CommandRequest(ticket, user, name, goal=goal))
-        else:
-            self._refuse(incoming, user, ErrorReply("malformed", f"{name} takes no content"))
+            raise RefusedError("unknown_command", f"{quoted(name)}: no such command; there are {', '.join(COMMANDS)}")
+        kind, takes = CONTENT.get(name, (NoContent | None, f"{name} takes no content"))
+        content = boundary.decode(incoming.payload, kind, takes, incoming.encoding)
+        share = content.percent / 100.0 if isinstance(content, Override) else None
+        goal = content.goal if isinstance(content, Stop) else None
+        reason = f"{name} by {user}"
+        if goal is not None and self._withdraw(incoming, goal, reason):
+            return
+        if len(self._commands) >= UNDER_WAY and name not in STOPPING:
+            raise RefusedError("busy", f"{len(self._commands)} commands are under way already: send fewer")
+        self._tickets += 1
+        if not self._link.send(message(CommandRequest(self._tickets, user, name, share, goal))):
+            raise RefusedError("busy", "too many requests at once: send it again")
+        self._commands.add(self._tickets)
+        within = self._home_within if name == "home" else REPLY_WITHIN
+        self._waiting[self._tickets] = _Waiting(incoming, time.monotonic() + within)
+        if name in STOPPING and goal is None:
+            replace = msgspec.structs.replace
+            self._backlog = deque((waiting, replace(request, withdrawn=reason)) for waiting, request in self._backlog)
 
     def _withdraw(self, incoming: Incoming, goal_id: str, reason: str) -> bool:
         """Stop a goal that waits here, before the loop has it; whether there is one."""
         for number, (waiting, request) in enumerate(self._backlog):
             if request.id == goal_id:
                 self._backlog[number] = waiting, msgspec.structs.replace(request, withdrawn=reason)
-                self._reply(incoming, CommandReply("stop", self._states.newest().mode))
+                self._replies.send(incoming, CommandReply("stop", self._states.newest().mode))
                 return True
         return False
 
-    def _forward(self, incoming: Incoming, make: Callable[[int], Request]) -> None:
-        self._tickets += 1
-        if self._link.send(message(make(self._tickets))):
-            within = self._home_within if incoming.key.endswith("/home") else REPLY_WITHIN
-            self._waiting[self._tickets] = _Waiting(incoming, time.monotonic() + within)
-        else:
-            self._reply(incoming, ErrorReply("busy", "too many requests at once: send it again"))
+    def _too_much(self, incoming: Incoming) -> None:
+        """Answer what there is no room for; called by Zenoh's threads."""
+        self._replies.send(incoming, ErrorReply("busy", "too many messages at once: send fewer"))
 
-    def _refuse(self, incoming: Incoming, user: str, error: ErrorReply) -> None:
-        """Answer what cannot be read; tell everyone too, since a put has no answer."""
-        self._reply(incoming, error)
+    def _refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
+        """Answer what cannot be taken; tell everyone too, since a put has no answer."""
+        text = quoted(str(refusal))
+        self._replies.send(incoming, ErrorReply(refusal.code, text))
+        user, *_ = [*incoming.key.split("/")[3:], ""]
+        self._tell(text, user if is_name(user) else "")
+
+    def _tell(self, text: str, user: str = "") -> None:
+        """Have the loop tell everyone, but not too often."""
         now = time.monotonic()
         if now - self._refusals_since >= 1.0:
             self._refusals, self._refusals_since = 0, now
         self._refusals += 1
         if self._refusals <= REFUSALS_PER_SECOND:
-            self._link.send(message(RefusedRequest(user[:64], error.message[:512])))
+            self._link.send(message(RefusedRequest(user, text)))
 
     # ------------------------------------------------------------------ loop to Zenoh
+
+    def _hear(self, packet: bytes, ready: Callable[[], None]) -> None:
+        """Take a packet of the loop's."""
+        content = memoryview(packet)[1:]
+        try:
+            if packet[0] == Kind.RECORDS:
+                self._publish(content)
+                return
+            answer = decode_answer(content)
+            self._take(answer)
+        except Closed:
+            raise
+        except Exception as error:  # noqa: BLE001 - it would come again after every restart
+            self._tell(quoted(f"the gateway could not read what the loop said, please report it: {error!r}"))
+            return
+        if isinstance(answer, Welcome):
+            self._inbox.declare()
+            ready()
 
     def _take(self, answer: Answer) -> None:
         self._last_words.take(answer)
@@ -326,8 +306,9 @@ class Gateway:
 
     def _answer(self, ticket: int, content: msgspec.Struct) -> None:
         waiting = self._waiting.pop(ticket, None)
+        self._commands.discard(ticket)
         if waiting is not None:
-            self._reply(waiting.incoming, content)
+            self._replies.send(waiting.incoming, content)
         if ticket in self._ahead:
             self._ahead.discard(ticket)
             self._send_goals()
@@ -337,24 +318,8 @@ class Gateway:
         for ticket in [ticket for ticket, waiting in self._waiting.items() if waiting.deadline < now]:
             self._answer(ticket, ErrorReply("timeout", "not carried out in time"))
 
-    def _reply(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        query = incoming.query
-        if query is None:
-            return
-        encoding = session.MSGPACK if incoming.encoding.startswith(session.MSGPACK) else session.JSON
-        payload = session.encode(content, encoding)
-        with query:  # dropped afterwards: else the caller waits for more until its time-out
-            if isinstance(content, ErrorReply):
-                query.reply_err(payload, encoding=encoding)
-            else:
-                query.reply(incoming.key, payload, encoding=encoding)
-
     def _key(self, *parts: str) -> str:
         return session.key(self._robot, *parts)
-
-
-def _plain(error: Exception) -> str:
-    return str(error).replace("`", "").replace(" - at $.", ": ").replace(" - at $", "")
 
 
 def _info(config: Config) -> Info:
@@ -377,7 +342,7 @@ def _info(config: Config) -> Info:
 
 def main(config: Config, link: Link, beat: Callable[[], None], ready: Callable[[object], None]) -> int:
     """Run the gateway's process; `ready` is called once it can be reached."""
-    with session.open_service(config.robot.name, config.zenoh.listen) as opened:
+    with session.open_service(config.zenoh.listen) as opened:
         gateway = Gateway(config, link, beat, opened)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
         gateway.serve(lambda: ready({}))

@@ -9,13 +9,18 @@ import contextlib
 import socket
 from pathlib import Path
 
-MAX_PACKET = 65_536
+from service.sizes import MAX_PACKET
+
 _BUFFER = 1 << 22
 """Bytes the kernel may hold for a peer that is slow: seconds of records, where the rights allow it."""
 
 
 class Closed(Exception):
     """The other side has gone."""
+
+
+class TooLarge(Exception):
+    """A packet that the other side would get cut."""
 
 
 class Link:
@@ -35,8 +40,10 @@ class Link:
     def send(self, packet: bytes | bytearray | memoryview) -> bool:
         """Send a packet; False where the peer is so far behind that the kernel takes no more.
 
-        Raises Closed when the peer has gone.
+        Raises Closed when the peer has gone, TooLarge for what it would get cut.
         """
+        if len(packet) > MAX_PACKET:
+            raise TooLarge(f"a packet of {len(packet)} bytes: at most {MAX_PACKET} go between the processes")
         try:
             self._socket.send(packet)
         except BlockingIOError:
@@ -90,7 +97,7 @@ class Port:
         self._link: Link | None = None
         self._lost = False
         self.dropped = 0
-        """Packets that the peer was too slow for."""
+        """Packets that the peer was too slow for, or that are too large."""
 
     @property
     def connected(self) -> bool:
@@ -109,11 +116,13 @@ class Port:
         return True
 
     def send(self, packet: bytes | bytearray | memoryview) -> bool:
-        """Send if there is a peer that keeps up; what it is too slow for is dropped and counted."""
+        """Send if there is a peer that keeps up; what it is too slow for, or is too large, is dropped and counted."""
         if self._link is None:
             return False
         try:
             sent = self._link.send(packet)
+        except TooLarge:
+            sent = False
         except Closed:
             self._drop_link()
             return False

@@ -26,7 +26,6 @@ from service.modes import Event as ModeEvent
 from service.packets import (
     DrivesFault,
     Farewell,
-    Happened,
     Input,
     Kind,
     Mishap,
@@ -36,6 +35,7 @@ from service.packets import (
     decode_remark,
     decode_request,
     message,
+    told,
 )
 from service.records import LAYOUT
 
@@ -310,7 +310,7 @@ class Loop:
             self._events += 1
             t = control.cycle * self._period
             event = Event(self._events, t, control.cycle, time.time(), **happening._asdict())
-            packet = message(Happened(event))
+            packet = told(event)
             self._kept.append(packet)
             self._recorder.send(packet)
         desk.happenings.clear()

@@ -9,102 +9,117 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-MAX_MESSAGE = 49_152
-"""A goal or command longer than this is refused before it is decoded [bytes]."""
+from service.sizes import MAX_NAME, MAX_POINTS
+from service.text import ID_RULE, is_id, quoted
 
-Identifier = Annotated[str, Meta(min_length=1, max_length=64)]
+SHORTEST_PIECE = 1e-4
+"""Least time between two points of a trajectory [s]: below, its derivatives lose their digits."""
+LOWEST_OVERRIDE = 1.0
+"""Least share of full speed at which motions run, but for 0, at which they stand [%]."""
+
+Identifier = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
 Level = Literal["info", "warning", "error"]
 Outcome = Literal["done", "rejected", "preempted", "stopped", "expired", "faulted"]
 Triple = tuple[float, float, float]
-Positive = Annotated[float, Meta(gt=0.0)]
-PositiveTriple = tuple[Positive, Positive, Positive]
+# Floors and ceilings: far beyond what a robot does, far from where numbers lose their digits.
+Coordinate = Annotated[float, Meta(ge=-1e3, le=1e3)]
+"""x, y or a slider's position [m], phi [rad], or their velocities."""
+Acceleration = Annotated[float, Meta(ge=-1e6, le=1e6)]
+OwnLimit = Annotated[float, Meta(ge=1e-4, le=1e6)]
+Coordinates = tuple[Coordinate, Coordinate, Coordinate]
+Speed = Annotated[float, Meta(ge=1e-3, le=1.0)]
+Validity = Annotated[float, Meta(ge=1e-3, le=86_400.0)]
+Moment = Annotated[float, Meta(ge=-86_400.0, le=86_400.0)]
+OwnTriple = tuple[OwnLimit, OwnLimit, OwnLimit]
 
 
 class OwnLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """A goal's own limits for x, y [m] and phi [rad], in place of the platform's; none may be above them."""
 
-    velocity: PositiveTriple | None = None
-    acceleration: PositiveTriple | None = None
-    jerk: PositiveTriple | None = None
+    velocity: OwnTriple | None = None
+    acceleration: OwnTriple | None = None
+    jerk: OwnTriple | None = None
 
     def __post_init__(self) -> None:
-        _check_finite(self)
+        _check(self)
 
 
 class PoseGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="pose"):
     """Move the platform to a pose, straight in pose space where the start allows."""
 
-    x: float
-    y: float
-    phi: float
+    x: Coordinate
+    y: Coordinate
+    phi: Coordinate
     id: Identifier | None = None
-    speed: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
+    speed: Speed = 1.0
     """Fraction of full speed: 0.5 takes twice as long over the same path."""
-    valid_for: Annotated[float, Meta(gt=0.0)] | None = None
+    valid_for: Validity | None = None
     """The goal expires unless it starts within so many seconds."""
     limits: OwnLimits | None = None
-    blend: Annotated[float, Meta(ge=0.0)] | None = None
+    blend: Annotated[float, Meta(ge=0.0, le=1e3)] | None = None
     """The next pose goal waits for this one, and begins when no point of the platform is farther than that from where
     it is to be [m]; without it, the next goal preempts this one."""
 
     def __post_init__(self) -> None:
-        _check_finite(self)
+        _check(self)
 
 
 class SlidersGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="sliders"):
     """Move the sliders to positions, straight in slider space where the start allows."""
 
-    position: Triple
+    position: Coordinates
     id: Identifier | None = None
-    speed: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
-    valid_for: Annotated[float, Meta(gt=0.0)] | None = None
+    speed: Speed = 1.0
+    valid_for: Validity | None = None
 
     def __post_init__(self) -> None:
-        _check_finite(self)
+        _check(self)
 
 
 class VelocityGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="velocity"):
     """Jog: move at a velocity [m/s, rad/s] until `timeout` passes without a fresh one of the same id."""
 
-    x: float
-    y: float
-    phi: float
+    x: Coordinate
+    y: Coordinate
+    phi: Coordinate
     id: Identifier | None = None
-    timeout: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
-    valid_for: Annotated[float, Meta(gt=0.0)] | None = None
+    timeout: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.1
+    valid_for: Validity | None = None
 
     def __post_init__(self) -> None:
-        _check_finite(self)
+        _check(self)
 
 
 class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
     """Where the platform is at a time [s]: x, y [m], phi [rad]; how fast and how accelerated, where given."""
 
-    t: float
-    x: float
-    y: float
-    phi: float
-    velocity: Triple | None = None
-    acceleration: Triple | None = None
+    t: Moment
+    x: Coordinate
+    y: Coordinate
+    phi: Coordinate
+    velocity: Coordinates | None = None
+    acceleration: tuple[Acceleration, Acceleration, Acceleration] | None = None
 
     def __post_init__(self) -> None:
-        _check_finite(self)
+        _check(self)
 
 
 class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="trajectory"):
     """Follow timed points, quintic between them, from where the robot stands."""
 
-    points: Annotated[tuple[TrajectoryPoint, ...], Meta(min_length=2, max_length=400)]
+    points: Annotated[tuple[TrajectoryPoint, ...], Meta(min_length=2, max_length=MAX_POINTS)]
     id: Identifier | None = None
     stretch: bool = False
     """Slow a trajectory that is too fast for a slider, instead of refusing it."""
-    valid_for: Annotated[float, Meta(gt=0.0)] | None = None
+    valid_for: Validity | None = None
 
     def __post_init__(self) -> None:
-        _check_finite(self)
+        _check(self)
         for before, after in itertools.pairwise(self.points):
-            if not before.t < after.t:
-                raise ValueError(f"points: t = {after.t} follows t = {before.t}: times must rise")
+            if not after.t - before.t > 0.999 * SHORTEST_PIECE:  # not a matter of the last digit
+                raise ValueError(
+                    f"points: t = {after.t} follows t = {before.t}: times must rise, by {SHORTEST_PIECE:g} s at least"
+                )
 
 
 Goal = PoseGoal | SlidersGoal | VelocityGoal | TrajectoryGoal
@@ -115,17 +130,28 @@ class Override(Struct, frozen=True, forbid_unknown_fields=True):
 
     percent: Annotated[float, Meta(ge=0.0, le=200.0)]
 
+    def __post_init__(self) -> None:
+        _check(self)
+        if 0.0 < self.percent < LOWEST_OVERRIDE:
+            raise ValueError(f"percent is {self.percent}: 0, or {LOWEST_OVERRIDE:g} to 200 are taken")
+
 
 class Stop(Struct, frozen=True, forbid_unknown_fields=True):
     """The content, if any, of the command stop: which goal is to be stopped, wherever it is, and no other."""
 
-    goal: Identifier
+    goal: Identifier | None = None
 
 
-def _check_finite(message: Struct) -> None:
-    """Refuse numbers that are not finite: msgpack can carry them."""
+class NoContent(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content of the other commands."""
+
+
+def _check(message: Struct) -> None:
+    """Refuse ids that cannot be shown, and numbers that are not finite, also in messages that were never decoded."""
     for name in message.__struct_fields__:
         value = getattr(message, name)
+        if name == "id" and value is not None and not is_id(value):
+            raise ValueError(f"id {quoted(value)!r} cannot be shown: {ID_RULE} are taken")
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, float) and not math.isfinite(number):
                 raise ValueError(f"{name} is {number}: it must be a finite number")

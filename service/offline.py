@@ -189,7 +189,8 @@ def workspace(
     terminal.say("")
     _print_slices([(angle, area(inside), area(whole)) for angle, inside, whole in slices])
     if plot:
-        terminal.say(f"\ndrawn to {plot}")
+        terminal.say("")
+        terminal.say(f"drawn to {plot}")
     return 0
 
 

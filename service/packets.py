@@ -5,10 +5,11 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Annotated
 
-from msgspec import Meta, Struct, msgpack
+from msgspec import Meta, Struct, msgpack, structs
 
 from drivers.interface import Counts
 from service.messages import Event, Goal, Level, Triple
+from service.sizes import MAX_PACKET
 
 
 class Kind(IntEnum):
@@ -160,3 +161,13 @@ decode_remark = msgpack.Decoder(Remark).decode
 def message(content: Request | Answer | Remark) -> bytes:
     """Pack a message."""
     return bytes((Kind.MESSAGE,)) + encode(content)
+
+
+def told(event: Event) -> bytes:
+    """Pack an event so that it fits: it is kept, and a gateway that could not read it would meet it again."""
+    packet = message(Happened(event))
+    if len(packet) <= MAX_PACKET:
+        return packet
+    words = f"{event.message[:1000]}… ({len(event.message)} characters)"
+    name, user = (text and text[:100] for text in (event.id, event.user))
+    return message(Happened(structs.replace(event, message=words, id=name, user=user)))

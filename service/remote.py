@@ -7,12 +7,11 @@ import threading
 import time
 from types import TracebackType
 
-import msgspec
-import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from service import session
 from service.errors import ServiceError
+from service.listener import Listener
 from service.messages import Event, Info, State
 from service.records import unpack
 from service.show import LIVE_HZ, Shortfall, Show
@@ -31,11 +30,12 @@ class RemoteView:
     """
 
     def __init__(self, info: Info, connect: str) -> None:
-        self._queue: queue.SimpleQueue[tuple[str, bytes] | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Event | State | bytes | None] = queue.SimpleQueue()
         self._lost = 0
         self._cycle: int | None = None
         self._bus_load: float | None = None
         self._session = session.open_client(connect)
+        self._listener = Listener()
         try:
             self._subscribe(info.robot)
             first = self._first(info)
@@ -67,17 +67,14 @@ class RemoteView:
         self._relay.close()
 
     def _subscribe(self, robot: str) -> None:
-        def to_queue(kind: str, sample: zenoh.Sample) -> None:
-            self._queue.put((kind, sample.payload.to_bytes()))
-
-        declare = self._session.declare_subscriber
+        heard, declare = self._listener, self._session.declare_subscriber
         self._declared = [
-            declare(session.key(robot, "records"), lambda sample: to_queue("records", sample)),
-            declare(session.key(robot, "state"), lambda sample: to_queue("state", sample)),
+            declare(session.key(robot, "records"), heard.batches(self._queue.put)),
+            declare(session.key(robot, "state"), heard.messages(State, self._queue.put)),
             declare_advanced_subscriber(
                 self._session,
                 session.key(robot, "event"),
-                lambda sample: to_queue("event", sample),
+                heard.messages(Event, self._queue.put),
                 history=HistoryConfig(detect_late_publishers=True),
                 recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
             ),
@@ -86,16 +83,16 @@ class RemoteView:
     def _first(self, info: Info) -> bytes:
         """Return the first records; what came before them comes again afterwards."""
         deadline = time.monotonic() + FIRST_WITHIN
-        before: list[tuple[str, bytes] | None] = []
+        before: list[Event | State | None] = []
         while (left := deadline - time.monotonic()) > 0.0:
             try:
                 item = self._queue.get(timeout=left)
             except queue.Empty:
                 break
-            if item is not None and item[0] == "records":
+            if isinstance(item, bytes):
                 for earlier in before:
                     self._queue.put(earlier)
-                return item[1]
+                return item
             before.append(item)
         raise ServiceError(
             f"robot {info.robot!r} answers, but no records come from it within {FIRST_WITHIN:g} s: "
@@ -104,13 +101,12 @@ class RemoteView:
 
     def _run(self) -> None:
         while (item := self._queue.get()) is not None:
-            kind, payload = item
-            if kind == "records":
-                self._records(payload)
-            elif kind == "event":
-                self._show.event(msgspec.json.decode(payload, type=Event))
+            if isinstance(item, bytes):
+                self._records(item)
+            elif isinstance(item, Event):
+                self._show.event(item)
             else:
-                self._state(msgspec.json.decode(payload, type=State))
+                self._state(item)
 
     def _records(self, batch: bytes) -> None:
         cycles = unpack(batch)["cycle"]

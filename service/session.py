@@ -6,20 +6,21 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-import msgspec
 import zenoh
 
 from service.errors import ServiceError
+from service.sizes import MAX_TRANSPORT
 
 DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
-JSON, MSGPACK, BINARY = "application/json", "application/msgpack", "application/octet-stream"
-TRANSPORT_LIMIT = 1 << 16
-"""A goal or command larger than this is thrown away by the transport, before anything is answered [bytes]."""
+GIVEN_UP_AFTER = 2.0
+"""Whoever takes nothing that must not be dropped, an answer or past events, is disconnected after so long [s]."""
 
-_NO_DISCOVERY = {
+_ALWAYS = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "scouting/gossip/autoconnect": {"router": [], "peer": [], "client": []},
+    "transport/shared_memory/enabled": False,  # the memory of strangers; and the size below is for what is sent
+    "transport/link/rx/max_message_size": MAX_TRANSPORT,
 }
 
 
@@ -28,9 +29,8 @@ def key(robot: str, *parts: str) -> str:
     return "/".join(("trirail", robot, *parts))
 
 
-def open_service(robot: str, listen: Sequence[str]) -> zenoh.Session:
+def open_service(listen: Sequence[str]) -> zenoh.Session:
     """Open the service's session: a peer that listens on the given locators and nowhere else."""
-    limited = [key(robot, "goal", "**"), key(robot, "cmd", "**")]
     return _open(
         {
             "mode": "peer",
@@ -38,16 +38,9 @@ def open_service(robot: str, listen: Sequence[str]) -> zenoh.Session:
             "connect/endpoints": [],
             "timestamping/enabled": True,  # advanced publishers order their history by it
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+            "transport/link/tx/queue/congestion_control/block/wait_before_close": round(GIVEN_UP_AFTER * 1e6),
             "transport/link/tx/queue/size/data_high": 16,
-            "low_pass_filter": [
-                {
-                    "id": "requests",
-                    "flows": ["ingress"],
-                    "messages": ["put", "query"],
-                    "key_exprs": limited,
-                    "size_limit": TRANSPORT_LIMIT,
-                }
-            ],
+            "transport/link/tx/queue/size/real_time": 16,  # answers come in bursts
         },
         f"cannot listen on {', '.join(listen)}",
         "another service may hold it: end that, or set zenoh.listen to another address",
@@ -73,14 +66,9 @@ def open_client(locator: str) -> zenoh.Session:
 def _open(settings: dict[str, Any], failure: str, remedy: str) -> zenoh.Session:
     zenoh.init_log_from_env_or("off")  # what zenoh would print is in the error below
     config = zenoh.Config()
-    for name, value in (_NO_DISCOVERY | settings).items():
+    for name, value in (_ALWAYS | settings).items():
         config.insert_json5(name, json.dumps(value))
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise ServiceError(f"{failure}; {remedy}") from error
-
-
-def encode(content: msgspec.Struct, encoding: str = JSON) -> bytes:
-    """Encode a message as the encoding says."""
-    return msgspec.msgpack.encode(content) if encoding.startswith(MSGPACK) else msgspec.json.encode(content)

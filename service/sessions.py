@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
-from rich.markup import escape
 from rich.text import Text
 
 from service import terminal
@@ -94,7 +93,8 @@ def report(*file: Path, plot: Path | None = None, json: Annotated[bool, Flag] = 
         return 0
     _print_summary(summed)
     if plot:
-        terminal.say(f"\ndrawn to {plot}")
+        terminal.say("")
+        terminal.say(f"drawn to {plot}")
     return 0
 
 
@@ -110,7 +110,7 @@ def _resend(recording: Recording, name: str, locator: str, json: bool) -> int:
     lines = _Lines()
     for motion in motions:
         longer = f", one is {motion.lacking} cycles longer" if motion.lacking else ""
-        lines.add(escape(motion.id), f"{motion.outcome}, {motion.cycles} cycles compared{longer}")
+        lines.add(terminal.plain(motion.id), f"{motion.outcome}, {motion.cycles} cycles compared{longer}")
         lines.add("  differ at most", _each(motion.position, 1e6, "µm"))
     lines.show()
     return 0
@@ -140,11 +140,11 @@ def _print_comparison(
 ) -> None:
     drives = f"simulated drives, {config}" if config else "the drives' recorded answers"
     lines = _Lines()
-    lines.add("session", escape(recording.name))
+    lines.add("session", terminal.plain(recording.name))
     lines.add("replayed", f"{compared.cycles} cycles, {compared.requests} requests, on {drives}")
-    lines.add("recorded by", escape(str(by)) if by else "[yellow]unknown software[/]")
+    lines.add("recorded by", terminal.plain(str(by)) if by else "[yellow]unknown software[/]")
     if by != here:
-        lines.add("[yellow]replayed by[/]", f"{escape(str(here))}: other software may plan otherwise")
+        lines.add("[yellow]replayed by[/]", f"{terminal.plain(str(here))}: other software may plan otherwise")
     if compared.lacking:
         lines.add("[yellow]not replayed[/]", f"{compared.lacking} cycles: what came before them is not recorded")
     if compared.first is None:
@@ -160,8 +160,8 @@ def _print_comparison(
 
 def _print_summary(summed: Summary) -> None:
     lines = _Lines()
-    lines.add("session", f"[bold]{escape(summed.name)}[/], {summed.began}")
-    lines.add("recorded by", escape(summed.software))
+    lines.add("session", f"[bold]{terminal.plain(summed.name)}[/], {summed.began}")
+    lines.add("recorded by", terminal.plain(summed.software))
     modes = ", ".join(f"{name} {_seconds(time)}" for name, time in summed.modes.items())
     lines.add("duration", f"{_seconds(summed.duration)}: {modes}")
     lines.add("moved", _each(summed.distance, 1.0, "m", 3))
@@ -185,7 +185,7 @@ def _print_summary(summed: Summary) -> None:
         if incidents:
             terminal.out.print(f"\n[{colour}]{title}[/]")
         for incident in incidents:
-            terminal.out.print(f"  {incident.t:9.3f} s  {escape(incident.message)}", soft_wrap=True)
+            terminal.out.print(f"  {incident.t:9.3f} s  {terminal.plain(incident.message)}", soft_wrap=True)
 
 
 def _print_goals(goals: list[GoalSummary]) -> None:
@@ -194,10 +194,10 @@ def _print_goals(goals: list[GoalSummary]) -> None:
     for goal in goals:
         took = "" if goal.ended is None else f"{goal.ended - goal.given:.3f} s"
         colour = OUTCOMES.get(goal.outcome, "cyan")
-        name = escape(f"{goal.id:{longest}}")
-        words = "" if goal.outcome == "done" else f": {escape(goal.message)}"
+        name = terminal.plain(f"{goal.id:{longest}}")
+        words = "" if goal.outcome == "done" else f": {terminal.plain(goal.message)}"
         line = f"  {goal.given:9.3f} s  {took:>9}  [{colour}]{goal.outcome:9}[/]  {name}  {goal.kind} of "
-        terminal.out.print(f"{line}{escape(goal.user)}{words}", soft_wrap=True)
+        terminal.out.print(f"{line}{terminal.plain(goal.user)}{words}", soft_wrap=True)
 
 
 class _Lines:

@@ -19,6 +19,7 @@ from rich.table import Table
 from service.client import Goal, Jog, Result, Robot
 from service.errors import ServiceError
 from service.messages import Event, GoalReply, Percentiles, State
+from service.text import json_printable, printable
 
 if TYPE_CHECKING:
     from service.config import Config
@@ -42,19 +43,24 @@ SILENT = 3.0
 """A service from which nothing is heard for so long is taken for gone [s]."""
 
 
+def plain(words: str) -> str:
+    """Return words from outside for the console: nothing in them is markup, steers it or begins a line."""
+    return escape(printable(words))
+
+
 def say(words: str) -> None:
     """Print a line."""
-    out.print(escape(words), soft_wrap=True)
+    out.print(plain(words), soft_wrap=True)
 
 
 def complain(words: str) -> None:
     """Print an error as one line on standard error."""
-    err.print(f"trirail: {escape(' '.join(words.split()))}", soft_wrap=True)
+    err.print(f"trirail: {plain(' '.join(words.split()))}", soft_wrap=True)
 
 
 def json(content: object) -> None:
     """Print one JSON object on a line of its own, at once."""
-    sys.stdout.write(msgspec.json.encode(content).decode() + "\n")
+    sys.stdout.write(json_printable(msgspec.json.encode(content).decode()) + "\n")
     sys.stdout.flush()
 
 
@@ -62,15 +68,15 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
     """Say that the service is up, where it is, and what it lacks."""
     loop, recorder = ready["loop"], ready["recorder"]
     out.print(f"[bold green]up[/]  robot [bold]{config.robot.name}[/] at {config.loop.rate_hz} Hz")
-    out.print(f"    goals      {', '.join(config.zenoh.listen)}", soft_wrap=True)
+    out.print(f"    goals      {plain(', '.join(config.zenoh.listen))}", soft_wrap=True)
     if recorder["live"]:
         out.print(f"    live view  trirail view  ({recorder['live']})", soft_wrap=True)
-    out.print(f"    recording  {recorder['recording']}", soft_wrap=True)
+    out.print(f"    recording  {plain(recorder['recording'])}", soft_wrap=True)
     out.print(f"    bus load   {loop['bus_load']:.0%}")
     if loop["bus_load"] > 0.8:
         out.print("    [yellow]warning[/]: above 80 % there is little left for repeated frames; lower loop.rate_hz")
     for lack in loop["lacking"]:
-        out.print(f"    [yellow]without[/] {escape(lack)}", soft_wrap=True)
+        out.print(f"    [yellow]without[/] {plain(lack)}", soft_wrap=True)
 
 
 def notes(reply: GoalReply) -> str:
@@ -94,7 +100,7 @@ def follow(robot: Robot, goal: Goal, title: str, *, show: bool = True) -> Result
         TextColumn("{task.fields[left]}"),
     )
     with Progress(*columns, console=out, transient=True, disable=not show) as progress:
-        task = progress.add_task(title + notes(goal.reply), total=1.0, left="")
+        task = progress.add_task(plain(title) + notes(goal.reply), total=1.0, left="")
         for state in robot.states(SILENT):
             if goal.result is not None:
                 return goal.result
@@ -136,27 +142,27 @@ def watch(robot: Robot) -> None:
 def event(happened: Event) -> None:
     """Print an event on a line."""
     level = f"[{LEVELS[happened.level]}]{happened.level:7}[/]"
-    out.print(f"{happened.seq:5}  {happened.t:9.3f} s  {level}  {escape(happened.message)}", soft_wrap=True)
+    out.print(f"{happened.seq:5}  {happened.t:9.3f} s  {level}  {plain(happened.message)}", soft_wrap=True)
 
 
 def checks(found: Sequence[Check]) -> None:
     """Print each check on a line, and under it what to do."""
     for check in found:
         verdict = f"[{VERDICTS[check.verdict]}]{check.verdict:8}[/]"
-        out.print(f"{verdict} {check.name:13} {escape(check.found)}", soft_wrap=True)
+        out.print(f"{verdict} {check.name:13} {plain(check.found)}", soft_wrap=True)
         if check.remedy:
-            out.print(f"{'':22} {escape(check.remedy)}", soft_wrap=True, style="dim")
+            out.print(f"{'':22} {plain(check.remedy)}", soft_wrap=True, style="dim")
 
 
 def _table(state: State, robot: str) -> Table:
     x, y, phi = state.pose
     grid = Table.grid(padding=(0, 2))
-    grid.add_row("robot", f"[bold]{robot}[/]  [{COLOURS.get(state.mode, '')}]{state.mode}[/]  t {state.t:.2f} s")
+    grid.add_row("robot", f"[bold]{robot}[/]  {_coloured(state.mode)}  t {state.t:.2f} s")
     for fault in state.faults:
-        grid.add_row("fault", f"[bold red]{escape(fault)}[/]")
+        grid.add_row("fault", f"[bold red]{plain(fault)}[/]")
     grid.add_row("pose", f"x {x * 1e3:9.3f} mm   y {y * 1e3:9.3f} mm   φ {math.degrees(phi):9.4f}°")
     if state.goal:
-        grid.add_row("goal", f"{state.goal.id}  {state.goal.progress:4.0%}  {state.goal.remaining:.1f} s left")
+        grid.add_row("goal", f"{plain(state.goal.id)}  {state.goal.progress:4.0%}  {state.goal.remaining:.1f} s left")
     sliders = state.sliders
     for index, name in enumerate("ABC"):
         grid.add_row(
@@ -174,8 +180,13 @@ def _table(state: State, robot: str) -> Table:
     grid.add_row("lateness", percentiles(loop.lateness_us))
     grid.add_row("cycle", percentiles(loop.cycle_us))
     for lack in loop.lacking:
-        grid.add_row("[yellow]without[/]", escape(lack))
+        grid.add_row("[yellow]without[/]", plain(lack))
     return grid
+
+
+def _coloured(mode: str) -> str:
+    colour = COLOURS.get(mode)
+    return f"[{colour}]{mode}[/]" if colour else plain(mode)
 
 
 def percentiles(values: Percentiles) -> str:

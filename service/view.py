@@ -114,7 +114,7 @@ def _browse(source: str, say: Callable[[dict[str, str], str], None]) -> None:
             if time.monotonic() > deadline:
                 raise ServiceError(f"the web viewer does not answer on port {port} within {START_WITHIN:g} s")
             time.sleep(0.05)
-        say({"url": url, "source": source}, f"{source} in the browser, on this machine alone: {url}\nCtrl-C ends it")
+        say({"url": url, "source": source}, f"{source} in the browser, on this machine alone, until Ctrl-C: {url}")
         if has_display():
             webbrowser.open(url)
         server.wait()

@@ -17,11 +17,12 @@ from paper_service import REACHED, driven, points
 from service import spawned
 from service.config import SIM, load
 from service.errors import RefusedError, ServiceError
-from service.messages import MAX_MESSAGE, TrajectoryGoal
+from service.messages import TrajectoryGoal
 from service.modes import MODES, Mode
 from service.packets import Accepted
 from service.reading import Line, Recording
 from service.records import DTYPE
+from service.sizes import MAX_MESSAGE
 
 PERIOD = 1e-3
 BOUNDS = (1e-14, 5e-14, 1e-11)

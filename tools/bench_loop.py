@@ -7,6 +7,7 @@ are woken by the same machine in the same minute.
 
 from __future__ import annotations
 
+import contextlib
 import json as json_format
 import os
 import shutil
@@ -71,13 +72,12 @@ def _connect(name: str, locator: str, service: subprocess.Popen[bytes]) -> Robot
     for _ in range(600):
         if service.poll() is not None:
             raise SystemExit("the service could not start")
-        try:
-            robot = Robot(name, locator, user="bench")
+        with contextlib.suppress(ServiceError), contextlib.ExitStack() as stack:
+            robot = stack.enter_context(Robot(name, locator, user="bench"))
             robot.state()
-        except ServiceError:
-            time.sleep(0.1)
-        else:
+            stack.pop_all()
             return robot
+        time.sleep(0.1)
     raise SystemExit("the service is not up after a minute")
 
 
