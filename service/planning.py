@@ -15,7 +15,7 @@ from service.config import PlatformLimits, SliderLimits
 from service.errors import RefusedError
 from service.geometry import Geometry
 from service.kinematics import inverse_into
-from service.limits import LEGS, Bounds
+from service.limits import COORDINATES, LEGS, Bounds, beyond, told_apart
 from service.motion import STILL, MotionState, from_ruckig, joined, stretched
 from service.paths import Path, constant
 from service.quintic import Point, quintic
@@ -33,6 +33,8 @@ JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
 from rest to rest: there a hair less jerk has one."""
 START = 1e-4
 """How far a trajectory may begin from where the robot stands [m, rad]."""
+STANDS = 1e-6
+"""Velocity at the ends of a trajectory that counts as rounding, and is taken for none [m/s, rad/s]."""
 
 TOO_FAST_IN_MOTION = RefusedError(
     "too_fast", "from its present motion the robot cannot take this path within its sliders' limits"
@@ -94,7 +96,7 @@ class Planner:
             low, high = self._travel
             if not low <= position <= high:
                 limit = low if position < low else high
-                text = f"slider {name}: position {position:.6g} m is beyond its limit {limit:.6g} m"
+                text = beyond(f"slider {name}: position", position, limit, "m")
                 raise RefusedError("out_of_workspace", text, slider=name, value=position, limit=limit)
 
     def lowered(
@@ -102,9 +104,11 @@ class Planner:
     ) -> Kinodynamic:
         """Return the platform's limits with a goal's own in their place. RefusedError where these are not lower."""
         for name, own, limits in zip(Kinodynamic._fields, (velocity, acceleration, jerk), self._platform, strict=True):
-            for coordinate, value, limit in zip(("x", "y", "phi"), own or limits, limits, strict=True):
+            for coordinate, value, limit in zip(COORDINATES, own or limits, limits, strict=True):
                 if value > limit:
-                    text = f"limits.{name} of {coordinate} is {value:.6g}: the robot's limit is {limit:.6g}"
+                    text = "limits.{} of {} is {}: the robot's limit is {}".format(
+                        name, coordinate, *told_apart(value, limit)
+                    )
                     raise RefusedError("above_limit", text, value=value, limit=limit)
         return Kinodynamic(
             velocity or self._platform.velocity,
@@ -159,10 +163,7 @@ class Planner:
 
         Too fast is refused, or slowed with `stretch`.
         """
-        for name, given, stands in zip(("x", "y", "phi"), points[0].pose, start.pose, strict=True):
-            if not start.at_rest or abs(given - stands) > START:
-                text = f"the trajectory begins at {name} = {given:.6g}, the robot is at {stands:.6g}: go there first"
-                raise RefusedError("wrong_start", text, value=given, limit=stands)
+        _check_ends(points, start)
         path = quintic(points, start.pose)
         yield
         excess = yield from self._checker.whole(path, start.pose)
@@ -253,6 +254,30 @@ class Planner:
             if solved(self._ruckig, request, trajectory):
                 return from_ruckig(trajectory, in_sliders)
         raise RefusedError("no_plan", "no motion leads there from the present one: send the goal again when it holds")
+
+
+def _check_ends(points: Sequence[Point], start: MotionState) -> None:
+    """Raise RefusedError where points do not begin as the robot stands, or do not end at rest.
+
+    What they begin or end with of an acceleration counts as the jerk over one cycle that it is (Checker.look).
+    """
+    if not start.at_rest:
+        raise RefusedError("wrong_start", "the robot moves: send the trajectory when it stands")
+    for name, given, stands in zip(COORDINATES, points[0].pose, start.pose, strict=True):
+        if abs(given - stands) > START:
+            text = "the trajectory begins at {} = {}, the robot is at {}: go there first".format(
+                name, *told_apart(given, stands)
+            )
+            raise RefusedError("wrong_start", text, value=given, limit=stands)
+    ends = (
+        ("wrong_start", "begins", "let it begin at rest, as the robot stands", points[0]),
+        ("wrong_end", "ends", "let it end at rest", points[-1]),
+    )
+    for code, does, remedy, point in ends:
+        for name, unit, value in zip(COORDINATES, ("m/s", "m/s", "rad/s"), point.velocity or STILL, strict=True):
+            if abs(value) > STANDS:
+                text = f"the trajectory {does} with {value:.6g} {unit} in {name}: {remedy}"
+                raise RefusedError(code, text, value=value, limit=0.0)
 
 
 def _end(path: Path) -> Array:
