@@ -29,9 +29,22 @@ class Violation(NamedTuple):
 
     def __str__(self) -> str:
         subject = f"slider {self.what}" if self.what in LEGS else f"platform {self.what}"
-        return (
-            f"{subject}: {self.quantity} {self.value:.6g} {self.unit} is beyond its limit {self.limit:.6g} {self.unit}"
-        )
+        return beyond(f"{subject}: {self.quantity}", self.value, self.limit, self.unit)
+
+
+def beyond(what: str, value: float, limit: float, unit: str) -> str:
+    """Say that a value is beyond its limit, with as many digits as it takes to tell the two apart."""
+    shown, bound = told_apart(value, limit)
+    return f"{what} {shown} {unit} is beyond its limit {bound} {unit}"
+
+
+def told_apart(value: float, other: float) -> tuple[str, str]:
+    """Return two numbers with six significant digits, or as many more as it takes to tell them apart."""
+    for digits in range(6, 18):
+        shown = f"{value:.{digits}g}", f"{other:.{digits}g}"
+        if shown[0] != shown[1]:
+            break
+    return shown
 
 
 class Bounds:
