@@ -16,6 +16,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
+from service import palette
 from service.client import Goal, Jog, Result, Robot
 from service.errors import ServiceError
 from service.messages import Event, GoalReply, Percentiles, State
@@ -27,15 +28,7 @@ if TYPE_CHECKING:
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
 
-COLOURS = {
-    "disabled": "dim",
-    "enabling": "cyan",
-    "homing": "magenta",
-    "holding": "green",
-    "moving": "bold green",
-    "stopping": "yellow",
-    "fault": "bold red",
-}
+COLOURS = {mode.value: palette.code(colour) for mode, colour in palette.MODES.items()}
 LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}
 VERDICTS = {"ok": "green", "warning": "yellow", "failure": "bold red"}
 SILENT = 3.0
