@@ -15,7 +15,9 @@ from typing import Annotated, Any, Literal, get_args
 import msgspec
 from msgspec import Meta, Struct
 
+from drivers import files
 from drivers.config import Can, Drives, Positive
+from drivers.errors import FileError
 from drivers.interface import NAMES
 from service.errors import ConfigError
 from service.geometry import Geometry, Leg, singular_angles
@@ -162,9 +164,9 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
 def load(path: Path) -> Config:
     """Read a configuration file. Raises ConfigError with the file, the key, the value and what is allowed."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; configs/sim.toml is one to start from") from error
+        text = files.text(path)
+    except FileError as error:
+        raise ConfigError(f"{error}; configs/sim.toml is one to start from") from error
     try:
         return _beside(path, parse(text))
     except ConfigError as error:
@@ -175,9 +177,12 @@ def parse(text: str) -> Config:
     """Read a configuration from TOML. Raises ConfigError."""
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        leaves = list(_leaves(raw))
+    except RecursionError as error:
+        raise ConfigError("not a configuration: its tables or arrays are nested too deeply") from error
+    except ValueError as error:  # TOMLDecodeError, and Python's own about an integer of thousands of digits
         raise ConfigError(f"not TOML: {error}") from error
-    for key, value in _leaves(raw):
+    for key, value in leaves:
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{key} = {value}: it must be a finite number")
     try:

@@ -16,6 +16,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
+from drivers.errors import shortened
 from service import palette
 from service.client import Goal, Jog, Result, Robot
 from service.errors import ServiceError
@@ -41,8 +42,8 @@ def say(words: str) -> None:
 
 
 def complain(words: str) -> None:
-    """Print an error as one line on standard error."""
-    err.print(f"trirail: {escape(' '.join(words.split()))}", soft_wrap=True)
+    """Print an error as one line of bounded length on standard error."""
+    err.print(f"trirail: {escape(shortened(' '.join(words.split())))}", soft_wrap=True)
 
 
 def json(content: object) -> None:
