@@ -16,6 +16,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
+from drivers.errors import shortened
+from service import palette
 from service.client import Goal, Jog, Result, Robot
 from service.errors import ServiceError
 from service.messages import Event, GoalReply, Percentiles, State
@@ -28,15 +30,7 @@ if TYPE_CHECKING:
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
 
-COLOURS = {
-    "disabled": "dim",
-    "enabling": "cyan",
-    "homing": "magenta",
-    "holding": "green",
-    "moving": "bold green",
-    "stopping": "yellow",
-    "fault": "bold red",
-}
+COLOURS = {mode.value: palette.code(colour) for mode, colour in palette.MODES.items()}
 LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}
 VERDICTS = {"ok": "green", "warning": "yellow", "failure": "bold red"}
 SILENT = 3.0
@@ -54,8 +48,8 @@ def say(words: str) -> None:
 
 
 def complain(words: str) -> None:
-    """Print an error as one line on standard error."""
-    err.print(f"trirail: {plain(' '.join(words.split()))}", soft_wrap=True)
+    """Print an error as one line of bounded length on standard error."""
+    err.print(f"trirail: {plain(shortened(' '.join(words.split())))}", soft_wrap=True)
 
 
 def json(content: object) -> None:

@@ -19,7 +19,7 @@ from drivers.eds import SERVO
 from drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 from drivers.interface import Feedback, PowerState, Triple
 from drivers.scaling import scale_of
-from drivers.setup402 import _settings, interpolation_period
+from drivers.settings402 import interpolation_period, settings_of
 from drivers.simulated import Servo, SimulatedBus, SimulatedDevice, SimulatedDrive
 from drivers.simulated.dictionary import Entry
 
@@ -275,7 +275,7 @@ class TestConfigure:
         """Of every object that is set: a drive that says it took the value and did not."""
         objects = canopen.import_od(str(SERVO))
         told = Entry.encode
-        settings = [*dict.fromkeys(setting[:2] for setting in _settings("A", CONFIG.A, CONFIG, SCALE, PERIOD))]
+        settings = [*dict.fromkeys(setting[:2] for setting in settings_of("A", CONFIG.A, CONFIG, SCALE, PERIOD))]
         assert {index for index, _ in settings} >= {0x60C2, 0x6065, 0x605A, 0x605E, 0x1016, 0x1017, 0x1029}
         assert {index for index, _ in settings} >= {0x1400, 0x1401, 0x1600, 0x1601, 0x1800, 0x1801, 0x1A00, 0x1A01}
         for index, subindex in settings:

@@ -29,7 +29,7 @@ def line(first: tuple[float, float, float] | None, last: tuple[float, float, flo
         (
             line((0.1, 0.0, 0.0), None),
             "wrong_start",
-            "the trajectory begins with 0.1 m/s in x: let it begin at rest, as",
+            "the trajectory begins with 0.1 m/s in x: let it begin at rest",
         ),
         (line(None, (0.1, 0.0, 0.0)), "wrong_end", "the trajectory ends with 0.1 m/s in x: let it end at rest"),
         (line(None, (0.0, 0.0, -0.2)), "wrong_end", "the trajectory ends with -0.2 rad/s in phi: let it end at rest"),
