@@ -44,7 +44,7 @@ _COMMANDS = {
 }
 _OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.FAULT: "faulted"}
 """How a goal ends on an event after which it is not under way; else it is stopped."""
-_GO_ON = (Event.GOAL, Event.STANDSTILL, Event.POWERED, Event.PAUSE, Event.RESUME, Event.ENABLE, Event.RESET)
+_GO_ON = (Event.GOAL, Event.STANDSTILL, Event.POWERED, Event.RESUME, Event.ENABLE, Event.RESET)
 """Events that leave alone what has been sent but not begun."""
 
 
@@ -249,8 +249,6 @@ class Control:
         else:
             self._withdraw(event, reason)
             self._go(event, reason)
-            if event is Event.PAUSE:
-                self.dispatch.hold()
         self.desk.undertake(request, self.cycle)
 
     def _take_override(self, request: CommandRequest) -> None:
@@ -303,8 +301,6 @@ class Control:
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = "released" if before.released else "arrived"
             self.desk.end(outcome, arrived if outcome == "done" else reason)
-        if not self.state.paused:
-            self.dispatch.go_on()
         if self.state.mode is not before.mode:
             self.desk.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:

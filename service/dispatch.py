@@ -33,7 +33,6 @@ class Dispatch:
         self._period = period
         self._waiting: deque[_Sent] = deque()
         self._planned: _Sent | None = None
-        self._held = False
 
     @property
     def idle(self) -> bool:
@@ -45,26 +44,14 @@ class Dispatch:
         age = (now_ns - request.received_ns) * 1e-9 / self._period
         sent = _Sent(request, cycle - age)
         self._waiting.append(sent)
-        self._held = False
         self._desk.keep_alive(request, self._alive_until(sent))
-
-    def hold(self) -> None:
-        """Begin nothing that has been sent until now, as long as the robot is paused and nothing else is sent."""
-        self._held = True
-        if self._pilot.busy and self._planned is not None:
-            self._waiting.appendleft(self._planned)
-        self._pilot.give_up()
-
-    def go_on(self) -> None:
-        """Hold nothing back any more."""
-        self._held = False
 
     def think(self, cycle: int, admit: Callable[[], bool]) -> GoalRequest | None:
         """Begin with the next goal if none is being planned, and take one step; return a goal that begins.
 
         `admit` raises RefusedError where the robot takes no goal, and says whether it is moving to one.
         """
-        if not self._held and not self._pilot.busy and self._waiting:
+        if not self._pilot.busy and self._waiting:
             self._planned = self._waiting.popleft()
             try:
                 self._consider(self._planned, cycle, admit)

@@ -52,7 +52,7 @@ CONTENT: dict[str, tuple[Any, str]] = {
     "stop": (Stop | None, 'stop takes nothing, or {"goal": id}'),
 }
 """What commands may carry; the others carry nothing."""
-STOPPING = ("stop", "disable", "quick_stop")
+STOPPING = ("stop", "disable", "quick_stop", "pause")
 AT_ONCE = 256
 """Messages from Zenoh that are read before the loop is listened to again."""
 BACKLOG = 20_000
