@@ -20,7 +20,7 @@ hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; install
 	$(VENV)/bin/python -m pip install --quiet --group hil
 	$(VENV)/bin/python tools/hil.py --install $(ARGS)
 
-ci-packages:  ## the system's packages for the tests of the viewers; those tests are skipped without
+ci-packages:  ## the system's packages for the tests of viewers and unit; those tests are skipped without
 	.ci/packages
 
 bench: $(READY)  ## the loop, the kinematics, planning and the recorder, measured
