@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 
-.PHONY: demo test hil ci-packages bench clean
+.PHONY: demo test hil chaos ci-packages bench clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
@@ -19,6 +19,9 @@ test: $(READY)  ## everything that decides: lint, format, types, import contract
 hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; installs what that needs, as root on Debian
 	$(VENV)/bin/python -m pip install --quiet --group hil
 	$(VENV)/bin/python tools/hil.py --install $(ARGS)
+
+chaos: $(READY)  ## every process killed, ended and frozen in every mode; half an hour; options: make chaos ARGS="--sample 10"
+	$(VENV)/bin/python tools/chaos.py $(ARGS)
 
 ci-packages:  ## the system's packages for the tests of viewers and unit; those tests are skipped without
 	.ci/packages
