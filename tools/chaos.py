@@ -183,7 +183,8 @@ def attempt(rig: Rig, case: Case) -> str:
     try:
         run(rig, case)
     except (Failed, TrirailError) as failure:
-        found = " ".join(str(failure).split())
+        rig.service.terminate()
+        found = " ".join(f"{failure}; warnings: {rig.warnings()}".split())
     finally:
         rig.fault("clear")
     try:

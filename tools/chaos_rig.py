@@ -179,6 +179,13 @@ class Rig:
         except ServiceError as error:
             raise Failed(str(error)) from error
 
+    def warnings(self) -> str:
+        """What the service has warned of, for people who look for the cause of a failure."""
+        with contextlib.suppress(Failed):
+            lines = [line for recording in self.recordings() for line in recording.events]
+            return " | ".join(f"{line.t:.2f} s {line.text}" for line in lines if line.level != "INFO")
+        return ""
+
     def ports_are_free(self) -> bool:
         """Whether both ports can be listened on."""
         for port in self.ports:
@@ -201,12 +208,6 @@ class Rig:
             if message is not None:
                 with self._lock:
                     self._heard.append(message)
-
-    def of(self, base: int, node: int, layout: struct.Struct) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        """The first value in each frame of a drive that was heard since the start of the service."""
-        with self._lock:
-            found = [layout.unpack(m.data[: layout.size])[0] for m in self._heard if m.arbitration_id == base + node]
-        return np.array(found, dtype=float)
 
     def ask(self, node: int, index: int) -> int:
         """Ask a drive for an object, by SDO."""
@@ -244,12 +245,27 @@ class Rig:
     def check_setpoints(self) -> None:
         """Failed where the setpoints step, in position or in velocity."""
         for node in NODES:
-            setpoints = self.of(frames.RPDO2, node, frames.SETPOINT) / self.counts
-            steps, bends = np.abs(np.diff(setpoints)), np.abs(np.diff(setpoints, 2))
-            if steps.max(initial=0.0) > self.limits.velocity * self.period * 1.01:
-                raise Failed(f"drive {node}: a setpoint steps by {steps.max() * 1e3:.2f} mm in a cycle")
-            if bends.max(initial=0.0) > self.limits.acceleration * self.period**2 * 1.05 + 1e-6:
-                raise Failed(f"drive {node}: the velocity of setpoints steps by {bends.max() / self.period:.3f} m/s")
+            for setpoints in self._followed(node):
+                step, bend = (np.abs(np.diff(setpoints, order)).max(initial=0.0) for order in (1, 2))
+                if step > self.limits.velocity * self.period * 1.01:
+                    raise Failed(f"drive {node}: a setpoint steps by {step * 1e3:.2f} mm in a cycle")
+                if bend > self.limits.acceleration * self.period**2 * 1.05 + 1e-6:
+                    raise Failed(f"drive {node}: the velocity of setpoints steps by {bend / self.period:.3f} m/s")
+
+    def _followed(self, node: int) -> list[np.ndarray[tuple[int], np.dtype[np.float64]]]:
+        """The setpoints of a drive while it was told to follow them [m]: else they are what is measured."""
+        runs: list[list[float]] = []
+        told = 0
+        with self._lock:
+            heard = list(self._heard)
+        for message in heard:
+            if message.arbitration_id == frames.RPDO1 + node:
+                before, told = told, frames.CONTROLWORD.unpack(message.data[:2])[0] & frames.ENABLE_OPERATION
+                if told == frames.ENABLE_OPERATION != before:
+                    runs.append([])
+            elif message.arbitration_id == frames.RPDO2 + node and told == frames.ENABLE_OPERATION:
+                runs[-1].append(frames.SETPOINT.unpack(message.data)[0] / self.counts)
+        return [np.array(run) for run in runs]
 
 
 def _python(*arguments: str) -> list[str]:
