@@ -124,6 +124,8 @@ class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     state_hz: Annotated[int, Meta(ge=1, le=200)] = 50
     live_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
     """Loopback port of the live Rerun server; 0 for none."""
+    live_mb: Annotated[float, Meta(ge=1.0, le=4096.0)] = 64.0
+    """Memory for what viewers that connect late are shown of the past [1e6 bytes]; beyond that the oldest is let go."""
     capture_can: bool = False
     """Write every CAN frame of the session beside the recording, in candump's log format."""
     rotate_minutes: Annotated[float, Meta(ge=0.01, le=100_000.0)] = 30.0

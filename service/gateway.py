@@ -82,12 +82,11 @@ class Gateway:
 
     def __init__(self, config: Config, link: Link, beat: Callable[[], None], opened: zenoh.Session) -> None:
         self._robot = config.robot.name
-        self._period = config.period
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
         self._home_within = REPLY_WITHIN + sum(homing)
         self._link = link
         self._beat = beat
-        self._last_words = LastWords()
+        self._last_words = LastWords(config.period)
         self._session = opened
         self._info = _info(config)
         self._states = StateMaker(config)
@@ -298,7 +297,7 @@ class Gateway:
 
     def _tell_of_its_end(self) -> None:
         """The loop has gone: where it has died, tell everyone in its place."""
-        for event in self._last_words.events(self._states.cycle, self._period):
+        for event in self._last_words.events(self._states.cycle):
             self._event.put(msgspec.json.encode(event))
         if (reason := self._last_words.reason) and self._states.cycle:
             state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason,))

@@ -13,14 +13,15 @@ from service.messages import Event
 from service.modes import Mode
 from service.packets import Answer, Farewell, GoalRequest, Happened, Input, Situation
 
-FROZEN = 0.5
-"""The loop sends records every 20 ms; silent for so long before its end, it was frozen [s]."""
+FROZEN, CYCLES = 0.5, 3
+"""The loop sends records every 20 ms, or in every cycle: silent for so long before its end, it was frozen [s]."""
 
 
 class LastWords:
     """Follows what the loop says; `events` is what is missing when it has gone."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, period: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._period = period
         self._clock = clock
         self._heard = clock()
         self._seq = 0
@@ -63,11 +64,11 @@ class LastWords:
         """What has become of the loop, for people; empty where it has ended as it should, or has never turned."""
         if self._farewell or not self._greeted:
             return ""
-        silent = self._clock() - self._heard
-        how = f"was frozen for {silent:.1f} s and is ended" if silent > FROZEN else "has died"
+        frozen = self._clock() - self._heard > max(FROZEN, CYCLES * self._period)
+        how = "was frozen and has been killed" if frozen else "has died"
         return f"the loop {how}: the drives stop by their own watchdogs"
 
-    def events(self, cycle: int, period: float) -> list[Event]:
+    def events(self, cycle: int) -> list[Event]:
         """Return what the loop would have said of its end in that cycle, the last that is known; nothing if it has."""
         reason = self.reason
         if not reason:
@@ -77,5 +78,5 @@ class LastWords:
             words = f"goal {goal_id} faulted: {reason}"
             missing.append(Happening("goal", "error", words, id=goal_id, outcome="faulted", user=user))
         missing.append(Happening("mode", "info", f"{Mode.FAULT}: {reason}", mode=Mode.FAULT))
-        t, wall = cycle * period, time.time()
+        t, wall = cycle * self._period, time.time()
         return [Event(self._seq + n, t, cycle, wall, **what._asdict()) for n, what in enumerate(missing, 1)]

@@ -32,9 +32,8 @@ class Intake:
     def __init__(self, config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> None:
         self._link = link
         self._ready = ready
-        self._period = config.period
         self._cycle = 0
-        self._last_words = LastWords()
+        self._last_words = LastWords(config.period)
         path = Path(record) if record else None
         self.recorder = recorder = Recorder(config, Path(config.telemetry.directory), path=path, warn=self._warn)
         folder = recorder.path.parent
@@ -57,7 +56,7 @@ class Intake:
 
     def loop_gone(self) -> None:
         """The loop has gone: where it has died, keep what it can no longer say."""
-        for event in self._last_words.events(self._cycle, self._period):
+        for event in self._last_words.events(self._cycle):
             self._hear(Happened(event))
 
     def close(self) -> None:

@@ -47,6 +47,7 @@ class _Child:
 
     def __init__(self, name: str, order: bytes, runtime: Path, beats: int, sockets: list[int]) -> None:
         self.name = name
+        self.began = time.monotonic()
         self.ready_with: dict[str, Any] | None = None
         self._hung_for = 0.0
         self.pipe, write = os.pipe()
@@ -176,6 +177,9 @@ class Supervisor:
         if now < self._next_turn:
             return
         self._next_turn = now + TURN
+        for child in self._children.values():
+            if child.ready_with is None and now - child.began > START_WITHIN:
+                child.kill_hung(START_WITHIN)
         for name, watch in self._watches.items():
             if watch.silent() and name in self._children:
                 self._children[name].kill_hung(self._patience[name])

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 from service.heartbeats import Heart
 
+SEND_WITHIN = 0.3
+"""How long it is waited for a systemd that does not read [s]."""
 FEEDS = 4
 """So often within the watchdog's time it is fed: systemd advises twice at least."""
 
@@ -20,7 +22,7 @@ def notify(state: str) -> None:
     if address:
         # An end of systemd's must not keep the robot from being stopped.
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender, contextlib.suppress(OSError):
-            sender.setblocking(False)
+            sender.settimeout(SEND_WITHIN)
             sender.connect("\0" + address[1:] if address.startswith("@") else address)
             sender.send(state.encode())
 

@@ -59,6 +59,8 @@ def test_shipped_configurations_load(path: Path) -> None:
             "with drives.A.counts_per_metre = 1e+07 that is 1e+07 turns/s, and an ODrive's feed-forward ends at 32.767",
         ),
         ('realtime = "prefer"', 'realtime = "yes"', "allowed are 'off', 'prefer', 'enforce'"),
+        ("gateway_timeout = 0.3", "gateway_timeout = 0.1", "watchdogs.gateway_timeout = 0.1: expected float >= 0.2"),
+        ("live_mb = 64", "live_mb = 0", "telemetry.live_mb = 0: expected float >= 1.0"),
         ("l0 = 0.3", "l0 = nan", "geometry.l0 = nan: it must be a finite number"),
         ("l0 = 0.3", "l0 = -0.3", "geometry.l0 = -0.3: expected float >= 0.001"),
         ("l0 = 0.3", "", "give either l0 (the symmetric robot) or three [[geometry.leg]] tables"),
