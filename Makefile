@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 
-.PHONY: demo test hil ci-packages bench clean
+.PHONY: demo test hil soak ci-packages bench clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
@@ -19,6 +19,10 @@ test: $(READY)  ## everything that decides: lint, format, types, import contract
 hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; installs what that needs, as root on Debian
 	$(VENV)/bin/python -m pip install --quiet --group hil
 	$(VENV)/bin/python tools/hil.py --install $(ARGS)
+
+SECONDS ?= 600
+soak: $(READY)  ## a service under a flood of junk, for make soak SECONDS=…: it must hold
+	$(VENV)/bin/python tools/flood.py $(SECONDS) $(ARGS)
 
 ci-packages:  ## the system's packages for the tests of the viewers; those tests are skipped without
 	.ci/packages
