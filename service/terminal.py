@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from service.config import Config
     from service.doctor import Check
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+out = Console(highlight=False, emoji=False)
+err = Console(stderr=True, highlight=False, emoji=False)
 
 COLOURS = {
     "disabled": "dim",

@@ -35,7 +35,7 @@ from service.sizes import MAX_MESSAGE
 SESSIONS = 200
 DEAF = 20
 """Sessions that subscribe to everything and never read."""
-HALF_OPEN = 40
+HALF_OPEN = 150
 """TCP connections on each port on which nothing sensible comes."""
 SENDERS = 4
 PENDING = 200
@@ -189,25 +189,23 @@ def private_service(folder: Path) -> Iterator[tuple[spawned.Process, str, tuple[
         yield process, locator, (zenoh_port, live_port)
 
 
-def use(robot: Robot, seconds: float) -> tuple[int, list[float]]:
-    """Move the robot to and fro and stop it, as its user would; return the goals taken and how long each stop took."""
+def use(locator: str, seconds: float) -> tuple[int, list[float]]:
+    """Come, move the robot and stop it, as its users would; return the goals taken and how long each stop took."""
     ends, taken = time.monotonic() + seconds, 0
     stops: list[float] = []
     for number in itertools.count():
         if time.monotonic() >= ends:
             break
-        with contextlib.suppress(RefusedError, ServiceError):
-            robot.move_to(x=0.02 * (number % 2), y=0.0, phi=0.0)
-            taken += 1
-        asked = time.monotonic()
-        try:
-            robot.stop()
-        except RefusedError:
-            pass
-        except ServiceError:
-            stops.append(math.inf)
-            continue
-        stops.append(time.monotonic() - asked)
+        asked = math.inf
+        with contextlib.suppress(ServiceError), Robot("demo", locator, user="ann") as robot:
+            with contextlib.suppress(RefusedError):
+                robot.move_to(x=0.02 * (number % 2), y=0.0, phi=0.0)
+                taken += 1
+            asked = time.monotonic()
+            with contextlib.suppress(RefusedError):
+                robot.stop()
+            asked -= time.monotonic()
+        stops.append(abs(asked))
         time.sleep(0.1)
     return taken, stops
 
@@ -220,7 +218,7 @@ def run(seconds: float, rate: float) -> list[str]:
             robot.enable()
             before = memory(pids)
             with Flood(locator, ports, rate) as flood:
-                taken, stops = use(robot, seconds)
+                taken, stops = use(locator, seconds)
             after = memory(pids)
             kinds = sum(flood.sent.values())
             print(f"{kinds} messages of {len(flood.sent)} kinds in {seconds:g} s, {flood.answered} answers")
