@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -94,3 +97,47 @@ def test_an_error_of_its_own_is_told_and_does_not_end_it(rig: Rig, monkeypatch: 
     assert [text[:14] for text in told] == ["internal error", "internal error", "the gateway co"]
     goal(gateway, "b")
     assert isinstance(link.sent[-1], GoalRequest)
+
+
+STUCK = """
+import sys, threading, zenoh
+from service.session import open_client
+session = open_client(sys.argv[1])
+never = threading.Event()
+stuck = zenoh.handlers.Callback(lambda reply: never.wait(), indirect=False)
+for _ in range(3000):
+    session.get("trirail/demo/info", stuck, timeout=60.0)
+print("asked", flush=True)
+never.wait()
+"""
+
+
+def test_an_asker_that_takes_no_answer_holds_up_nobody_else(rig: Rig, tmp_path: Path) -> None:
+    gateway, _ = rig
+    gateway._inbox.declare()
+    locator = f"unixsock-stream/{tmp_path}/z"
+    over = threading.Event()
+
+    def serve() -> None:
+        while not over.wait(0.001):
+            for incoming in gateway._inbox.take(1000):
+                gateway._handle(incoming)
+
+    serving = threading.Thread(target=serve)
+    serving.start()
+    with (
+        session.open_client(locator) as other,
+        subprocess.Popen([sys.executable, "-c", STUCK, locator], stdout=subprocess.PIPE) as asker,
+    ):
+        try:
+            assert asker.stdout is not None
+            assert asker.stdout.readline() == b"asked\n"
+            for _ in range(5):
+                (reply,) = other.get("trirail/demo/cmd/ann/dance", timeout=20.0)
+                assert reply.err is not None
+                assert "no such command" in reply.err.payload.to_string()
+            assert gateway._replies.waiting > 100  # so many were not even tried meanwhile
+        finally:
+            asker.kill()
+            over.set()
+            serving.join()
