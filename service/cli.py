@@ -211,7 +211,7 @@ def resume(*, service: Service = HERE) -> int:
 
 @app.command
 def override(percent: float, /, *, service: Service = HERE) -> int:
-    """Let motions run at a share of full speed, 0 to 200 %, never beyond the limits."""
+    """Let motions run at a share of full speed, 0 or 1 to 200 %, never beyond the limits."""
     from service.client import Robot
 
     with Robot(service.robot, service.connect) as robot:

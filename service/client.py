@@ -293,8 +293,12 @@ class Robot:
         self.command("resume")
 
     def override(self, percent: float) -> None:
-        """Let this motion and those to come run at a share of full speed, 0 to 200 %, within the limits."""
-        self.command("override", msgspec.json.encode(Override(percent)))
+        """Let this motion and those to come run at a share of full speed, 0 or 1 to 200 %, within the limits."""
+        try:
+            content = Override(percent)
+        except ValueError as error:
+            raise RefusedError("malformed", f"no override: {error}") from error
+        self.command("override", msgspec.json.encode(content))
 
     def command(self, name: str, content: bytes | None = None) -> CommandReply:
         """Send a command; return once the service confirms that it has been carried out."""

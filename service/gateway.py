@@ -55,8 +55,10 @@ CONTENT: dict[str, tuple[Any, str]] = {
 STOPPING = ("stop", "disable", "quick_stop", "pause")
 AT_ONCE = 256
 """Messages from Zenoh that are read before the loop is listened to again."""
-BACKLOG = 20_000
+BACKLOG = 5_000
 """Goals that may wait for those before them; beyond that they are refused."""
+PATIENCE = 8.0
+"""A goal that has waited longer for those before it does not begin any more: its sender gives up soon [s]."""
 AHEAD = 2
 """Goals that the loop has at once, so that it has the next one when it is done with the last. The others wait here:
 a command overtakes them, and what waits when the robot is told to stop does not begin any more."""
@@ -192,6 +194,9 @@ class Gateway:
         """Pass on as many goals as the loop is to have."""
         while self._backlog and len(self._ahead) < AHEAD:
             incoming, request = self._backlog[0]
+            if time.monotonic_ns() - request.received_ns > PATIENCE * 1e9 and request.withdrawn is None:
+                reason = f"too many goals before it: it has waited longer than {PATIENCE:g} s"
+                request = msgspec.structs.replace(request, withdrawn=reason)
             if not self._link.send(message(request)):
                 return
             self._backlog.popleft()

@@ -14,8 +14,9 @@ import zenoh
 from service import session
 from service.sizes import MAX_MESSAGE, MAX_UNREAD
 
-UNREAD = 65_536
-"""Messages that may wait to be read; beyond that they are refused."""
+UNREAD = 8192
+"""Messages that may wait to be read; beyond that they are refused, commands at twice as many: a flood of goals must not
+keep a stop out."""
 
 Kind = Literal["goal", "cmd", "info"]
 
@@ -102,7 +103,8 @@ class Inbox:
         content = payload.to_bytes() if payload is not None and size <= MAX_MESSAGE else b""
         incoming = Incoming(kind, key, size, content, encoding, query)
         with self._lock:
-            fits = len(self._waiting) < UNREAD and self._bytes + len(content) <= MAX_UNREAD
+            room = 2 if kind == "cmd" else 1
+            fits = len(self._waiting) < room * UNREAD and self._bytes + len(content) <= room * MAX_UNREAD
             if fits:
                 self._waiting.append(incoming)
                 self._bytes += len(content)

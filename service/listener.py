@@ -1,4 +1,4 @@
-"""What a client hears of what is published: what is no message is skipped, counted, and said once for each key."""
+"""What a client hears of what is published: what is no message is skipped, counted, and said once."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ class Listener:
     def __init__(self) -> None:
         self.skipped = 0
         """Samples that were no messages."""
-        self._said: set[str] = set()
 
     def messages(self, kind: type[T], take: Callable[[T], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
         """Return what hands over messages of a kind, at once and in the connection's own thread: it must be quick."""
@@ -55,6 +54,5 @@ class Listener:
 
     def _skip(self, key: str, refusal: RefusedError) -> None:
         self.skipped += 1
-        if key not in self._said and len(self._said) < 100:
-            self._said.add(key)
-            _LOG.warning("trirail: skipped on %s: %s; more of that are only counted", quoted(key), refusal)
+        if self.skipped == 1:
+            _LOG.warning("trirail: skipped on %s: %s; what else is no message is only counted", quoted(key), refusal)

@@ -15,12 +15,13 @@ from service.errors import RefusedError
 from service.inbox import Incoming
 from service.messages import ErrorReply
 
-SENDERS = 8
-"""Threads: so many askers may be frozen before the others' answers wait for one of them to be given up."""
-UNSENT = 65_536
-"""Answers that may wait to be sent; beyond that they are lost."""
+LANES = 32
+"""Threads, and queues before them: an asker's answers go all through one, chosen by the key that was asked."""
 CLOSE_WITHIN = 2.0
 """How long the last answers may take [s]."""
+
+
+_Lane = queue.SimpleQueue[tuple[Incoming, msgspec.Struct] | None]
 
 
 class Replies:
@@ -28,28 +29,36 @@ class Replies:
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
-        self._queue: queue.Queue[tuple[Incoming, msgspec.Struct] | None] = queue.Queue(UNSENT)
-        self._threads = [threading.Thread(target=self._run, name="replies", daemon=True) for _ in range(SENDERS)]
+        self._lanes: list[_Lane] = [queue.SimpleQueue() for _ in range(LANES)]
+        self._threads = [
+            threading.Thread(target=self._run, args=(lane,), name="replies", daemon=True) for lane in self._lanes
+        ]
         for thread in self._threads:
             thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """How many answers wait for their turn."""
+        return sum(lane.qsize() for lane in self._lanes)
 
     def send(self, incoming: Incoming, content: msgspec.Struct) -> None:
         """Answer a query; nothing for a put."""
         if incoming.query is not None:
-            with contextlib.suppress(queue.Full):
-                self._queue.put_nowait((incoming, content))
+            # Of a command the user decides and not its name: who asks for one thing and does not listen is the same.
+            asker = "/".join(incoming.key.split("/")[:4])
+            # Not bounded: a query that is let go says so to its asker, and that may wait as long as an answer.
+            self._lanes[hash(asker) % LANES].put((incoming, content))
 
     def close(self) -> None:
         """Send what waits, for a while at most."""
         deadline = time.monotonic() + CLOSE_WITHIN
-        for _ in self._threads:
-            with contextlib.suppress(queue.Full):
-                self._queue.put(None, timeout=max(0.0, deadline - time.monotonic()))
+        for lane in self._lanes:
+            lane.put(None)
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
 
-    def _run(self) -> None:
-        while (item := self._queue.get()) is not None:
+    def _run(self, lane: _Lane) -> None:
+        while (item := lane.get()) is not None:
             incoming, content = item
             if incoming.query is not None:
                 with contextlib.suppress(zenoh.ZError):  # the asker has gone

@@ -36,6 +36,9 @@ def open_service(listen: Sequence[str]) -> zenoh.Session:
             "mode": "peer",
             "listen/endpoints": list(listen),
             "connect/endpoints": [],
+            # Connections on which nothing comes must not keep others out.
+            "transport/unicast/accept_pending": 1000,
+            "transport/unicast/accept_timeout": 3000,
             "timestamping/enabled": True,  # advanced publishers order their history by it
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
             "transport/link/tx/queue/congestion_control/block/wait_before_close": round(GIVEN_UP_AFTER * 1e6),

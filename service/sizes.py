@@ -8,8 +8,8 @@ MAX_MESSAGE = 262_144
 """A goal or command: the largest goal as JSON, indented and with all its digits. What is longer is refused before it is
 decoded [bytes]."""
 MAX_TRANSPORT = 4_194_304
-"""What the transport puts together of fragments, for each client: this bounds its memory. Up to that a message that is
-too large is answered; beyond, the transport ends the connection [bytes]."""
+"""What the transport puts together of fragments, for each client and priority: this bounds its memory. Up to that a
+message that is too large is answered; what is larger it throws away, and who asked waits until its time-out [bytes]."""
 MAX_UNREAD = 16_777_216
 """Messages that may wait in the gateway to be read, all together; beyond that they are refused [bytes]."""
 MAX_NAME = 64

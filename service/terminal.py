@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from service.config import Config
     from service.doctor import Check
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+out = Console(highlight=False, emoji=False)
+err = Console(stderr=True, highlight=False, emoji=False)
 
 COLOURS = {mode.value: palette.code(colour) for mode, colour in palette.MODES.items()}
 LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}

@@ -10,6 +10,7 @@ import msgspec
 from drivers import files
 from service.errors import TrirailError
 from service.messages import TrajectoryPoint
+from service.text import quoted
 
 COLUMNS = ("t", "x", "y", "phi")
 VELOCITY, ACCELERATION = ("vx", "vy", "w"), ("ax", "ay", "e")
@@ -21,8 +22,10 @@ def read(path: Path) -> list[TrajectoryPoint]:
     if path.suffix == ".json":
         try:
             return msgspec.json.decode(text, type=list[TrajectoryPoint])
-        except (msgspec.DecodeError, RecursionError) as error:
-            raise TrirailError(f"{path}: {str(error).replace('`', '')}") from error
+        except RecursionError as error:
+            raise TrirailError(f"{path}: nested too deep; a list of points is wanted") from error
+        except (msgspec.MsgspecError, ValueError) as error:
+            raise TrirailError(f"{path}: {quoted(str(error).replace('`', ''))}") from error
     try:
         return _from_csv(path, text)
     except csv.Error as error:
@@ -35,7 +38,7 @@ def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
     allowed = {*COLUMNS, *VELOCITY, *ACCELERATION}
     if not set(COLUMNS) <= set(names) <= allowed:
         raise TrirailError(
-            f"{path}: line 1: columns {', '.join(names) or 'none'}; wanted {', '.join(COLUMNS)}, "
+            f"{path}: line 1: columns {quoted(', '.join(names)) or 'none'}; wanted {', '.join(COLUMNS)}, "
             f"and if known {', '.join((*VELOCITY, *ACCELERATION))}"
         )
     points = []
@@ -50,7 +53,7 @@ def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
                 )
             )
         except (TypeError, ValueError, AttributeError) as error:
-            raise TrirailError(f"{path}: line {rows.line_num}: {error}") from error
+            raise TrirailError(f"{path}: line {rows.line_num}: {quoted(str(error))}") from error
     return points
 
 

@@ -1,0 +1,1 @@
+"""Whatever comes from outside: generated, at every boundary."""

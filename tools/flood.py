@@ -1,0 +1,267 @@
+"""A service among strangers: junk of every kind, for so many seconds, on every port it has; does it hold?
+
+Two hundred client sessions send what cannot be read, twenty subscribe and never read, and TCP connections stay
+half open on the Zenoh port and on Rerun's. Meanwhile a user moves the robot and stops it. Afterwards the same processes
+must live, the robot must move to a goal, and what memory and log have grown by must be bounded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import json
+import math
+import os
+import random
+import socket
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import zenoh
+
+from service import boundary, session, spawned
+from service.client import Robot
+from service.errors import RefusedError, ServiceError, TrirailError
+from service.sinks import free_port
+from service.sizes import MAX_MESSAGE
+
+SESSIONS = 200
+DEAF = 20
+"""Sessions that subscribe to everything and never read."""
+HALF_OPEN = 150
+"""TCP connections on each port on which nothing sensible comes."""
+SENDERS = 4
+PENDING = 200
+"""Queries of one sender that may be without an answer."""
+GREATEST_MB = 900.0
+"""What no process of the service may be beyond [1e6 bytes]."""
+LOG_BYTES = 100_000
+STOP_WITHIN = 5.0
+"""How long a stop may take to be answered on a machine that the flood keeps busy [s]."""
+
+ODD = ("\x1b[2J", "\u202e", "\0", "\n", "[/]", "\ue000", "😀", "'", "`", "%s", "{}")
+NUMBERS = (0.0, -0.0, 1e-310, 1e-17, 0.5, 1.0, 1e17, 1e300, -1e300)
+
+
+class Message(NamedTuple):
+    """What is to be sent: by a query, or by a put."""
+
+    key: str
+    payload: bytes
+    encoding: str | None = None
+
+
+def _goal(rnd: random.Random, **fields: object) -> bytes:
+    goal = {"kind": "pose", "x": rnd.choice((9.0, 1e300)), "y": rnd.choice(NUMBERS), "phi": 0.0} | fields
+    return json.dumps(goal).encode()
+
+
+def _trajectory(points: int) -> bytes:
+    listed = [{"t": n, "x": 9.0, "y": 0.0, "phi": 0.0} for n in range(points)]
+    return json.dumps({"kind": "trajectory", "points": listed}).encode()
+
+
+def _key(*parts: str) -> str:
+    return session.key("demo", *parts)
+
+
+JUNK: dict[str, Callable[[random.Random], Message]] = {
+    "bytes": lambda rnd: Message(_key("goal", "eve"), rnd.randbytes(rnd.randrange(200))),
+    "packed bytes": lambda rnd: Message(_key("goal", "eve"), rnd.randbytes(50), boundary.MSGPACK),
+    "nested": lambda rnd: Message(_key("goal", "eve"), rnd.choice((b'{"a":', b"[", b'{"kind":')) * rnd.randrange(9000)),
+    "nested, packed": lambda rnd: Message(_key("goal", "eve"), b"\x91" * rnd.randrange(9000), boundary.MSGPACK),
+    "numbers": lambda rnd: Message(_key("goal", "eve"), _goal(rnd, speed=rnd.choice(NUMBERS), blend=1e-320)),
+    "fields": lambda rnd: Message(_key("goal", "eve"), _goal(rnd, **{rnd.choice(ODD) * 9: rnd.choice(ODD)})),
+    "ids": lambda rnd: Message(_key("goal", "eve"), _goal(rnd, id=rnd.choice(ODD) * rnd.randrange(90))),
+    "users": lambda rnd: Message(_key("goal", rnd.choice("ü x%") * rnd.choice((1, 65, 3000))), _goal(rnd)),
+    "too large": lambda rnd: Message(_key("goal", "eve"), bytes(rnd.randrange(MAX_MESSAGE, 2 * MAX_MESSAGE))),
+    "encodings": lambda rnd: Message(_key("goal", "eve"), _goal(rnd), rnd.choice(("image/png", "a/b;c", "zenoh/x"))),
+    "wildcards": lambda rnd: Message(rnd.choice(("**", "trirail/**", _key("**"), _key("goal", "*"))), _goal(rnd)),
+    "commands": lambda rnd: Message(_key("cmd", "eve", rnd.choice(("dance", "override", "pause"))), rnd.randbytes(9)),
+    "states": lambda rnd: Message(_key(rnd.choice(("state", "event", "records"))), rnd.randbytes(rnd.randrange(3000))),
+    "info": lambda rnd: Message(_key("info"), rnd.randbytes(rnd.randrange(3000))),
+    "trajectories": lambda rnd: Message(_key("goal", "eve"), _trajectory(rnd.randrange(500))),
+    "duplicates": lambda rnd: Message(_key("goal", "eve"), _goal(rnd, x=9.0, id="same")),
+}
+
+
+class Flood:
+    """Sends junk while its context lasts."""
+
+    def __init__(self, locator: str, ports: tuple[int, ...], rate: float) -> None:
+        self.sent: Counter[str] = Counter()
+        self.answered = 0
+        self._locator = locator
+        self._ports = ports
+        self._pause = SENDERS / rate
+        self._over = threading.Event()
+        self._stack = contextlib.ExitStack()
+        self._threads: list[threading.Thread] = []
+
+    def __enter__(self) -> Flood:
+        sessions = [self._stack.enter_context(session.open_client(self._locator)) for _ in range(SESSIONS)]
+        deaf = [one.declare_subscriber("trirail/**", zenoh.handlers.FifoChannel(1)) for one in sessions[:DEAF]]
+        self._stack.callback(deaf.clear)
+        share = (SESSIONS - DEAF) // SENDERS
+        for number in range(SENDERS):
+            own = sessions[DEAF + number * share :][:share]
+            self._begin(lambda own=own, number=number: self._send(own, random.Random(number)))  # type: ignore[misc]
+        for port in self._ports:
+            self._begin(lambda port=port: self._half_open(port, random.Random(port)))  # type: ignore[misc]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        for thread in self._threads:
+            thread.join()
+        self._stack.close()
+
+    def _begin(self, what: Callable[[], None]) -> None:
+        thread = threading.Thread(target=what, daemon=True)
+        thread.start()
+        self._threads.append(thread)
+
+    def _send(self, sessions: list[zenoh.Session], rnd: random.Random) -> None:
+        pending = threading.Semaphore(PENDING)
+
+        def over(_: zenoh.Reply) -> None:
+            self.answered += 1
+
+        for one in itertools.cycle(sessions):
+            kind, make = rnd.choice(list(JUNK.items()))
+            key, payload, encoding = make(rnd)
+            with contextlib.suppress(zenoh.ZError):  # a connection that the service has ended
+                if kind == "states" or rnd.random() < 0.3:
+                    one.put(key, payload, encoding=encoding)
+                elif pending.acquire(timeout=5.0):
+                    handler = zenoh.handlers.Callback(over, drop=pending.release, indirect=False)
+                    one.get(key, handler, payload=payload, encoding=encoding, timeout=5.0)
+            self.sent[kind] += 1
+            if self._over.wait(self._pause):
+                return
+
+    def _half_open(self, port: int, rnd: random.Random) -> None:
+        kept: list[socket.socket] = []
+        while not self._over.wait(0.02):
+            with contextlib.suppress(OSError):
+                connection = socket.create_connection(("127.0.0.1", port), timeout=1.0)
+                kept.append(connection)
+                connection.setblocking(False)
+                connection.send(
+                    rnd.choice((b"", b"\0", rnd.randbytes(900), b"GET / HTTP/1.1\r\n", b"PRI * HTTP/2.0\r\n"))
+                )
+                self.sent["connections"] += 1
+            while len(kept) > HALF_OPEN:
+                kept.pop(rnd.randrange(len(kept))).close()
+        for connection in kept:
+            connection.close()
+
+
+def processes(supervisor: int) -> dict[str, int]:
+    """Return a service's processes by their names."""
+    found = {"supervisor": supervisor}
+    for entry in Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split():
+        found[Path(f"/proc/{entry}/cmdline").read_text().split("\0")[3]] = int(entry)
+    return found
+
+
+def memory(pids: dict[str, int]) -> dict[str, float]:
+    """Return what each process holds of the memory [1e6 bytes]."""
+    page = os.sysconf("SC_PAGE_SIZE")
+    return {name: int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * page / 1e6 for name, pid in pids.items()}
+
+
+@contextlib.contextmanager
+def private_service(folder: Path) -> Iterator[tuple[spawned.Process, str, tuple[int, int]]]:
+    """Run a service on TCP ports of its own; give its process, its locator and the ports."""
+    zenoh_port, live_port = free_port(), free_port()
+    config, private = spawned.private(folder, live_port)
+    locator = f"tcp/127.0.0.1:{zenoh_port}"
+    config.write_text(config.read_text().replace(private, locator))
+    with spawned.service(config, folder / "flood.rrd") as process:
+        yield process, locator, (zenoh_port, live_port)
+
+
+def use(locator: str, seconds: float) -> tuple[int, list[float]]:
+    """Come, move the robot and stop it, as its users would; return the goals taken and how long each stop took."""
+    ends, taken = time.monotonic() + seconds, 0
+    stops: list[float] = []
+    for number in itertools.count():
+        if time.monotonic() >= ends:
+            break
+        asked = math.inf
+        with contextlib.suppress(ServiceError), Robot("demo", locator, user="ann") as robot:
+            with contextlib.suppress(RefusedError):
+                robot.move_to(x=0.02 * (number % 2), y=0.0, phi=0.0)
+                taken += 1
+            asked = time.monotonic()
+            with contextlib.suppress(RefusedError):
+                robot.stop()
+            asked -= time.monotonic()
+        stops.append(abs(asked))
+        time.sleep(0.1)
+    return taken, stops
+
+
+def run(seconds: float, rate: float) -> list[str]:
+    """Flood a service for so many seconds; print what happened, and return what did not hold."""
+    with tempfile.TemporaryDirectory() as name, private_service(Path(name)) as (service, locator, ports):
+        pids = processes(service.pid)
+        with Robot("demo", locator, user="ann") as robot:
+            robot.enable()
+            before = memory(pids)
+            with Flood(locator, ports, rate) as flood:
+                taken, stops = use(locator, seconds)
+            after = memory(pids)
+            kinds = sum(flood.sent.values())
+            print(f"{kinds} messages of {len(flood.sent)} kinds in {seconds:g} s, {flood.answered} answers")
+            print(f"{taken} goals taken, {len(stops)} stops, the slowest answered in {max(stops):.2f} s")
+            for process in pids:
+                print(f"{process:12}{before[process]:7.0f} MB before, {after[process]:7.0f} MB after")
+            return list(_failures(robot, service.pid, pids, after, stops))
+
+
+def _failures(
+    robot: Robot, service: int, pids: dict[str, int], after: dict[str, float], stops: list[float]
+) -> Iterator[str]:
+    if processes(service) != pids:
+        yield f"processes have ended: {pids} before, {processes(service)} after"
+    if max(stops) > STOP_WITHIN:
+        yield f"a stop was answered after {max(stops):.1f} s"
+    for name, held in after.items():
+        if held > GREATEST_MB:
+            yield f"the {name} holds {held:.0f} MB"
+    size = os.stat(f"/proc/{service}/fd/1").st_size
+    print(f"{size} bytes of log")
+    if size > LOG_BYTES:
+        yield f"the log has {size} bytes"
+    try:
+        result = robot.move_to(x=0.03, y=0.01, phi=0.1).wait(20.0)
+        if result.outcome != "done":
+            yield f"the robot did not move: {result.message}"
+    except (TrirailError, TimeoutError) as error:
+        yield f"the robot does not move: {error}"
+
+
+def main() -> int:
+    """Run as the command line says; exit 1 where something did not hold."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("seconds", type=float)
+    parser.add_argument("--rate", type=float, default=3000.0, help="messages a second at most, of all sessions")
+    arguments = parser.parse_args()
+    failures = run(arguments.seconds, arguments.rate)
+    for failure in failures:
+        print(f"does not hold: {failure}")
+    print("held" if not failures else "did not hold")
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
