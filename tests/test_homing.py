@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,7 @@ from conftest import CONFIG, Delay, Rig, changed
 
 from drivers import config, frames
 from drivers.eds import SERVO
+from drivers.homing402 import TAKEN_UP
 from drivers.interface import PowerState
 from drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from service.config import Config, geometry
@@ -287,6 +289,54 @@ def test_a_stop_halts_it_and_it_can_begin_again(event: str | Event, end: Mode, w
     assert isinstance(rig.command("home"), Confirmed)
     assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
     rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("delay", [None, part_of_a_cycle, a_cycle, one_drive_late])
+@pytest.mark.parametrize("when", [*range(12), 30])
+def test_a_drive_that_is_halted_follows_setpoints_only_when_it_stands(delay: Delay | None, when: int) -> None:
+    """However slowly it brakes, and whatever its last statusword from before the start still said of a standstill."""
+    rig = Rig(incremental(acceleration=0.1), delay)
+    rig.enable()
+    rig.cycles(5)
+    begin(rig, when)
+    rig.order("stop")
+    while rig.mode is not Mode.HOLDING:
+        was = modes(rig)
+        rig.cycle()
+        for drive, before, now in zip(rig.drives, was, modes(rig), strict=True):
+            if (before, now) == (6, 8):
+                assert drive.servo.velocity == 0.0
+                assert abs(drive.objects[0x607A, 0].value - drive.servo.position) <= 1
+    assert rig.control.fault is None
+    settled(rig)
+    rig.bus.shutdown()
+
+
+def test_the_held_setpoint_is_taken_up_before_setpoints_are_followed(rig: Rig) -> None:
+    """Where an encoder flickers by some counts, the drive has the one position that is held from then on."""
+    held: list[bytes] = []
+    asked: list[int] = []
+    receive, flicker = rig.bus.recv, itertools.cycle((0, 7, -5))
+
+    def recv(timeout: float | None = None) -> can.Message | None:
+        message = receive(timeout)
+        if message is not None and message.arbitration_id == frames.TPDO2 + 1 and not asked:
+            (counts,) = frames.POSITION.unpack(message.data)
+            message.data[:] = frames.POSITION.pack(counts + next(flicker))
+        return message
+
+    rig.bus.recv = recv  # type: ignore[method-assign]
+    rig.enable()
+    begin(rig, 40)
+    rig.order("stop")
+    while rig.mode is not Mode.HOLDING:
+        rig.cycle()
+        held += [bytes(message.data) for message in rig.sent if message.arbitration_id == frames.RPDO2 + 1]
+        if any(m.arbitration_id == frames.SDO_REQUEST + 1 and m.data[:5] == b"\x2f\x60\x60\0\x08" for m in rig.sent):
+            asked.append(len(held))  # the setpoint of this cycle goes out after the request
+    (since,) = asked
+    assert len(set(held[since - 1 - TAKEN_UP :])) == 1
+    assert len(set(held[since - 1 - TAKEN_UP - 3 :])) > 1
 
 
 def test_a_stop_when_the_last_drive_is_home_comes_too_late(rig: Rig) -> None:
