@@ -17,7 +17,6 @@ from conftest import CONFIG, Delay, Rig, changed
 
 from drivers import config, frames
 from drivers.eds import SERVO
-from drivers.homing402 import TAKEN_UP
 from drivers.interface import PowerState
 from drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from service.config import Config, geometry
@@ -291,25 +290,54 @@ def test_a_stop_halts_it_and_it_can_begin_again(event: str | Event, end: Mode, w
     rig.bus.shutdown()
 
 
-@pytest.mark.parametrize("delay", [None, part_of_a_cycle, a_cycle, one_drive_late])
-@pytest.mark.parametrize("when", [*range(12), 30])
-def test_a_drive_that_is_halted_follows_setpoints_only_when_it_stands(delay: Delay | None, when: int) -> None:
-    """However slowly it brakes, and whatever its last statusword from before the start still said of a standstill."""
-    rig = Rig(incremental(acceleration=0.1), delay)
-    rig.enable()
-    rig.cycles(5)
-    begin(rig, when)
+def halted_at_rest(rig: Rig) -> None:
+    """Stop; a drive that is halted follows setpoints again only when it stands, and from where it stands."""
     rig.order("stop")
     while rig.mode is not Mode.HOLDING:
-        was = modes(rig)
+        was, speeds = modes(rig), [drive.servo.velocity for drive in rig.drives]
         rig.cycle()
-        for drive, before, now in zip(rig.drives, was, modes(rig), strict=True):
+        for drive, speed, before, now in zip(rig.drives, speeds, was, modes(rig), strict=True):
             if (before, now) == (6, 8):
-                assert drive.servo.velocity == 0.0
+                assert speed == 0.0
                 assert abs(drive.objects[0x607A, 0].value - drive.servo.position) <= 1
     assert rig.control.fault is None
     settled(rig)
     rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("delay", [None, part_of_a_cycle, a_cycle, one_drive_late])
+@pytest.mark.parametrize("when", [2, 5, 30, 300])
+def test_a_drive_that_brakes_slowly_follows_setpoints_only_when_it_stands(delay: Delay | None, when: int) -> None:
+    rig = Rig(incremental(acceleration=0.1), delay)
+    rig.enable()
+    begin(rig, when)
+    halted_at_rest(rig)
+
+
+@pytest.mark.parametrize("when", range(2, 10))
+def test_a_standstill_from_before_the_start_is_not_taken_for_that_of_the_halt(
+    when: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Statuswords come three cycles late, from a drive that is fast at once and brakes slowly."""
+
+    def late_status(message: can.Message) -> float:
+        return 3.0 * PERIOD if message.arbitration_id == frames.TPDO1 + 1 else 0.0
+
+    rig = Rig(incremental(acceleration=50.0), late_status)
+    drive = rig.drives[0]
+    move = drive.homing.move
+
+    def brake_slowly(step: float, halted: bool) -> None:
+        if halted or not drive.homing.under_way:
+            drive.servo.run(0.0, 0.1 * CONFIG.drives.A.counts_per_metre, step)
+        else:
+            move(step, halted)
+
+    monkeypatch.setattr(drive.homing, "move", brake_slowly)
+    rig.enable()
+    rig.cycles(5)
+    begin(rig, when)
+    halted_at_rest(rig)
 
 
 def test_the_held_setpoint_is_taken_up_before_setpoints_are_followed(rig: Rig) -> None:
@@ -335,8 +363,9 @@ def test_the_held_setpoint_is_taken_up_before_setpoints_are_followed(rig: Rig) -
         if any(m.arbitration_id == frames.SDO_REQUEST + 1 and m.data[:5] == b"\x2f\x60\x60\0\x08" for m in rig.sent):
             asked.append(len(held))  # the setpoint of this cycle goes out after the request
     (since,) = asked
-    assert len(set(held[since - 1 - TAKEN_UP :])) == 1
-    assert len(set(held[since - 1 - TAKEN_UP - 3 :])) > 1
+    # Of the setpoints written before the request the last one waits for the next SYNC; the one before is taken up.
+    assert len(set(held[since - 3 :])) == 1
+    assert len(set(held[since - 6 : since - 3])) > 1
 
 
 def test_a_stop_when_the_last_drive_is_home_comes_too_late(rig: Rig) -> None:
