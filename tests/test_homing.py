@@ -290,6 +290,12 @@ def test_a_stop_halts_it_and_it_can_begin_again(event: str | Event, end: Mode, w
     rig.bus.shutdown()
 
 
+def braking_slowly(acceleration: float) -> Config:
+    """Drives whose quick-stop ramp, by which simulated ones halt as well, is a tenth of a metre per second squared."""
+    robot = incremental(acceleration=acceleration)
+    return msgspec.structs.replace(robot, drives=msgspec.structs.replace(robot.drives, quick_stop_deceleration=0.1))
+
+
 def halted_at_rest(rig: Rig) -> None:
     """Stop; a drive that is halted follows setpoints again only when it stands, and from where it stands."""
     rig.order("stop")
@@ -308,32 +314,20 @@ def halted_at_rest(rig: Rig) -> None:
 @pytest.mark.parametrize("delay", [None, part_of_a_cycle, a_cycle, one_drive_late])
 @pytest.mark.parametrize("when", [2, 5, 30, 300])
 def test_a_drive_that_brakes_slowly_follows_setpoints_only_when_it_stands(delay: Delay | None, when: int) -> None:
-    rig = Rig(incremental(acceleration=0.1), delay)
+    rig = Rig(braking_slowly(acceleration=0.1), delay)
     rig.enable()
     begin(rig, when)
     halted_at_rest(rig)
 
 
 @pytest.mark.parametrize("when", range(2, 10))
-def test_a_standstill_from_before_the_start_is_not_taken_for_that_of_the_halt(
-    when: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_standstill_from_before_the_start_is_not_taken_for_that_of_the_halt(when: int) -> None:
     """Statuswords come three cycles late, from a drive that is fast at once and brakes slowly."""
 
     def late_status(message: can.Message) -> float:
         return 3.0 * PERIOD if message.arbitration_id == frames.TPDO1 + 1 else 0.0
 
-    rig = Rig(incremental(acceleration=50.0), late_status)
-    drive = rig.drives[0]
-    move = drive.homing.move
-
-    def brake_slowly(step: float, halted: bool) -> None:
-        if halted or not drive.homing.under_way:
-            drive.servo.run(0.0, 0.1 * CONFIG.drives.A.counts_per_metre, step)
-        else:
-            move(step, halted)
-
-    monkeypatch.setattr(drive.homing, "move", brake_slowly)
+    rig = Rig(braking_slowly(acceleration=50.0), late_status)
     rig.enable()
     rig.cycles(5)
     begin(rig, when)
