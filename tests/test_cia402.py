@@ -530,6 +530,14 @@ class TestPower:
         feedback = enabled.cycles(1500)
         assert (feedback.fault, feedback.state) == (None, (P.OPERATION_ENABLED,) * 3)
 
+    @pytest.mark.parametrize("stop", ["disable", "quick_stop"])
+    def test_drives_that_are_enabled_again_in_time_keep_their_power(self, enabled: Rig, stop: str) -> None:
+        getattr(enabled.drives, stop)()
+        enabled.cycles(200)
+        enabled.enable()
+        feedback = enabled.cycles(1500)
+        assert (feedback.fault, feedback.state) == (None, (P.OPERATION_ENABLED,) * 3)
+
     def test_drives_that_stop_and_lose_power_are_no_fault(self, enabled: Rig) -> None:
         enabled.drives.disable()
         assert enabled.cycles(1500).fault is None

@@ -578,6 +578,20 @@ class TestFaults:
         assert fault is not None
         assert fault.message == "drive B: is in closed loop control 1 s after reset; idle was expected"
 
+    @pytest.mark.parametrize("stop", ["disable", "quick_stop"])
+    def test_drives_that_are_enabled_again_in_time_keep_their_power(self, enabled: Rig, stop: str) -> None:
+        getattr(enabled.drives, stop)()
+        enabled.cycles(400)
+        enabled.enable()
+        feedback = enabled.cycles(1500)
+        assert (feedback.fault, feedback.state) == (None, (P.OPERATION_ENABLED,) * 3)
+
+    def test_a_quick_stop_before_the_first_setpoint_takes_the_power_back(self, ready: Rig) -> None:
+        ready.drives.enable()
+        ready.drives.quick_stop()
+        feedback = ready.cycles(1500)
+        assert (feedback.fault, feedback.state) == (None, (P.SWITCH_ON_DISABLED,) * 3)
+
     def test_reset_of_drives_that_follow_setpoints_takes_no_power(self, enabled: Rig) -> None:
         enabled.drives.reset()
         feedback = enabled.cycles(1500)
