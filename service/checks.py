@@ -127,7 +127,7 @@ class Checker:
         if advance(self._legs, *path, *law[:2], time, near, motion) or inverse_into(self._legs, motion, rows):
             return RefusedError("singular", f"{where}: the robot is singular there")
         still = rows[0].tolist(), STILL, STILL, rows[3].tolist()
-        violation = self._bounds.pose(motion[0].tolist()) or self._bounds.setpoint(still, still[0])
+        violation = self._bounds.pose(motion[0].tolist()) or self._bounds.setpoint(still)
         if violation is None:
             return RefusedError("out_of_workspace", where)
         return RefusedError(
