@@ -40,6 +40,10 @@ class Goal(NamedTuple):
     """How far from its end the next goal may begin [m]; None where that preempts it."""
     expires: float
     """In which cycle it is too late to begin."""
+    alive_until: float
+    """In which cycle it ends unless it has been renewed, for a jog."""
+    released: bool = False
+    """Whether that has happened: a jog that nobody renewed does not come back."""
 
 
 class Desk:
@@ -50,7 +54,7 @@ class Desk:
         """The goal that the robot is moving to, and those to follow it."""
         self.answers: list[Answer] = []
         self.happenings: list[Happening] = []
-        self._commands: list[tuple[CommandRequest, int]] = []
+        self._commands: dict[str, deque[tuple[CommandRequest, int]]] = {}
         self._ended: dict[str, None] = {}
 
     # ------------------------------------------------------------------ goals
@@ -66,8 +70,23 @@ class Desk:
         running = any(goal.id == goal_id for goal in self.goals)
         if goal_id in self._ended or (running and not self._is_fresh(request)):
             raise RefusedError("duplicate_id", f"goal id {goal_id!r} has been used: every goal needs its own")
+        if self.goal is not None and self.goal.released and self._is_fresh(request):
+            raise RefusedError("jog_over", f"jog {goal_id!r} was not renewed in time and is over: begin a new one")
 
-    def begin(self, request: GoalRequest, taken: Taken, expires: float) -> None:
+    def keep_alive(self, request: GoalRequest, until: float) -> None:
+        """Let the jog under way go on until a cycle, if this renews it."""
+        if self._is_fresh(request):
+            self.goals[0] = self.goals[0]._replace(alive_until=until)
+
+    def release(self, cycle: int) -> Goal | None:
+        """Return the jog under way if it has not been renewed in time, the first time that this is so."""
+        goal = self.goal
+        if goal is None or goal.released or cycle <= goal.alive_until:
+            return None
+        self.goals[0] = goal._replace(released=True)
+        return goal
+
+    def begin(self, request: GoalRequest, taken: Taken, expires: float, alive_until: float) -> None:
         """Accept a goal; those before it are preempted, unless it follows them or is the same jog afresh."""
         self.answers.append(
             Accepted(request.ticket, request.id, taken.duration, taken.slowed, taken.stops_first, taken.queued)
@@ -78,7 +97,7 @@ class Desk:
             self.end("preempted", f"preempted by goal {request.id}")
         blend = request.goal.blend if isinstance(request.goal, PoseGoal) else None
         is_jog = isinstance(request.goal, VelocityGoal)
-        self.goals.append(Goal(request.id, request.user, is_jog, blend, expires))
+        self.goals.append(Goal(request.id, request.user, is_jog, blend, expires, alive_until))
 
     def pass_on(self) -> None:
         """The first goal is reached, and the one that waited for it has begun."""
@@ -117,9 +136,14 @@ class Desk:
                 self._ending(request.id, request.user, outcome, text)
 
     def _is_fresh(self, request: GoalRequest) -> bool:
-        """Whether it renews the jog that is under way."""
+        """Whether it renews the jog that is under way; only its own user can."""
         goal = self.goal
-        return goal is not None and goal.id == request.id and goal.is_jog and isinstance(request.goal, VelocityGoal)
+        return (
+            goal is not None
+            and (goal.id, goal.user) == (request.id, request.user)
+            and goal.is_jog
+            and isinstance(request.goal, VelocityGoal)
+        )
 
     def _ending(self, goal_id: str, user: str, outcome: Outcome, reason: str) -> None:
         level = _LEVELS.get(outcome, "info")
@@ -132,23 +156,21 @@ class Desk:
 
     def undertake(self, request: CommandRequest, cycle: int) -> None:
         """Take a command on; it is answered once it has been carried out."""
-        self._commands.append((request, cycle))
+        self._commands.setdefault(request.name, deque()).append((request, cycle))
 
     def settle(self, verdict: Callable[[str, int], str | None], mode: str) -> None:
         """Answer the commands that are done or never will be.
 
         `verdict`, given a command's name and the cycle it came in, is "" for done, None for not yet, else why not.
+        A command is never done before an earlier one of its name: where that is not, the later ones are not looked at.
         """
-        still = []
-        for request, since in self._commands:
-            why = verdict(request.name, since)
-            if why is None:
-                still.append((request, since))
-            elif why:
-                self.answers.append(Refused(request.ticket, "failed", f"{request.name} failed: {why}"))
-            else:
-                self.answers.append(Confirmed(request.ticket, request.name, mode))
-        self._commands = still
+        for name, under_way in self._commands.items():
+            while under_way and (why := verdict(name, under_way[0][1])) is not None:
+                request, _ = under_way.popleft()
+                if why:
+                    self.answers.append(Refused(request.ticket, "failed", f"{name} failed: {why}"))
+                else:
+                    self.answers.append(Confirmed(request.ticket, name, mode))
 
     # ------------------------------------------------------------------ everyone
 

@@ -198,7 +198,8 @@ class Goals:
         """Return the time along a run's path from which on it is within `blend` of its end [s]."""
         end = run.path.duration
         target = _state(run.path, end).pose
-        soonest = run.at.s + LEAD * self._period * max(run.at.rate, run.target)
+        # Strictly ahead, also where time along the path stands still: at override 0 it may be told to run at any time.
+        soonest = run.at.s + LEAD * self._period * max(run.at.rate, run.target, 1.0)
         low, high = max(soonest, run.seams[-1].s if run.seams else 0.0), end
         if low >= end or self._planner.nearness(_state(run.path, low).pose, target) <= blend:
             return min(low, end)

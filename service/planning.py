@@ -32,6 +32,8 @@ ROOM = 0.97
 """Share of what would just fit that is made use of where rounding must not make it too fast."""
 JOGS = 5
 """How often a jog is tried slower or shorter before it only brakes."""
+FASTEST_OVERRIDE = 2.0
+"""At how many times its nominal rate the time along a path may be told to run."""
 JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
 """Ruckig finds no solution just where one kind of profile gives way to another, as for a distance of 2 a³ / j²
 from rest to rest: there a hair less jerk has one."""
@@ -142,12 +144,13 @@ class Planner:
         return (yield from self._to_rest(start, sliders, target, self._sliders, speed, in_sliders=True))
 
     def jog(self, start: MotionState, velocity: Sequence[float], timeout: float) -> Steps[Plan]:
-        """Plan to a velocity, held until `timeout` is over or a limit comes near, and to rest.
+        """Plan to a velocity, held until `timeout` is surely over or a limit comes near, and to rest.
 
+        `timeout` is real time, and time along the path runs at up to twice its rate: who ends the jog is the control.
         Faster than platform or sliders may: as fast as they may. Raises RefusedError where not even braking stays
         inside.
         """
-        share, hold = 1.0, timeout
+        share, hold = 1.0, FASTEST_OVERRIDE * timeout
         for value, limit in zip(velocity, self._platform.velocity, strict=True):
             if abs(value) * share > limit:
                 share = limit / abs(value)

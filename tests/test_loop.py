@@ -11,11 +11,14 @@ from conftest import Rig
 from service import links
 from service.clock import Tick
 from service.links import Link, Port
-from service.loop import BATCHES_PER_SECOND, Loop
+from service.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop
+from service.messages import PoseGoal
 from service.modes import Mode
 from service.packets import (
     CommandRequest,
+    Confirmed,
     DrivesFault,
+    GoalRequest,
     Happened,
     Input,
     Kind,
@@ -51,6 +54,9 @@ class Shell:
         self.gateway.send(message(CommandRequest(1, "ann", "enable")))
         self.cycles(20)
         assert self.loop.control.state.mode is Mode.HOLDING
+
+    def is_in(self, mode: Mode) -> bool:
+        return self.loop.control.state.mode is mode
 
     def received(self, by: Link | None = None) -> list[bytes]:
         packets = []
@@ -170,3 +176,46 @@ def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
     assert told[1][1].startswith("the recorder said something unreadable")
     assert len(told) == 2
     assert shell.loop.control.state.mode is Mode.HOLDING
+
+
+def answered(packets: list[bytes]) -> list[int]:
+    """Tickets of the commands that are confirmed, in order."""
+    said = [decode_answer(packet[1:]) for packet in packets if packet[0] == Kind.MESSAGE]
+    return [answer.ticket for answer in said if isinstance(answer, Confirmed)]
+
+
+def test_a_stop_behind_a_flood_of_commands_is_carried_out_while_they_arrive(shell: Shell) -> None:
+    shell.enabled()
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.08, 0.02, 0.2), now)))
+    shell.cycles(100)
+    assert shell.is_in(Mode.MOVING)
+    for ticket in range(100, 200):
+        shell.gateway.send(message(CommandRequest(ticket, "eve", "override", 1.0)))
+    shell.gateway.send(message(CommandRequest(200, "ann", "stop")))
+    shell.cycles(100 // REQUESTS_A_CYCLE + 1)
+    assert shell.is_in(Mode.STOPPING)
+    shell.cycles(400)
+    assert answered(shell.received())[1:] == list(range(100, 201))
+
+
+def test_an_answer_waits_for_a_gateway_that_is_slow(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    shell.enabled()
+    shell.received()
+    with monkeypatch.context() as full:
+        full.setattr(shell.ports[0], "send", lambda _packet: False)
+        for ticket in range(100, 130):
+            shell.gateway.send(message(CommandRequest(ticket, "ann", "stop")))
+        shell.cycles(50)
+    shell.cycles(10)
+    assert answered(shell.received()) == list(range(100, 130))
+
+
+def test_nobody_is_told_what_a_gateway_that_is_gone_was_asked(shell: Shell, tmp_path: Path) -> None:
+    shell.enabled()
+    shell.gateway.send(message(CommandRequest(100, "ann", "stop")))
+    shell.gateway.close()
+    shell.cycles(30)
+    shell.gateway = links.connect(tmp_path / "gateway")
+    shell.cycles(30)
+    assert answered(shell.received()) == []

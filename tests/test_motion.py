@@ -65,7 +65,7 @@ def accepted(answer: Answer) -> Accepted:
 
 
 def stands(rig: Rig) -> bool:
-    return rig.mode is Mode.HOLDING and not rig.control._pilot.busy and rig.control.dispatch.ready
+    return rig.mode is Mode.HOLDING and rig.control.dispatch.idle
 
 
 def bare(start: tuple[float, float, float], end: tuple[float, float, float]) -> float:
@@ -347,7 +347,7 @@ def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig) -> None:
         if k % 100 == 0:
             rig.rows.clear()
             rig.seen.clear()
-    rig.until(lambda: rig.control.dispatch.ready and not rig._posted and not rig.control._pilot.busy, 50_000)
+    rig.until(lambda: rig.control.dispatch.idle, 50_000)
     rig.order("override", 1.0)
     rig.order("stop")
     rig.until(lambda: rig.mode in (Mode.HOLDING, Mode.DISABLED, Mode.FAULT))
