@@ -17,7 +17,7 @@ EDGE = 1e-6
 """By so much may a setpoint be beyond a limit of position that its path was checked against [m, rad]."""
 EXCESS = 1e-3
 """By that share may a setpoint exceed a limit of velocity, acceleration or jerk that its path was checked against."""
-PLATFORM_EXCESS = (0.01, 0.03, 0.1)
+PLATFORM_EXCESS = (0.01, 0.05, 0.1)
 """Likewise the platform's velocity, acceleration and jerk: plans make use of all of it (checks.PLATFORM_LAWS)."""
 
 
