@@ -35,8 +35,17 @@ class Violation(NamedTuple):
     unit: str
 
     def __str__(self) -> str:
-        subject = f"slider {self.what}" if self.what in LEGS else f"platform {self.what}"
-        return beyond(f"{subject}: {self.quantity}", self.value, self.limit, self.unit)
+        return beyond(f"{self.subject}: {self.quantity}", self.value, self.limit, self.unit)
+
+    @property
+    def subject(self) -> str:
+        """What is beyond its bound, in words."""
+        return f"slider {self.what}" if self.what in LEGS else f"platform {self.what}"
+
+    @property
+    def bound(self) -> str:
+        """The bound alone, in words."""
+        return f"{self.subject} ({self.quantity} {self.limit:.6g} {self.unit})"
 
 
 def beyond(what: str, value: float, limit: float, unit: str) -> str:

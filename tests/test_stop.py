@@ -230,7 +230,7 @@ def test_a_jog_lasts_as_long_as_it_is_renewed(rig: Rig, override: float) -> None
         assert isinstance(rig.send("j1", VelocityGoal(0.02, 0.0, 0.0, timeout=0.06)), Accepted)
         rig.cycles(20)
     assert rig.mode is Mode.MOVING
-    assert rig.control.commanded.velocity[0] == pytest.approx(0.02 * min(override, 2.0), rel=1e-6)
+    assert rig.control.commanded.velocity[0] == pytest.approx(0.02 * min(override, 1.0), rel=1e-6)
     assert rig.outcomes() == []
 
 
