@@ -13,7 +13,7 @@ from service.config import Limits
 from service.errors import RefusedError
 from service.geometry import Geometry
 from service.kinematics import inverse_into
-from service.limits import COORDINATES, LEGS, Bounds
+from service.limits import COORDINATES, LEGS, Bounds, Violation
 from service.motion import STILL
 from service.paths import ROUNDING, Path, advance, constant
 from service.steps import Steps
@@ -122,12 +122,10 @@ class Checker:
     def refusal(self, path: Path, time: float, pose: Sequence[float]) -> RefusedError:
         """Say what is out of reach at a time along a path, and where on it that is."""
         where = f"the path leads out of the workspace after {max(0.0, time) / path.duration:.0%} of its time"
-        rows, near, law = np.zeros((6, 3)), np.array(pose, dtype=np.float64), constant(1.0)
-        motion = np.zeros((3, 3))
-        if advance(self._legs, *path, *law[:2], time, near, motion) or inverse_into(self._legs, motion, rows):
+        rows = self._rows(path, time, pose)
+        if rows is None:
             return RefusedError("singular", f"{where}: the robot is singular there")
-        still = rows[0].tolist(), STILL, STILL, rows[3].tolist()
-        violation = self._bounds.pose(motion[0].tolist()) or self._bounds.setpoint(still, still[0])
+        violation = self._beyond(*rows)
         if violation is None:
             return RefusedError("out_of_workspace", where)
         return RefusedError(
@@ -137,3 +135,22 @@ class Checker:
             value=violation.value,
             limit=violation.limit,
         )
+
+    def bound(self, path: Path, time: float, pose: Sequence[float]) -> str:
+        """Name the limit that a path meets at a time along it, where it is out of reach."""
+        rows = self._rows(path, time, pose)
+        violation = self._beyond(*rows) if rows is not None else None
+        return violation.bound if violation is not None else "the workspace"
+
+    def _rows(self, path: Path, time: float, pose: Sequence[float]) -> tuple[Array, Array] | None:
+        """Return the platform's motion and the sliders' at a time along a path; None where the robot is singular."""
+        rows, near, law = np.zeros((6, 3)), np.array(pose, dtype=np.float64), constant(1.0)
+        motion = np.zeros((3, 3))
+        if advance(self._legs, *path, *law[:2], time, near, motion) or inverse_into(self._legs, motion, rows):
+            return None
+        return motion, rows
+
+    def _beyond(self, motion: Array, rows: Array) -> Violation | None:
+        """Return which position is beyond its limit."""
+        still = rows[0].tolist(), STILL, STILL, rows[3].tolist()
+        return self._bounds.pose(motion[0].tolist()) or self._bounds.setpoint(still)

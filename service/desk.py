@@ -44,6 +44,8 @@ class Goal(NamedTuple):
     """In which cycle it ends unless it has been renewed, for a jog."""
     released: bool = False
     """Whether that has happened: a jog that nobody renewed does not come back."""
+    bound: str | None = None
+    """The limit before which a jog comes to rest."""
 
 
 class Desk:
@@ -55,7 +57,8 @@ class Desk:
         self.answers: list[Answer] = []
         self.happenings: list[Happening] = []
         self._commands: dict[str, deque[tuple[CommandRequest, int]]] = {}
-        self._ended: dict[str, None] = {}
+        self._ended: dict[str, str | None] = {}
+        """Goals that have ended, and the limit at which that was, for a jog."""
 
     # ------------------------------------------------------------------ goals
 
@@ -68,14 +71,17 @@ class Desk:
         """Raise RefusedError if the id has been used; a jog's own velocities share one."""
         goal_id = request.id
         running = any(goal.id == goal_id for goal in self.goals)
-        if goal_id in self._ended or (running and not self._is_fresh(request)):
+        if isinstance(request.goal, VelocityGoal) and (bound := self._ended.get(goal_id)):
+            text = f"jog {goal_id!r} has ended at the limit of {bound}: begin a new one, away from it"
+            raise RefusedError("at_limit", text)
+        if goal_id in self._ended or (running and not self.renewed_by(request)):
             raise RefusedError("duplicate_id", f"goal id {goal_id!r} has been used: every goal needs its own")
-        if self.goal is not None and self.goal.released and self._is_fresh(request):
+        if self.goal is not None and self.goal.released and self.renewed_by(request):
             raise RefusedError("jog_over", f"jog {goal_id!r} was not renewed in time and is over: begin a new one")
 
     def keep_alive(self, request: GoalRequest, until: float) -> None:
         """Let the jog under way go on until a cycle, if this renews it."""
-        if self._is_fresh(request):
+        if self.renewed_by(request):
             self.goals[0] = self.goals[0]._replace(alive_until=until)
 
     def release(self, cycle: int) -> Goal | None:
@@ -91,13 +97,14 @@ class Desk:
         self.answers.append(
             Accepted(request.ticket, request.id, taken.duration, taken.slowed, taken.stops_first, taken.queued)
         )
-        if self._is_fresh(request):
+        if self.renewed_by(request):
+            self.goals[0] = self.goals[0]._replace(bound=taken.bound)
             return
         if not taken.queued:
             self.end("preempted", f"preempted by goal {request.id}")
         blend = request.goal.blend if isinstance(request.goal, PoseGoal) else None
         is_jog = isinstance(request.goal, VelocityGoal)
-        self.goals.append(Goal(request.id, request.user, is_jog, blend, expires, alive_until))
+        self.goals.append(Goal(request.id, request.user, is_jog, blend, expires, alive_until, bound=taken.bound))
 
     def pass_on(self) -> None:
         """The first goal is reached, and the one that waited for it has begun."""
@@ -109,13 +116,14 @@ class Desk:
         kept = [self.goals.popleft() for _ in range(min(but, len(self.goals)))]
         while self.goals:
             goal = self.goals.popleft()
-            self._ending(goal.id, goal.user, outcome, reason)
+            bound = goal.bound if outcome == "done" and not goal.released else None
+            self._ending(goal.id, goal.user, outcome, f"at the limit of {bound}" if bound else reason, bound)
         self.goals.extend(kept)
 
     def withdraw(self, request: GoalRequest, outcome: Outcome, reason: str) -> None:
         """Answer that a goal has ended before it began."""
         self.answers.append(Refused(request.ticket, outcome, f"goal {request.id} {outcome} before it began: {reason}"))
-        if not self._is_fresh(request):
+        if not self.renewed_by(request):
             self._ending(request.id, request.user, outcome, reason)
 
     def refuse(self, request: Request, refusal: RefusedError) -> None:
@@ -126,16 +134,16 @@ class Desk:
         self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))
         if isinstance(request, CommandRequest):
             self.tell("refused", "warning", f"{request.name} refused: {text}", user=request.user)
-        elif refusal.code == "duplicate_id":
+        elif refusal.code in ("duplicate_id", "at_limit"):
             self.tell("refused", "warning", text, user=request.user)
         else:
             outcome: Outcome = "expired" if refusal.code == "expired" else "rejected"
-            if self._is_fresh(request):
+            if self.renewed_by(request):
                 self.tell("refused", "warning", text, user=request.user)
             else:
                 self._ending(request.id, request.user, outcome, text)
 
-    def _is_fresh(self, request: GoalRequest) -> bool:
+    def renewed_by(self, request: GoalRequest) -> bool:
         """Whether it renews the jog that is under way; only its own user can."""
         goal = self.goal
         return (
@@ -145,9 +153,9 @@ class Desk:
             and isinstance(request.goal, VelocityGoal)
         )
 
-    def _ending(self, goal_id: str, user: str, outcome: Outcome, reason: str) -> None:
+    def _ending(self, goal_id: str, user: str, outcome: Outcome, reason: str, bound: str | None = None) -> None:
         level = _LEVELS.get(outcome, "info")
-        self._ended[goal_id] = None
+        self._ended[goal_id] = bound
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]
         self.tell("goal", level, f"goal {goal_id} {outcome}: {reason}", id=goal_id, outcome=outcome, user=user)

@@ -115,6 +115,8 @@ class Dispatch:
         if request.withdrawn is not None:
             desk.withdraw(request, "stopped", request.withdrawn)
             return
+        if isinstance(goal, VelocityGoal) and not any((goal.x, goal.y, goal.phi)) and not desk.renewed_by(request):
+            raise RefusedError("no_velocity", "a jog of no velocity moves nothing: give it one along x, y or phi")
         moving = admit()
         if goal.valid_for is not None and cycle - sent.cycle > goal.valid_for / self._period:
             raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 import signal
 import time
@@ -285,7 +286,8 @@ class Gateway:
             case Situation() | Welcome():
                 self._states.update(answer)
             case Accepted(ticket, goal_id, duration, slowed, stops_first, queued):
-                self._answer(ticket, GoalReply(goal_id, duration, slowed, stops_first, queued))
+                expected = duration if math.isfinite(duration) else None
+                self._answer(ticket, GoalReply(goal_id, expected, slowed, stops_first, queued))
             case Confirmed(ticket, name, mode):
                 self._answer(ticket, CommandReply(name, mode))
             case Refused(ticket, code, text, slider, value, limit):

@@ -46,6 +46,8 @@ class Motion(NamedTuple):
     """How many times slower than was asked for, for the limits' sake."""
     stops_first: bool = False
     """Whether the robot stops on its old path before."""
+    bound: str | None = None
+    """The limit before which a jog comes to rest."""
 
 
 class Extension(NamedTuple):
@@ -144,7 +146,7 @@ class Goals:
         if start.at_rest:
             plan = yield from self._plan(goal, start)
             run = yield from self.laws.begin(plan.path, rate, start.pose)
-            return Motion(deque([run]), None, run.ends if rate else math.inf, plan.slowed)
+            return Motion(deque([run]), None, run.ends if rate else math.inf, plan.slowed, bound=plan.bound)
         now = course.runs[0].at.rate
         if now < SLOWEST:
             raise TOO_FAST_IN_MOTION
@@ -157,7 +159,7 @@ class Goals:
             if run.target >= now:
                 final = yield from self.laws.possible(plan.path, 0.0, rate, start.pose)
                 duration = plan.path.duration / final if final else math.inf
-                return Motion(deque([run]), None, duration, plan.slowed)
+                return Motion(deque([run]), None, duration, plan.slowed, bound=plan.bound)
             now = run.target  # an override that the old path could take, and the new one cannot
         raise TOO_FAST_IN_MOTION
 
@@ -171,7 +173,7 @@ class Goals:
         plan = yield from self._plan(goal, rest(end))
         run = yield from self.laws.begin(plan.path, rate, end)
         duration = stop.ends - stop.time + run.ends if rate else math.inf
-        return Motion(deque([stop, run]), None, duration, plan.slowed, stops_first=True)
+        return Motion(deque([stop, run]), None, duration, plan.slowed, stops_first=True, bound=plan.bound)
 
     def _plan(self, goal: Goal, start: MotionState) -> Steps[Plan]:
         planner = self._planner

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from service.course import Course
@@ -22,11 +23,13 @@ class Taken(NamedTuple):
     """A goal is the robot's now."""
 
     duration: float
-    """Expected time from now to arrival [s]."""
+    """Expected time from now to arrival [s]; infinite while the override is zero."""
     slowed: float
     stops_first: bool
     queued: bool
     """Whether it begins when the one before it is reached."""
+    bound: str | None = None
+    """The limit before which a jog comes to rest."""
 
 
 class Pilot:
@@ -115,13 +118,15 @@ class Pilot:
             course.take(decided.runs, decided.turn)
             if decided.runs[-1].target != self.override:
                 self._change = self._run_at(self.override)
-            return Taken(waiting + decided.duration, decided.slowed, decided.stops_first, queued=False)
+            duration = waiting + decided.duration
+            return Taken(duration, decided.slowed, decided.stops_first, queued=False, bound=decided.bound)
         run, extension = decided
         if not course.runs or course.runs[-1] is not run or run.at.s >= extension.s:
             return None  # the motion that it was to follow has ended: plan it anew
         self._goal = None
         run.append(extension.s, extension.path)
-        return Taken(course.remaining, extension.slowed, stops_first=False, queued=True)
+        duration = course.remaining if run.target else math.inf
+        return Taken(duration, extension.slowed, stops_first=False, queued=True)
 
     def _run_at(self, rate: float) -> Steps[None]:
         """Change the rate of the goal's motion; where that follows a stop on the old path, the stop stays as it is."""

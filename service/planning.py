@@ -63,6 +63,8 @@ class Plan(NamedTuple):
     path: Path
     slowed: float = 1.0
     """How many times slower it is than was asked for, for the limits' sake."""
+    bound: str | None = None
+    """The limit before which a jog comes to rest."""
 
 
 class Planner:
@@ -150,7 +152,7 @@ class Planner:
         Faster than platform or sliders may: as fast as they may. Raises RefusedError where not even braking stays
         inside.
         """
-        share, hold = 1.0, FASTEST_OVERRIDE * timeout
+        share, hold, bound = 1.0, FASTEST_OVERRIDE * timeout, None
         for value, limit in zip(velocity, self._platform.velocity, strict=True):
             if abs(value) * share > limit:
                 share = limit / abs(value)
@@ -158,10 +160,13 @@ class Planner:
             ramp, brake, path = self._jog(start, [share * value for value in velocity], hold)
             found = self._checker.look(path, constant(1.0), 0.0, path.duration, start.pose)
             if found.fits or (found.bearable and not start.at_rest):
-                return Plan(path, 1.0 / share)
+                return Plan(path, 1.0 / share, bound)
             if math.isnan(found.beyond):
                 share *= ROOM / found.excess
-            elif hold > 0.0:
+                yield
+                continue
+            bound = self._checker.bound(path, found.beyond, start.pose)
+            if hold > 0.0:
                 hold = max(0.0, found.beyond - ramp - brake)  # to rest where it would have been out of reach
             else:
                 share /= 2.0
@@ -169,7 +174,7 @@ class Planner:
         path = self._to_velocity(start, STILL, self._platform)
         if not self._checker.bears((yield from self._checker.whole(path, start.pose))):
             raise TOO_FAST_IN_MOTION
-        return Plan(path)
+        return Plan(path, bound=bound)
 
     def follow(self, start: MotionState, points: Sequence[Point], stretch: bool) -> Steps[Plan]:
         """Take timed points for a path, quintic between them. Raises RefusedError.

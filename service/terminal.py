@@ -73,11 +73,16 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
         out.print(f"    [yellow]without[/] {plain(lack)}", soft_wrap=True)
 
 
+def expected(reply: GoalReply) -> str:
+    """Say how long a goal is expected to take."""
+    return f"{reply.duration:.2f} s" if reply.duration is not None else "no expected end while the override is 0"
+
+
 def notes(reply: GoalReply) -> str:
     """Say what is out of the ordinary with an accepted goal; nothing where all is as asked."""
     said = []
     if reply.slowed > 1.001:
-        said.append(f"slowed {reply.slowed:.2f} times, since a slider could not follow")
+        said.append(f"slowed {reply.slowed:.2f} times, to stay within the limits")
     if reply.stops_first:
         said.append("stops on the old path first")
     if reply.queued:

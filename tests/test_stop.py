@@ -110,7 +110,7 @@ def slow(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Rig:
 
 def planned(rig: Rig, goal: PoseGoal, name: str) -> None:
     """Move, and send a goal whose planning is not over."""
-    rig.goal("running", -0.05, 0.0, 0.0)
+    rig.goal("running", -0.12, 0.0, 0.0)
     rig.cycles(150)
     rig.post(name, goal)
     assert not rig.control.dispatch.idle

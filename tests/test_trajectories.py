@@ -26,11 +26,7 @@ def line(first: tuple[float, float, float] | None, last: tuple[float, float, flo
 @pytest.mark.parametrize(
     ("goal", "code", "said"),
     [
-        (
-            line((0.1, 0.0, 0.0), None),
-            "wrong_start",
-            "the trajectory begins with 0.1 m/s in x: let it begin at rest",
-        ),
+        (line((0.1, 0.0, 0.0), None), "wrong_start", "the trajectory begins with 0.1 m/s in x: let it begin"),
         (line(None, (0.1, 0.0, 0.0)), "wrong_end", "the trajectory ends with 0.1 m/s in x: let it end at rest"),
         (line(None, (0.0, 0.0, -0.2)), "wrong_end", "the trajectory ends with -0.2 rad/s in phi: let it end at rest"),
     ],
@@ -52,10 +48,8 @@ def test_one_that_is_sent_in_motion_is_told_to_wait(rig: Rig) -> None:
     x = rig.control.commanded.pose[0]
     points = TrajectoryPoint(0.0, x, 0.0, 0.0), TrajectoryPoint(1.0, 0.0, 0.0, 0.0)
     answer = refusal(rig.send("g2", TrajectoryGoal(points)))
-    assert (answer.code, "the robot moves: send the trajectory when it stands" in answer.message) == (
-        "wrong_start",
-        True,
-    )
+    assert answer.code == "wrong_start"
+    assert "the robot moves: send the trajectory when it stands" in answer.message
 
 
 SPEED = st.floats(-0.5, 0.5)
