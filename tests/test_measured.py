@@ -70,7 +70,6 @@ def test_following_error_is_to_the_setpoint_that_was_due_at_the_sync_of_the_posi
     measured = standing(first)
     for setpoint in written:
         measured.note(setpoint)
-    assert measured.last_written == written[-1]
     measured.take(Feedback(position, ON, None, age=age, follows=follows))
     due = [first] * 6 + written
     expected = [due[-2 - age[n]][n] - position[n] if follows[n] else 0.0 for n in range(3)]
