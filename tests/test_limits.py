@@ -297,3 +297,57 @@ def test_a_position_just_beyond_its_limit_is_told_from_it(rig: Rig) -> None:
     rig.enable()
     answer = refusal(rig.send("g1", SlidersGoal((-0.1700001, 0.0, 0.0))))
     assert "position -0.1700001 m is beyond its limit -0.17 m" in answer.message
+
+
+# ---------------------------------------------------------------------- jogs, and an override of zero
+
+
+@pytest.mark.parametrize(
+    ("velocity", "bound"),
+    [
+        ((0.2, 0.0, 0.0), "platform x (position 0.15 m)"),
+        ((0.0, 0.0, -1.0), "platform phi (position -1.2 rad)"),
+    ],
+)
+def test_a_jog_into_a_limit_ends_there_and_says_so(rig: Rig, velocity: tuple[float, float, float], bound: str) -> None:
+    rig.enable()
+    jog = VelocityGoal(*velocity, timeout=0.2)
+    for _ in range(60):
+        answer = rig.send("j1", jog)
+        rig.cycles(40)
+        if rig.mode is Mode.HOLDING:
+            break
+    assert isinstance(answer, Accepted)
+    assert rig.outcomes() == [("j1", "done")]
+    assert f"goal j1 done: at the limit of {bound}" in [said.message for said in rig.happenings]
+    again = refusal(rig.send("j1", jog))
+    assert again.code == "at_limit"
+    assert f"has ended at the limit of {bound}" in again.message
+    assert rig.outcomes() == [("j1", "done")]
+
+
+def test_a_jog_that_is_let_go_before_a_limit_is_not_at_it(rig: Rig) -> None:
+    rig.enable()
+    rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.4))
+    rig.until(rig.holds)
+    assert [said.message for said in rig.happenings if said.outcome] == ["goal j1 done: released"]
+
+
+def test_a_jog_of_no_velocity_brakes_one_and_begins_none(rig: Rig) -> None:
+    rig.enable()
+    assert refusal(rig.send("j1", VelocityGoal(0.0, 0.0, 0.0))).code == "no_velocity"
+    rig.send("j2", VelocityGoal(0.1, 0.0, 0.0, timeout=0.5))
+    rig.cycles(200)
+    assert isinstance(rig.send("j2", VelocityGoal(0.0, 0.0, 0.0, timeout=0.5)), Accepted)
+    rig.until(rig.holds, 200)
+
+
+@pytest.mark.parametrize("goal", [PoseGoal(0.05, 0.0, 0.0), SlidersGoal((0.01, 0.0, 0.0))])
+def test_at_override_zero_a_goal_has_no_expected_end(rig: Rig, goal: Goal) -> None:
+    rig.enable()
+    rig.command("override", 0.0)
+    for number in range(2):
+        blended = goal if isinstance(goal, SlidersGoal) else PoseGoal(0.05, 0.01 * number, 0.0, blend=0.01)
+        answer = rig.send(f"g{number}", blended)
+        assert isinstance(answer, Accepted)
+        assert answer.duration == math.inf
