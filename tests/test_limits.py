@@ -6,19 +6,22 @@ import math
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import CONFIG, Rig, changed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from test_control import GOAL, PERIOD, ROBOT, assert_within_limits, refusal
 
+from drivers.interface import Feedback, PowerState
 from service.checks import PLATFORM_LAWS
 from service.kinematics import inverse
 from service.limits import EDGE, EXCESS, PLATFORM_EXCESS, Bounds, told_apart
+from service.measured import Measured
 from service.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from service.modes import Mode
 from service.motion import MotionState, rest
 from service.packets import Accepted
+from service.planning import START
 
 LIMITS = CONFIG.limits
 PLATFORM = np.array([LIMITS.platform.velocity, LIMITS.platform.acceleration, LIMITS.platform.jerk])
@@ -351,3 +354,66 @@ def test_at_override_zero_a_goal_has_no_expected_end(rig: Rig, goal: Goal) -> No
         answer = rig.send(f"g{number}", blended)
         assert isinstance(answer, Accepted)
         assert answer.duration == math.inf
+
+
+@pytest.mark.parametrize(("override", "speed"), [(2.0, 0.5), (0.5, 1.0), (0.3, 0.5), (1.5, 0.3)])
+@pytest.mark.parametrize("wait", [60, 150, 250])
+def test_a_goal_that_preempts_at_an_override_goes_on_as_the_robot_moves(
+    override: float, speed: float, wait: int
+) -> None:
+    """The new path cannot take the rate of the old one, or its time runs slower: neither is a step of the setpoints."""
+    rig = Watched()
+    rig.enable()
+    rig.command("override", override)
+    rig.goal("g1", 0.1, 0.0, 0.0, speed=speed)
+    rig.cycles(wait)
+    answer = rig.goal("g2", 0.03, 0.06, 0.2)
+    assert isinstance(answer, Accepted)
+    assert not answer.stops_first
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
+    assert (rig.used() <= np.array(PLATFORM_LAWS) + BETWEEN).all()
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("coordinate", range(3))
+def test_how_far_a_trajectory_may_begin_from_where_the_robot_stands(rig: Rig, coordinate: int) -> None:
+    rig.enable()
+    for off, taken in ((0.99 * START, True), (-1.01 * START, False)):
+        x, y, phi = np.eye(3)[coordinate] * off
+        made = TrajectoryPoint(0.0, x, y, phi), TrajectoryPoint(1.0, 0.0, 0.0, 0.0)
+        answer = rig.send(f"g{off}", TrajectoryGoal(made))
+        assert isinstance(answer, Accepted) is taken
+        if not taken:
+            assert refusal(answer).code == "wrong_start"
+        rig.until(rig.holds)
+    assert_within_limits(rig)
+
+
+def test_a_slider_beyond_its_travel_is_not_enabled() -> None:
+    """The pose is inside the platform's limits: it is the slider that is not."""
+    low, high = 0.0, LIMITS.platform.phi[0]
+    for _ in range(50):
+        middle = (low + high) / 2.0
+        inside = min(sliders_at(0.0, 0.0, middle)) >= LIMITS.slider.position[0] - 1e-4
+        low, high = (middle, high) if inside else (low, middle)
+    assert abs(high) < abs(LIMITS.platform.phi[0])
+    rig = Rig(changed(CONFIG, start=sliders_at(0.0, 0.0, high)))
+    answer = refusal(rig.command("enable"))
+    assert answer.code == "out_of_workspace"
+    assert "the robot stands outside its limits: slider A: position" in answer.message
+    assert rig.mode is Mode.DISABLED
+    rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("drive", range(3))
+def test_a_position_jumps_beyond_twice_what_a_slider_can_do_in_a_cycle(drive: int) -> None:
+    step = SLIDER.velocity * PERIOD
+    for share, jumps in ((0.999, False), (1.001, True)):
+        measured = Measured(ROBOT.packed(), PERIOD, step)
+        here = Feedback((0.0, 0.0, 0.0), (PowerState.SWITCH_ON_DISABLED,) * 3, None)
+        measured.start(here)
+        a, b, c = np.eye(3)[drive] * share * 2.0 * step
+        measured.take(Feedback((a, b, c), here.state, None))
+        assert measured.jumps == tuple(jumps and n == drive for n in range(3))
