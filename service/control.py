@@ -314,9 +314,7 @@ class Control:
         course.forget()
         if len(course.runs) > 1:  # it is stopping already, for a goal that is not to follow any more
             course.runs.pop()
-            self._pilot.stop_thinking()
-        else:
-            self._pilot.run_at(0.0)
+        self._pilot.run_at(0.0)
 
     def _stand(self, run: Run) -> None:
         """The motion has ended where it should, or its law has brought it to a standstill on the way."""

@@ -58,8 +58,11 @@ class Dispatch:
             except RefusedError as refusal:
                 self._desk.refuse(self._planned.request, refusal)
         try:
+            if self._pilot.busy and self._planned is not None:
+                self._desk.check_id(self._planned.request)  # a jog may end while its renewal is being planned
             taken = self._pilot.think()
         except RefusedError as refusal:
+            self._pilot.give_up()
             if self._planned is not None:
                 self._desk.refuse(self._planned.request, refusal)
             return None

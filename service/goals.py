@@ -147,10 +147,9 @@ class Goals:
             plan = yield from self._plan(goal, start)
             run = yield from self.laws.begin(plan.path, rate, start.pose)
             return Motion(deque([run]), None, run.ends if rate else math.inf, plan.slowed, bound=plan.bound)
-        now = course.runs[0].at.rate
-        if now < SLOWEST:
+        if course.runs[0].at.rate < SLOWEST:
             raise TOO_FAST_IN_MOTION
-        for _ in range(2):
+        for now in (course.runs[0].at.rate, 1.0):  # an override that the old path could take the new one may not
             # The new path's time goes on at the rate of the old one's: in it, the motion is that much slower.
             velocity = [value / now for value in start.velocity]
             acceleration = [value / now**2 for value in start.acceleration]
@@ -160,7 +159,6 @@ class Goals:
                 final = yield from self.laws.possible(plan.path, 0.0, rate, start.pose)
                 duration = plan.path.duration / final if final else math.inf
                 return Motion(deque([run]), None, duration, plan.slowed, bound=plan.bound)
-            now = run.target  # an override that the old path could take, and the new one cannot
         raise TOO_FAST_IN_MOTION
 
     def _stop_first(self, goal: Goal, course: Course, rate: float) -> Steps[Motion]:

@@ -45,7 +45,7 @@ class Laws:
         A stop becomes quicker as it goes on: the slower the motion, the more is left of the limits.
         """
         rate = yield from self.possible(run.path, run.at.s, rate, pose)
-        while not run.arrived:
+        while not run.arrived and not rate == run.target == 0.0:
             if (yield from self.try_change(run, rate, pose)):
                 break
         while rate == 0.0 and not run.stands:

@@ -117,7 +117,7 @@ class Bounds:
         return None
 
     def platform(self, motion: Rows, before: Rows) -> Violation | None:
-        """Check the platform's pose, velocity and acceleration, and the jerk since the cycle before."""
+        """Check the platform's velocity and acceleration, and the jerk since the cycle before."""
         more = PLATFORM_EXCESS
         for n, (velocity, acceleration, most) in enumerate(self._platform):
             name, unit = COORDINATES[n], UNITS[n]
@@ -129,7 +129,7 @@ class Bounds:
             jerk = self._jerk(motion, before, n)
             if not jerk <= most * (1.0 + more[2]):
                 return Violation(name, "jerk", jerk, most, f"{unit}/s³")
-        return self.pose(motion[0])
+        return None
 
     def _jerk(self, now: Rows, before: Rows, n: int) -> float:
         """Return the least jerk that explains rows (position, velocity, acceleration) one cycle after others.

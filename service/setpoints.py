@@ -44,7 +44,12 @@ class Setpoints:
         rows = self._sliders.tolist()
         bounds = self._bounds
         before = self._before or rest(commanded.pose)
-        violation = bounds.setpoint(rows) or bounds.step(rows, self.rows) or bounds.platform(commanded, before)
+        violation = (
+            bounds.setpoint(rows)
+            or bounds.pose(commanded.pose)
+            or bounds.step(rows, self.rows)
+            or bounds.platform(commanded, before)
+        )
         if violation:
             return f"setpoint refused: {violation}"
         self.rows, self._before = rows, commanded

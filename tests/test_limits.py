@@ -6,19 +6,22 @@ import math
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import CONFIG, Rig, changed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from test_control import GOAL, PERIOD, ROBOT, assert_within_limits, refusal
 
+from drivers.interface import Feedback, PowerState
 from service.checks import PLATFORM_LAWS
 from service.kinematics import inverse
 from service.limits import EDGE, EXCESS, PLATFORM_EXCESS, Bounds, told_apart
+from service.measured import Measured
 from service.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from service.modes import Mode
 from service.motion import MotionState, rest
 from service.packets import Accepted
+from service.planning import START
 
 LIMITS = CONFIG.limits
 PLATFORM = np.array([LIMITS.platform.velocity, LIMITS.platform.acceleration, LIMITS.platform.jerk])
@@ -297,3 +300,120 @@ def test_a_position_just_beyond_its_limit_is_told_from_it(rig: Rig) -> None:
     rig.enable()
     answer = refusal(rig.send("g1", SlidersGoal((-0.1700001, 0.0, 0.0))))
     assert "position -0.1700001 m is beyond its limit -0.17 m" in answer.message
+
+
+# ---------------------------------------------------------------------- jogs, and an override of zero
+
+
+@pytest.mark.parametrize(
+    ("velocity", "bound"),
+    [
+        ((0.2, 0.0, 0.0), "platform x (position 0.15 m)"),
+        ((0.0, 0.0, -1.0), "slider A (position -0.17 m)"),
+    ],
+)
+def test_a_jog_into_a_limit_ends_there_and_says_so(rig: Rig, velocity: tuple[float, float, float], bound: str) -> None:
+    rig.enable()
+    jog = VelocityGoal(*velocity, timeout=0.2)
+    for _ in range(60):
+        answer = rig.send("j1", jog)
+        rig.cycles(40)
+        if rig.mode is Mode.HOLDING:
+            break
+    assert isinstance(answer, Accepted) or refusal(answer).code == "at_limit"  # it ended as this one was planned
+    assert rig.outcomes() == [("j1", "done")]
+    assert f"goal j1 done: at the limit of {bound}" in [said.message for said in rig.happenings]
+    again = refusal(rig.send("j1", jog))
+    assert again.code == "at_limit"
+    assert f"has ended at the limit of {bound}" in again.message
+    assert rig.outcomes() == [("j1", "done")]
+
+
+def test_a_jog_that_is_let_go_before_a_limit_is_not_at_it(rig: Rig) -> None:
+    rig.enable()
+    rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.4))
+    rig.until(rig.holds)
+    assert [said.message for said in rig.happenings if said.outcome] == ["goal j1 done: released"]
+
+
+def test_a_jog_of_no_velocity_brakes_one_and_begins_none(rig: Rig) -> None:
+    rig.enable()
+    assert refusal(rig.send("j1", VelocityGoal(0.0, 0.0, 0.0))).code == "no_velocity"
+    rig.send("j2", VelocityGoal(0.1, 0.0, 0.0, timeout=0.5))
+    rig.cycles(200)
+    assert isinstance(rig.send("j2", VelocityGoal(0.0, 0.0, 0.0, timeout=0.5)), Accepted)
+    rig.until(rig.holds, 200)
+
+
+@pytest.mark.parametrize("goal", [PoseGoal(0.05, 0.0, 0.0), SlidersGoal((0.01, 0.0, 0.0))])
+def test_at_override_zero_a_goal_has_no_expected_end(rig: Rig, goal: Goal) -> None:
+    rig.enable()
+    rig.command("override", 0.0)
+    for number in range(2):
+        blended = goal if isinstance(goal, SlidersGoal) else PoseGoal(0.05, 0.01 * number, 0.0, blend=0.01)
+        answer = rig.send(f"g{number}", blended)
+        assert isinstance(answer, Accepted)
+        assert answer.duration == math.inf
+
+
+@pytest.mark.parametrize(("override", "speed"), [(2.0, 0.5), (0.5, 1.0), (0.3, 0.5), (1.5, 0.3)])
+@pytest.mark.parametrize("wait", [60, 150, 250])
+def test_a_goal_that_preempts_at_an_override_goes_on_as_the_robot_moves(
+    override: float, speed: float, wait: int
+) -> None:
+    """The new path cannot take the rate of the old one, or its time runs slower: neither is a step of the setpoints."""
+    rig = Watched()
+    rig.enable()
+    rig.command("override", override)
+    rig.goal("g1", 0.1, 0.0, 0.0, speed=speed)
+    rig.cycles(wait)
+    answer = rig.goal("g2", 0.03, 0.06, 0.2)
+    assert isinstance(answer, Accepted)
+    assert not answer.stops_first
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
+    assert (rig.used() <= np.array(PLATFORM_LAWS) + BETWEEN).all()
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("coordinate", range(3))
+def test_how_far_a_trajectory_may_begin_from_where_the_robot_stands(rig: Rig, coordinate: int) -> None:
+    rig.enable()
+    for off, taken in ((0.99 * START, True), (-1.01 * START, False)):
+        x, y, phi = np.eye(3)[coordinate] * off
+        made = TrajectoryPoint(0.0, x, y, phi), TrajectoryPoint(1.0, 0.0, 0.0, 0.0)
+        answer = rig.send(f"g{off}", TrajectoryGoal(made))
+        assert isinstance(answer, Accepted) is taken
+        if not taken:
+            assert refusal(answer).code == "wrong_start"
+        rig.until(rig.holds)
+    assert_within_limits(rig)
+
+
+def test_a_slider_beyond_its_travel_is_not_enabled() -> None:
+    """The pose is inside the platform's limits: it is the slider that is not."""
+    low, high = 0.0, LIMITS.platform.phi[0]
+    for _ in range(50):
+        middle = (low + high) / 2.0
+        inside = min(sliders_at(0.0, 0.0, middle)) >= LIMITS.slider.position[0] - 1e-4
+        low, high = (middle, high) if inside else (low, middle)
+    assert abs(high) < abs(LIMITS.platform.phi[0])
+    rig = Rig(changed(CONFIG, start=sliders_at(0.0, 0.0, high)))
+    answer = refusal(rig.command("enable"))
+    assert answer.code == "out_of_workspace"
+    assert "the robot stands outside its limits: slider A: position" in answer.message
+    assert rig.mode is Mode.DISABLED
+    rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("drive", range(3))
+def test_a_position_jumps_beyond_twice_what_a_slider_can_do_in_a_cycle(drive: int) -> None:
+    step = SLIDER.velocity * PERIOD
+    for share, jumps in ((0.999, False), (1.001, True)):
+        measured = Measured(ROBOT.packed(), PERIOD, step)
+        here = Feedback((0.0, 0.0, 0.0), (PowerState.SWITCH_ON_DISABLED,) * 3, None)
+        measured.start(here)
+        a, b, c = np.eye(3)[drive] * share * 2.0 * step
+        measured.take(Feedback((a, b, c), here.state, None))
+        assert measured.jumps == tuple(jumps and n == drive for n in range(3))
