@@ -280,3 +280,8 @@ def test_only_enable_powers_up() -> None:
             decided = step(state, event)
             if isinstance(decided, Step) and decided.action is Action.POWER_UP:
                 assert (state.mode, event) == (Mode.DISABLED, Event.ENABLE)
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_a_goal_is_under_way_in_motion_and_while_it_is_paused(state: State) -> None:
+    assert state.has_goal == (state in (MOVING, PAUSING, PAUSED))

@@ -578,6 +578,19 @@ class TestFaults:
         assert fault is not None
         assert fault.message == "drive B: is in closed loop control 1 s after reset; idle was expected"
 
+    @pytest.mark.parametrize("index", range(3))
+    def test_a_slider_that_is_moved_by_hand_without_power_has_no_following_error(
+        self, enabled: Rig, index: int
+    ) -> None:
+        enabled.drives.disable()
+        assert enabled.cycles(300).state == (P.SWITCH_ON_DISABLED,) * 3
+        drive, device = CONFIG.each[index], enabled.devices[index]
+        device.servo.position += 4.0 * CONFIG.following_error * drive.counts_per_metre
+        device.servo.hold()
+        feedback = enabled.cycles(20)
+        assert feedback.fault is None
+        assert abs(feedback.position[index] - START[index]) > 3.0 * CONFIG.following_error
+
     @pytest.mark.parametrize("stop", ["disable", "quick_stop"])
     def test_drives_that_are_enabled_again_in_time_keep_their_power(self, enabled: Rig, stop: str) -> None:
         getattr(enabled.drives, stop)()

@@ -95,6 +95,15 @@ def test_a_queue_that_is_full_in_three_cycles_in_a_row_is_a_fault(full: list[boo
     assert len(rig.wire.warnings()) == any(full)
 
 
+def test_a_queue_that_was_full_before_the_first_cycle_counts_as_one_cycle(rig: Rig) -> None:
+    rig.bus.failing = FULL
+    rig.wire.send(frames.message(0x80, b""))
+    rig.cycle(full=True)
+    assert rig.wire.fault is None
+    rig.cycle(full=True)
+    assert rig.wire.fault is not None
+
+
 def test_frames_are_taken_in_by_the_thousand_and_then_the_cycle_goes_on(rig: Rig) -> None:
     for _ in range(1500):
         rig.arrive(0x281, bytes(4))
