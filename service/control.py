@@ -1,13 +1,14 @@
 """The robot's control, one cycle at a time, without a clock, a socket or a file.
 
-Each cycle: `observe` what the drives said, `handle` a request if there is one, `advance` the motion and solve the
-sliders, and `write` the setpoints behind the last gate. What is to be said of it waits at the `desk`.
+Each `cycle`: `observe` what the drives said, `handle` what is asked for, `advance` the motion and solve the sliders,
+and `write` the setpoints behind the last gate. What is to be said of it waits at the `desk`.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections import deque
+from collections.abc import Callable, Iterable
 
 from drivers.interface import NAMES, Drives, Feedback, PowerState
 from service.config import Config, geometry
@@ -19,15 +20,19 @@ from service.goals import Goals
 from service.limits import EDGE, Bounds
 from service.measured import Measured
 from service.messages import Outcome, PoseGoal, SlidersGoal
-from service.modes import DISABLED, HOLDING, MOVING, Action, Event, Mode, Refusal, State, step
+from service.modes import DISABLED, HOLDING, Action, Event, Mode, Refusal, State, step
 from service.motion import STILL, MotionState, Run, rest
-from service.packets import CommandRequest, GoalRequest, Request
+from service.packets import CommandRequest, GoalRequest, Mishap, Request
 from service.pilot import Pilot
+from service.records import Part
 from service.setpoints import Setpoints
 from service.steps import finish
 from service.verdicts import still_powered, verdict
 
 Triple = tuple[float, float, float]
+
+Given = tuple[Request | Mishap, int]
+"""What the control is given in a cycle, and when, by the monotonic clock [ns]."""
 
 SETTLE = 0.1
 """How long the drives may take to leave their fault state after a reset [s]."""
@@ -42,9 +47,9 @@ _COMMANDS = {
     "resume": Event.RESUME,
     "home": Event.HOME,
 }
-_OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.FAULT: "faulted"}
+_OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.ARRIVED: "done", Event.FAULT: "faulted"}
 """How a goal ends on an event after which it is not under way; else it is stopped."""
-_GO_ON = (Event.GOAL, Event.STANDSTILL, Event.POWERED, Event.RESUME, Event.ENABLE, Event.RESET)
+_GO_ON = (Event.GOAL, Event.STANDSTILL, Event.ARRIVED, Event.POWERED, Event.RESUME, Event.ENABLE, Event.RESET)
 """Events that leave alone what has been sent but not begun."""
 
 
@@ -68,10 +73,33 @@ class Control:
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._settle_cycles = max(3, round(SETTLE / config.period))
 
-        self.cycle = 0
+        self.cycles = 0
         self.state: State = DISABLED
         self.fault: str | None = None
         self._entered = 0
+
+    def cycle(self, feedback: Feedback, given: Iterable[Given], mark: Callable[[Part], None] = lambda _: None) -> None:
+        """Run one cycle: what the drives said at its SYNC, and what else is given in it; then motion and setpoints.
+
+        `given` is read after the drives have been; `mark` is called at the end of each part. Nothing that goes wrong
+        in it leaves the robot moving.
+        """
+        self.observe(feedback)
+        try:
+            for what, now_ns in given:
+                if isinstance(what, Mishap):
+                    self.happen(Event[what.event], what.reason)
+                else:
+                    self.handle(what, now_ns)
+            mark(Part.MODE)
+            self.advance()
+            mark(Part.MOTION)
+            self.solve()
+        except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
+            self.trip(f"internal error, please report it: {error!r}")
+        mark(Part.KINEMATICS)
+        self.write()
+        mark(Part.WRITE)
 
     # ------------------------------------------------------------------ the cycle, in its order
 
@@ -89,7 +117,7 @@ class Control:
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
-        self.cycle += 1
+        self.cycles += 1
         before = self.measured.feedback
         self.measured.take(feedback)
         for warning in feedback.warnings:
@@ -118,7 +146,7 @@ class Control:
         """Take a request at a time of the monotonic clock: a command at once, a goal behind those before it."""
         try:
             if isinstance(request, GoalRequest):
-                self.dispatch.take(request, now_ns, self.cycle)
+                self.dispatch.take(request, now_ns, self.cycles)
             elif isinstance(request, CommandRequest):
                 self._take_command(request)
             else:
@@ -137,15 +165,15 @@ class Control:
 
     def advance(self) -> None:
         """End a jog that nobody renews, plan one step further, and move the commanded state on by one period."""
-        released = self.desk.release(self.cycle) if self.state.mode is Mode.MOVING else None
+        released = self.desk.release(self.cycles) if self.state.mode is Mode.MOVING else None
         if released is not None:
             self._go(Event.RELEASE, f"goal {released.id} of {released.user} is not renewed")
-        beginning = self.dispatch.think(self.cycle, self._admit)
+        beginning = self.dispatch.think(self.cycles, self._admit)
         if beginning is not None:
             self._go(Event.GOAL, f"goal {beginning.id} of {beginning.user}")
         for _ in range(self._course.advance()):
             self.desk.pass_on()
-        self.dispatch.expire(self.cycle)
+        self.dispatch.expire(self.cycles)
 
     def solve(self) -> None:
         """Solve the sliders for the commanded state, by the paper's recursion; pass the last gate, or trip."""
@@ -230,7 +258,7 @@ class Control:
         if event is Event.HOME and not self._can_home:
             raise RefusedError("nothing_to_home", "absolute encoders: there is nothing to home")
         if request.goal is not None and self.dispatch.stop_alone(request.goal, f"{request.name} by {request.user}"):
-            self.desk.undertake(request, self.cycle)
+            self.desk.undertake(request, self.cycles)
             return
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
@@ -249,7 +277,7 @@ class Control:
         else:
             self._withdraw(event, reason)
             self._go(event, reason)
-        self.desk.undertake(request, self.cycle)
+        self.desk.undertake(request, self.cycles)
 
     def _take_override(self, request: CommandRequest) -> None:
         """Let this motion and those to come run at another rate."""
@@ -257,14 +285,14 @@ class Control:
         if self.state.mode is Mode.MOVING:
             self._pilot.run_at(self.override)
         self.desk.tell("service", "info", f"override {self.override:.0%} by {request.user}", user=request.user)
-        self.desk.undertake(request, self.cycle)
+        self.desk.undertake(request, self.cycles)
 
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
 
     def _verdict(self, name: str, since: int) -> str | None:
         """Say what has become of a command that came in a cycle: service.verdicts.verdict."""
-        settled = self.cycle - since >= self._settle_cycles
+        settled = self.cycles - since >= self._settle_cycles
         return verdict(name, self.state.mode, self.fault, self.measured, settled=settled)
 
     # ------------------------------------------------------------------ from state to state
@@ -296,7 +324,7 @@ class Control:
                 self._drives.stop_homing()
         before, self.state = self.state, decided.state
         if self.state.mode is not before.mode:
-            self._entered = self.cycle
+            self._entered = self.cycles
         if not self.state.has_goal:
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = "released" if before.released else "arrived"
@@ -318,11 +346,7 @@ class Control:
 
     def _stand(self, run: Run) -> None:
         """The motion has ended where it should, or its law has brought it to a standstill on the way."""
-        if self.state.mode is Mode.MOVING and not run.arrived:
-            return  # the override is zero
-        if run.arrived and self.state.paused:
-            self.state = MOVING  # it arrived all the same: nothing is left to resume
-        self._go(Event.STANDSTILL, "standstill")
+        self._go(Event.ARRIVED if run.arrived else Event.STANDSTILL, "standstill")
 
     def _power_up(self) -> None:
         """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""
@@ -331,7 +355,7 @@ class Control:
                 self._go(Event.POWERED, "all drives are enabled; where the sliders are is not known: send home")
             elif self._rest_at_setpoints():
                 self._go(Event.POWERED, "all drives are enabled")
-        elif self.cycle - self._entered > self._enable_cycles:
+        elif self.cycles - self._entered > self._enable_cycles:
             waiting = [
                 f"drive {name} is {state}"
                 for name, state in zip(NAMES, self.measured.feedback.state, strict=True)
@@ -369,6 +393,6 @@ class Control:
 
     def _follow_measured(self) -> None:
         """Command the pose that is measured, and the sliders to where they are."""
-        stopped_now = self.state.mode is Mode.FAULT and self._entered == self.cycle
+        stopped_now = self.state.mode is Mode.FAULT and self._entered == self.cycles
         self._course.commanded = rest(self.measured.pose)
         self.setpoints.follow(held=self.state.mode not in (Mode.DISABLED, Mode.FAULT), stopped_now=stopped_now)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
 import time
 from collections import deque
@@ -16,7 +17,7 @@ from drivers.interface import DriveFault, Drives
 from service import realtime
 from service.clock import Tick, Ticker
 from service.config import Config
-from service.control import Control
+from service.control import Control, Given
 from service.heartbeats import Heartbeats, Watch
 from service.kinematics import warm_up
 from service.links import Port
@@ -37,7 +38,7 @@ from service.packets import (
     message,
     told,
 )
-from service.records import LAYOUT
+from service.records import LAYOUT, Part, Record, pack_into
 
 BATCHES_PER_SECOND = 50
 REQUESTS_A_CYCLE = 4
@@ -103,7 +104,8 @@ class Loop:
         self._batch = bytearray(1 + self._batch_size * LAYOUT.size)
         self._batch[0] = Kind.RECORDS
         self._batched = 0
-        self._record_ns = 0
+        self._marked_ns = 0
+        self._parts_ns = [0] * len(Part)
         self._recorded = False
 
     def run(self, ticker: Ticker) -> None:
@@ -117,39 +119,27 @@ class Loop:
 
     def cycle(self, tick: Tick) -> None:
         """Run one cycle. Nothing in it waits, and nothing that goes wrong in it leaves the robot moving."""
-        now = time.perf_counter_ns
-        control = self.control
-        began = now()
+        self._marked_ns = time.perf_counter_ns()
         self._drives.sync()
-        synced = now()
+        self._mark(Part.SYNC)
         feedback = self._drives.read()
-        read = now()
-        control.observe(feedback)
-        self._watch(tick, feedback.fault)
-        decided = moved = now()
-        try:
-            for request in self._requests():
-                self._note(tick, request)
-                control.handle(request, tick.deadline_ns + tick.lateness_ns)
-            decided = now()
-            control.advance()
-            moved = now()
-            control.solve()
-        except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
-            control.trip(f"internal error, please report it: {error!r}")
-        solved = now()
-        control.write()
-        written = now()
-        parts = (
-            synced - began,
-            read - synced,
-            decided - read,
-            moved - decided,
-            solved - moved,
-            written - solved,
-        )
-        self._record(tick, parts)
-        self._record_ns = now() - written
+        self._mark(Part.READ)
+        self.control.cycle(feedback, self._given_in(tick, feedback.fault), self._mark)
+        self._record(tick)
+        self._mark(Part.RECORD)
+
+    def _mark(self, part: Part) -> None:
+        """Note how long a part of the cycle has taken, at its end."""
+        now = time.perf_counter_ns()
+        self._parts_ns[part] = now - self._marked_ns
+        self._marked_ns = now
+
+    def _given_in(self, tick: Tick, fault: DriveFault | None) -> Iterator[Given]:
+        """Yield what the control is given in a cycle, and keep it for the recorder."""
+        now_ns = tick.deadline_ns + tick.lateness_ns
+        for what in itertools.chain(self._watch(tick, fault), self._requests()):
+            self._note(tick, what)
+            yield what, now_ns
 
     def _requests(self) -> Iterator[Request]:
         """Take what the gateway has sent: as much as comes in a cycle, and no more than a cycle has time for.
@@ -162,8 +152,8 @@ class Loop:
                 return
             yield decode_request(memoryview(packet)[1:])
 
-    def _watch(self, tick: Tick, fault: DriveFault | None) -> None:
-        """Count what the ticker missed, notice a fault, a gateway that is lost or frozen and a wish to end."""
+    def _watch(self, tick: Tick, fault: DriveFault | None) -> Iterator[Mishap]:
+        """Count what the ticker missed; yield what has happened: late ticks, a lost gateway, a wish to end."""
         if fault is not self._fault:
             self._fault = fault
             self._note(tick, DrivesFault(fault.message if fault else None))
@@ -172,76 +162,74 @@ class Loop:
             self._late_streak += tick.missed
             if self._late_streak > self._max_overruns:
                 text = f"{self._late_streak} ticks missed in a row: the machine is too busy"
-                self._happen(tick, ModeEvent.LATE, text)
                 self._late_streak = 0
+                yield Mishap(ModeEvent.LATE.name, text)
         else:
             self._late_streak = 0
-        self._watch_gateway(tick)
+        if (lost := self._gateway_lost()) is not None:
+            yield Mishap(ModeEvent.GATEWAY_LOST.name, lost)
         if self.ending and self._ending_since is None:
-            self._ending_since = self.control.cycle
-            self._happen(tick, ModeEvent.SHUTDOWN, "the service is ending: controlled stop, drives disabled")
+            self._ending_since = self.control.cycles
+            yield Mishap(ModeEvent.SHUTDOWN.name, "the service is ending: controlled stop, drives disabled")
 
-    def _watch_gateway(self, tick: Tick) -> None:
+    def _gateway_lost(self) -> str | None:
+        """Return how the gateway has been lost in this cycle; None where it has not."""
         if self._gateway.take_lost():
             self._gateway_frozen = False
-            self._happen(tick, ModeEvent.GATEWAY_LOST, "the gateway is gone: controlled stop")
-        elif self._gateway_watch.silent():
+            return "the gateway is gone: controlled stop"
+        if self._gateway_watch.silent():
             if not self._gateway_frozen:
                 self._gateway_frozen = True
-                text = f"the gateway is frozen, no sign of life for {self._gateway_timeout:g} s: controlled stop"
-                self._happen(tick, ModeEvent.GATEWAY_LOST, text)
+                return f"the gateway is frozen, no sign of life for {self._gateway_timeout:g} s: controlled stop"
         elif self._gateway_watch.heard:
             self._gateway_frozen = False
-
-    def _happen(self, tick: Tick, event: ModeEvent, reason: str) -> None:
-        self._note(tick, Mishap(event.name, reason))
-        self.control.happen(event, reason)
+        return None
 
     def _note(self, tick: Tick, given: Request | Mishap | DrivesFault) -> None:
         """Keep what the control is given in this cycle, for the recorder."""
         self._inputs += 1
-        self._given.append(Input(self._inputs, self.control.cycle, tick.deadline_ns + tick.lateness_ns, given))
+        self._given.append(Input(self._inputs, self.control.cycles, tick.deadline_ns + tick.lateness_ns, given))
 
     def _over(self) -> bool:
         if self._ending_since is None:
             return False
         control = self.control
         stands = control.state.mode in (Mode.DISABLED, Mode.FAULT) and not control.measured.powered
-        return stands or (control.cycle - self._ending_since) * self._period > SHUTDOWN
+        return stands or (control.cycles - self._ending_since) * self._period > SHUTDOWN
 
-    def _record(self, tick: Tick, parts: tuple[int, ...]) -> None:
+    def _record(self, tick: Tick) -> None:
         """Append this cycle's record; pass batch, answers and events on."""
         control = self.control
-        feedback = control.measured.feedback
+        feedback, measured, commanded = control.measured.feedback, control.measured, control.commanded
         rows = control.setpoints.rows
-        LAYOUT.pack_into(
-            self._batch,
-            1 + self._batched * LAYOUT.size,
-            control.cycle,
-            tick.deadline_ns,
-            tick.lateness_ns,
-            *parts,
-            self._record_ns,
-            self._overruns,
-            MODES.index(control.state.mode),
-            *feedback.state,
-            *(min(age, OLDEST) for age in feedback.age),
-            *feedback.follows,
-            *feedback.homed,
-            feedback.homing,
-            *control.measured.pose,
-            *control.commanded.pose,
-            *control.commanded.velocity,
-            *control.commanded.acceleration,
-            *feedback.position,
-            *control.measured.velocity,
-            *rows[0],
-            *rows[1],
-            *rows[2],
-            *rows[3],
-            *control.measured.following_error,
-            *control.progress,
+        progress, remaining = control.progress
+        record = Record(
+            cycle=control.cycles,
+            deadline_ns=tick.deadline_ns,
+            lateness_ns=tick.lateness_ns,
+            parts_ns=self._parts_ns,
+            overruns=self._overruns,
+            mode=MODES.index(control.state.mode),
+            drive_state=feedback.state,
+            age=[min(age, OLDEST) for age in feedback.age],
+            follows=feedback.follows,
+            homed=feedback.homed,
+            homing=feedback.homing,
+            pose=measured.pose,
+            commanded_pose=commanded.pose,
+            commanded_pose_velocity=commanded.velocity,
+            commanded_pose_acceleration=commanded.acceleration,
+            position=feedback.position,
+            velocity=measured.velocity,
+            commanded_position=rows[0],
+            commanded_velocity=rows[1],
+            commanded_acceleration=rows[2],
+            passive_position=rows[3],
+            following_error=measured.following_error,
+            progress=progress,
+            remaining=remaining,
         )
+        pack_into(self._batch, 1 + self._batched * LAYOUT.size, record)
         self._batched += 1
         if self._batched == self._batch_size:
             self._flush()
@@ -268,7 +256,7 @@ class Loop:
 
     def _weigh(self) -> None:
         """Once a second, work out how much of the bus is in use, and tell it."""
-        cycles = self.control.cycle - self._weighed_at
+        cycles = self.control.cycles - self._weighed_at
         if cycles * self._period >= 1.0:
             bits, self._bits = self._drives.traffic - self._bits, self._drives.traffic
             self._bus_load = round(bits / (cycles * self._period * self._bitrate), 3)
@@ -308,8 +296,8 @@ class Loop:
         self._given.clear()
         for happening in desk.happenings:
             self._events += 1
-            t = control.cycle * self._period
-            event = Event(self._events, t, control.cycle, time.time(), **happening._asdict())
+            t = control.cycles * self._period
+            event = Event(self._events, t, control.cycles, time.time(), **happening._asdict())
             packet = told(event)
             self._kept.append(packet)
             self._recorder.send(packet)

@@ -37,7 +37,8 @@ class Event(Enum):
     HOME = auto()
     POWERED = auto()  # all drives reached operation enabled
     HOMED = auto()  # all drives know where they are, and follow setpoints again
-    STANDSTILL = auto()  # the commanded motion has ended
+    STANDSTILL = auto()  # the commanded motion has come to rest
+    ARRIVED = auto()  # so it has, and at the end of its path
     FAULT = auto()  # a drive, the bus or a setpoint is bad
     GATEWAY_LOST = auto()
     LATE = auto()  # too many ticks missed in a row
@@ -188,7 +189,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.RELEASE: Step(RELEASING, Action.BRAKE),
         Event.HOME: _MOVING,
         Event.RESET: _NO_FAULT,
-        Event.STANDSTILL: Step(HOLDING),
+        Event.ARRIVED: Step(HOLDING),
         Event.GATEWAY_LOST: Step(STOPPING, Action.BRAKE),
         Event.LATE: Step(STOPPING, Action.BRAKE),
         Event.SHUTDOWN: Step(STOPPING_TO_DISABLE, Action.BRAKE),
@@ -203,6 +204,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.HOME: _STOPPING,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: Step(HOLDING),
+        Event.ARRIVED: Step(HOLDING),
         Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),
         Event.QUICK_STOP: _TRIP,
         Event.FAULT: _TRIP,
@@ -215,6 +217,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.HOME: _DISABLING,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: _POWER_OFF,
+        Event.ARRIVED: _POWER_OFF,
         Event.QUICK_STOP: _TRIP,
         Event.FAULT: _TRIP,
     },
@@ -226,6 +229,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.HOME: _PAUSED,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: Step(PAUSED),
+        Event.ARRIVED: Step(HOLDING),
         Event.GATEWAY_LOST: Step(STOPPING),
         Event.LATE: Step(STOPPING),
         Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),
@@ -252,6 +256,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.HOME: _STOPPING,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: Step(HOLDING),
+        Event.ARRIVED: Step(HOLDING),
         Event.GATEWAY_LOST: Step(STOPPING),
         Event.LATE: Step(STOPPING),
         Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),

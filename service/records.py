@@ -6,19 +6,64 @@ Records have a fixed binary layout, are packed by the loop, travel in batches, a
 from __future__ import annotations
 
 import struct
-from typing import Any
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-PARTS = ("sync", "read", "mode", "motion", "kinematics", "write", "record")
-"""The parts of a cycle that are timed, in their order."""
+
+class Part(IntEnum):
+    """The parts of a cycle that are timed, in their order."""
+
+    SYNC = 0
+    READ = 1
+    MODE = 2
+    MOTION = 3
+    KINEMATICS = 4
+    WRITE = 5
+    RECORD = 6
+
+
+PARTS = tuple(part.name.lower() for part in Part)
+"""Their names."""
+
+
+class Record(NamedTuple):
+    """One record, with the fields of FIELDS; a field of several numbers is a sequence of so many."""
+
+    cycle: int
+    deadline_ns: int
+    lateness_ns: int
+    parts_ns: Sequence[int]
+    overruns: int
+    mode: int
+    drive_state: Sequence[int]
+    age: Sequence[int]
+    follows: Sequence[bool]
+    homed: Sequence[bool]
+    homing: bool
+    pose: Sequence[float]
+    commanded_pose: Sequence[float]
+    commanded_pose_velocity: Sequence[float]
+    commanded_pose_acceleration: Sequence[float]
+    position: Sequence[float]
+    velocity: Sequence[float]
+    commanded_position: Sequence[float]
+    commanded_velocity: Sequence[float]
+    commanded_acceleration: Sequence[float]
+    passive_position: Sequence[float]
+    following_error: Sequence[float]
+    progress: float
+    remaining: float
+
 
 FIELDS: tuple[tuple[str, str, int], ...] = (
     ("cycle", "q", 1),  # SYNCs sent since the start; times the period, the nominal time
     ("deadline_ns", "q", 1),  # when this cycle was due, monotonic clock
     ("lateness_ns", "q", 1),  # how much later it began
-    ("parts_ns", "i", len(PARTS)),  # time spent in each part; "record" is that of the cycle before
+    ("parts_ns", "i", len(Part)),  # time spent in each part; "record" is that of the cycle before
     ("overruns", "q", 1),  # ticks missed since the start
     ("mode", "B", 1),  # index into service.modes.MODES
     ("drive_state", "B", 3),  # drivers.interface.PowerState of A, B, C
@@ -49,6 +94,19 @@ DTYPE: np.dtype[Any] = np.dtype(
 )
 LAYOUT = struct.Struct("<" + "".join(f"{n}{code}" for _, code, n in FIELDS))
 """The same layout as DTYPE, for packing one record: as many values as the fields have, in their order."""
+_SINGLE = tuple(n == 1 for _, _, n in FIELDS)
+
+
+def pack_into(buffer: bytearray, offset: int, record: Record) -> None:
+    """Pack a record into a buffer, where LAYOUT.size bytes are free."""
+    values: list[Any] = []
+    value: Any
+    for value, single in zip(record, _SINGLE, strict=True):
+        if single:
+            values.append(value)
+        else:
+            values.extend(value)
+    LAYOUT.pack_into(buffer, offset, *values)
 
 
 def last_cycle(batch: bytes) -> int:

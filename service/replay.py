@@ -22,8 +22,8 @@ from drivers.interface import DriveFault, Drives, Feedback, PowerState, Triple
 from service.config import Config
 from service.control import Control
 from service.errors import ServiceError
-from service.modes import MODES, Event, Mode
-from service.packets import DrivesFault, Input, Mishap
+from service.modes import MODES, Mode
+from service.packets import DrivesFault, Input
 from service.reading import Recording
 
 SETPOINTS = ("commanded_position", "commanded_velocity")
@@ -86,14 +86,14 @@ def _run(
     clock.step()
     drives.sync()
     control.start(drives.read())
-    control.cycle = int(records["cycle"][0]) - 1
+    control.cycles = int(records["cycle"][0]) - 1
     waiting = deque(given)
     made = np.zeros((len(records), 2, 3))
     modes = np.zeros(len(records), np.uint8)
     for row in range(len(records)):
         clock.step()
         drives.sync()
-        _cycle(control, drives, list(_due(waiting, control.cycle + 1)))
+        _cycle(control, drives, list(_due(waiting, control.cycles + 1)))
         made[row] = control.setpoints.rows[:2]
         modes[row] = MODES.index(control.state.mode)
     return made, modes
@@ -105,19 +105,9 @@ def _cycle(control: Control, drives: Drives, given: Sequence[Input]) -> None:
         for what in given:
             if isinstance(what.given, DrivesFault):
                 drives.fail(what.given.message)
-    control.observe(drives.read())
-    for what in given:
-        if isinstance(what.given, Mishap):
-            control.happen(Event[what.given.event], what.given.reason)
-    try:
-        for what in given:
-            if not isinstance(what.given, Mishap | DrivesFault):
-                control.handle(what.given, what.now_ns)
-        control.advance()
-        control.solve()
-    except Exception as error:  # noqa: BLE001 - as in the loop, so that it comes out the same
-        control.trip(f"internal error, please report it: {error!r}")
-    control.write()
+    control.cycle(
+        drives.read(), [(what.given, what.now_ns) for what in given if not isinstance(what.given, DrivesFault)]
+    )
     control.desk.answers.clear()
     control.desk.happenings.clear()
 

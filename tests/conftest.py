@@ -20,7 +20,7 @@ from drivers import frames
 from drivers.bus import PROTOCOLS
 from drivers.simulated import SimulatedDrive, simulated_bus
 from service.config import SIM, Config, load
-from service.control import Control
+from service.control import Control, Given
 from service.desk import Happening
 from service.messages import Goal, PoseGoal
 from service.modes import Mode
@@ -113,12 +113,8 @@ class Rig:
         self.sent.clear()
         control = self.control
         self.driver.sync()
-        control.observe(self.driver.read())
-        if request is not None:
-            control.handle(request, round(self.now * 1e9))
-        control.advance()
-        control.solve()
-        control.write()
+        given: list[Given] = [] if request is None else [(request, round(self.now * 1e9))]
+        control.cycle(self.driver.read(), given)
         self.rows.append(control.setpoints.rows)
         self.seen.append([frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6])
         desk = control.desk

@@ -20,6 +20,7 @@ from service.packets import (
     Situation,
     Welcome,
 )
+from service.records import FIELDS, LAYOUT, Record, pack_into, unpack
 
 
 @pytest.mark.parametrize(
@@ -51,3 +52,16 @@ def test_answers(answer: Answer) -> None:
     packet = packets.message(answer)
     assert packet[0] == Kind.MESSAGE
     assert packets.decode_answer(packet[1:]) == answer
+
+
+def test_a_record_has_its_fields_where_readers_look_for_them() -> None:
+    """Packed by name, read by name: each field holds what was put into it, and nothing else."""
+    sizes = {name: n for name, _, n in FIELDS}
+    assert tuple(sizes) == Record._fields
+    numbers = iter(range(1, 1000))
+    given = {name: next(numbers) if n == 1 else [next(numbers) for _ in range(n)] for name, n in sizes.items()}
+    buffer = bytearray(5 + LAYOUT.size)
+    pack_into(buffer, 5, Record(**given))  # type: ignore[arg-type]
+    (row,) = unpack(buffer[5:])
+    for name, value in given.items():
+        assert row[name].tolist() == value
