@@ -1,0 +1,54 @@
+"""The kill matrix itself: whole, and able to see what it is there to see; the matrix is run by `make chaos`."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+
+import can
+import numpy as np
+import pytest
+from chaos import CASES, HARM, MODES
+from chaos_rig import NODES, PROCESSES, Failed, Rig
+
+from drivers import frames
+from service import modes
+from service.config import SIM, load
+
+
+def test_it_has_every_mode_process_and_harm() -> None:
+    assert len(set(CASES)) == len(MODES) * len(PROCESSES) * len(HARM) == 120
+    assert set(MODES) == {*map(str, modes.MODES)} - {"homing"}  # its drives have absolute encoders
+
+
+def heard(setpoints: list[float], told: int = frames.ENABLE_OPERATION) -> Rig:
+    """A rig that has heard these setpoints [m]."""
+    rig = Rig.__new__(Rig)
+    config = load(SIM)
+    rig.period, rig.limits, rig.counts = 0.01, config.limits.slider, 1e7
+    rig._lock = threading.Lock()
+    rig._heard = []
+    for node in NODES:
+        rig._heard.append(frames.message(frames.RPDO1 + node, frames.CONTROLWORD.pack(told)))
+        for position in setpoints:
+            content = frames.SETPOINT.pack(round(position * 1e7), 0)
+            rig._heard.append(can.Message(arbitration_id=frames.RPDO2 + node, data=content, is_extended_id=False))
+    return rig
+
+
+SMOOTH = [float(5.0 * (0.01 * k) ** 2) for k in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("setpoints", "told", "said"),
+    [
+        (SMOOTH, frames.ENABLE_OPERATION, None),
+        ([0.0, 0.0, 0.02, 0.04], frames.ENABLE_OPERATION, "a setpoint steps by 20.00 mm"),
+        ([0.0, 0.0, 0.003, 0.006], frames.ENABLE_OPERATION, r"the velocity of setpoints steps by 0\.300 m/s"),
+        ([0.0, 0.0, 0.02, 0.04], frames.QUICK_STOP, None),  # nobody follows these
+    ],
+)
+def test_a_jump_of_what_is_followed_is_seen(setpoints: list[float], told: int, said: str | None) -> None:
+    assert np.ptp(setpoints) > 0.0
+    with pytest.raises(Failed, match=said) if said else contextlib.nullcontext():
+        heard(setpoints, told).check_setpoints()
