@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 
-.PHONY: demo test hil soak ci-packages bench clean
+.PHONY: demo test hil chaos soak ci-packages bench clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
@@ -20,11 +20,14 @@ hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; install
 	$(VENV)/bin/python -m pip install --quiet --group hil
 	$(VENV)/bin/python tools/hil.py --install $(ARGS)
 
+chaos: $(READY)  ## every process killed, ended and frozen in every mode; half an hour; options: make chaos ARGS="--sample 10"
+	$(VENV)/bin/python tools/chaos.py $(ARGS)
+
 SECONDS ?= 600
 soak: $(READY)  ## a service under a flood of junk, for make soak SECONDS=…: it must hold
 	$(VENV)/bin/python tools/flood.py $(SECONDS) $(ARGS)
 
-ci-packages:  ## the system's packages for the tests of the viewers; those tests are skipped without
+ci-packages:  ## the system's packages for the tests of viewers and unit; those tests are skipped without
 	.ci/packages
 
 bench: $(READY)  ## the loop, the kinematics, planning and the recorder, measured

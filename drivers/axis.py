@@ -10,8 +10,6 @@ from drivers.scaling import Scale
 
 MISSED_ANSWERS = 3
 MISSED_HEARTBEATS = 3
-HIGH_LOAD = 0.8
-"""Worst-case share of the bus from which on people are warned: what is not cyclic has to wait."""
 
 
 class Axis:

@@ -14,10 +14,8 @@ from collections.abc import Callable
 
 import can
 
-from drivers import config, frames, setup402
-from drivers.axis import HIGH_LOAD
+from drivers import config, frames, load, setup402
 from drivers.axis402 import Axis
-from drivers.errors import BusError
 from drivers.homing402 import Homing
 from drivers.interface import NAMES, DriveFault, Feedback, PowerState, Triple
 from drivers.scaling import scale_of
@@ -91,22 +89,15 @@ class Cia402:
         A drive in fault is not an error here; feedback tells of it and `reset` clears it.
         """
         rate = 1.0 / period
-        load = frames.bus_load(rate, self._bitrate, self._drives.heartbeat)
-        if load > 1.0:
-            fits = max(0.0, frames.highest_rate(self._bitrate, self._drives.heartbeat))
-            raise BusError(
-                f"{rate:g} Hz takes {load:.0%} of the bus at {self._bitrate} bit/s; "
-                f"the highest rate that fits is {fits:.0f} Hz"
-            )
+        self.bus_load = load.checked(rate, self._bitrate, self._drives)
         scales = tuple(axis.scale for axis in self._axes)
         starts = setup402.configure(self._wire.bus, self._drives, scales, period, self._clock)
         for axis, start in zip(self._axes, starts, strict=True):
             axis.take_position(start.counts)
             axis.error_code = start.error_code
             axis.take_status(start.statusword)
-        self.bus_load = load
-        if load > HIGH_LOAD:
-            self._wire.warn(f"CAN bus: {rate:g} Hz takes {load:.0%} of it at worst; keep below {HIGH_LOAD:.0%}")
+        if warning := load.warning(rate, self.bus_load):
+            self._wire.warn(warning)
         self._period = period
 
     def sync(self) -> None:

@@ -6,7 +6,19 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-Positive = Annotated[float, Meta(gt=0.0)]
+# Bounds keep out what no machine of this kind has, so that nothing overflows or loses its digits behind them.
+Coordinate = Annotated[float, Meta(ge=-100.0, le=100.0)]
+"""A place [m]."""
+Distance = Annotated[float, Meta(ge=1e-6, le=1.0)]
+"""A small length, as of a following error [m]."""
+Velocity = Annotated[float, Meta(ge=1e-5, le=100.0)]
+"""[m/s] or [rad/s]."""
+Acceleration = Annotated[float, Meta(ge=1e-4, le=1e4)]
+"""[m/s²] or [rad/s²]."""
+Timeout = Annotated[float, Meta(ge=0.01, le=600.0)]
+"""[s]."""
+Name = Annotated[str, Meta(max_length=4096, pattern=r"^[^\x00-\x1f\x7f]*$")]
+"""A file's or a device's name: no control characters."""
 NodeId = Annotated[int, Meta(ge=0, le=127)]
 """CANopen has 1 to 127, ODrive 0 to 62; the driver refuses the rest."""
 
@@ -14,26 +26,26 @@ NodeId = Annotated[int, Meta(ge=0, le=127)]
 class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
     """How the simulated drives behave; used only with interface = "simulated"."""
 
-    time_constant: Annotated[float, Meta(ge=0.0)] = 0.004
+    time_constant: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.004
     """First-order lag of the servo behind its setpoint [s]."""
-    feed_forward_gain: Annotated[float, Meta(ge=0.0)] = 1.0
+    feed_forward_gain: Annotated[float, Meta(ge=0.0, le=2.0)] = 1.0
     """Share of the velocity feed-forward that the servo makes use of; what it leaves is made up with a lag."""
-    max_velocity: Positive = 2.0
+    max_velocity: Velocity = 2.0
     """What the slider can do at most [m/s]."""
-    max_acceleration: Positive = 100.0
+    max_acceleration: Acceleration = 100.0
     """What the slider can do at most [m/s²]."""
-    missed_syncs: Annotated[int, Meta(ge=1)] = 3
+    missed_syncs: Annotated[int, Meta(ge=1, le=100_000)] = 3
     """So many SYNCs missed in a row make a CiA 402 drive stop by itself; an ODrive has its watchdog."""
-    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    start: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     """Slider positions at power-on [m]."""
 
 
 class Can(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [can]: any python-can interface, or "simulated" (three drives inside the process)."""
 
-    interface: str
-    channel: str = ""
-    bitrate: Annotated[int, Meta(gt=0)] = 1_000_000
+    interface: Name
+    channel: Name = ""
+    bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
     """Bits per second: for the bus load, and for interfaces that set it themselves."""
     simulated: Simulated = Simulated()
 
@@ -43,13 +55,13 @@ class Homing(Struct, frozen=True, forbid_unknown_fields=True):
 
     method: Annotated[int, Meta(ge=-128, le=127)]
     """Object 6098h. Its directions are those of the drive's own counts; negative ones are the maker's."""
-    speed_switch: Positive
+    speed_switch: Velocity
     """Object 6099h:01, while the switch is searched [m/s]."""
-    speed_zero: Positive
+    speed_zero: Velocity
     """Object 6099h:02, while its edge or the index pulse is searched [m/s]."""
-    acceleration: Positive
+    acceleration: Acceleration
     """Object 609Ah [m/s²]."""
-    timeout: Annotated[float, Meta(gt=0.0, le=180.0)] = 60.0
+    timeout: Annotated[float, Meta(ge=0.01, le=180.0)] = 60.0
     """How long it may take [s]; so it bounds the way that a slider goes where it meets no switch."""
 
     def __post_init__(self) -> None:
@@ -61,15 +73,15 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     """One drive: section [drives.A], [drives.B] or [drives.C]."""
 
     node: NodeId
-    counts_per_metre: Positive
+    counts_per_metre: Annotated[float, Meta(ge=1e-3, le=1e12)]
     """The drive's own unit of position, per metre of the slider: counts of a CiA 402 drive, turns of an ODrive."""
     direction: Literal[1, -1] = 1
     """-1 where counts fall as the slider position rises."""
-    offset: float = 0.0
+    offset: Coordinate = 0.0
     """Slider position at zero counts [m]; after homing, that at home."""
     homing: Homing | None = None
     """None where the encoder is absolute."""
-    eds: str | None = None
+    eds: Name | None = None
     """Its maker's EDS, relative to the configuration file; the shipped servo.eds when absent."""
 
 
@@ -82,15 +94,15 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     C: Drive
     master_node: NodeId = 126
     """The node id of the service itself, for its heartbeat on CANopen."""
-    heartbeat: Positive = 0.1
+    heartbeat: Annotated[float, Meta(ge=0.001, le=21.845)] = 0.1
     """Period of everyone's heartbeat [s]; three missed ones are a loss. An ODrive must have been given it."""
-    following_error: Positive = 0.005
+    following_error: Distance = 0.005
     """The following error window [m]: the drives' own, object 6065h; for ODrives, which have none, the driver's."""
-    quick_stop_deceleration: Positive = 10.0
+    quick_stop_deceleration: Acceleration = 10.0
     """The quick-stop ramp [m/s²]: the drives' own, object 6085h; for ODrives, which have none, the driver's."""
-    stop_timeout: Positive = 1.0
+    stop_timeout: Timeout = 1.0
     """How long a drive may take to lose its power, down the quick-stop ramp or when it is disabled [s]."""
-    sdo_timeout: Positive = 0.5
+    sdo_timeout: Timeout = 0.5
     """How long a drive may take to answer a configuration request [s]."""
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
@@ -10,7 +11,8 @@ from typing import Final
 import canopen
 from canopen.objectdictionary import ObjectDictionary
 
-from drivers.errors import DriveError
+from drivers import files
+from drivers.errors import DriveError, FileError
 
 SERVO: Final = Path(__file__).with_name("servo.eds")
 """Object dictionary of a CiA 402 servo drive: names and types of every object used here."""
@@ -43,9 +45,10 @@ _MOST_NAMED = 3
 def load(drive: str, file: Path, node: int, needed: Iterable[Key]) -> ObjectDictionary:
     """The objects of the drive called `drive`; DriveError if the file cannot be used or lacks one that is `needed`."""
     try:
-        objects = canopen.import_od(str(file), node)
-    except OSError as error:
-        raise DriveError(f"drive {drive}: cannot read EDS {file}: {error.strerror}") from error
+        with files.opened(file) as content, io.TextIOWrapper(content, encoding="utf-8", errors="replace") as text:
+            objects = canopen.import_od(text, node)
+    except (FileError, OSError) as error:
+        raise DriveError(f"drive {drive}: cannot read EDS {error}") from error
     except (configparser.Error, ValueError, KeyError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise DriveError(f"drive {drive}: {file} is not an EDS as CiA 306 has it: {reason}") from error

@@ -2,9 +2,31 @@
 
 from __future__ import annotations
 
+LONGEST = 500
+"""Characters of a message at most."""
+_CUT = " … "
+
+
+def shortened(text: str, longest: int = LONGEST) -> str:
+    """Cut a text that is too long in its middle: it begins with what is wrong and where, and ends with the remedy."""
+    if len(text) <= longest:
+        return text
+    end = longest // 3
+    return f"{text[: longest - end - len(_CUT)]}{_CUT}{text[-end:]}"
+
 
 class TrirailError(Exception):
-    """Anything trirail refuses or cannot do; the message is one line that says what, where and the remedy."""
+    """Anything trirail refuses or cannot do; the message is one line that says what, where and the remedy.
+
+    It is of bounded length, for it may repeat what a file or a message held.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(shortened(message))
+
+
+class FileError(TrirailError):
+    """A file that cannot be read."""
 
 
 class DriveError(TrirailError):

@@ -21,10 +21,9 @@ from collections.abc import Callable
 
 import can
 
-from drivers import config, odrive_setup
+from drivers import config, load, odrive_setup
 from drivers import odrive_frames as frames
-from drivers.axis import HIGH_LOAD, MISSED_ANSWERS
-from drivers.errors import BusError
+from drivers.axis import MISSED_ANSWERS
 from drivers.interface import NAMES, DriveFault, Feedback, Triple
 from drivers.odrive_axis import OdriveAxis
 from drivers.odrive_frames import AxisState
@@ -105,18 +104,11 @@ class Odrive:
         A drive with errors is not an error here; feedback tells of it and `reset` clears it.
         """
         rate = 1.0 / period
-        load = frames.bus_load(rate, self._bitrate, self._drives.heartbeat)
-        if load > 1.0:
-            fits = max(0.0, frames.highest_rate(self._bitrate, self._drives.heartbeat))
-            raise BusError(
-                f"{rate:g} Hz takes {load:.0%} of the bus at {self._bitrate} bit/s; "
-                f"the highest rate that fits is {fits:.0f} Hz"
-            )
+        self.bus_load = load.checked(rate, self._bitrate, self._drives)
         self._period = period
         odrive_setup.configure(self._wire, self._axes, self._drives, self._clock)
-        self.bus_load = load
-        if load > HIGH_LOAD:
-            self._wire.warn(f"CAN bus: {rate:g} Hz takes {load:.0%} of it at worst; keep below {HIGH_LOAD:.0%}")
+        if warning := load.warning(rate, self.bus_load):
+            self._wire.warn(warning)
 
     def sync(self) -> None:
         """Send the setpoints written since the last cycle, which are in force on arrival; ask for the positions.

@@ -14,16 +14,13 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from drivers import frames
 from drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
+from drivers.settings402 import INVALID, NO_REMOTE_REQUEST
 
 # What canopen would say of a failed transfer is in the DriveError; standard error is for that one line.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 Clock = Callable[[], float]
 
-INVALID = 1 << 31
-"""Bit of a PDO's COB-ID: the PDO is not used."""
-NO_REMOTE_REQUEST = 1 << 30
-"""Bit of a TPDO's COB-ID; some drives report it always, some never."""
 NO_SUCH_OBJECT = (0x0602_0000, 0x0609_0011)
 """SDO abort codes: object does not exist, subindex does not exist (CiA 301)."""
 

@@ -12,7 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from service.modes import MODES
+from service import palette
+from service.modes import MODES, Mode
 from service.reading import Recording
 from service.summary import POWERED, GoalSummary, Summary
 
@@ -20,14 +21,7 @@ __all__ = ["draw"]
 
 INK, GREY, PALE, RED, AMBER = "#1f2933", "#7b8794", "#d3d9e0", "#c0392b", "#e0a100"
 SLIDERS = ("#d1495b", "#2e8b57", "#2f6fb3")
-MODE_COLOURS = {
-    "disabled": "#e4e7eb",
-    "enabling": "#9fd8e6",
-    "holding": "#cfe8d5",
-    "moving": "#57b36f",
-    "stopping": "#f2c84b",
-    "fault": "#d64545",
-}
+MODE_COLOURS = {mode: palette.code(palette.pale(colour)) for mode, colour in palette.MODES.items()}
 OUTCOMES = {"done": "#2f6fb3", "rejected": AMBER, "expired": AMBER, "faulted": RED, "unknown": GREY}
 OTHER = "#8c6bb1"
 """Goals that were preempted or stopped."""
@@ -86,7 +80,7 @@ def _modes(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], summe
     for number, goal in enumerate(summed.goals):
         _goal(panel, goal, 1.1 + 0.5 * (number % 2), float(t[-1]))
     panel.set(ylim=(-0.1, 2.2), yticks=[0.45, 1.55], yticklabels=["mode", "goals"])
-    shown = [Patch(color=MODE_COLOURS[name], label=name) for name in summed.modes]
+    shown = [Patch(color=MODE_COLOURS[Mode(name)], label=name) for name in summed.modes]
     kinds = {goal.outcome: OUTCOMES.get(goal.outcome, OTHER) for goal in summed.goals}
     shown += [Patch(color=colour, label=f"goal {outcome}") for outcome, colour in kinds.items()]
     panel.legend(

@@ -372,7 +372,7 @@ def _command(name: str, service: Service) -> int:
 def _follow(service: Service, robot: Robot, goal: Goal, wait: bool, title: str) -> int:
     """Say that a goal is accepted, or follow it to its end."""
     if not wait:
-        words = f"goal {goal.id}: {goal.duration:.2f} s{terminal.notes(goal.reply)}"
+        words = f"goal {goal.id}: {terminal.expected(goal.reply)}{terminal.notes(goal.reply)}"
         _print(service, msgspec.to_builtins(goal.reply), words)
         return 0
     result = terminal.follow(robot, goal, title, show=not service.json)

@@ -78,8 +78,8 @@ class Goal:
         return self._result
 
     @property
-    def duration(self) -> float:
-        """Expected time from acceptance to arrival [s]."""
+    def duration(self) -> float | None:
+        """Expected time from acceptance to arrival [s]; None while the override is zero."""
         return self.reply.duration
 
     def cancel(self) -> None:
@@ -139,7 +139,8 @@ class Jog:
             try:
                 self._send()
             except TrirailError as error:
-                self.error = error
+                if not (isinstance(error, RefusedError) and error.code == "at_limit"):  # that is how it should end
+                    self.error = error
                 return
 
 

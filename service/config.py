@@ -15,7 +15,9 @@ from typing import Annotated, Any, Literal, get_args
 import msgspec
 from msgspec import Meta, Struct
 
-from drivers.config import Can, Drives, Positive
+from drivers import files
+from drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
+from drivers.errors import DriveError, FileError
 from drivers.interface import NAMES
 from service.errors import ConfigError
 from service.geometry import Geometry, Leg, singular_angles
@@ -24,10 +26,12 @@ _PACKAGED = Path(__file__).parent / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[1] / "configs") / "sim.toml"
 """The configuration that needs nothing: no hardware, no rights, no other program."""
 
-Triple = tuple[float, float, float]
-PositiveTriple = tuple[Positive, Positive, Positive]
-Range = tuple[float, float]
-Fraction = Annotated[float, Meta(gt=0.0, le=1.0)]
+Angle = Annotated[float, Meta(ge=-2.0 * math.pi, le=2.0 * math.pi)]
+"""[rad]."""
+Jerk = Annotated[float, Meta(ge=1e-3, le=1e6)]
+"""[m/s³] or [rad/s³]."""
+Point = tuple[Coordinate, Coordinate]
+Range = tuple[Coordinate, Coordinate]
 
 
 class Robot(Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,29 +44,29 @@ class Robot(Struct, frozen=True, forbid_unknown_fields=True):
 class LegTable(Struct, frozen=True, forbid_unknown_fields=True):
     """One leg of a robot as built: [[geometry.leg]], metres and radians, as service.geometry.Leg."""
 
-    anchor: Range
-    rail_angle: float
-    home: float
-    edge_point: Range
-    edge_angle: float
+    anchor: Point
+    rail_angle: Angle
+    home: Coordinate
+    edge_point: Point
+    edge_angle: Angle
 
 
 class GeometryTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [geometry]: the paper's symmetric robot by `l0`, or three measured legs."""
 
-    l0: Positive | None = None
+    l0: Annotated[float, Meta(ge=0.001, le=100.0)] | None = None
     leg: tuple[LegTable, LegTable, LegTable] | None = None
 
 
 class PlatformLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [limits.platform]: for x, y [m] and phi [rad]."""
 
-    velocity: PositiveTriple
-    acceleration: PositiveTriple
-    jerk: PositiveTriple
+    velocity: tuple[Velocity, Velocity, Velocity]
+    acceleration: tuple[Acceleration, Acceleration, Acceleration]
+    jerk: tuple[Jerk, Jerk, Jerk]
     x: Range
     y: Range
-    phi: Range
+    phi: tuple[Angle, Angle]
 
 
 class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
@@ -72,10 +76,10 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """Travel of lambda_10 [m]."""
     passive: Range
     """Travel of lambda_32 along the platform's edges [m]."""
-    velocity: Positive
-    acceleration: Positive
-    jerk: Positive
-    following_error: Positive
+    velocity: Velocity
+    acceleration: Acceleration
+    jerk: Jerk
+    following_error: Distance
     """Setpoint less measured position beyond which everything stops [m]."""
 
 
@@ -84,7 +88,7 @@ class Limits(Struct, frozen=True, forbid_unknown_fields=True):
 
     platform: PlatformLimits
     slider: SliderLimits
-    singularity_margin: Positive = 0.1
+    singularity_margin: Annotated[float, Meta(ge=0.001, le=1.5)] = 0.1
     """How near phi may come to a singular angle [rad]."""
 
 
@@ -102,41 +106,45 @@ class Loop(Struct, frozen=True, forbid_unknown_fields=True):
     realtime: Literal["off", "prefer", "enforce"] = "prefer"
     """Whether SCHED_FIFO, locked memory and a pinned processor are done without, wished for, or demanded."""
     priority: Annotated[int, Meta(ge=1, le=99)] = 80
-    cpu: Annotated[int, Meta(ge=0)] | None = None
+    cpu: Annotated[int, Meta(ge=0, le=8191)] | None = None
     """The processor to stay on; the last one that the process may use when absent."""
 
 
 class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [zenoh]."""
 
-    listen: Annotated[tuple[str, ...], Meta(min_length=1)] = ("tcp/127.0.0.1:7447",)
+    listen: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=64)] = ("tcp/127.0.0.1:7447",)
 
 
 class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [telemetry]."""
 
-    directory: str = "recordings"
+    directory: Name = "recordings"
     """Where recordings go, relative to where the service was started."""
     state_hz: Annotated[int, Meta(ge=1, le=200)] = 50
     live_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
     """Loopback port of the live Rerun server; 0 for none."""
+    live_mb: Annotated[float, Meta(ge=1.0, le=4096.0)] = 64.0
+    """Memory for what viewers that connect late are shown of the past [1e6 bytes]; beyond that the oldest is let go."""
     capture_can: bool = False
     """Write every CAN frame of the session beside the recording, in candump's log format."""
-    rotate_minutes: Positive = 30.0
+    rotate_minutes: Annotated[float, Meta(ge=0.01, le=100_000.0)] = 30.0
     """A recording goes on in another file after so long."""
-    rotate_mb: Annotated[float, Meta(ge=1.0)] = 1000.0
+    rotate_mb: Annotated[float, Meta(ge=1.0, le=1e6)] = 1000.0
     """A recording goes on in another file where this one is so large [1e6 bytes]."""
-    keep_mb: Annotated[float, Meta(ge=1.0)] = 20_000.0
+    keep_mb: Annotated[float, Meta(ge=1.0, le=1e9)] = 20_000.0
     """How much the recordings in the folder may take together [1e6 bytes]; beyond that the oldest are deleted."""
 
 
 class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [watchdogs]."""
 
-    enable_timeout: Positive = 2.0
+    enable_timeout: Timeout = 2.0
     """How long the drives may take to power up [s]."""
-    max_overruns: Annotated[int, Meta(ge=1)] = 10
+    max_overruns: Annotated[int, Meta(ge=1, le=100_000)] = 10
     """So many missed ticks in a row are a controlled stop."""
+    gateway_timeout: Annotated[float, Meta(ge=0.2, le=10.0)] = 0.3
+    """So long without a sign of life from the gateway, which gives 20 a second, is a controlled stop [s]."""
 
 
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
@@ -162,9 +170,9 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
 def load(path: Path) -> Config:
     """Read a configuration file. Raises ConfigError with the file, the key, the value and what is allowed."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; configs/sim.toml is one to start from") from error
+        text = files.text(path)
+    except FileError as error:
+        raise ConfigError(f"{error}; configs/sim.toml is one to start from") from error
     try:
         return _beside(path, parse(text))
     except ConfigError as error:
@@ -175,9 +183,12 @@ def parse(text: str) -> Config:
     """Read a configuration from TOML. Raises ConfigError."""
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        leaves = list(_leaves(raw))
+    except RecursionError as error:
+        raise ConfigError("not a configuration: its tables or arrays are nested too deeply") from error
+    except ValueError as error:  # TOMLDecodeError, and Python's own about an integer of thousands of digits
         raise ConfigError(f"not TOML: {error}") from error
-    for key, value in _leaves(raw):
+    for key, value in leaves:
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{key} = {value}: it must be a finite number")
     try:
@@ -265,6 +276,8 @@ def _type_at(path: str) -> Any:
 
 def _check(config: Config) -> None:
     """Refuse what is well-formed but impossible."""
+    from drivers import config_checks
+
     robot = geometry(config.geometry)
     platform, slider = config.limits.platform, config.limits.slider
     ranges = {
@@ -300,7 +313,12 @@ def _check(config: Config) -> None:
         )
     if config.drives.protocol == "odrive":
         _check_canopen_only(config)
-        _check_feed_forward(config)
+    places = (*slider.position, *(config.can.simulated.start if config.can.interface == "simulated" else ()))
+    motion = config_checks.Motion(config.period, min(places), max(places), slider.velocity, slider.following_error)
+    try:
+        config_checks.check(config.drives, motion)
+    except DriveError as error:
+        raise ConfigError(str(error)) from error
 
 
 def _check_canopen_only(config: Config) -> None:
@@ -312,17 +330,3 @@ def _check_canopen_only(config: Config) -> None:
             )
         if drive.eds is not None:
             raise ConfigError(f"drives.{name}.eds = {drive.eds}: an ODrive has no object dictionary; leave it out")
-
-
-def _check_feed_forward(config: Config) -> None:
-    """CANSimple has 16 bits for the velocity feed-forward; without it an ODrive lags out of its window."""
-    from drivers.odrive_frames import MAX_FEED_FORWARD
-
-    for name, drive in zip(NAMES, config.drives.each, strict=True):
-        turns = config.limits.slider.velocity * drive.counts_per_metre
-        if turns > MAX_FEED_FORWARD:
-            raise ConfigError(
-                f"limits.slider.velocity = {config.limits.slider.velocity:g}: with drives.{name}.counts_per_metre = "
-                f"{drive.counts_per_metre:g} that is {turns:g} turns/s, and an ODrive's feed-forward ends at "
-                f"{MAX_FEED_FORWARD:g}; lower the velocity, or use a longer lead"
-            )

@@ -44,7 +44,7 @@ _COMMANDS = {
 }
 _OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.FAULT: "faulted"}
 """How a goal ends on an event after which it is not under way; else it is stopped."""
-_GO_ON = (Event.GOAL, Event.STANDSTILL, Event.POWERED, Event.PAUSE, Event.RESUME, Event.ENABLE, Event.RESET)
+_GO_ON = (Event.GOAL, Event.STANDSTILL, Event.POWERED, Event.RESUME, Event.ENABLE, Event.RESET)
 """Events that leave alone what has been sent but not begun."""
 
 
@@ -115,10 +115,10 @@ class Control:
         self.desk.settle(self._verdict, self.state.mode)
 
     def handle(self, request: Request, now_ns: int) -> None:
-        """Take one request at a time of the monotonic clock: goals wait until those before them are planned."""
+        """Take a request at a time of the monotonic clock: a command at once, a goal behind those before it."""
         try:
             if isinstance(request, GoalRequest):
-                self.dispatch.take(request, now_ns)
+                self.dispatch.take(request, now_ns, self.cycle)
             elif isinstance(request, CommandRequest):
                 self._take_command(request)
             else:
@@ -136,7 +136,10 @@ class Control:
         self._go(event, reason)
 
     def advance(self) -> None:
-        """Plan one step further, and move the commanded state on by one period."""
+        """End a jog that nobody renews, plan one step further, and move the commanded state on by one period."""
+        released = self.desk.release(self.cycle) if self.state.mode is Mode.MOVING else None
+        if released is not None:
+            self._go(Event.RELEASE, f"goal {released.id} of {released.user} is not renewed")
         beginning = self.dispatch.think(self.cycle, self._admit)
         if beginning is not None:
             self._go(Event.GOAL, f"goal {beginning.id} of {beginning.user}")
@@ -232,6 +235,8 @@ class Control:
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
+        if event is Event.PAUSE and self.desk.goal is not None and self.desk.goal.is_jog:
+            event = Event.STOP  # nobody would be at the key when it is resumed
         if decided.action is Action.POWER_UP:
             self.setpoints.check_rest()
             if self.measured.homed:
@@ -294,7 +299,8 @@ class Control:
             self._entered = self.cycle
         if not self.state.has_goal:
             outcome = _OUTCOMES.get(event, "stopped")
-            self.desk.end(outcome, "arrived" if outcome == "done" else reason)
+            arrived = "released" if before.released else "arrived"
+            self.desk.end(outcome, arrived if outcome == "done" else reason)
         if self.state.mode is not before.mode:
             self.desk.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:

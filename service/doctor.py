@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from msgspec import Struct
 
-from drivers.frames import bus_load, highest_rate
+from drivers.load import HIGH, bus_load, highest_rate
 from service.clock import Tick
 from service.config import Config
 
@@ -21,8 +21,6 @@ FRAMES_A_CYCLE = 8
 """That the service sends at most: SYNC, heartbeat, three setpoints, three controlwords."""
 LATE = 0.1
 """Share of the period by which one tick in a thousand may be late."""
-FULL = 0.8
-"""Above this share of the bus little is left for repeated frames."""
 
 
 class Check(Struct, frozen=True):
@@ -183,13 +181,13 @@ def _queue(name: str, length: int | None) -> Check:
 
 
 def load(config: Config) -> Check:
-    """The share of the bus that the cycle takes at worst."""
-    rate, bitrate, heartbeat = config.loop.rate_hz, config.can.bitrate, config.drives.heartbeat
-    share = bus_load(rate, bitrate, heartbeat)
+    """The share of the bus that the cycle takes at worst, as the driver counts it."""
+    rate, bitrate, drives = config.loop.rate_hz, config.can.bitrate, config.drives
+    share = bus_load(rate, bitrate, drives)
     found = f"{share:.0%} of {bitrate} bit/s at {rate} Hz"
-    if share <= FULL:
+    if share <= HIGH:
         return Check("bus load", "ok", found)
-    remedy = f"loop.rate_hz below {FULL * highest_rate(bitrate, heartbeat):.0f}, or a higher bitrate"
+    remedy = f"loop.rate_hz below {HIGH * highest_rate(bitrate, drives):.0f}, or a higher bitrate"
     return Check("bus load", "failure" if share > 1.0 else "warning", found, remedy)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 import signal
 import time
@@ -18,9 +19,12 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_a
 from service import __version__, boundary, session
 from service.config import Config, geometry
 from service.errors import RefusedError
+from service.heartbeats import BEAT_EVERY
 from service.inbox import Inbox, Incoming
+from service.lastwords import LastWords
 from service.links import Closed, Link
 from service.messages import CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
+from service.modes import Mode
 from service.packets import (
     Accepted,
     Answer,
@@ -49,7 +53,7 @@ CONTENT: dict[str, tuple[Any, str]] = {
     "stop": (Stop | None, 'stop takes nothing, or {"goal": id}'),
 }
 """What commands may carry; the others carry nothing."""
-STOPPING = ("stop", "disable", "quick_stop")
+STOPPING = ("stop", "disable", "quick_stop", "pause")
 AT_ONCE = 256
 """Messages from Zenoh that are read before the loop is listened to again."""
 BACKLOG = 5_000
@@ -79,11 +83,13 @@ class _Waiting(NamedTuple):
 class Gateway:
     """Takes requests from Zenoh, passes them to the loop, and answers and publishes what the loop says."""
 
-    def __init__(self, config: Config, link: Link, opened: zenoh.Session) -> None:
+    def __init__(self, config: Config, link: Link, beat: Callable[[], None], opened: zenoh.Session) -> None:
         self._robot = config.robot.name
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
         self._home_within = REPLY_WITHIN + sum(homing)
         self._link = link
+        self._beat = beat
+        self._last_words = LastWords(config.period)
         self._session = opened
         self._info = _info(config)
         self._states = StateMaker(config)
@@ -129,14 +135,18 @@ class Gateway:
         poll.register(self._inbox.fileno(), select.POLLIN)
         try:
             while not self._ending:
-                poll.poll(1000)
+                self._beat()
+                poll.poll(BEAT_EVERY * 1e3)
                 for incoming in self._inbox.take(AT_ONCE):
+                    self._beat()
                     self._handle(incoming)
                 while (packet := self._link.receive()) is not None:
+                    self._beat()
+                    self._last_words.heard()
                     self._hear(packet, ready)
                 self._give_up_late()
         except Closed:
-            return
+            self._tell_of_its_end()
         finally:
             for incoming in [
                 *(waiting.incoming for waiting in self._waiting.values()),
@@ -193,6 +203,7 @@ class Gateway:
             self._backlog.popleft()
             self._backlog_bytes -= incoming.size
             self._ahead.add(request.ticket)
+            self._last_words.take(request)
             self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
 
     def _command(self, incoming: Incoming) -> None:
@@ -268,13 +279,15 @@ class Gateway:
             ready()
 
     def _take(self, answer: Answer) -> None:
+        self._last_words.take(answer)
         match answer:
             case Happened(event):
                 self._event.put(msgspec.json.encode(event))
             case Situation() | Welcome():
                 self._states.update(answer)
             case Accepted(ticket, goal_id, duration, slowed, stops_first, queued):
-                self._answer(ticket, GoalReply(goal_id, duration, slowed, stops_first, queued))
+                expected = duration if math.isfinite(duration) else None
+                self._answer(ticket, GoalReply(goal_id, expected, slowed, stops_first, queued))
             case Confirmed(ticket, name, mode):
                 self._answer(ticket, CommandReply(name, mode))
             case Refused(ticket, code, text, slider, value, limit):
@@ -288,6 +301,14 @@ class Gateway:
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
             self._state.put(msgspec.json.encode(self._states.newest()))
+
+    def _tell_of_its_end(self) -> None:
+        """The loop has gone: where it has died, tell everyone in its place."""
+        for event in self._last_words.events(self._states.cycle):
+            self._event.put(msgspec.json.encode(event))
+        if (reason := self._last_words.reason) and self._states.cycle:
+            state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason,))
+            self._state.put(msgspec.json.encode(state))
 
     def _answer(self, ticket: int, content: msgspec.Struct) -> None:
         waiting = self._waiting.pop(ticket, None)
@@ -325,10 +346,10 @@ def _info(config: Config) -> Info:
     )
 
 
-def main(config: Config, link: Link, ready: Callable[[object], None]) -> int:
+def main(config: Config, link: Link, beat: Callable[[], None], ready: Callable[[object], None]) -> int:
     """Run the gateway's process; `ready` is called once it can be reached."""
     with session.open_service(config.zenoh.listen) as opened:
-        gateway = Gateway(config, link, opened)
+        gateway = Gateway(config, link, beat, opened)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
         gateway.serve(lambda: ready({}))
     return 0

@@ -30,6 +30,8 @@ STOPS = tuple(0.5**k for k in range(5))
 """Shares of the quickest stop that are tried when a goal needs one first."""
 SLOWER = 1.3
 """How much slower a path is made that an override makes too fast."""
+SLOWED = 12
+"""How often: 1.3 to the power of 12 is 23 times."""
 
 
 class Motion(NamedTuple):
@@ -41,9 +43,11 @@ class Motion(NamedTuple):
     duration: float
     """From when it begins to arrival [s]."""
     slowed: float = 1.0
-    """How many times slower than was asked for, for the sliders' sake."""
+    """How many times slower than was asked for, for the limits' sake."""
     stops_first: bool = False
     """Whether the robot stops on its old path before."""
+    bound: str | None = None
+    """The limit before which a jog comes to rest."""
 
 
 class Extension(NamedTuple):
@@ -121,10 +125,12 @@ class Goals:
                 pass
             yield
         plan = yield from self._to_pose(goal, rest(_state(run.path, end).pose))
-        while not self._fits(run, end, plan.path):  # it is faster than at full speed, by an override
-            yield
+        for _ in range(SLOWED):
+            if self._fits(run, end, plan.path):
+                return Extension(end, plan.path, plan.slowed)
+            yield  # it is faster than at full speed, by an override
             plan = Plan(stretched(plan.path, SLOWER), SLOWER * plan.slowed)
-        return Extension(end, plan.path, plan.slowed)
+        raise RefusedError("no_plan", "no motion follows at this override: send the goal again when it is lower")
 
     def _check(self, goal: Goal) -> None:
         """Refuse what can be reached from nowhere."""
@@ -140,18 +146,22 @@ class Goals:
         if start.at_rest:
             plan = yield from self._plan(goal, start)
             run = yield from self.laws.begin(plan.path, rate, start.pose)
-            return Motion(deque([run]), None, run.ends, plan.slowed)
+            return Motion(deque([run]), None, run.ends if rate else math.inf, plan.slowed, bound=plan.bound)
         now = course.runs[0].at.rate
         if now < SLOWEST:
             raise TOO_FAST_IN_MOTION
-        # The new path's time goes on at the rate of the old one's: in it, the motion is that much slower.
-        velocity = [value / now for value in start.velocity]
-        acceleration = [value / now**2 for value in start.acceleration]
-        plan = yield from self._plan(goal, MotionState(start.pose, velocity, acceleration))
-        run = yield from self.laws.begin(plan.path, now, start.pose)
-        if run.target < now:
-            raise TOO_FAST_IN_MOTION
-        return Motion(deque([run]), None, plan.path.duration / (rate or 1.0), plan.slowed)
+        for _ in range(2):
+            # The new path's time goes on at the rate of the old one's: in it, the motion is that much slower.
+            velocity = [value / now for value in start.velocity]
+            acceleration = [value / now**2 for value in start.acceleration]
+            plan = yield from self._plan(goal, MotionState(start.pose, velocity, acceleration))
+            run = yield from self.laws.begin(plan.path, now, start.pose)
+            if run.target >= now:
+                final = yield from self.laws.possible(plan.path, 0.0, rate, start.pose)
+                duration = plan.path.duration / final if final else math.inf
+                return Motion(deque([run]), None, duration, plan.slowed, bound=plan.bound)
+            now = run.target  # an override that the old path could take, and the new one cannot
+        raise TOO_FAST_IN_MOTION
 
     def _stop_first(self, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
         """Plan from where the motion under way can be stopped."""
@@ -162,7 +172,8 @@ class Goals:
         end = stop.state(stop.ends - stop.time, course.commanded.pose).pose
         plan = yield from self._plan(goal, rest(end))
         run = yield from self.laws.begin(plan.path, rate, end)
-        return Motion(deque([stop, run]), None, stop.ends - stop.time + run.ends, plan.slowed, stops_first=True)
+        duration = stop.ends - stop.time + run.ends if rate else math.inf
+        return Motion(deque([stop, run]), None, duration, plan.slowed, stops_first=True, bound=plan.bound)
 
     def _plan(self, goal: Goal, start: MotionState) -> Steps[Plan]:
         planner = self._planner
@@ -189,7 +200,8 @@ class Goals:
         """Return the time along a run's path from which on it is within `blend` of its end [s]."""
         end = run.path.duration
         target = _state(run.path, end).pose
-        soonest = run.at.s + LEAD * self._period * max(run.at.rate, run.target)
+        # Strictly ahead, also where time along the path stands still: at override 0 it may be told to run at any time.
+        soonest = run.at.s + LEAD * self._period * max(run.at.rate, run.target, 1.0)
         low, high = max(soonest, run.seams[-1].s if run.seams else 0.0), end
         if low >= end or self._planner.nearness(_state(run.path, low).pose, target) <= blend:
             return min(low, end)
@@ -202,7 +214,7 @@ class Goals:
         return high
 
     def _fits(self, run: Run, s: float, path: Path) -> bool:
-        """Whether the sliders can take a path behind a run's, by the run's law."""
+        """Whether sliders and platform can take a path behind a run's, by the run's law."""
         longer = run.copy()
         longer.append(s, path)
         law, first = longer.law, longer.reaches(s)

@@ -1,4 +1,4 @@
-"""How time runs along a path: at a rate, and from one rate to another within what the sliders can do."""
+"""How time runs along a path: at a rate, and from one rate to another within the limits of sliders and platform."""
 
 from __future__ import annotations
 
@@ -34,24 +34,35 @@ class Laws:
         self._change_jerk = min(j / v for j, v in zip(platform.jerk, platform.velocity, strict=True))
 
     def begin(self, path: Path, rate: float, pose: Sequence[float]) -> Steps[Run]:
-        """Start a path at a rate, or as near to it as the sliders' limits allow."""
+        """Start a path at a rate, or as near to it as the limits allow."""
         rate = yield from self.possible(path, 0.0, rate, pose)
         return Run(self._legs, path, constant(rate), rate)
 
     def change(self, run: Run, rate: float, pose: Sequence[float]) -> Steps[None]:
-        """Let the time along a path run at another rate: as soon as the sliders' limits allow, as fast as they do.
+        """Let the time along a path run at another rate: as soon as the limits allow, as fast as they do.
 
         Until then the old law goes on, as the run does between the steps: at the end of the path it stands too.
+        A stop becomes quicker as it goes on: the slower the motion, the more is left of the limits.
         """
         rate = yield from self.possible(run.path, run.at.s, rate, pose)
         while not run.arrived:
             if (yield from self.try_change(run, rate, pose)):
-                return
+                break
+        while rate == 0.0 and not run.stands:
+            yield
+            yield from self.try_change(run, rate, pose, sooner=True)
 
-    def try_change(self, run: Run, rate: float, pose: Sequence[float], shares: Sequence[float] = SHARES) -> Steps[bool]:
-        """Do the same at one of some shares of the quickest change, the first that the sliders can bear, if any."""
+    def try_change(
+        self, run: Run, rate: float, pose: Sequence[float], shares: Sequence[float] = SHARES, *, sooner: bool = False
+    ) -> Steps[bool]:
+        """Do the same at one of some shares of the quickest change, the first that the limits allow, if any.
+
+        With `sooner` only where the run comes to stand sooner than by the law that it has.
+        """
         for share in shares:
             law = self._ramp(run, rate, share)
+            if sooner and (law is None or float(law.knots[-2]) > run.ends - run.time - self._period):
+                return False
             if law is not None:
                 until = min(arrival(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
                 if self._checker.look(run.path, law, 0.0, until, pose).bearable:
@@ -61,12 +72,15 @@ class Laws:
         return False
 
     def possible(self, path: Path, s: float, rate: float, pose: Sequence[float]) -> Steps[float]:
-        """Return the rate, or the greatest at which the sliders can take the path from `s` on."""
+        """Return the rate, or the greatest at which sliders and platform can take the path from `s` on.
+
+        Every path fits at one: above that there is only what makes it slower than its limits.
+        """
         if rate <= 1.0:
             return rate
         found = self._checker.look(path, constant(1.0, s), 0.0, path.duration - s, pose)
         yield
-        return min(rate, 1.0 / found.excess) if math.isnan(found.beyond) and found.excess > 0.0 else rate
+        return min(rate, max(1.0, 1.0 / found.excess)) if math.isnan(found.beyond) and found.excess > 0.0 else 1.0
 
     def _ramp(self, run: Run, rate: float, share: float) -> Path | None:
         """Return the law from the present rate to another, at a share of the quickest change; None without one."""

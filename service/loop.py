@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 import msgspec
@@ -13,24 +13,43 @@ import msgspec
 from drivers.bus import connect
 from drivers.capture import Capture
 from drivers.interface import DriveFault, Drives
-from service import packets, realtime
+from service import realtime
 from service.clock import Tick, Ticker
 from service.config import Config
 from service.control import Control
+from service.heartbeats import Heartbeats, Watch
 from service.kinematics import warm_up
 from service.links import Port
 from service.messages import Event
 from service.modes import MODES, Mode
 from service.modes import Event as ModeEvent
-from service.packets import DrivesFault, Input, Kind, Mishap, Request, Situation, Welcome, message
+from service.packets import (
+    DrivesFault,
+    Farewell,
+    Input,
+    Kind,
+    Mishap,
+    Request,
+    Situation,
+    Welcome,
+    decode_remark,
+    decode_request,
+    message,
+    told,
+)
 from service.records import LAYOUT
 from service.text import quoted
 
 BATCHES_PER_SECOND = 50
+REQUESTS_A_CYCLE = 4
+"""Requests that are taken in one cycle: at 1 kHz more than the gateway can send, so that a stop waits for nothing."""
+ANSWERS_A_CYCLE = 8
 EVENTS_KEPT = 1000
 """Events kept for a gateway that comes anew: the one before may have died with some that it had not published."""
 OLDEST = 255
 """No feedback is recorded as older [SYNCs]."""
+LEAST_PATIENCE = 3
+"""Cycles for which the gateway may be silent, however few there are a second."""
 SHUTDOWN = 3.0
 """How long a controlled stop may take before the drives are left to their own quick stop [s]."""
 
@@ -44,6 +63,7 @@ class Loop:
         drives: Drives,
         gateway: Port,
         recorder: Port,
+        heartbeats: Heartbeats,
         *,
         capture: Capture | None = None,
         lacking: tuple[str, ...] = (),
@@ -68,8 +88,14 @@ class Loop:
         self._ending_since: int | None = None
         self._overruns = 0
         self._late_streak = 0
+        self._heart = heartbeats.of("loop")
+        self._gateway_timeout = config.watchdogs.gateway_timeout
+        patience = max(LEAST_PATIENCE, round(self._gateway_timeout * config.loop.rate_hz))
+        self._gateway_watch = Watch(heartbeats.of("gateway"), patience)
+        self._gateway_frozen = False
         self._events = 0
         self._kept: deque[bytes] = deque(maxlen=EVENTS_KEPT)
+        self._answers: deque[bytes] = deque()
         self._told = 0
         self._inputs = 0
         self._given: list[Input] = []
@@ -103,11 +129,9 @@ class Loop:
         self._watch(tick, feedback.fault)
         decided = moved = now()
         try:
-            request = self._gateway.receive() if control.dispatch.ready else None
-            if request is not None:
-                decoded = packets.decode_request(memoryview(request)[1:])
-                self._note(tick, decoded)
-                control.handle(decoded, tick.deadline_ns + tick.lateness_ns)
+            for request in self._requests():
+                self._note(tick, request)
+                control.handle(request, tick.deadline_ns + tick.lateness_ns)
             decided = now()
             control.advance()
             moved = now()
@@ -128,8 +152,19 @@ class Loop:
         self._record(tick, parts)
         self._record_ns = now() - written
 
+    def _requests(self) -> Iterator[Request]:
+        """Take what the gateway has sent: as much as comes in a cycle, and no more than a cycle has time for.
+
+        Nothing is taken of what a frozen one has left, until it serves again.
+        """
+        for _ in range(0 if self._gateway_frozen else REQUESTS_A_CYCLE):
+            packet = self._gateway.receive()
+            if packet is None:
+                return
+            yield decode_request(memoryview(packet)[1:])
+
     def _watch(self, tick: Tick, fault: DriveFault | None) -> None:
-        """Count what the ticker missed, notice a fault, a lost gateway and a wish to end."""
+        """Count what the ticker missed, notice a fault, a gateway that is lost or frozen and a wish to end."""
         if fault is not self._fault:
             self._fault = fault
             self._note(tick, DrivesFault(fault.message if fault else None))
@@ -142,11 +177,22 @@ class Loop:
                 self._late_streak = 0
         else:
             self._late_streak = 0
-        if self._gateway.take_lost():
-            self._happen(tick, ModeEvent.GATEWAY_LOST, "the gateway is gone: controlled stop")
+        self._watch_gateway(tick)
         if self.ending and self._ending_since is None:
             self._ending_since = self.control.cycle
             self._happen(tick, ModeEvent.SHUTDOWN, "the service is ending: controlled stop, drives disabled")
+
+    def _watch_gateway(self, tick: Tick) -> None:
+        if self._gateway.take_lost():
+            self._gateway_frozen = False
+            self._happen(tick, ModeEvent.GATEWAY_LOST, "the gateway is gone: controlled stop")
+        elif self._gateway_watch.silent():
+            if not self._gateway_frozen:
+                self._gateway_frozen = True
+                text = f"the gateway is frozen, no sign of life for {self._gateway_timeout:g} s: controlled stop"
+                self._happen(tick, ModeEvent.GATEWAY_LOST, text)
+        elif self._gateway_watch.heard:
+            self._gateway_frozen = False
 
     def _happen(self, tick: Tick, event: ModeEvent, reason: str) -> None:
         self._note(tick, Mishap(event.name, reason))
@@ -202,9 +248,12 @@ class Loop:
             self._flush()
         if control.desk.answers or control.desk.happenings or self._given:
             self._speak()
+        if self._answers:
+            self._send_answers()
 
     def _flush(self) -> None:
-        """Send the batch, take new peers, and what was kept for them; listen to the recorder."""
+        """Give a sign of life; send the batch, take new peers, and what was kept for them; listen to the recorder."""
+        self._heart.beat()
         if self._batched:
             batch = bytes(self._batch[: 1 + self._batched * LAYOUT.size])
             self._batched = 0
@@ -237,7 +286,7 @@ class Loop:
             return
         self._recorded = True
         try:
-            remark = packets.decode_remark(memoryview(packet)[1:])
+            remark = decode_remark(memoryview(packet)[1:])
         except msgspec.DecodeError as error:  # the recorder must not be able to stop the robot
             self.control.desk.tell("service", "warning", f"the recorder said something unreadable: {error}")
         else:
@@ -262,14 +311,13 @@ class Loop:
             self._events += 1
             t = control.cycle * self._period
             event = Event(self._events, t, control.cycle, time.time(), **happening._asdict())
-            packet = packets.told(event)
+            packet = told(event)
             self._kept.append(packet)
             self._recorder.send(packet)
         desk.happenings.clear()
         self._situate()
         self._send_events()
-        for answer in desk.answers:
-            self._gateway.send(message(answer))
+        self._answers.extend(map(message, desk.answers))
         desk.answers.clear()
 
     def _situate(self) -> None:
@@ -283,6 +331,15 @@ class Loop:
             self._gateway.send(situation)
             self._recorder.send(situation)
 
+    def _send_answers(self) -> None:
+        """Answer some requests; what the gateway is too slow for waits, what it has gone without is nobody's."""
+        if not self._gateway.connected:
+            self._answers.clear()
+        for _ in range(min(len(self._answers), ANSWERS_A_CYCLE)):
+            if not self._gateway.send(self._answers[0]):
+                return
+            self._answers.popleft()
+
     def _send_events(self) -> None:
         """Tell the gateway of every event that is kept and that it does not know."""
         self._told = max(self._told, self._events - len(self._kept))
@@ -290,16 +347,17 @@ class Loop:
             self._told += 1
 
 
-def main(config: Config, gateway: Port, recorder: Port, ready: Callable[[object], None]) -> int:
+def main(config: Config, gateway: Port, recorder: Port, heartbeats: Heartbeats, ready: Callable[[object], None]) -> int:
     """Run the loop's process; `ready` is called with what the loop runs without once it turns."""
     drives: Drives | None = None
+    ended_as_told = False
     try:
         warm_up()
         capture = Capture() if config.telemetry.capture_can else None
         drives = connect(config.can, config.drives, capture=capture)
         drives.configure(config.period)
         lacking = realtime.acquire(config.loop)
-        loop = Loop(config, drives, gateway, recorder, capture=capture, lacking=lacking)
+        loop = Loop(config, drives, gateway, recorder, heartbeats, capture=capture, lacking=lacking)
 
         def end(_signal: int, _frame: FrameType | None) -> None:
             loop.ending = True
@@ -307,9 +365,13 @@ def main(config: Config, gateway: Port, recorder: Port, ready: Callable[[object]
         signal.signal(signal.SIGTERM, end)
         ready({"lacking": lacking, "bus_load": drives.bus_load})
         loop.run(Ticker(round(config.period * 1e9)))
+        ended_as_told = True
     finally:
+        heartbeats.of("loop").rest()  # the drives may take their time to stop
         if drives is not None:
             drives.close()
-        gateway.close()
-        recorder.close()
+        for port in (gateway, recorder):
+            if ended_as_told:
+                port.send(message(Farewell()))
+            port.close()
     return 0

@@ -47,11 +47,6 @@ class Measured:
         """Whether it is known where the sliders are."""
         return all(self.feedback.homed)
 
-    @property
-    def last_written(self) -> Triple:
-        """The newest setpoint [m]."""
-        return self._written[-1]
-
     def start(self, feedback: Feedback) -> None:
         """Take the first feedback, for the setpoints of the past too."""
         self.feedback = feedback

@@ -110,7 +110,7 @@ class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
     points: Annotated[tuple[TrajectoryPoint, ...], Meta(min_length=2, max_length=MAX_POINTS)]
     id: Identifier | None = None
     stretch: bool = False
-    """Slow a trajectory that is too fast for a slider, instead of refusing it."""
+    """Slow a trajectory that is too fast for a slider or the platform, instead of refusing it."""
     valid_for: Validity | None = None
 
     def __post_init__(self) -> None:
@@ -161,10 +161,10 @@ class GoalReply(Struct, frozen=True):
     """A goal was accepted; it ends in exactly one event."""
 
     id: str
-    duration: float
-    """Expected time from now to arrival [s]."""
+    duration: float | None
+    """Expected time from now to arrival [s]; None while the override is zero: then it has no expected end."""
     slowed: float = 1.0
-    """How many times slower it is than was asked for, since a slider could not follow."""
+    """How many times slower it is than was asked for, since a slider or the platform may not move so fast."""
     stops_first: bool = False
     """The robot stops on its old path first: from its present motion it could not, or would be later."""
     queued: bool = False

@@ -33,6 +33,7 @@ class Event(Enum):
     RESET = auto()
     PAUSE = auto()
     RESUME = auto()
+    RELEASE = auto()  # nobody keeps the jog alive any more
     HOME = auto()
     POWERED = auto()  # all drives reached operation enabled
     HOMED = auto()  # all drives know where they are, and follow setpoints again
@@ -59,16 +60,17 @@ class Action(Enum):
 
 
 class State(NamedTuple):
-    """A mode, and what is to come once the robot stands: its drives disabled, or the same goal again."""
+    """A mode, and what is to come once the robot stands: its drives disabled, the same goal again, or a jog's end."""
 
     mode: Mode
     disable_after: bool = False
     paused: bool = False
+    released: bool = False
 
     @property
     def has_goal(self) -> bool:
         """Whether a goal can be under way."""
-        return self.mode is Mode.MOVING or self.paused
+        return self.mode is Mode.MOVING or self.paused or self.released
 
 
 class Step(NamedTuple):
@@ -94,9 +96,22 @@ STOPPING = State(Mode.STOPPING)
 STOPPING_TO_DISABLE = State(Mode.STOPPING, disable_after=True)
 PAUSING = State(Mode.STOPPING, paused=True)
 PAUSED = State(Mode.HOLDING, paused=True)
+RELEASING = State(Mode.STOPPING, released=True)
 FAULT = State(Mode.FAULT)
 
-STATES = (DISABLED, ENABLING, HOMING, HOLDING, MOVING, STOPPING, STOPPING_TO_DISABLE, PAUSING, PAUSED, FAULT)
+STATES = (
+    DISABLED,
+    ENABLING,
+    HOMING,
+    HOLDING,
+    MOVING,
+    STOPPING,
+    STOPPING_TO_DISABLE,
+    PAUSING,
+    PAUSED,
+    RELEASING,
+    FAULT,
+)
 
 _NO_FAULT = Refusal("no_fault", "there is no fault to reset")
 _DISABLED = Refusal("not_enabled", "the robot is disabled: send enable first")
@@ -170,6 +185,7 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.GOAL: Step(MOVING, Action.START),
         Event.STOP: Step(STOPPING, Action.BRAKE),
         Event.PAUSE: Step(PAUSING, Action.BRAKE),
+        Event.RELEASE: Step(RELEASING, Action.BRAKE),
         Event.HOME: _MOVING,
         Event.RESET: _NO_FAULT,
         Event.STANDSTILL: Step(HOLDING),
@@ -225,6 +241,20 @@ _TABLE: dict[State, dict[Event, Step | Refusal]] = {
         Event.RESET: _NO_FAULT,
         Event.GATEWAY_LOST: Step(HOLDING),
         Event.SHUTDOWN: _POWER_OFF,
+        Event.QUICK_STOP: _TRIP,
+        Event.FAULT: _TRIP,
+    },
+    RELEASING: {
+        Event.DISABLE: Step(STOPPING_TO_DISABLE),
+        Event.GOAL: Step(MOVING, Action.START),
+        Event.STOP: Step(STOPPING),
+        Event.RESUME: _NOT_PAUSED,
+        Event.HOME: _STOPPING,
+        Event.RESET: _NO_FAULT,
+        Event.STANDSTILL: Step(HOLDING),
+        Event.GATEWAY_LOST: Step(STOPPING),
+        Event.LATE: Step(STOPPING),
+        Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),
         Event.QUICK_STOP: _TRIP,
         Event.FAULT: _TRIP,
     },

@@ -90,7 +90,7 @@ def ik(
     sensitivities = sensitivity(robot, pose)
     isotropy, distance = float(conditioning(robot, pose)), float(distance_to_singularity(robot, pose))
     bounds = Bounds(config.limits, config.period)
-    refused = bounds.pose(pose.tolist()), bounds.setpoint(list(solved.values()), before=solved["position"])
+    refused = bounds.pose(pose.tolist()), bounds.setpoint(list(solved.values()))
     warnings = [str(violation) for violation in refused if violation]
     if offline.json:
         derived = {"conditioning": isotropy, "distance_to_singularity": distance, "warnings": warnings}
@@ -123,7 +123,7 @@ def fk(a: float, b: float, c: float, /, *, offline: Offline = DEFAULT) -> int:
 
     config, robot = _load(offline)
     sliders = a, b, c
-    beyond = Bounds(config.limits, config.period).setpoint([sliders], before=sliders)
+    beyond = Bounds(config.limits, config.period).setpoint([sliders])
     if beyond:
         raise _out_of_reach([beyond])
     pose = forward(robot, sliders)

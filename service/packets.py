@@ -95,6 +95,10 @@ class Happened(Struct, frozen=True, tag=True):
     event: Event
 
 
+class Farewell(Struct, frozen=True, tag=True):
+    """Loop to both: it has ended as it should, with drives that have no power. Without it, the loop has died."""
+
+
 class Situation(Struct, frozen=True, tag=True):
     """Loop to both: what records do not say and the state needs; sent when it changes."""
 
@@ -145,7 +149,7 @@ class Remark(Struct, frozen=True, tag=True):
 
 
 Request = GoalRequest | CommandRequest | RefusedRequest
-Answer = Accepted | Confirmed | Refused | Welcome | Happened | Situation | Input
+Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Situation | Input
 
 encode = msgpack.Encoder().encode
 decode_request = msgpack.Decoder(Request).decode

@@ -41,6 +41,19 @@ MODES: dict[Mode, Colour] = {
     Mode.STOPPING: (196, 104, 44),
     Mode.FAULT: (200, 56, 56),
 }
+"""Every mode's colour: in the live view as it is, on paper in its pale shade, in terminals as rich's style."""
+
+
+def pale(colour: Colour) -> Colour:
+    """Return the colour as it fills areas on white: halfway to it."""
+    red, green, blue = colour[:3]
+    return (red + 255) // 2, (green + 255) // 2, (blue + 255) // 2
+
+
+def code(colour: Colour) -> str:
+    """Return the colour as #rrggbb, which matplotlib and rich take."""
+    red, green, blue = colour[:3]
+    return f"#{red:02x}{green:02x}{blue:02x}"
 
 
 def dark(colour: Colour) -> Colour:

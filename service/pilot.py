@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from service.course import Course
+from service.errors import RefusedError
 from service.goals import Extension, Goals, Motion
+from service.laws import SHARES
 from service.messages import Goal, PoseGoal
 from service.motion import Run
 from service.steps import Steps
+
+MOST_STEPS = 500
+"""A goal that is not planned within so many steps is refused: about twenty are needed, and twice that in a crowd."""
+ROUND = len(SHARES)
+"""Steps that a change of rate has for itself before a goal is planned all the same: one try of every share."""
 
 
 class Taken(NamedTuple):
     """A goal is the robot's now."""
 
     duration: float
-    """Expected time from now to arrival [s]."""
+    """Expected time from now to arrival [s]; infinite while the override is zero."""
     slowed: float
     stops_first: bool
     queued: bool
     """Whether it begins when the one before it is reached."""
+    bound: str | None = None
+    """The limit before which a jog comes to rest."""
 
 
 class Pilot:
@@ -34,7 +44,9 @@ class Pilot:
         self._goal: Goal | None = None
         self._blend: float | None = None
         self._steps: Steps[Motion] | Steps[tuple[Run, Extension]] | None = None
+        self._spent = 0
         self._change: Steps[None] | None = None
+        self._tried = 0
 
     @property
     def busy(self) -> bool:
@@ -43,15 +55,16 @@ class Pilot:
 
     def plan(self, goal: Goal, blend: float | None = None) -> None:
         """Begin to plan a goal: to preempt the motion under way, or to follow it from within `blend` [m] of its end."""
-        self._goal, self._blend, self._steps = goal, blend, None
+        self._goal, self._blend, self._steps, self._spent = goal, blend, None, 0
 
     def give_up(self) -> None:
         """Plan the goal no longer."""
         self._goal = self._steps = None
+        self._tried = 0
 
     def run_at(self, rate: float) -> None:
         """Let the goal's motion run at another rate, as soon as the sliders allow."""
-        self._change = self._run_at(rate)
+        self._change, self._tried = self._run_at(rate), 0
         self._steps = None  # what was planned from the old motion is out of date
 
     def stop_thinking(self) -> None:
@@ -59,16 +72,25 @@ class Pilot:
         self._change = None
 
     def think(self) -> Taken | None:
-        """Take one step; return how a goal is reached once that is decided. Raises RefusedError if it cannot be."""
-        if self._change is not None:
+        """Take one step; return how a goal is reached once that is decided. Raises RefusedError if it cannot be.
+
+        A change of rate goes first; where the sliders do not allow it yet, a goal does not wait for it: it is planned
+        from the motion as it is, and the change is tried again afterwards.
+        """
+        if self._change is not None and self._steps is None and (self._goal is None or self._tried < ROUND):
+            self._tried += 1
             if _ended(self._change):
                 self._change = None
             return None
         if self._goal is None or self._course.turning:  # what is yet to begin cannot be planned from
             return None
-        if self._steps is None:
-            self._steps = self._begin(self._goal)
+        self._spent += 1
+        if self._spent > MOST_STEPS:
+            self.give_up()
+            raise RefusedError("no_plan", f"no motion to it was found in {MOST_STEPS} steps: send the goal again")
         try:
+            if self._steps is None:
+                self._steps = self._begin(self._goal)
             next(self._steps)
         except StopIteration as decided:
             return self._take(decided.value)
@@ -89,20 +111,22 @@ class Pilot:
     def _take(self, decided: Motion | tuple[Run, Extension]) -> Taken | None:
         """Carry out what has been decided."""
         course = self._course
-        self._steps = None
+        self._steps, self._tried = None, 0
         if isinstance(decided, Motion):
             self._goal = self._change = None
             waiting = max(0, decided.turn - course.cycle) * self._period if decided.turn is not None else 0.0
             course.take(decided.runs, decided.turn)
             if decided.runs[-1].target != self.override:
                 self._change = self._run_at(self.override)
-            return Taken(waiting + decided.duration, decided.slowed, decided.stops_first, queued=False)
+            duration = waiting + decided.duration
+            return Taken(duration, decided.slowed, decided.stops_first, queued=False, bound=decided.bound)
         run, extension = decided
         if not course.runs or course.runs[-1] is not run or run.at.s >= extension.s:
             return None  # the motion that it was to follow has ended: plan it anew
         self._goal = None
         run.append(extension.s, extension.path)
-        return Taken(course.remaining, extension.slowed, stops_first=False, queued=True)
+        duration = course.remaining if run.target else math.inf
+        return Taken(duration, extension.slowed, stops_first=False, queued=True)
 
     def _run_at(self, rate: float) -> Steps[None]:
         """Change the rate of the goal's motion; where that follows a stop on the old path, the stop stays as it is."""

@@ -10,29 +10,39 @@ import numpy as np
 from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 
 from service.algebra import Array
-from service.checks import Checker
+from service.checks import Checker, excess, fastest
 from service.config import PlatformLimits, SliderLimits
 from service.errors import RefusedError
 from service.geometry import Geometry
 from service.kinematics import inverse_into
-from service.limits import LEGS, Bounds
+from service.limits import COORDINATES, LEGS, Bounds, beyond, told_apart
 from service.motion import STILL, MotionState, from_ruckig, joined, stretched
 from service.paths import Path, constant
 from service.quintic import Point, quintic
 from service.solver import solved
 from service.steps import Steps
 
-GENTLEST = 0.3
-"""Share of the platform's limits below which no plan from motion is tried."""
+GENTLEST = 0.1
+"""Share of any limit below which no plan from motion is tried."""
+TRIES = 3
+"""How often a plan from motion is tried, with lower limits each time."""
+LOOKS = 8
+"""How often a slowed path is looked at, and slowed further, until it fits."""
 ROOM = 0.97
 """Share of what would just fit that is made use of where rounding must not make it too fast."""
 JOGS = 5
 """How often a jog is tried slower or shorter before it only brakes."""
+FASTEST_OVERRIDE = 2.0
+"""At how many times its nominal rate the time along a path may be told to run."""
 JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
 """Ruckig finds no solution just where one kind of profile gives way to another, as for a distance of 2 a³ / j²
 from rest to rest: there a hair less jerk has one."""
+A_HAIR_MORE = 1.0 + 1e-6
+"""What rounding may lose."""
 START = 1e-4
 """How far a trajectory may begin from where the robot stands [m, rad]."""
+STANDS = 1e-6
+"""Velocity at the ends of a trajectory that counts as rounding, and is taken for none [m/s, rad/s]."""
 
 TOO_FAST_IN_MOTION = RefusedError(
     "too_fast", "from its present motion the robot cannot take this path within its sliders' limits"
@@ -52,7 +62,9 @@ class Plan(NamedTuple):
 
     path: Path
     slowed: float = 1.0
-    """How many times slower it is than was asked for, for the sliders' sake."""
+    """How many times slower it is than was asked for, for the limits' sake."""
+    bound: str | None = None
+    """The limit before which a jog comes to rest."""
 
 
 class Planner:
@@ -94,7 +106,7 @@ class Planner:
             low, high = self._travel
             if not low <= position <= high:
                 limit = low if position < low else high
-                text = f"slider {name}: position {position:.6g} m is beyond its limit {limit:.6g} m"
+                text = beyond(f"slider {name}: position", position, limit, "m")
                 raise RefusedError("out_of_workspace", text, slider=name, value=position, limit=limit)
 
     def lowered(
@@ -102,9 +114,11 @@ class Planner:
     ) -> Kinodynamic:
         """Return the platform's limits with a goal's own in their place. RefusedError where these are not lower."""
         for name, own, limits in zip(Kinodynamic._fields, (velocity, acceleration, jerk), self._platform, strict=True):
-            for coordinate, value, limit in zip(("x", "y", "phi"), own or limits, limits, strict=True):
+            for coordinate, value, limit in zip(COORDINATES, own or limits, limits, strict=True):
                 if value > limit:
-                    text = f"limits.{name} of {coordinate} is {value:.6g}: the robot's limit is {limit:.6g}"
+                    text = "limits.{} of {} is {}: the robot's limit is {}".format(
+                        name, coordinate, *told_apart(value, limit)
+                    )
                     raise RefusedError("above_limit", text, value=value, limit=limit)
         return Kinodynamic(
             velocity or self._platform.velocity,
@@ -117,8 +131,8 @@ class Planner:
     ) -> Steps[Plan]:
         """Plan to rest at a pose, straight in pose space from rest; at `speed` 0.5 it takes twice as long.
 
-        A path that is too fast for a slider is slowed. Raises RefusedError with slider or coordinate, value and
-        limit where it leaves the workspace, or where it cannot be slowed since it starts in motion.
+        A path that is too fast for a slider or the platform is slowed. Raises RefusedError with slider or coordinate,
+        value and limit where it leaves the workspace, or where it cannot be slowed since it starts in motion.
         """
         self.check_pose(target)
         return (yield from self._to_rest(start, start, target, limits or self._platform, speed))
@@ -132,50 +146,59 @@ class Planner:
         return (yield from self._to_rest(start, sliders, target, self._sliders, speed, in_sliders=True))
 
     def jog(self, start: MotionState, velocity: Sequence[float], timeout: float) -> Steps[Plan]:
-        """Plan to a velocity, held until `timeout` is over or a limit comes near, and to rest.
+        """Plan to a velocity, held until `timeout` is surely over or a limit comes near, and to rest.
 
-        Faster than a slider can: as fast as it can. Raises RefusedError where not even braking stays inside.
+        `timeout` is real time, and time along the path runs at up to twice its rate: who ends the jog is the control.
+        Faster than platform or sliders may: as fast as they may. Raises RefusedError where not even braking stays
+        inside.
         """
-        share, hold = 1.0, timeout
+        share, hold, bound = 1.0, FASTEST_OVERRIDE * timeout, None
+        for value, limit in zip(velocity, self._platform.velocity, strict=True):
+            if abs(value) * share > limit:
+                share = limit / abs(value)
         for _ in range(JOGS):
             ramp, brake, path = self._jog(start, [share * value for value in velocity], hold)
             found = self._checker.look(path, constant(1.0), 0.0, path.duration, start.pose)
-            if found.fits:
-                return Plan(path, 1.0 / share)
+            if found.fits or (found.bearable and not start.at_rest):
+                return Plan(path, 1.0 / share, bound)
             if math.isnan(found.beyond):
                 share *= ROOM / found.excess
-            elif hold > 0.0:
+                yield
+                continue
+            bound = self._checker.bound(path, found.beyond, start.pose)
+            if hold > 0.0:
                 hold = max(0.0, found.beyond - ramp - brake)  # to rest where it would have been out of reach
             else:
                 share /= 2.0
             yield
         path = self._to_velocity(start, STILL, self._platform)
-        if (yield from self._checker.whole(path, start.pose)) > 1.0:
+        if not self._checker.bears((yield from self._checker.whole(path, start.pose))):
             raise TOO_FAST_IN_MOTION
-        return Plan(path)
+        return Plan(path, bound=bound)
 
     def follow(self, start: MotionState, points: Sequence[Point], stretch: bool) -> Steps[Plan]:
         """Take timed points for a path, quintic between them. Raises RefusedError.
 
         Too fast is refused, or slowed with `stretch`.
         """
-        for name, given, stands in zip(("x", "y", "phi"), points[0].pose, start.pose, strict=True):
-            if not start.at_rest or abs(given - stands) > START:
-                text = f"the trajectory begins at {name} = {given:.6g}, the robot is at {stands:.6g}: go there first"
-                raise RefusedError("wrong_start", text, value=given, limit=stands)
+        _check_ends(points, start)
         path = quintic(points, start.pose)
         yield
-        excess = yield from self._checker.whole(path, start.pose)
-        if excess <= 1.0:
+        worst = yield from self._checker.whole(path, start.pose)
+        slower = excess(worst)
+        if slower <= 1.0:
             return Plan(path)
         if not stretch:
             raise RefusedError(
                 "too_fast",
-                f'the trajectory is {excess:.3g} times too fast for a slider: send it slower, or with "stretch": true',
-                value=excess,
+                f"the trajectory is {slower:.3g} times too fast for {fastest(worst)}: "
+                f'let it take {slower * path.duration:.3g} s, or send it with "stretch": true',
+                value=slower,
                 limit=1.0,
             )
-        return Plan(stretched(path, excess), excess)
+        yield
+        path, slower = yield from self._slowed(path, slower, start.pose)
+        return Plan(path, slower)
 
     def nearness(self, pose: Sequence[float], target: Sequence[float]) -> float:
         """Return how far a point of the platform is at most from where it is to be [m]."""
@@ -196,19 +219,35 @@ class Planner:
         """Plan from `begin`, the platform's motion `start` or that of the sliders."""
         if start.at_rest:
             path = self._solve(begin, limits, in_sliders, target=target)
-            excess = yield from self._checker.whole(path, start.pose)
-            slowed = max(1.0, excess * speed)
-            return Plan(stretched(path, slowed / speed) if slowed > speed else path, slowed)
-        share = 1.0
-        for _ in range(2):
-            lower = Kinodynamic(*([speed * share * value for value in values] for values in limits))
+            slower = max(1.0 / speed, excess((yield from self._checker.whole(path, start.pose))))
+            if slower > 1.0:
+                yield
+                path, slower = yield from self._slowed(path, slower, start.pose)
+            return Plan(path, slower * speed)
+        shares = np.full(3, speed)
+        for _ in range(TRIES):
+            lower = Kinodynamic(*(np.array(limits) * shares[:, None]).tolist())
             path = self._solve(begin, lower, in_sliders, target=target)
-            excess = yield from self._checker.whole(path, start.pose)
-            if excess <= 1.0:
-                return Plan(path, 1.0 / share)
-            share = max(GENTLEST, ROOM / excess)
+            worst = yield from self._checker.whole(path, start.pose)
+            if self._checker.bears(worst):
+                return Plan(path, speed / float(shares.min()))
+            shares = shares * np.clip(ROOM / worst.max(axis=0), GENTLEST, 1.0)
             yield
         raise TOO_FAST_IN_MOTION
+
+    def _slowed(self, path: Path, factor: float, pose: Sequence[float]) -> Steps[tuple[Path, float]]:
+        """Return a path, so many times slower or as many more as it takes to fit, and how many that is.
+
+        Slower it is not the same motion: what was over within a step, as a short jerk, lasts longer.
+        """
+        for _ in range(LOOKS):
+            slow = stretched(path, factor)
+            found = excess((yield from self._checker.whole(slow, pose)))
+            if found <= 1.0:
+                return slow, factor
+            factor *= found * A_HAIR_MORE
+            yield
+        raise RefusedError("too_fast", f"the path does not fit its limits even {factor:.3g} times slower")
 
     def _jog(self, start: MotionState, velocity: Sequence[float], hold: float) -> tuple[float, float, Path]:
         """Return how long it takes to reach a velocity, and to brake from it, and the whole path."""
@@ -253,6 +292,30 @@ class Planner:
             if solved(self._ruckig, request, trajectory):
                 return from_ruckig(trajectory, in_sliders)
         raise RefusedError("no_plan", "no motion leads there from the present one: send the goal again when it holds")
+
+
+def _check_ends(points: Sequence[Point], start: MotionState) -> None:
+    """Raise RefusedError where points do not begin as the robot stands, or do not end at rest.
+
+    What they begin or end with of an acceleration counts as the jerk over one cycle that it is (Checker.look).
+    """
+    if not start.at_rest:
+        raise RefusedError("wrong_start", "the robot moves: send the trajectory when it stands")
+    for name, given, stands in zip(COORDINATES, points[0].pose, start.pose, strict=True):
+        if abs(given - stands) > START:
+            text = "the trajectory begins at {} = {}, the robot is at {}: go there first".format(
+                name, *told_apart(given, stands)
+            )
+            raise RefusedError("wrong_start", text, value=given, limit=stands)
+    ends = (
+        ("wrong_start", "begins", "let it begin at rest, as the robot stands", points[0]),
+        ("wrong_end", "ends", "let it end at rest", points[-1]),
+    )
+    for code, does, remedy, point in ends:
+        for name, unit, value in zip(COORDINATES, ("m/s", "m/s", "rad/s"), point.velocity or STILL, strict=True):
+            if abs(value) > STANDS:
+                text = f"the trajectory {does} with {value:.6g} {unit} in {name}: {remedy}"
+                raise RefusedError(code, text, value=value, limit=0.0)
 
 
 def _end(path: Path) -> Array:

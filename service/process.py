@@ -1,6 +1,7 @@
-"""What each of the service's child processes begins with: `python -m service.process NAME RUNTIME READY [SOCKETS…]`.
+"""What each of the service's child processes begins with: `service.process NAME RUNTIME READY BEATS [SOCKETS…]`.
 
-Its order comes on standard input; READY is a descriptor on which the process says, once, that it is up.
+Its order comes on standard input; READY is a descriptor on which the process says, once, that it is up;
+BEATS that of the heartbeats.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import msgspec
 from service import links
 from service.config import Config
 from service.errors import TrirailError
+from service.heartbeats import Heartbeats
 from service.realtime import die_with_parent
 
 
@@ -28,7 +30,7 @@ class Order(msgspec.Struct, frozen=True):
     """Recording file to write, None for one named by the time."""
 
 
-def _main(name: str, runtime: Path, ready: Callable[[object], None], sockets: list[int]) -> int:
+def _main(name: str, runtime: Path, heartbeats: Heartbeats, ready: Callable[[object], None], sockets: list[int]) -> int:
     order = msgspec.json.decode(sys.stdin.buffer.read(), type=Order)
     config = order.config
     # Each process imports what it needs and no more: the loop must not load Zenoh or Rerun.
@@ -36,12 +38,12 @@ def _main(name: str, runtime: Path, ready: Callable[[object], None], sockets: li
         from service import loop
 
         gateway, recorder = (links.Port(socket.socket(fileno=number)) for number in sockets)
-        return loop.main(config, gateway, recorder, ready)
+        return loop.main(config, gateway, recorder, heartbeats, ready)
     link = links.connect(runtime / name)
     if name == "gateway":
         from service import gateway as gate
 
-        return gate.main(config, link, ready)
+        return gate.main(config, link, heartbeats.of("gateway").beat, ready)
     from service import recording
 
     return recording.main(config, order.record, link, ready)
@@ -49,16 +51,18 @@ def _main(name: str, runtime: Path, ready: Callable[[object], None], sockets: li
 
 def main() -> int:
     """Run one child process; return its exit code."""
-    name, runtime, descriptor, *sockets = sys.argv[1:]
+    name, runtime, descriptor, beats, *sockets = sys.argv[1:]
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends it to all; the supervisor alone acts on it
-    die_with_parent(signal.SIGTERM)
+    if name == "loop":
+        # The others end by themselves once it has gone, so that what it says of its end is published and on disk.
+        die_with_parent(signal.SIGTERM)
 
     def ready(content: object) -> None:
         # The descriptor stays open: its end is how the supervisor learns of this process's end.
         os.write(int(descriptor), msgspec.json.encode(content))
 
     try:
-        return _main(name, Path(runtime), ready, [int(number) for number in sockets])
+        return _main(name, Path(runtime), Heartbeats(int(beats)), ready, [int(number) for number in sockets])
     except TrirailError as error:
         print(f"trirail: {error}", file=sys.stderr, flush=True)  # noqa: T201 - a process says why it ends
         return os.EX_CONFIG

@@ -21,14 +21,15 @@ class Point(NamedTuple):
 
 
 def quintic(points: Sequence[Point], start: Sequence[float]) -> Path:
-    """Join points into a path that begins at the pose `start`.
+    """Join points into a path from standstill at the pose `start` to standstill.
 
-    Velocities that are not given are those between the neighbours, accelerations likewise; both are zero at the ends.
+    Velocities that are not given are those between the neighbours, accelerations likewise; these are zero at the ends.
     """
     t = np.array([point.t for point in points])
     p = np.array([point.pose for point in points])
     p[0] = start
     v = _filled([point.velocity for point in points], t, p)
+    v[0] = v[-1] = 0.0
     a = _filled([point.acceleration for point in points], t, v)
     h = np.diff(t)[:, None]
     gap = p[1:] - p[:-1] - h * v[:-1] - h**2 / 2.0 * a[:-1]

@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk, RrdReader
 from rerun.error_utils import RerunWarning
 
+from drivers import files
+from drivers.errors import FileError
 from service.columns import SECOND, structs
 from service.errors import ServiceError
 from service.journal import EVENTS, JSON, REQUESTS
@@ -124,6 +126,8 @@ def _whole(path: Path) -> Iterator[Path]:
     """Give the file itself or, if its last message was cut off, a copy without that: Rerun would read none of it."""
     try:
         size, length = path.stat().st_size, _whole_length(path)
+    except FileError as error:
+        raise ServiceError(str(error)) from error
     except OSError as error:
         raise ServiceError(f"{path}: {error.strerror}") from error
     if length == size:
@@ -140,7 +144,7 @@ def _whole(path: Path) -> Iterator[Path]:
 
 def _whole_length(path: Path) -> int:
     """Return how many bytes of a file end with a whole message; all of a file that was closed."""
-    with path.open("rb") as file:
+    with files.opened(path) as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise ServiceError(f"{path}: not a recording: an RRD file begins with {_MAGIC.decode()}")
         size, end = os.fstat(file.fileno()).st_size, _FILE_HEADER

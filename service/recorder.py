@@ -62,7 +62,8 @@ class Recorder:
         self._is_black_box = name is not None
         self._own_folder = directory if path is None and name is None else None
         session = name or f"{config.robot.name}-{datetime.fromtimestamp(started_ns * 1e-9).astimezone():%Y%m%d-%H%M%S}"
-        server = live_server(config.telemetry.live_port) if live and config.telemetry.live_port else None
+        telemetry = config.telemetry
+        server = live_server(telemetry.live_port, telemetry.live_mb) if live and telemetry.live_port else None
         try:
             first = claim(directory, session) if path is None else _overwrite(path)
             channel = config.can.channel or config.can.interface

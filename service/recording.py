@@ -12,10 +12,12 @@ from pathlib import Path
 
 from service.blackbox import BlackBox
 from service.config import Config
+from service.lastwords import LastWords
 from service.links import Closed, Link
 from service.messages import Level
 from service.packets import Answer, Happened, Input, Kind, Remark, Situation, Welcome, decode_answer, message
 from service.recorder import Recorder
+from service.records import last_cycle
 
 GATHER = 0.14
 """How long to let packets gather before they are taken: to wake for each costs more than what is in it [s].
@@ -30,6 +32,8 @@ class Intake:
     def __init__(self, config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> None:
         self._link = link
         self._ready = ready
+        self._cycle = 0
+        self._last_words = LastWords(config.period)
         path = Path(record) if record else None
         self.recorder = recorder = Recorder(config, Path(config.telemetry.directory), path=path, warn=self._warn)
         folder = recorder.path.parent
@@ -39,14 +43,21 @@ class Intake:
 
     def take(self, packet: bytes) -> None:
         """Take a packet."""
+        self._last_words.heard()
         content = packet[1:]
         if packet[0] == Kind.RECORDS:
+            self._cycle = last_cycle(content)
             self.recorder.records(content)
             self._box.records(content)
         elif packet[0] == Kind.FRAMES:
             self.recorder.frames(content)
         else:
             self._hear(decode_answer(content))
+
+    def loop_gone(self) -> None:
+        """The loop has gone: where it has died, keep what it can no longer say."""
+        for event in self._last_words.events(self._cycle):
+            self._hear(Happened(event))
 
     def close(self) -> None:
         """Complete all files."""
@@ -55,6 +66,7 @@ class Intake:
 
     def _hear(self, said: Answer) -> None:
         recorder, box = self.recorder, self._box
+        self._last_words.take(said)
         match said:
             case Happened(event):
                 recorder.event(event)
@@ -102,7 +114,7 @@ def main(config: Config, record: str | None, link: Link, ready: Callable[[object
                 intake.take(packet)
             intake.recorder.save()
     except Closed:
-        pass
+        intake.loop_gone()
     finally:
         intake.close()
     return 0

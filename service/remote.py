@@ -18,6 +18,8 @@ from service.show import LIVE_HZ, Shortfall, Show
 from service.sinks import free_port, live_relay, live_server
 from service.subject import Subject
 
+HISTORY_MB = 256.0
+"""Memory for what viewers that connect late are shown of the past; nothing else runs in this process [1e6 bytes]."""
 FIRST_WITHIN = 5.0
 """How long the first records may take [s]."""
 MISSING = "missing so far: {} cycles on the way here, {} batches in this view (viewer too slow)"
@@ -41,7 +43,7 @@ class RemoteView:
             first = self._first(info)
             offset_ns = time.time_ns() - int(unpack(first)[-1]["deadline_ns"])
             self._show = Show(Subject.told(info), f"{info.robot} from {connect}", offset_ns)
-            server = live_server(free_port())
+            server = live_server(free_port(), HISTORY_MB)
         except BaseException:
             self._session.close()  # type: ignore[no-untyped-call]
             raise

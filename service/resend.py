@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from service import terminal
 from service.client import Goal, Robot
 from service.errors import RefusedError, ServiceError
 from service.messages import Event, Override, Stop
@@ -137,7 +138,7 @@ def _send(recording: Recording, robot: Robot, say: Callable[[str], None]) -> tup
                 renamed[given.id] = f"{given.id[:50]}-{suffix}"
                 goal = msgspec.structs.replace(given.goal, id=renamed[given.id])
                 goals[given.id] = robot.send(_given(goal), renamed[given.id])
-                say(f"goal {given.id}: {goals[given.id].duration:.2f} s")
+                say(f"goal {given.id}: {terminal.expected(goals[given.id].reply)}")
             elif isinstance(given, CommandRequest):
                 robot.command(given.name, _content(given, renamed))
                 say(given.name)

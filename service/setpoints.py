@@ -12,7 +12,7 @@ from service.errors import RefusedError
 from service.kinematics import inverse_into
 from service.limits import Bounds
 from service.measured import Measured
-from service.motion import MotionState
+from service.motion import MotionState, rest
 
 
 class Setpoints:
@@ -25,6 +25,8 @@ class Setpoints:
         self._step = step
         self._motion = np.zeros((3, 3))
         self._sliders = np.zeros((6, 3))
+        self._before: MotionState | None = None
+        """The platform's motion in the cycle before; None where the sliders were not solved for one."""
         self.rows: list[list[float]] = self._sliders.tolist()
         """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32."""
 
@@ -40,10 +42,12 @@ class Setpoints:
         if singular:
             return f"slider {NAMES[singular - 1]}: no setpoint, the commanded pose is singular or not a number"
         rows = self._sliders.tolist()
-        violation = self._bounds.setpoint(rows, self._measured.last_written) or self._bounds.pose(commanded.pose)
+        bounds = self._bounds
+        before = self._before or rest(commanded.pose)
+        violation = bounds.setpoint(rows) or bounds.step(rows, self.rows) or bounds.platform(commanded, before)
         if violation:
             return f"setpoint refused: {violation}"
-        self.rows = rows
+        self.rows, self._before = rows, commanded
         return None
 
     def follow(self, *, held: bool, stopped_now: bool) -> None:
@@ -75,6 +79,7 @@ class Setpoints:
         self._motion[0] = measured.pose
         if inverse_into(self._legs, self._motion, self._sliders) == 0:
             self.rows = self._sliders.tolist()
+        self._before = None
         self.rows[0] = position
         self.rows[1] = self.rows[2] = [0.0, 0.0, 0.0]
 
@@ -94,7 +99,7 @@ class Setpoints:
         self._motion[0] = pose or math.nan
         if pose is None or inverse_into(self._legs, self._motion, self._sliders):
             raise RefusedError("singular", "the measured sliders belong to no pose: move them by hand, then enable")
-        violation = self._bounds.pose(pose) or self._bounds.setpoint(self._sliders.tolist(), position)
+        violation = self._bounds.pose(pose) or self._bounds.setpoint(self._sliders.tolist())
         if violation:
             raise RefusedError(
                 "out_of_workspace",

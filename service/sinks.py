@@ -21,8 +21,6 @@ from rerun.chunk import Chunk
 from service.errors import ServiceError
 
 HOST = "127.0.0.1"
-LIVE_MEMORY = "256MiB"
-"""History that the live server keeps for viewers that connect late."""
 BACKLOG = 20
 """Batches that may wait for the live view: 2 s."""
 RESERVE = 64 << 20
@@ -153,8 +151,11 @@ def _serves(descriptor: int, port: int) -> bool:
         return False
 
 
-def live_server(port: int) -> rr.GrpcServerSink:
-    """Return a server for viewers on this machine. ServiceError if the port is taken."""
+def live_server(port: int, memory_mb: float) -> rr.GrpcServerSink:
+    """Return a server for viewers on this machine, that keeps so much of the past for those who connect late.
+
+    Raises ServiceError if the port is taken.
+    """
     with socket.socket() as probe:  # the sink would only log it, and discard all that it is sent
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -164,7 +165,7 @@ def live_server(port: int) -> rr.GrpcServerSink:
                 f"live view: cannot listen on {HOST}:{port}: {error.strerror}; "
                 "set telemetry.live_port to a free port, or to 0 for no live view"
             ) from error
-    return rr.GrpcServerSink(HOST, port, server_memory_limit=LIVE_MEMORY)
+    return rr.GrpcServerSink(HOST, port, server_memory_limit=f"{memory_mb:.0f}MB")
 
 
 def live_relay(stream: rr.RecordingStream) -> Relay:

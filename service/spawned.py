@@ -13,9 +13,11 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 from service.config import SIM
 from service.errors import RefusedError, ServiceError, TrirailError
+from service.interpreter import python
 
 START_WITHIN = 120.0
 """How long it may take to come up; the very first start compiles the kinematics [s]."""
@@ -29,25 +31,12 @@ Process = subprocess.Popen[bytes]
 def service(config: Path, recording: Path) -> Iterator[Process]:
     """Run a service that is up; end it in any case, and show what it said if it fails.
 
-    It is up when it says so, as to systemd. Asking on its port instead could find another service, and move that.
     Raises ServiceError if it cannot start.
     """
-    with (
-        tempfile.TemporaryFile() as log,
-        tempfile.TemporaryDirectory() as folder,
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready,
-    ):
-        ready.bind(f"{folder}/ready")
-        ready.settimeout(0.1)
-        process = subprocess.Popen(
-            [sys.executable, "-m", "service", "run", str(config), "--record", str(recording)],
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-            env=os.environ | {"NOTIFY_SOCKET": ready.getsockname()},
-        )
+    with tempfile.TemporaryFile() as log:
+        process = None
         try:
-            _wait(process, ready)
+            process = start(config, log, "--record", str(recording))
             yield process
         except RefusedError:
             raise  # it works, and has said why not
@@ -56,7 +45,31 @@ def service(config: Path, recording: Path) -> Iterator[Process]:
             sys.stderr.write(log.read().decode())
             raise
         finally:
+            if process is not None:
+                end(process)
+
+
+def start(config: Path, log: IO[bytes], *arguments: str, **environment: str) -> Process:
+    """Start a service, and wait until it is up; what it says goes to `log`. Raises ServiceError if it cannot start.
+
+    It is up when it says so, as to systemd. Asking on its port instead could find another service, and move that.
+    """
+    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
+        ready.bind(f"{folder}/ready")
+        ready.settimeout(0.1)
+        process = subprocess.Popen(
+            python("-m", "service", "run", str(config), *arguments),
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            env=os.environ | {"NOTIFY_SOCKET": ready.getsockname()} | environment,
+        )
+        try:
+            _wait(process, ready)
+        except BaseException:
             end(process)
+            raise
+        return process
 
 
 def end(process: Process) -> int:

@@ -62,6 +62,11 @@ class StateMaker:
             self._statistics_due = int(newest["cycle"]) + self._rate_hz
             self._statistics = self._lateness.percentiles(), self._cycle.percentiles()
 
+    @property
+    def cycle(self) -> int:
+        """Cycle of the newest record; 0 for none."""
+        return 0 if self._newest is None else int(self._newest["cycle"])
+
     def newest(self) -> State:
         """Make the state of the newest record."""
         row = self._newest

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import selectors
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,7 +19,10 @@ from msgspec import structs
 from service import links
 from service.config import Config
 from service.errors import ServiceError
+from service.heartbeats import PROCESSES, Heartbeats, Watch
+from service.interpreter import CHILD, python
 from service.process import Order
+from service.systemd import Watchdog, notify
 
 CHILDREN = ("loop", "gateway", "recorder")
 PORTS = ("gateway", "recorder")
@@ -31,6 +32,12 @@ END_WITHIN = 6.0
 """How long they may take to end before they are killed [s]."""
 RESTARTS = 5
 """So many restarts of one process within a minute come at once."""
+TURN = 0.1
+"""How often the supervisor looks whether the others are alive [s]."""
+SILENT = 0.7
+"""A process that should give signs of life and gives none for so long is hung, and is killed [s]."""
+LEAST_CYCLES = 3
+"""So many cycles the loop may take for a sign of life, however long they are."""
 RETRY = 10.0
 """How long it is waited before any more, for a recorder; the gateway's are the service's end [s]."""
 
@@ -38,15 +45,15 @@ RETRY = 10.0
 class _Child:
     """A child process, and a pipe on which it says that it is ready and whose end is its end."""
 
-    def __init__(self, name: str, order: bytes, runtime: Path, sockets: list[int]) -> None:
+    def __init__(self, name: str, order: bytes, runtime: Path, beats: int, sockets: list[int]) -> None:
         self.name = name
+        self.began = time.monotonic()
         self.ready_with: dict[str, Any] | None = None
+        self._hung_for = 0.0
         self.pipe, write = os.pipe()
-        arguments = [name, str(runtime), str(write), *map(str, sockets)]
+        arguments = [name, str(runtime), str(write), str(beats), *map(str, sockets)]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "service.process", *arguments],
-            stdin=subprocess.PIPE,
-            pass_fds=[write, *sockets],
+            python("-m", CHILD, *arguments), stdin=subprocess.PIPE, pass_fds=[write, beats, *sockets]
         )
         os.close(write)
         if self.process.stdin is not None:
@@ -68,10 +75,19 @@ class _Child:
             return False
         return True
 
+    def kill_hung(self, silent: float) -> None:
+        """Kill it for having given no sign of life for so long [s]; SIGTERM would wait, if it is stopped."""
+        self._hung_for = silent
+        self.process.kill()
+
     @property
     def how(self) -> str:
         """How it ended, for people."""
         code = self.process.returncode
+        if self._hung_for and code == -signal.SIGKILL:
+            return f"no sign of life for {self._hung_for:g} s, so it was killed"
+        if code == 0:
+            return "another process sent it SIGTERM"
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
@@ -86,6 +102,14 @@ class Supervisor:
         self._selector = selectors.DefaultSelector()
         self._restarts: dict[str, list[float]] = {name: [] for name in CHILDREN}
         self._due: dict[str, float] = {}
+        self._heartbeats = Heartbeats.create()
+        loop_silent = max(SILENT, LEAST_CYCLES * config.period)
+        self._patience = {"loop": loop_silent, "gateway": max(SILENT, config.watchdogs.gateway_timeout)}
+        self._watches = {
+            name: Watch(self._heartbeats.of(name), round(seconds / TURN)) for name, seconds in self._patience.items()
+        }
+        self._watchdog = Watchdog([self._heartbeats.of(name) for name in PROCESSES])
+        self._next_turn = 0.0
         self._ending = False
         self._failed = False
         self._turned = False
@@ -112,7 +136,10 @@ class Supervisor:
 
     def _start(self, name: str) -> None:
         sockets = [listening.fileno() for listening in self._listening] if name == "loop" else []
-        child = _Child(name, msgspec.json.encode(self._orders[name]), self._runtime, sockets)
+        if name in PROCESSES:
+            self._heartbeats.of(name).rest()
+        beats = self._heartbeats.descriptor
+        child = _Child(name, msgspec.json.encode(self._orders[name]), self._runtime, beats, sockets)
         self._children[name] = child
         self._selector.register(child.pipe, selectors.EVENT_READ, child)
 
@@ -120,17 +147,20 @@ class Supervisor:
         deadline = time.monotonic() + START_WITHIN
         is_up = False
         while not self._ending:
-            for key, _ in self._selector.select(1.0):
-                child: _Child | None = key.data
+            heard: list[_Child | None] = [key.data for key, _ in self._selector.select(TURN)]
+            # The loop first: the others end because it has ended, and not by themselves.
+            for child in sorted(heard, key=lambda child: child is not self._children.get("loop")):
                 if child is None:
                     self._say(f"{signals.take().name}: stopping the robot and disabling the drives")
                     self._ending = True
-                elif not child.listen():
+                elif not child.listen() and not self._ending:
                     self._on_end(child)
             if self._ending:
                 continue
             self._start_due()
+            self._look_after()
             if is_up:
+                self._watchdog.feed()
                 continue
             ready = {name: child.ready_with for name, child in self._children.items() if child.ready_with is not None}
             if len(ready) == len(CHILDREN):
@@ -141,17 +171,36 @@ class Supervisor:
                 missing = ", ".join(name for name in CHILDREN if name not in ready)
                 raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")
 
+    def _look_after(self) -> None:
+        """Once a turn, kill who should give signs of life and gives none: its end is then dealt with as any other."""
+        now = time.monotonic()
+        if now < self._next_turn:
+            return
+        self._next_turn = now + TURN
+        for child in self._children.values():
+            if child.ready_with is None and now - child.began > START_WITHIN:
+                child.kill_hung(START_WITHIN)
+        for name, watch in self._watches.items():
+            if watch.silent() and name in self._children:
+                self._children[name].kill_hung(self._patience[name])
+
     def _on_end(self, child: _Child) -> None:
         """Decide what the end of a process means."""
         self._forget(child)
         child.process.wait()
+        if child.name != "loop" and self._loop_is_ending():
+            return  # so it has ended as well, as it should
         said_why = child.process.returncode == os.EX_CONFIG
         name, restarts = child.name, self._restarts[child.name]
         if name == "loop":
             self._turned = child.ready_with is not None
-            self._fail(
-                "" if said_why else f"the loop is dead ({child.how}): the drives stop by their own watchdogs; ending"
-            )
+            if child.process.returncode == 0:
+                consequence = "it has stopped the robot and disabled the drives"
+            elif self._turned:
+                consequence = "the drives stop by their own watchdogs"
+            else:
+                consequence = "it had not begun"
+            self._fail("" if said_why else f"the loop is dead ({child.how}): {consequence}; ending")
             return
         if child.ready_with is None and not restarts:
             self._fail("" if said_why else f"the {name} could not start ({child.how})")
@@ -167,6 +216,11 @@ class Supervisor:
         self._say(f"the {name} has died ({child.how}): {consequence}; starting it again{when}")
         self._orders[name] = structs.replace(self._orders[name], record=None)  # never over the first recording
         self._due[name] = now + wait
+
+    def _loop_is_ending(self) -> bool:
+        """Whether the loop has turned and does not any more: its end is what is told, and not that of the others."""
+        loop = self._children.get("loop")
+        return loop is None or (loop.ready_with is not None and not self._heartbeats.of("loop").count)
 
     def _start_due(self) -> None:
         """Start again what is due."""
@@ -189,7 +243,8 @@ class Supervisor:
         notify("STOPPING=1")
         if loop := self._children.get("loop"):
             loop.process.send_signal(signal.SIGTERM)
-            loop.wait(time.monotonic() + END_WITHIN)
+            if not loop.wait(time.monotonic() + END_WITHIN):
+                self._kill(loop)
             self._turned = self._turned or loop.ready_with is not None
         # The others end by themselves once the loop has gone and what it said is published and on disk; one that has
         # never turned has said nothing.
@@ -200,11 +255,14 @@ class Supervisor:
                 child.process.send_signal(signal.SIGTERM)
         for child in list(self._children.values()):
             if not child.wait(asked):
-                self._say(f"the {child.name} does not end: killing it")
-                child.process.kill()
-                child.process.wait()
+                self._kill(child)
             self._failed = self._failed or child.process.returncode != 0
             self._forget(child)
+
+    def _kill(self, child: _Child) -> None:
+        self._say(f"the {child.name} does not end: killing it")
+        child.process.kill()
+        child.process.wait()
 
 
 class _Signals:
@@ -228,13 +286,3 @@ class _Signals:
             signal.signal(number, handler)
         self.reader.close()
         self._writer.close()
-
-
-def notify(state: str) -> None:
-    """Tell systemd, where it asked for it: sd_notify(3)."""
-    address = os.environ.get("NOTIFY_SOCKET")
-    if address:
-        # An end of systemd's must not keep the robot from being stopped.
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender, contextlib.suppress(OSError):
-            sender.connect("\0" + address[1:] if address.startswith("@") else address)
-            sender.send(state.encode())

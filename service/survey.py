@@ -1,4 +1,4 @@
-"""What a path, run by a law, asks of the sliders: looked at along its whole length, compiled."""
+"""What a path, run by a law, asks of sliders and platform: looked at along its whole length, compiled."""
 
 from __future__ import annotations
 
@@ -10,33 +10,56 @@ import numpy as np
 from service.algebra import Array
 from service.closure import LEGS, forward_motion, inverse_motion
 from service.compiled import compiled
-from service.paths import HALVINGS, ROUNDING, motion_at, reached
+from service.paths import HALVINGS, ROUNDING, motion_at, reached, value_at
 
 __all__ = ["survey"]
 
 NEAR = 1e-3
 """How near a limit a position may turn without being looked at [m, rad]."""
+WITHIN = 4
+"""Parts of every piece of a path at whose ends it is looked at."""
+
+
+@compiled()
+def _add(times: Array, n: int, time: float, first: float, until: float) -> int:
+    """Put a time behind the first n if it is between two others; return how many there are."""
+    if first <= time <= until:
+        times[n] = time
+        n += 1
+    return n
 
 
 @compiled()
 def _moments(
     knots: Array, law_knots: Array, law_pieces: Array, first: float, until: float, even: int, step: float
 ) -> Array:
-    """Return when to look at a path, ascending: evenly, and over the step before and the one after every knot.
+    """Return when to look at a path, ascending: evenly, within every piece, and on both sides of every knot.
 
     Jerk is greatest next to a knot, of the path or of the law, and may be so for a short time only. Its mean over
     a step across a knot lies between the means over the steps that end and begin there.
     """
-    times = np.empty(even + 2 * (len(knots) + len(law_knots)))
+    times = np.empty(even + (WITHIN + 1) * len(knots) + 2 * len(law_knots))
     for k in range(even):
         times[k] = first + (until - first) * k / (even - 1)
     n = even
-    for k in range(len(knots) + len(law_knots)):
-        knot = reached(law_knots, law_pieces, knots[k], until) if k < len(knots) else law_knots[k - len(knots)]
-        for time in (knot - step, knot):
-            if first <= time <= until:
-                times[n] = time
-                n += 1
+    law = np.empty((3, 1))
+    value_at(law_knots, law_pieces, first, law)
+    begin = law[0, 0]
+    value_at(law_knots, law_pieces, until, law)
+    end = law[0, 0]
+    for k in range(len(knots)):
+        for part in range(WITHIN if k < len(knots) - 1 else 1):
+            s = knots[k]
+            if part:
+                s += (knots[k + 1] - knots[k]) * part / WITHIN
+            if begin <= s <= end:
+                time = reached(law_knots, law_pieces, s, until)
+                n = _add(times, n, time, first, until)
+                if not part:
+                    n = _add(times, n, time - step, first, until)
+    for knot in law_knots:
+        n = _add(times, n, knot, first, until)
+        n = _add(times, n, knot - step, first, until)
     return np.sort(times[:n])
 
 
@@ -111,6 +134,24 @@ def _turns(way: Way, last: float, time: float, near: Array, motion: Array, slide
 
 
 @compiled()
+def _weigh(now: Array, then: Array, i: int, step: float, whole: bool, worst: Array) -> None:
+    """Raise `worst` (3,) to the velocity, acceleration and jerk of column i of rows (position, velocity, acceleration).
+
+    `then` are the rows a step later. `whole` tells whether the motion goes on for the whole step.
+    """
+    worst[0] = max(worst[0], abs(now[1, i]))
+    worst[1] = max(worst[1], abs(now[2, i]))
+    # The mean jerk of this step, and what the velocity says of its beginning and its end: a rate may change
+    # within a single step, where the accelerations before and after are the same.
+    change = then[1, i] - now[1, i]
+    early = 2.0 * (change / step - now[2, i]) / step
+    late = 2.0 * (then[2, i] - change / step) / step
+    worst[2] = max(worst[2], abs(early + late) / 2.0)
+    if whole:
+        worst[2] = max(worst[2], abs(early), abs(late))
+
+
+@compiled()
 def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst: Array) -> tuple[float, float]:
     """Look at a path at ascending times and a step later; return the last time within reach, and one beyond it."""
     motion, sliders = np.empty((3, 3, 3)), np.empty((3, 6, 3))
@@ -128,22 +169,15 @@ def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst:
         last = time + step
         if not _look(way, last, near, motion[0], sliders[0]):
             return time, last
+        whole = time >= 0.0 and last <= until  # else it is the step from or to a standstill, in which nothing else is
         for i in range(3):
-            worst[0] = max(worst[0], abs(sliders[1, 1, i]))
-            worst[1] = max(worst[1], abs(sliders[1, 2, i]))
-            # The mean jerk of this step, and what the velocity says of its beginning and its end: a rate may change
-            # within a single step, where the accelerations before and after are the same.
-            change = sliders[0, 1, i] - sliders[1, 1, i]
-            early = 2.0 * (change / step - sliders[1, 2, i]) / step
-            late = 2.0 * (sliders[0, 2, i] - change / step) / step
-            worst[2] = max(worst[2], abs(early + late) / 2.0)
-            if time >= 0.0 and last <= until:  # else it is the step from or to a standstill, in which nothing else is
-                worst[2] = max(worst[2], abs(early), abs(late))
+            _weigh(sliders[1], sliders[0], i, step, whole, worst[0])
+            _weigh(motion[1], motion[0], i, step, whole, worst[1 + i])
     return last, math.nan
 
 
 @compiled(
-    f"f8({LEGS}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[::1])"
+    f"f8({LEGS}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
 def survey(
     legs: Array,
@@ -160,12 +194,13 @@ def survey(
     box: Array,
     worst: Array,
 ) -> float:
-    """Look at a path, run by a law, between two times; write the sliders' greatest velocity, acceleration and jerk.
+    """Look at a path, run by a law, between two times; write the greatest velocities, accelerations and jerks.
 
-    It is looked at `even` times, at its knots, and where a position turns near its limit. Jerk is what the setpoints
-    before and after a `step` [s] say of it, as the drives see it. `start` is the pose at the first time. `box` (2, 5)
-    holds the limits, low and high, of x, y, phi, lambda_10 and lambda_32. Returns when it is first out of reach, else
-    not a number; `worst` (3,) means nothing where it is.
+    It is looked at `even` times, at its knots and between them, and where a position turns near its limit. Jerk is
+    what the setpoints before and after a `step` [s] say of it, as the drives see it. `start` is the pose at the first
+    time. `box` (2, 5) holds the limits, low and high, of x, y, phi, lambda_10 and lambda_32. Returns when it is first
+    out of reach, else not a number. `worst` (4, 3) has velocity, acceleration and jerk of the fastest slider, of x, y
+    and phi; it means nothing where the path is out of reach.
     """
     way = Way(legs, knots, pieces, in_sliders, law_knots, law_pieces, box)
     times = _moments(knots, law_knots, law_pieces, first, until, even, step)

@@ -16,6 +16,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
+from drivers.errors import shortened
+from service import palette
 from service.client import Goal, Jog, Result, Robot
 from service.errors import ServiceError
 from service.messages import Event, GoalReply, Percentiles, State
@@ -28,15 +30,7 @@ if TYPE_CHECKING:
 out = Console(highlight=False, emoji=False)
 err = Console(stderr=True, highlight=False, emoji=False)
 
-COLOURS = {
-    "disabled": "dim",
-    "enabling": "cyan",
-    "homing": "magenta",
-    "holding": "green",
-    "moving": "bold green",
-    "stopping": "yellow",
-    "fault": "bold red",
-}
+COLOURS = {mode.value: palette.code(colour) for mode, colour in palette.MODES.items()}
 LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}
 VERDICTS = {"ok": "green", "warning": "yellow", "failure": "bold red"}
 SILENT = 3.0
@@ -54,8 +48,8 @@ def say(words: str) -> None:
 
 
 def complain(words: str) -> None:
-    """Print an error as one line on standard error."""
-    err.print(f"trirail: {plain(' '.join(words.split()))}", soft_wrap=True)
+    """Print an error as one line of bounded length on standard error."""
+    err.print(f"trirail: {plain(shortened(' '.join(words.split())))}", soft_wrap=True)
 
 
 def json(content: object) -> None:
@@ -79,11 +73,16 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
         out.print(f"    [yellow]without[/] {plain(lack)}", soft_wrap=True)
 
 
+def expected(reply: GoalReply) -> str:
+    """Say how long a goal is expected to take."""
+    return f"{reply.duration:.2f} s" if reply.duration is not None else "no expected end while the override is 0"
+
+
 def notes(reply: GoalReply) -> str:
     """Say what is out of the ordinary with an accepted goal; nothing where all is as asked."""
     said = []
     if reply.slowed > 1.001:
-        said.append(f"slowed {reply.slowed:.2f} times, since a slider could not follow")
+        said.append(f"slowed {reply.slowed:.2f} times, to stay within the limits")
     if reply.stops_first:
         said.append("stops on the old path first")
     if reply.queued:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 
+from drivers import files
 from service.errors import TrirailError
 from service.messages import TrajectoryPoint
 from service.text import quoted
@@ -17,10 +18,7 @@ VELOCITY, ACCELERATION = ("vx", "vy", "w"), ("ax", "ay", "e")
 
 def read(path: Path) -> list[TrajectoryPoint]:
     """Read the points of a trajectory. Raises TrirailError with file, line and what would be right."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise TrirailError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    text = files.text(path)
     if path.suffix == ".json":
         try:
             return msgspec.json.decode(text, type=list[TrajectoryPoint])

@@ -18,6 +18,7 @@ from urllib.parse import quote, urlsplit
 
 from service.client import Robot
 from service.errors import ServiceError
+from service.interpreter import python
 from service.sinks import HOST, free_port
 
 WEB_PORT = 9090
@@ -125,7 +126,7 @@ def _rerun(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
 
     Raises ServiceError if it has failed by itself.
     """
-    command = [sys.executable, "-m", "rerun_cli", "--bind", HOST, "--hide-welcome-screen", *arguments]
+    command = python("-m", "rerun_cli", "--bind", HOST, "--hide-welcome-screen", *arguments)
     with tempfile.TemporaryFile() as log:
         viewer = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
         try:

@@ -6,7 +6,6 @@ import heapq
 import itertools
 import math
 import os
-from collections import deque
 from collections.abc import Callable, Iterator
 from typing import cast
 
@@ -90,7 +89,6 @@ class Rig:
         self.happenings: list[Happening] = []
         self.rows: list[list[list[float]]] = []
         self.seen: list[list[tuple[int, int]]] = []
-        self._posted: deque[Request] = deque()
         self._tickets = itertools.count(1)
 
     def _note(self, message: can.Message, timeout: float | None = None) -> None:
@@ -117,9 +115,7 @@ class Rig:
         self.driver.sync()
         control.observe(self.driver.read())
         if request is not None:
-            self._posted.append(request)
-        if control.dispatch.ready and self._posted:
-            control.handle(self._posted.popleft(), round(self.now * 1e9))
+            control.handle(request, round(self.now * 1e9))
         control.advance()
         control.solve()
         control.write()

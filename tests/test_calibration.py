@@ -390,6 +390,6 @@ def test_other_errors_are_one_line(measured: Path, tmp_path: Path, capsys: pytes
     assert "cannot write" in complaint(str(measured), "--output", str(tmp_path))
     binary = tmp_path / "binary.csv"
     binary.write_bytes(b"\xff\xfe\x00x")
-    assert "not a CSV file" in complaint(str(binary))
+    assert "not text in UTF-8" in complaint(str(binary))
     with pytest.raises(SystemExit, match="2"):
         calibrate.main([])

@@ -19,7 +19,7 @@ from drivers.eds import SERVO
 from drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 from drivers.interface import Feedback, PowerState, Triple
 from drivers.scaling import scale_of
-from drivers.setup402 import _settings, interpolation_period
+from drivers.settings402 import interpolation_period, settings_of
 from drivers.simulated import Servo, SimulatedBus, SimulatedDevice, SimulatedDrive
 from drivers.simulated.dictionary import Entry
 
@@ -275,7 +275,7 @@ class TestConfigure:
         """Of every object that is set: a drive that says it took the value and did not."""
         objects = canopen.import_od(str(SERVO))
         told = Entry.encode
-        settings = [*dict.fromkeys(setting[:2] for setting in _settings("A", CONFIG.A, CONFIG, SCALE, PERIOD))]
+        settings = [*dict.fromkeys(setting[:2] for setting in settings_of("A", CONFIG.A, CONFIG, SCALE, PERIOD))]
         assert {index for index, _ in settings} >= {0x60C2, 0x6065, 0x605A, 0x605E, 0x1016, 0x1017, 0x1029}
         assert {index for index, _ in settings} >= {0x1400, 0x1401, 0x1600, 0x1601, 0x1800, 0x1801, 0x1A00, 0x1A01}
         for index, subindex in settings:
@@ -514,6 +514,29 @@ class TestPower:
         fault = enabled.found("timeout", within=1010).fault
         assert fault is not None
         assert fault.message == "drive A: is operation enabled 1 s after disable; switch on disabled was expected"
+
+    def test_drive_that_keeps_its_power_after_a_reset_is_told_of_again(self, enabled: Rig) -> None:
+        enabled.devices[1].objects.on_write(0x6040, lambda entry, old: None)
+        enabled.drives.quick_stop()
+        enabled.found("timeout", within=1010)
+        enabled.drives.reset()
+        assert enabled.cycles(round(CONFIG.stop_timeout / PERIOD) - 1).fault is None
+        fault = enabled.found("timeout", within=3).fault
+        assert fault is not None
+        assert fault.message == "drive B: is operation enabled 1 s after reset; switch on disabled was expected"
+
+    def test_reset_of_drives_that_follow_setpoints_takes_no_power(self, enabled: Rig) -> None:
+        enabled.drives.reset()
+        feedback = enabled.cycles(1500)
+        assert (feedback.fault, feedback.state) == (None, (P.OPERATION_ENABLED,) * 3)
+
+    @pytest.mark.parametrize("stop", ["disable", "quick_stop"])
+    def test_drives_that_are_enabled_again_in_time_keep_their_power(self, enabled: Rig, stop: str) -> None:
+        getattr(enabled.drives, stop)()
+        enabled.cycles(200)
+        enabled.enable()
+        feedback = enabled.cycles(1500)
+        assert (feedback.fault, feedback.state) == (None, (P.OPERATION_ENABLED,) * 3)
 
     def test_drives_that_stop_and_lose_power_are_no_fault(self, enabled: Rig) -> None:
         enabled.drives.disable()
@@ -929,6 +952,16 @@ class TestClose:
         assert [device.nmt for device in enabled.devices] == [frames.PRE_OPERATIONAL] * 3
         assert enabled.controlwords() == [[0x02, 0x00]] * 3
         assert enabled.bus.shutdowns == 1
+
+    @pytest.mark.parametrize("index", range(3))
+    def test_takes_power_off_a_drive_that_is_deaf_to_pdos(self, enabled: Rig, index: int) -> None:
+        """In NMT pre-operational, where a drive without object 6007h keeps its power, it hears SDOs only."""
+        device = enabled.devices[index]
+        device.objects[0x6007, 0].value = 0
+        device.receive(frames.NMT, frames.NMT_COMMAND.pack(frames.NMT_PRE_OPERATIONAL, device.node), enabled.clock.now)
+        assert device.state is P.OPERATION_ENABLED
+        enabled.drives.close()
+        assert [device.state for device in enabled.devices] == [P.SWITCH_ON_DISABLED] * 3
 
     def test_while_moving_brakes_by_the_ramp_first(self, enabled: Rig) -> None:
         position = list(START)

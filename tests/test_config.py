@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated, get_args, get_origin
 
 import pytest
+from conftest import Rig
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from msgspec import Meta, Struct
+from msgspec.structs import fields
 
-from service.config import SIM, load, parse
+from drivers.errors import LONGEST, BusError
+from service import provenance
+from service.config import SIM, Config, load, parse
 from service.errors import ConfigError
+from service.messages import PoseGoal
+from service.modes import Mode
 
 TEXT = SIM.read_text()
 CONFIGS = sorted(SIM.parent.glob("*.toml"))
@@ -48,8 +59,10 @@ def test_shipped_configurations_load(path: Path) -> None:
             "with drives.A.counts_per_metre = 1e+07 that is 1e+07 turns/s, and an ODrive's feed-forward ends at 32.767",
         ),
         ('realtime = "prefer"', 'realtime = "yes"', "allowed are 'off', 'prefer', 'enforce'"),
+        ("gateway_timeout = 0.3", "gateway_timeout = 0.1", "watchdogs.gateway_timeout = 0.1: expected float >= 0.2"),
+        ("live_mb = 64", "live_mb = 0", "telemetry.live_mb = 0: expected float >= 1.0"),
         ("l0 = 0.3", "l0 = nan", "geometry.l0 = nan: it must be a finite number"),
-        ("l0 = 0.3", "l0 = -0.3", "geometry.l0 = -0.3: expected float > 0.0"),
+        ("l0 = 0.3", "l0 = -0.3", "geometry.l0 = -0.3: expected float >= 0.001"),
         ("l0 = 0.3", "", "give either l0 (the symmetric robot) or three [[geometry.leg]] tables"),
         (
             "following_error = 0.004",
@@ -64,7 +77,7 @@ def test_shipped_configurations_load(path: Path) -> None:
         ("x = [-0.15, 0.15]", "x = [0.1]", "limits.platform.x = [0.1]: expected array of length 2"),
         ("phi = [-1.2, 0.85]", "phi = [-1.2, 1.0]", "singular angle 1.0472: keep below 0.8972"),
         ("phi = [-1.2, 0.85]", "phi = [-2.1, 0.8]", "singular angle -2.0944: keep above -1.9444"),
-        ("jerk = [40.0, 40.0, 240.0]", "jerk = [40.0, 0.0, 240.0]", "jerk[1] = 0.0: expected float > 0.0"),
+        ("jerk = [40.0, 40.0, 240.0]", "jerk = [40.0, 0.0, 240.0]", "jerk[1] = 0.0: expected float >= 0.001"),
     ],
 )
 def test_wrong_ones_are_refused_in_one_line(right: str, wrong: str, said: str) -> None:
@@ -112,7 +125,7 @@ def test_homing_is_for_drives_that_have_a_table_of_it() -> None:
     [
         (0, 0.005, "drives.B.homing = {'method': 0"),
         (300, 0.005, "drives.B.homing.method = 300: expected int <= 127"),
-        (19, 0.0, "drives.B.homing.speed_zero = 0.0: expected float > 0.0"),
+        (19, 0.0, "drives.B.homing.speed_zero = 0.0: expected float >= 1e-05"),
     ],
 )
 def test_homing_that_is_refused(method: int, zero: float, said: str) -> None:
@@ -149,3 +162,134 @@ def test_an_eds_lies_beside_the_configuration(tmp_path: Path) -> None:
     path.write_text(TEXT.replace("[drives.B]\n", '[drives.B]\neds = "makes/b.eds"\n'))
     drives = load(path).drives
     assert [drive.eds for drive in drives.each] == [None, str(tmp_path / "makes/b.eds"), None]
+
+
+# ---------------------------------------------------------------------- what loads, runs
+
+NUMBER = re.compile(r"(?<== )-?[0-9][0-9.e+-]*$|(?<=[\[ ])-?[0-9][0-9.e+-]*(?=[,\]])", re.MULTILINE)
+ODRIVES = TEXT.replace('protocol = "cia402"', 'protocol = "odrive"').replace(
+    "counts_per_metre = 1e7", "counts_per_metre = 25.0"
+)
+WHOLE = [provenance.toml(parse(text)) for text in (TEXT, ODRIVES)]
+"""Every key there is, defaults included, of each protocol."""
+
+
+@st.composite
+def texts(draw: st.DrawFn) -> str:
+    """A whole configuration in which some numbers are others: at a bound, beyond any, or a little different."""
+    text = draw(st.sampled_from(WHOLE))
+    found = list(NUMBER.finditer(text))
+    chosen = draw(st.lists(st.sampled_from(found), min_size=1, max_size=4, unique_by=lambda number: number.start()))
+    for number in sorted(chosen, key=lambda number: -number.start()):
+        old = float(number[0])
+        if "." in number[0] or "e" in number[0]:
+            scaled = st.floats(-12.0, 12.0).map(lambda power: 10.0**power).map((old or 1.0).__mul__)
+            near = st.floats(0.1, 10.0).map(old.__mul__)
+            extreme = st.sampled_from([0.0, -old, 5e-324, 1e-310, 1e-6, 1e3, 9e18, 1.7e308])
+            new = repr(draw(near | scaled | extreme))
+        else:
+            new = str(draw(st.integers(0, 5000) | st.sampled_from([-1, int(old) + 1, 2**31, 2**63, 10**30])))
+        text = text[: number.start()] + new + text[number.end() :]
+    return text
+
+
+@settings(max_examples=200)
+@given(text=texts())
+@example(text=WHOLE[0].replace("counts_per_metre = 10000000.0", "counts_per_metre = 100.0"))
+@example(text=WHOLE[0].replace("feed_forward_gain = 0.95", "feed_forward_gain = 9e18"))
+@example(text=WHOLE[0].replace("offset = 0.0", "offset = 99.0"))
+@example(
+    text=WHOLE[1].replace("offset = 0.0", "offset = 99.0").replace("following_error = 0.004", "following_error = 1e-5")
+)
+def test_a_configuration_that_loads_can_be_run(text: str) -> None:
+    """No exception ends the loop: not at the start, nor when power comes, nor in motion, nor in a stop."""
+    try:
+        config = parse(text)
+    except ConfigError as error:
+        said = str(error)
+    else:
+        said = run_a_little(config)
+    assert "\n" not in said
+    assert len(said) <= LONGEST
+
+
+def run_a_little(config: Config) -> str:
+    """Power up, begin to move and stop; return why the bus is too slow for the configuration, if it is."""
+    try:
+        rig = Rig(config)
+    except BusError as error:
+        return str(error)
+    rig.order("enable")
+    rig.until(lambda: rig.mode is not Mode.ENABLING, 5000)
+    rig.post("g-1", PoseGoal(x=0.01, y=-0.01, phi=0.05))
+    rig.cycles(30)
+    rig.order("stop")
+    rig.cycles(30)
+    rig.order("disable")
+    rig.cycles(30)
+    rig.bus.shutdown()
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "said"),
+    [
+        (
+            "counts_per_metre = 1e7",
+            "counts_per_metre = 100",
+            "drives.A.counts_per_metre = 100, offset = 0: the position goes in steps of 0.01 m, too coarse for "
+            "limits.slider.following_error, 0.004 m; wanted counts_per_metre of at least 2500",
+        ),
+        ("counts_per_metre = 1e7", "counts_per_metre = 1e12", "drives.A.counts_per_metre = 1e+12"),
+        (
+            "feed_forward_gain = 0.95",
+            "feed_forward_gain = 9e18",
+            "can.simulated.feed_forward_gain = 9e+18: expected float <= 2.0",
+        ),
+        ("rate_hz = 1000", "rate_hz = 2500", ""),
+        ("rate_hz = 1000", "rate_hz = 16", "object 60C2h takes 1 to 255 times a power of ten"),
+        ("rate_hz = 1000", "rate_hz = 1", "drives.heartbeat = 0.1: heartbeats go out with the cycle; wanted at least"),
+        ("bitrate = 1_000_000", "bitrate = 1", "can.bitrate = 1: expected int >= 10000"),
+        ("velocity = 1.0", "velocity = 5e-5", "too coarse for limits.slider.velocity"),
+        (
+            "quick_stop_deceleration = 10.0",
+            "quick_stop_deceleration = 1e3",
+            "quick_stop_deceleration 1000 is 1e+10 counts",
+        ),
+        ('directory = "recordings"', 'directory = "a\\u0000b"', "telemetry.directory"),
+    ],
+)
+def test_numbers_no_machine_could_carry_out_are_refused(right: str, wrong: str, said: str) -> None:
+    assert right in TEXT
+    text = TEXT.replace(right, wrong, 1)
+    if not said:
+        assert parse(text)
+        return
+    with pytest.raises(ConfigError) as refused:
+        parse(text)
+    assert said in str(refused.value)
+
+
+def bounds(kind: object, path: str = "") -> Iterator[tuple[str, Meta | None]]:
+    """Every number's place in a configuration, and its bounds."""
+    if isinstance(kind, type) and issubclass(kind, Struct):
+        for field in fields(kind):
+            yield from bounds(field.type, f"{path}.{field.name}".lstrip("."))
+    elif get_origin(kind) is Annotated:
+        inner, *metas = get_args(kind)
+        yield from ((path, metas[0]) for _ in range(inner in (int, float)))
+        yield from bounds(inner, path) if get_args(inner) else ()
+    elif kind in (int, float):
+        yield path, None
+    else:
+        for inner in get_args(kind):
+            yield from bounds(inner, path)
+
+
+def test_every_number_has_a_floor_and_a_ceiling() -> None:
+    found = list(bounds(Config))
+    assert len(found) > 60
+    for path, meta in found:
+        assert meta is not None, path
+        assert meta.ge is not None, path
+        assert meta.le is not None, path

@@ -557,7 +557,7 @@ def test_trajectories_that_are_refused(rig: Rig) -> None:
     assert refusal(rig.send("g3", TrajectoryGoal(out))).code == "out_of_workspace"
     stretched = rig.send("g4", TrajectoryGoal(fast, stretch=True))
     assert isinstance(stretched, Accepted)
-    assert stretched.duration == pytest.approx(0.1 * answer.value, rel=1e-6)
+    assert stretched.duration == pytest.approx(0.1 * answer.value, rel=1e-4)
     rig.until(lambda: rig.mode is Mode.HOLDING)
     assert_within_limits(rig)
 
@@ -565,7 +565,7 @@ def test_trajectories_that_are_refused(rig: Rig) -> None:
 def test_a_trajectory_may_not_jump_into_its_acceleration(rig: Rig) -> None:
     rig.enable()
     still = (0.0, 0.0, 0.0)
-    for acceleration, taken in ((0.3, True), (0.5, False)):  # within a millisecond: 300 and 500 m/s³, 400 are allowed
+    for acceleration, taken in ((0.03, True), (0.05, False)):  # within a millisecond: 30 and 50 m/s³, 40 are allowed
         points = (
             TrajectoryPoint(0.0, 0.0, 0.0, 0.0, velocity=still, acceleration=(acceleration, 0.0, 0.0)),
             TrajectoryPoint(1.0, 0.05, 0.0, 0.0, velocity=still, acceleration=still),

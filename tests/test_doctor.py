@@ -5,12 +5,18 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
+from drivers.bus import PROTOCOLS
+from drivers.errors import BusError
+from drivers.simulated import simulated_bus
 from service import doctor, probes
 from service.clock import Tick
 from service.config import SIM, Config, load
@@ -139,6 +145,36 @@ def test_another_interface_is_said_to_be_unknown() -> None:
 def test_bus_load(bitrate: int, rate: int, verdict: str) -> None:
     config = changed(changed(REAL, "can", bitrate=bitrate), "loop", rate_hz=rate)
     assert doctor.load(config).verdict == verdict
+
+
+RATES = st.sampled_from([1, 10, 50, 100, 125, 200, 250, 400, 500, 800, 1000, 1250, 2000, 4000])
+BITRATES = st.sampled_from([10_000, 20_000, 50_000, 125_000, 250_000, 500_000, 800_000, 1_000_000]) | st.integers(
+    10_000, 2_000_000
+)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@settings(max_examples=25)
+@example(rate=500, bitrate=500_000, heartbeat=0.1)
+@given(rate=RATES, bitrate=BITRATES, heartbeat=st.floats(0.01, 1.0))
+def test_the_bus_load_is_judged_as_the_driver_does(protocol: str, rate: int, bitrate: int, heartbeat: float) -> None:
+    config = changed(SIMULATED, "can", bitrate=bitrate)
+    scaled = {"B": msgspec.structs.replace(config.drives.B, counts_per_metre=25.0)} if protocol == "odrive" else {}
+    config = changed(config, "drives", protocol=protocol, heartbeat=heartbeat, **scaled)
+    config = changed(config, "loop", rate_hz=rate)
+    clock = count(1000.0, 1e-6)
+    bus = simulated_bus(config.can, config.drives, lambda: next(clock))
+    driver = PROTOCOLS[protocol](bus, bitrate, config.drives, lambda: next(clock))
+    check = doctor.load(config)
+    refused = ""
+    try:
+        driver.configure(config.period)
+    except BusError as error:
+        refused = str(error)
+    bus.shutdown()
+    warned = any("CAN bus" in warning for warning in driver.read().warnings)
+    assert check.verdict == ("failure" if refused else "warning" if warned else "ok")
+    assert check.found.split(" ")[0] in (refused or f"{driver.bus_load:.0%}")
 
 
 @pytest.mark.parametrize(("text", "found"), [("", ()), ("3", (3,)), ("1-3,6,8-9", (1, 2, 3, 6, 8, 9))])

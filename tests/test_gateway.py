@@ -37,7 +37,7 @@ Rig = tuple[Gateway, FakeLink]
 def rig(tmp_path: Path) -> Iterator[Rig]:
     link = FakeLink()
     with session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
-        yield Gateway(CONFIG, link, opened), link  # type: ignore[arg-type]
+        yield Gateway(CONFIG, link, lambda: None, opened), link  # type: ignore[arg-type]
 
 
 def goal(gateway: Gateway, name: str) -> None:

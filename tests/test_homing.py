@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -287,6 +288,78 @@ def test_a_stop_halts_it_and_it_can_begin_again(event: str | Event, end: Mode, w
     assert isinstance(rig.command("home"), Confirmed)
     assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
     rig.bus.shutdown()
+
+
+def braking_slowly(acceleration: float) -> Config:
+    """Drives whose quick-stop ramp, by which simulated ones halt as well, is a tenth of a metre per second squared."""
+    robot = incremental(acceleration=acceleration)
+    return msgspec.structs.replace(robot, drives=msgspec.structs.replace(robot.drives, quick_stop_deceleration=0.1))
+
+
+def halted_at_rest(rig: Rig) -> None:
+    """Stop; a drive that is halted follows setpoints again only when it stands, and from where it stands."""
+    rig.order("stop")
+    while rig.mode is not Mode.HOLDING:
+        was, speeds = modes(rig), [drive.servo.velocity for drive in rig.drives]
+        rig.cycle()
+        for drive, speed, before, now in zip(rig.drives, speeds, was, modes(rig), strict=True):
+            if (before, now) == (6, 8):
+                assert speed == 0.0
+                assert abs(drive.objects[0x607A, 0].value - drive.servo.position) <= 1
+    assert rig.control.fault is None
+    settled(rig)
+    rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("delay", [None, part_of_a_cycle, a_cycle, one_drive_late])
+@pytest.mark.parametrize("when", [2, 5, 30, 300])
+def test_a_drive_that_brakes_slowly_follows_setpoints_only_when_it_stands(delay: Delay | None, when: int) -> None:
+    rig = Rig(braking_slowly(acceleration=0.1), delay)
+    rig.enable()
+    begin(rig, when)
+    halted_at_rest(rig)
+
+
+@pytest.mark.parametrize("when", range(2, 10))
+def test_a_standstill_from_before_the_start_is_not_taken_for_that_of_the_halt(when: int) -> None:
+    """Statuswords come three cycles late, from a drive that is fast at once and brakes slowly."""
+
+    def late_status(message: can.Message) -> float:
+        return 3.0 * PERIOD if message.arbitration_id == frames.TPDO1 + 1 else 0.0
+
+    rig = Rig(braking_slowly(acceleration=50.0), late_status)
+    rig.enable()
+    rig.cycles(5)
+    begin(rig, when)
+    halted_at_rest(rig)
+
+
+def test_the_held_setpoint_is_taken_up_before_setpoints_are_followed(rig: Rig) -> None:
+    """Where an encoder flickers by some counts, the drive has the one position that is held from then on."""
+    held: list[bytes] = []
+    asked: list[int] = []
+    receive, flicker = rig.bus.recv, itertools.cycle((0, 7, -5))
+
+    def recv(timeout: float | None = None) -> can.Message | None:
+        message = receive(timeout)
+        if message is not None and message.arbitration_id == frames.TPDO2 + 1 and not asked:
+            (counts,) = frames.POSITION.unpack(message.data)
+            message.data[:] = frames.POSITION.pack(counts + next(flicker))
+        return message
+
+    rig.bus.recv = recv  # type: ignore[method-assign]
+    rig.enable()
+    begin(rig, 40)
+    rig.order("stop")
+    while rig.mode is not Mode.HOLDING:
+        rig.cycle()
+        held += [bytes(message.data) for message in rig.sent if message.arbitration_id == frames.RPDO2 + 1]
+        if any(m.arbitration_id == frames.SDO_REQUEST + 1 and m.data[:5] == b"\x2f\x60\x60\0\x08" for m in rig.sent):
+            asked.append(len(held))  # the setpoint of this cycle goes out after the request
+    (since,) = asked
+    # Of the setpoints written before the request the last one waits for the next SYNC; the one before is taken up.
+    assert len(set(held[since - 3 :])) == 1
+    assert len(set(held[since - 6 : since - 3])) > 1
 
 
 def test_a_stop_when_the_last_drive_is_home_comes_too_late(rig: Rig) -> None:

@@ -10,12 +10,16 @@ from conftest import Rig
 
 from service import links
 from service.clock import Tick
+from service.heartbeats import Heartbeats, Watch
 from service.links import Link, Port
-from service.loop import BATCHES_PER_SECOND, Loop
+from service.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop
+from service.messages import PoseGoal
 from service.modes import Mode
 from service.packets import (
     CommandRequest,
+    Confirmed,
     DrivesFault,
+    GoalRequest,
     Happened,
     Input,
     Kind,
@@ -37,7 +41,8 @@ class Shell:
         self.ports = Port(links.listen(folder / "gateway")), Port(links.listen(folder / "recorder"))
         self.gateway: Link = links.connect(folder / "gateway")
         self.recorder: Link = links.connect(folder / "recorder")
-        self.loop = Loop(rig.config, rig.driver, *self.ports)
+        self.heartbeats = Heartbeats.create()
+        self.loop = Loop(rig.config, rig.driver, *self.ports, self.heartbeats)
         self.loop.control.start(rig.control.measured.feedback)
 
     def cycles(self, number: int, missed: int = 0) -> None:
@@ -51,6 +56,9 @@ class Shell:
         self.gateway.send(message(CommandRequest(1, "ann", "enable")))
         self.cycles(20)
         assert self.loop.control.state.mode is Mode.HOLDING
+
+    def mode(self) -> Mode:
+        return self.loop.control.state.mode
 
     def received(self, by: Link | None = None) -> list[bytes]:
         packets = []
@@ -130,6 +138,81 @@ def test_a_lost_gateway_is_noticed(shell: Shell) -> None:
     assert shell.loop.control.state.mode is Mode.HOLDING  # it stood: nothing to stop
 
 
+def beating(shell: Shell, cycles: int) -> None:
+    """Cycles of a loop whose gateway gives its signs of life."""
+    for _ in range(cycles // 50):
+        shell.heartbeats.of("gateway").beat()
+        shell.cycles(50)
+
+
+def moving(shell: Shell) -> None:
+    shell.enabled()
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.08, 0.02, 0.2, speed=0.2), now)))
+    beating(shell, 150)
+    assert shell.mode() is Mode.MOVING
+
+
+def test_a_frozen_gateway_is_a_controlled_stop_that_says_so(shell: Shell) -> None:
+    moving(shell)
+    shell.cycles(249)
+    assert shell.mode() is Mode.MOVING  # 0.3 s are not over
+    shell.cycles(3)
+    assert shell.mode() is Mode.STOPPING
+    shell.cycles(1000)
+    assert shell.mode() is Mode.HOLDING
+    said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
+    events = [answer.event for answer in said if isinstance(answer, Happened)]
+    assert [event.message for event in events if event.level == "warning"] == [
+        "the gateway is frozen, no sign of life for 0.3 s: controlled stop"
+    ]
+    assert [(event.id, event.outcome) for event in events if event.outcome] == [("g-1", "stopped")]
+
+
+def test_what_a_frozen_gateway_has_left_is_not_taken_until_it_serves_again(shell: Shell) -> None:
+    shell.enabled()
+    beating(shell, 50)
+    shell.cycles(300)
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.01, 0.0, 0.0), now)))
+    shell.cycles(500)
+    assert shell.mode() is Mode.HOLDING
+    beating(shell, 50)
+    assert shell.mode() is Mode.MOVING
+
+
+def test_what_a_frozen_gateway_has_left_dies_with_it(shell: Shell, tmp_path: Path) -> None:
+    shell.enabled()
+    beating(shell, 50)
+    shell.cycles(300)
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.01, 0.0, 0.0), now)))
+    shell.gateway.close()
+    shell.heartbeats.of("gateway").rest()
+    shell.cycles(30)
+    shell.gateway = links.connect(tmp_path / "gateway")
+    shell.cycles(300)  # the next one takes its time to serve
+    beating(shell, 500)
+    assert shell.mode() is Mode.HOLDING
+
+
+def test_a_machine_that_stands_still_is_no_frozen_gateway(shell: Shell) -> None:
+    moving(shell)
+    shell.rig.now += 0.09
+    shell.cycles(1, missed=90)
+    beating(shell, 300)
+    assert shell.mode() is Mode.MOVING
+
+
+def test_the_loop_gives_signs_of_life_while_it_turns(shell: Shell) -> None:
+    watch = Watch(shell.heartbeats.of("loop"), 2)
+    for _ in range(20):
+        shell.cycles(20)
+        assert not watch.silent()
+        assert watch.heard
+    assert [watch.silent() for _ in range(3)] == [False, False, True]
+
+
 def test_it_ends_when_the_robot_has_no_power(shell: Shell) -> None:
     shell.enabled()
     shell.loop.ending = True
@@ -185,3 +268,46 @@ def test_whatever_the_fault_says_the_gateway_and_the_recorder_can_read_it(shell:
         faults = [answer.fault for answer in said if isinstance(answer, Situation) and answer.fault]
         assert all(fault.startswith("xxx") and fault.isprintable() for fault in faults)
         assert faults
+
+
+def answered(packets: list[bytes]) -> list[int]:
+    """Tickets of the commands that are confirmed, in order."""
+    said = [decode_answer(packet[1:]) for packet in packets if packet[0] == Kind.MESSAGE]
+    return [answer.ticket for answer in said if isinstance(answer, Confirmed)]
+
+
+def test_a_stop_behind_a_flood_of_commands_is_carried_out_while_they_arrive(shell: Shell) -> None:
+    shell.enabled()
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.08, 0.02, 0.2), now)))
+    shell.cycles(100)
+    assert shell.mode() is Mode.MOVING
+    for ticket in range(100, 200):
+        shell.gateway.send(message(CommandRequest(ticket, "eve", "override", 1.0)))
+    shell.gateway.send(message(CommandRequest(200, "ann", "stop")))
+    shell.cycles(100 // REQUESTS_A_CYCLE + 1)
+    assert shell.mode() is Mode.STOPPING
+    shell.cycles(400)
+    assert answered(shell.received())[1:] == list(range(100, 201))
+
+
+def test_an_answer_waits_for_a_gateway_that_is_slow(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    shell.enabled()
+    shell.received()
+    with monkeypatch.context() as full:
+        full.setattr(shell.ports[0], "send", lambda _packet: False)
+        for ticket in range(100, 130):
+            shell.gateway.send(message(CommandRequest(ticket, "ann", "stop")))
+        shell.cycles(50)
+    shell.cycles(10)
+    assert answered(shell.received()) == list(range(100, 130))
+
+
+def test_nobody_is_told_what_a_gateway_that_is_gone_was_asked(shell: Shell, tmp_path: Path) -> None:
+    shell.enabled()
+    shell.gateway.send(message(CommandRequest(100, "ann", "stop")))
+    shell.gateway.close()
+    shell.cycles(30)
+    shell.gateway = links.connect(tmp_path / "gateway")
+    shell.cycles(30)
+    assert answered(shell.received()) == []

@@ -48,11 +48,16 @@ def lose_the_gateway(shell: Shell) -> None:
     shell.gateway.close()
 
 
+def freeze_the_gateway(shell: Shell) -> None:
+    shell.heartbeats.of("gateway").beat()
+    shell.cycles(400)
+
+
 def end(shell: Shell) -> None:
     shell.loop.ending = True
 
 
-@pytest.mark.parametrize("happen", [lose_a_drive, push_a_slider, be_late, lose_the_gateway, end])
+@pytest.mark.parametrize("happen", [lose_a_drive, push_a_slider, be_late, lose_the_gateway, freeze_the_gateway, end])
 def test_a_mishap_comes_out_the_same(shell: Shell, happen: Callable[[Shell], None]) -> None:
     shell.cycles(40)  # without power, with the recorder there
     shell.enabled()

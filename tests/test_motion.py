@@ -65,7 +65,7 @@ def accepted(answer: Answer) -> Accepted:
 
 
 def stands(rig: Rig) -> bool:
-    return rig.mode is Mode.HOLDING and not rig.control._pilot.busy and rig.control.dispatch.ready
+    return rig.mode is Mode.HOLDING and rig.control.dispatch.idle
 
 
 def bare(start: tuple[float, float, float], end: tuple[float, float, float]) -> float:
@@ -347,7 +347,7 @@ def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig) -> None:
         if k % 100 == 0:
             rig.rows.clear()
             rig.seen.clear()
-    rig.until(lambda: rig.control.dispatch.ready and not rig._posted and not rig.control._pilot.busy, 50_000)
+    rig.until(lambda: rig.control.dispatch.idle, 50_000)
     rig.order("override", 1.0)
     rig.order("stop")
     rig.until(lambda: rig.mode in (Mode.HOLDING, Mode.DISABLED, Mode.FAULT))
@@ -390,6 +390,16 @@ def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
     rig.bus.shutdown()
 
 
+PLAIN_SET_OUT = Goals._set_out
+
+
+def only_from_rest(goals: Goals, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
+    """Plan from no motion, so that the robot stops first."""
+    if not course.commanded.at_rest:
+        raise TOO_FAST_IN_MOTION
+    return (yield from PLAIN_SET_OUT(goals, goal, course, rate))
+
+
 @pytest.mark.parametrize(
     ("config", "first", "second"),
     [
@@ -402,19 +412,14 @@ def test_of_two_ways_the_sooner_is_taken(
     monkeypatch: pytest.MonkeyPatch, config: Config, first: tuple[float, ...], second: tuple[float, ...]
 ) -> None:
     """From the same motion, with lower limits or after a stop: each where the other is not to be had, and then both."""
-    plain_set_out, plain_stop_first = Goals._set_out, Goals._stop_first
-
-    def no_lower_limits(goals: Goals, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
-        if not course.commanded.at_rest:
-            raise TOO_FAST_IN_MOTION
-        return (yield from plain_set_out(goals, goal, course, rate))
+    plain_stop_first = Goals._stop_first
 
     def no_stop(goals: Goals, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
         raise TOO_FAST_IN_MOTION
         yield
 
     def asked(wait: int, way: str) -> tuple[Rig, Answer]:
-        monkeypatch.setattr(Goals, "_set_out", no_lower_limits if way == "stop" else plain_set_out)
+        monkeypatch.setattr(Goals, "_set_out", only_from_rest if way == "stop" else PLAIN_SET_OUT)
         monkeypatch.setattr(Goals, "_stop_first", no_stop if way == "lower" else plain_stop_first)
         rig = Rig(config)
         rig.enable()
@@ -446,8 +451,11 @@ def test_of_two_ways_the_sooner_is_taken(
 
 
 @pytest.mark.parametrize("later", range(4))
-def test_a_stop_is_kept_though_the_rate_of_the_goal_to_come_is_thought_about(later: int) -> None:
+def test_a_stop_is_kept_though_the_rate_of_the_goal_to_come_is_thought_about(
+    monkeypatch: pytest.MonkeyPatch, later: int
+) -> None:
     """The robot stops for a goal that is then to run at an override; it is told to stop as that is being looked at."""
+    monkeypatch.setattr(Goals, "_set_out", only_from_rest)
     rig = Rig(SLOW)
     rig.enable()
     rig.goal("g1", 0.08, 0.02, 0.3)

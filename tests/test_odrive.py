@@ -566,6 +566,37 @@ class TestFaults:
         assert fault is not None
         assert fault.message == f"drive B: is in closed loop control 1 s after {stop}; idle was expected"
 
+    def test_drive_that_keeps_its_power_after_a_reset_is_told_of_again(
+        self, enabled: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setitem(enabled.devices[1]._handlers, frames.SET_AXIS_STATE, lambda data: None)
+        enabled.drives.disable()
+        enabled.found("timeout", within=1010)
+        enabled.drives.reset()
+        assert enabled.cycles(round(CONFIG.stop_timeout / PERIOD) - 1).fault is None
+        fault = enabled.found("timeout", within=3).fault
+        assert fault is not None
+        assert fault.message == "drive B: is in closed loop control 1 s after reset; idle was expected"
+
+    @pytest.mark.parametrize("stop", ["disable", "quick_stop"])
+    def test_drives_that_are_enabled_again_in_time_keep_their_power(self, enabled: Rig, stop: str) -> None:
+        getattr(enabled.drives, stop)()
+        enabled.cycles(400)
+        enabled.enable()
+        feedback = enabled.cycles(1500)
+        assert (feedback.fault, feedback.state) == (None, (P.OPERATION_ENABLED,) * 3)
+
+    def test_a_quick_stop_before_the_first_setpoint_takes_the_power_back(self, ready: Rig) -> None:
+        ready.drives.enable()
+        ready.drives.quick_stop()
+        feedback = ready.cycles(1500)
+        assert (feedback.fault, feedback.state) == (None, (P.SWITCH_ON_DISABLED,) * 3)
+
+    def test_reset_of_drives_that_follow_setpoints_takes_no_power(self, enabled: Rig) -> None:
+        enabled.drives.reset()
+        feedback = enabled.cycles(1500)
+        assert (feedback.fault, feedback.state) == (None, (P.OPERATION_ENABLED,) * 3)
+
 
 class TestLateAnswers:
     def test_age_is_told_and_what_comes_late_or_never_is_counted(self, ready: Rig) -> None:

@@ -31,6 +31,7 @@ from service import provenance
 from service.client import Robot
 from service.config import SIM, load
 from service.errors import RefusedError, ServiceError
+from service.interpreter import child, python
 from service.messages import Event, GoalReply, OwnLimits, State
 from service.modes import MODES, Mode
 from service.reading import read
@@ -78,10 +79,7 @@ class Service:
 
     def child(self, name: str) -> int:
         """Process id of one of its children."""
-        for entry in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split():
-            if Path(f"/proc/{entry}/cmdline").read_bytes().split(b"\0")[3] == name.encode():
-                return int(entry)
-        raise AssertionError(f"no {name} among the children")
+        return child(self.process.pid, name)
 
     def end(self, number: int = signal.SIGTERM) -> int:
         """Send a signal and wait for the exit code."""
@@ -98,7 +96,7 @@ class Service:
 
 
 def run(*arguments: object, **options: Any) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-m", "service", "run", *map(str, arguments)], **options)
+    return subprocess.Popen(python("-m", "service", "run", *map(str, arguments)), **options)
 
 
 def trirail(*arguments: object, locator: str = "") -> subprocess.CompletedProcess[str]:

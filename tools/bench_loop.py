@@ -13,7 +13,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from service.client import Robot
 from service.config import SIM, load
 from service.errors import ServiceError
+from service.interpreter import python
 from service.records import PARTS, unpack
 
 QUANTILES = (50.0, 99.0, 99.9, 100.0)
@@ -65,7 +65,7 @@ def measure(seconds: float) -> dict[str, Any]:
 
 
 def _start(*arguments: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-m", "service", *arguments], stdout=subprocess.DEVNULL)
+    return subprocess.Popen(python("-m", "service", *arguments), stdout=subprocess.DEVNULL)
 
 
 def _connect(name: str, locator: str, service: subprocess.Popen[bytes]) -> Robot:

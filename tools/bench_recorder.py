@@ -19,7 +19,7 @@ from moving import keep_moving
 from service import spawned
 from service.client import Robot
 from service.config import load
-from service.errors import TrirailError
+from service.interpreter import child
 from service.sinks import HOST, free_port
 
 CPU_LIMIT = 0.03
@@ -37,7 +37,7 @@ def measure(seconds: float) -> dict[str, dict[str, float]]:
         rate = load(config).loop.rate_hz
         recording = Path(folder) / "bench.rrd"
         with spawned.service(config, recording) as service, Robot("demo", locator, user="bench") as robot:
-            recorder, loop = (_child(service.pid, name) for name in ("recorder", "loop"))
+            recorder, loop = (child(service.pid, name) for name in ("recorder", "loop"))
 
             def taken() -> dict[str, float]:
                 keep_moving(robot, 3.0)  # until all that happens once has happened
@@ -76,14 +76,6 @@ def _state(recorder: int, loop: int, recording: Path, robot: Robot) -> tuple[flo
     """Return time, processor time of recorder and loop [s], bytes and cycles so far."""
     cycles = robot.state().loop.cycles
     return time.monotonic(), _cpu(recorder), _cpu(loop), float(recording.stat().st_size), float(cycles)
-
-
-def _child(service: int, name: str) -> int:
-    """Return the process id of one of a service's processes."""
-    for child in Path(f"/proc/{service}/task/{service}/children").read_text(encoding="ascii").split():
-        if Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")[3] == name.encode():
-            return int(child)
-    raise TrirailError(f"the service has no process {name}")
 
 
 def _cpu(process: int) -> float:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import math
 import sys
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers import files
 from service import config
 from service.algebra import Array
 from service.calibration import PARAMETERS, Calibration, CalibrationError, identify
@@ -35,12 +37,12 @@ point, which is only the zero of lambda_32: along rail and edge both stay as in 
 def read(path: Path, *, degrees: bool = False) -> tuple[Array, Array, list[int]]:
     """Return poses (N, 3) and sliders (N, 3) in m and rad, and the lines on which they stand.
 
-    Raises CalibrationError with the line of what is wrong.
+    Raises FileError, or CalibrationError with the line of what is wrong.
     """
     rows: list[list[float]] = []
     lines: list[int] = []
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with io.StringIO(files.text(path), newline="") as file:
             reader = csv.reader(file)
             names = [name.strip() for name in next(reader, [])]
             if sorted(names) != sorted(COLUMNS):
@@ -49,9 +51,7 @@ def read(path: Path, *, degrees: bool = False) -> tuple[Array, Array, list[int]]
                 if fields:
                     rows.append(_numbers(names, fields, reader.line_num))
                     lines.append(reader.line_num)
-    except OSError as error:
-        raise CalibrationError(str(error.strerror)) from error
-    except (UnicodeDecodeError, csv.Error) as error:
+    except csv.Error as error:
         raise CalibrationError(f"not a CSV file: {error}") from error
     data = np.array(rows).reshape(-1, len(COLUMNS))
     if degrees:

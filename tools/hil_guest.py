@@ -101,7 +101,7 @@ class Machine:
 
     def doctor(self) -> str:
         """What `trirail doctor` says of can0. Raises Failed unless all of it is well."""
-        command = (sys.executable, "-m", "service", "doctor", self._folder / "robot.toml", "--json")
+        command = (sys.executable, "-P", "-m", "service", "doctor", self._folder / "robot.toml", "--json")
         said = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=False)
         can0 = [check for check in json.loads(said.stdout)["checks"] if check["name"].startswith("can0")]
         if len(can0) != 3 or any(check["verdict"] != "ok" for check in can0):
@@ -129,7 +129,7 @@ class Machine:
             systemd.settimeout(1.0)
             process = self.start(
                 "service",
-                *(sys.executable, "-c", PATIENT, "run", self._folder / "robot.toml"),
+                *(sys.executable, "-P", "-c", PATIENT, "run", self._folder / "robot.toml"),
                 NOTIFY_SOCKET=address,
             )
             until(lambda: _received(systemd) == "READY=1", "the service is up", process)

@@ -26,7 +26,7 @@ PORTABLE = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 def prepare(folder: Path) -> None:
     """Compile the kinematics here, for the machine to load."""
     done = subprocess.run(
-        (sys.executable, "-c", "import service.loop, service.gateway, service.recording, service.client"),
+        (sys.executable, "-P", "-c", "import service.loop, service.gateway, service.recording, service.client"),
         cwd=ROOT,
         env=os.environ | PORTABLE | {"NUMBA_CACHE_DIR": str(folder / "numba")},
         capture_output=True,

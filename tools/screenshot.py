@@ -19,6 +19,7 @@ from pathlib import Path
 from PIL import Image
 from rerun.experimental import ViewerClient
 
+from service.interpreter import python
 from service.sinks import free_port
 
 TIMEOUT = 60.0
@@ -50,7 +51,7 @@ def main() -> int:
 def viewer(recording: Path, width: int, height: int) -> Iterator[ViewerClient]:
     """Run a viewer without a window until it has loaded a recording; yield a client of it."""
     port = free_port()
-    command = [sys.executable, "-m", "rerun_cli", "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1"]
+    command = python("-m", "rerun_cli", "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1")
     command += ["--window-size", f"{width}x{height + TITLE_BAR}", "--port", str(port), str(recording)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True

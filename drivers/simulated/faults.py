@@ -11,8 +11,8 @@ from typing import Final
 
 import can
 
-from drivers import canerrors
-from drivers.errors import DriveError
+from drivers import canerrors, files
+from drivers.errors import DriveError, FileError
 from drivers.interface import NAMES, PowerState
 from drivers.simulated.devices import SimulatedDevice
 from drivers.simulated.drive import SimulatedDrive
@@ -113,9 +113,9 @@ class Faults:
     def load(self, path: Path) -> None:
         """Take up a file, one fault a line; # begins a comment. Raises DriveError with file and line."""
         try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise DriveError(f"{path}: cannot read faults: {error}") from error
+            text = files.text(path)
+        except FileError as error:
+            raise DriveError(f"cannot read faults: {error}") from error
         for number, line in enumerate(text.splitlines(), start=1):
             words = line.partition("#")[0].strip()
             if words:

@@ -171,7 +171,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gateway,
     folder = tmp_path_factory.mktemp("zenoh")
     link = FakeLink()
     with session.open_service([f"unixsock-stream/{folder}/z"]) as opened:
-        yield Gateway(CONFIG, link, opened), link  # type: ignore[arg-type]
+        yield Gateway(CONFIG, link, lambda: None, opened), link  # type: ignore[arg-type]
 
 
 @given(kind=st.sampled_from(("goal", "cmd", "info")), key=keys, payload=payloads, encoding=st.sampled_from(ENCODINGS))

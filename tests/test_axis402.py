@@ -1,0 +1,163 @@
+"""One CiA 402 drive as its frames tell of it: when it counts as silent, in fault, restarted or out of operation."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from drivers import frames
+from drivers.axis402 import Axis
+from drivers.interface import DriveFault, PowerState
+from drivers.scaling import Scale
+
+P = PowerState
+ENABLED, READY, FAULT = b"\x37\x02", b"\x31\x02", b"\x18\x02"
+ERROR = bytes.fromhex("1043 08 0000000000")
+OVER = bytes(8)
+OPERATIONAL, PRE_OPERATIONAL, BOOT_UP = b"\x05", b"\x7f", b"\0"
+WANTED: frames.Wanted = P.OPERATION_ENABLED
+OFF: frames.Wanted = P.SWITCH_ON_DISABLED
+T = 50.0
+
+
+def made() -> Axis:
+    """A drive that is heard and follows setpoints."""
+    axis = Axis("B", 2, Scale(-1e6, 0.1), heartbeat=100.0)
+    axis.on_heartbeat(OPERATIONAL, T)
+    axis.on_status(ENABLED, T)
+    axis.on_position(frames.POSITION.pack(1000), T)
+    assert axis.fault(T, WANTED) is None
+    return axis
+
+
+def state_of(axis: Axis) -> PowerState:
+    return axis.state
+
+
+def test_position_and_counts_are_those_of_the_frame() -> None:
+    axis = made()
+    assert axis.actual == 1000
+    assert axis.position == pytest.approx(0.099)
+
+
+def test_statuswords_may_be_missing_for_three_of_their_periods() -> None:
+    axis = made()
+    assert axis.fault(T + 0.299, WANTED) is None
+    fault = axis.fault(T + 0.301, WANTED)
+    assert fault == ("B", "silent", 0, "drive B: no statusword for 0.301 s")
+
+
+def test_a_fault_reset_has_the_time_of_two_statuswords() -> None:
+    axis = made()
+    axis.on_status(FAULT, T)
+    assert axis.fault(T, WANTED) == ("B", "fault", 0, "drive B: fault")
+    axis.forgive(T)
+    assert axis.fault(T + 0.199, WANTED) is None
+    assert axis.fault(T + 0.201, WANTED) == ("B", "fault", 0, "drive B: fault, still 0.2 s after a fault reset")
+    axis.on_status(READY, T + 0.25)
+    axis.on_status(FAULT, T + 0.26)  # a new one has no time
+    assert axis.fault(T + 0.26, OFF) == ("B", "fault", 0, "drive B: fault")
+
+
+def test_a_fault_has_the_code_of_its_emergency_until_it_is_over() -> None:
+    axis = made()
+    axis.on_emergency(ERROR, T)
+    assert axis.fault(T, WANTED) == ("B", "emcy", 0x4310, "drive B: emergency 4310, error register 08")
+    axis.forgive(T)
+    assert axis.fault(T, WANTED) == ("B", "emcy", 0x4310, "drive B: emergency 4310 is still in force")
+    axis.on_emergency(OVER, T)
+    assert axis.fault(T, WANTED) is None
+
+
+def test_a_drive_that_has_left_its_fault_has_no_code_of_it() -> None:
+    axis = made()
+    axis.on_status(FAULT, T)
+    axis.on_emergency(ERROR, T)
+    axis.forgive(T)
+    assert axis.fault(T + 1.0, WANTED) == (
+        "B", "fault", 0x4310, "drive B: fault, error 4310, still 0.2 s after a fault reset",
+    )  # fmt: skip
+    axis.on_status(READY, T + 1.0)
+    assert axis.error_code == 0
+    assert axis.fault(T + 1.0, OFF) is None
+
+
+@pytest.mark.parametrize("told_by", ["heartbeat", "position"])
+def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -> None:
+    axis = Axis("B", 2, Scale(1e6, 0.0), heartbeat=100.0)
+    axis.on_status(ENABLED, T)
+    axis.on_heartbeat(PRE_OPERATIONAL, T)  # from before it was started
+    assert axis.fault(T, WANTED) is None
+    assert state_of(axis) is P.OPERATION_ENABLED
+    if told_by == "heartbeat":
+        axis.on_heartbeat(OPERATIONAL, T)
+    else:
+        axis.on_position(frames.POSITION.pack(0), T)
+    assert not axis.mute
+    axis.on_heartbeat(PRE_OPERATIONAL, T)
+    assert axis.fault(T, WANTED) == ("B", "state", 0, "drive B: left NMT operational: is pre-operational")
+    assert state_of(axis) is P.NOT_READY_TO_SWITCH_ON
+    assert axis.mute
+    assert axis.left_operational
+    axis.forgive(T + 5.0)
+    assert not axis.left_operational  # it is started once
+    assert axis.fault(T + 5.299, OFF) is None  # its statuswords have time anew
+    axis.on_heartbeat(OPERATIONAL, T + 5.0)
+    assert not axis.mute
+
+
+def test_a_restart_stays_whatever_is_forgiven() -> None:
+    axis = made()
+    axis.on_emergency(ERROR, T)
+    axis.on_heartbeat(BOOT_UP, T)
+    said = ("B", "state", 0, "drive B: has restarted and lost its set-up; restart the service")
+    assert axis.fault(T, WANTED) == said
+    assert state_of(axis) is P.NOT_READY_TO_SWITCH_ON
+    axis.forgive(T)
+    assert axis.fault(T, WANTED) == said
+
+
+def test_only_the_answer_about_the_statusword_is_one() -> None:
+    axis = made()
+    axis.on_sdo(b"\x4b\x41\x60\0" + READY + b"\0\0", T + 1.0)
+    assert (axis.state, axis.status_heard) == (P.READY_TO_SWITCH_ON, T + 1.0)
+    axis.on_sdo(b"\x4b\x40\x60\0" + ENABLED + b"\0\0", T + 2.0)
+    axis.on_sdo(b"\x4b\x41\x60\0" + ENABLED, T + 2.0)  # too short for an SDO
+    assert (axis.state, axis.status_heard) == (P.READY_TO_SWITCH_ON, T + 1.0)
+    assert axis.sdo_answer == b"\x4b\x40\x60\0" + ENABLED + b"\0\0"
+
+
+@pytest.mark.parametrize("state", P)
+@pytest.mark.parametrize("wanted", [P.SWITCH_ON_DISABLED, P.OPERATION_ENABLED, P.QUICK_STOP_ACTIVE])
+def test_only_a_drive_that_followed_setpoints_can_leave_that_unasked(state: P, wanted: frames.Wanted) -> None:
+    axis = made()
+    axis.state = state
+    fault = axis.fault(T, wanted)
+    in_fault = state in (P.FAULT, P.FAULT_REACTION_ACTIVE)
+    if not in_fault:
+        left = wanted is P.OPERATION_ENABLED and state is not P.OPERATION_ENABLED
+        assert (fault is not None) == left
+        axis.powered_up = False
+        assert axis.fault(T, wanted) is None
+    else:
+        assert isinstance(fault, DriveFault)
+        assert fault.cause == "fault"
+
+
+@pytest.mark.parametrize("state", P)
+def test_a_drive_that_may_still_move_is_late_to_lose_its_power(state: P) -> None:
+    axis = made()
+    axis.state = state
+    without = (P.NOT_READY_TO_SWITCH_ON, P.SWITCH_ON_DISABLED, P.FAULT, P.FAULT_REACTION_ACTIVE)
+    late = axis.late_for("quick stop", 1.0)
+    said = ("B", "timeout", 0, f"drive B: is {state} 1 s after quick stop; switch on disabled was expected")
+    assert late == (None if state in without else said)
+
+
+def test_what_is_no_state_of_cia_402_is_a_fault() -> None:
+    axis = made()
+    axis.on_status(b"\x2a\0", T)
+    assert axis.fault(T, WANTED) == ("B", "state", 0, "drive B: statusword 002A is that of no CiA 402 state")
+    assert state_of(axis) is P.OPERATION_ENABLED
+    assert axis.heard < math.inf

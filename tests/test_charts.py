@@ -1,0 +1,45 @@
+"""A report's picture, as `trirail report --plot` draws it: of sessions in any mode, with one table of colours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import made
+import numpy as np
+import pytest
+from rich.style import Style
+
+from service import charts, palette, sessions, terminal
+from service.config import SIM, load
+from service.modes import MODES, Mode
+from service.recorder import Recorder
+
+
+def test_every_mode_has_a_colour_of_its_own_wherever_it_is_shown() -> None:
+    assert set(palette.MODES) == set(Mode)
+    for shown in (palette.MODES, charts.MODE_COLOURS, terminal.COLOURS):
+        assert [*shown] == [*MODES]
+        assert len(set(shown.values())) == len(MODES)
+    assert all(Style.parse(style).color is not None for style in terminal.COLOURS.values())
+
+
+@pytest.mark.parametrize("picture", ["session.png", "session.svg"])
+def test_a_session_that_was_in_every_mode_is_drawn(
+    picture: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    records = made.records(0.7)
+    records["mode"] = np.repeat(np.arange(len(MODES)), len(records) // len(MODES))
+    recording = tmp_path / "session.rrd"
+    recorder = Recorder(load(SIM), tmp_path, path=recording, live=False)
+    recorder.records(records[:350].tobytes())
+    recorder.records(records[350:].tobytes())
+    recorder.close()
+    assert sessions.report(recording, plot=tmp_path / picture) == 0
+    said = capsys.readouterr().out
+    assert all(f"{mode} 0.1 s" in said for mode in MODES)
+    if picture.endswith(".svg"):
+        drawn = (tmp_path / picture).read_text()
+        assert all(f"<!-- {mode} -->" in drawn for mode in MODES)  # the legend names each
+        assert all(f"fill: {colour}" in drawn for colour in charts.MODE_COLOURS.values())
+    else:
+        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,183 @@
+"""Processes of a service that freeze, or that somebody ends: what clients, log, exit code and recording say of it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from test_service import (
+    END_WITHIN,
+    UP_WITHIN,
+    Service,
+    again,
+    assert_stopped_smoothly,
+    in_motion,
+    service,
+    until,
+)
+
+from service.errors import ServiceError
+from service.messages import Event
+from service.modes import MODES, Mode
+from service.reading import Recording, read
+
+__all__ = ["service"]
+
+pytestmark = pytest.mark.slow
+
+
+def recording(service: Service) -> Recording:
+    """The session's only recording."""
+    (file,) = (file for file in (service.folder / "recordings").glob("*.rrd") if not file.name.startswith("fault-"))
+    return read(file)
+
+
+def events(recorded: Recording) -> list[Event]:
+    return [line.event for line in recorded.events if line.event is not None]
+
+
+def outcomes(recorded: Recording) -> list[tuple[str | None, str | None]]:
+    return [(event.id, event.outcome) for event in events(recorded) if event.outcome is not None]
+
+
+def test_a_frozen_gateway_is_a_controlled_stop_and_is_replaced(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        os.kill(service.child("gateway"), signal.SIGSTOP)
+        service.wait_said("the gateway has died (no sign of life for 0.7 s, so it was killed)")
+    with again(service) as robot:
+        state = until(robot, lambda state: state.mode == "holding")
+        assert 0.01 < state.pose[0] < 0.09
+        assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
+        robot.disable()
+    assert service.end() == 0
+    assert_stopped_smoothly(service.frames())
+    recorded = recording(service)
+    assert ("long", "stopped") in outcomes(recorded)
+    assert any("the gateway is frozen, no sign of life for 0.3 s" in event.message for event in events(recorded))
+
+
+def test_a_frozen_loop_ends_the_service_and_everyone_is_told(service: Service) -> None:
+    heard: list[Event] = []
+    with service.robot() as robot:
+        in_motion(robot)
+        os.kill(service.child("loop"), signal.SIGSTOP)
+        for event in robot.events(history=True, timeout=5.0):
+            heard.append(event)
+            if event.mode == "fault":
+                break
+    assert service.process.wait(END_WITHIN) == 1
+    assert "the loop is dead (no sign of life for 0.7 s, so it was killed): the drives stop" in service.log.read_text()
+    assert "frozen" in heard[-1].message
+    assert [(event.id, event.outcome) for event in heard if event.outcome] == [("long", "faulted")]
+    recorded = recording(service)
+    assert outcomes(recorded) == [("long", "faulted")]
+    assert [event.seq for event in events(recorded)] == list(range(1, len(events(recorded)) + 1))
+
+
+def test_the_state_says_that_the_loop_has_died(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        states = robot.states(timeout=2.0)
+        newest = next(states)
+        os.kill(service.child("loop"), signal.SIGKILL)
+        with contextlib.suppress(ServiceError):
+            for newest in states:  # noqa: B007
+                pass
+    assert newest.mode == "fault"
+    assert newest.faults == ("the loop has died: the drives stop by their own watchdogs",)
+    assert service.process.wait(END_WITHIN) == 1
+
+
+def test_sigterm_to_the_loop_alone_is_told_as_what_it_is(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        os.kill(service.child("loop"), signal.SIGTERM)
+        assert service.process.wait(END_WITHIN) == 1
+    said = (
+        "the loop is dead (another process sent it SIGTERM): it has stopped the robot and disabled the drives; ending"
+    )
+    assert said in service.log.read_text()
+    assert_stopped_smoothly(service.frames())
+    recorded = recording(service)
+    assert outcomes(recorded) == [("long", "stopped")]
+    assert MODES[recorded.records["mode"][-1]] is Mode.DISABLED
+
+
+def test_sigterm_to_the_gateway_alone_is_told_as_what_it_is(service: Service) -> None:
+    with service.robot() as robot:
+        robot.enable()
+    os.kill(service.child("gateway"), signal.SIGTERM)
+    service.wait_said("the gateway has died (another process sent it SIGTERM): the loop stops the robot and holds")
+    with again(service) as robot:
+        assert robot.state().mode == "holding"
+
+
+def test_a_killed_supervisor_leaves_a_complete_recording(service: Service) -> None:
+    """The loop stops the robot; the recorder outlives it, to have what it said of that."""
+    with service.robot() as robot:
+        in_motion(robot)
+        children = [service.child(name) for name in ("loop", "gateway", "recorder")]
+        service.process.kill()
+        for child in children:
+            wait_gone(child)
+    assert_stopped_smoothly(service.frames())
+    recorded = recording(service)
+    assert outcomes(recorded) == [("long", "stopped")]
+    assert MODES[recorded.records["mode"][-1]] is Mode.DISABLED
+
+
+def wait_gone(process: int) -> None:
+    """Wait for the end of a process that is nobody's child here."""
+    with contextlib.suppress(ProcessLookupError):
+        descriptor = os.pidfd_open(process)
+        ended, _, _ = select.select([descriptor], [], [], END_WITHIN)
+        os.close(descriptor)
+        assert ended
+
+
+@pytest.fixture
+def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """A socket as systemd has it, for a service with a watchdog of 1 s."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        listening.bind(str(tmp_path / "notify"))
+        listening.settimeout(UP_WITHIN)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "1000000")
+        monkeypatch.delenv("WATCHDOG_PID", raising=False)
+        yield listening
+
+
+def test_the_watchdog_is_fed_while_loop_and_gateway_are_alive(told: socket.socket, tmp_path: Path) -> None:
+    service = Service(tmp_path)
+    while told.recv(100) != b"READY=1":
+        pass
+    for _ in range(5):
+        assert told.recv(100) == b"WATCHDOG=1"
+    os.kill(service.child("gateway"), signal.SIGSTOP)
+    service.wait_said("the gateway has died")
+    told.setblocking(False)
+    with contextlib.suppress(BlockingIOError):
+        while told.recv(100):  # what was sent before
+            pass
+    told.settimeout(UP_WITHIN)
+    assert told.recv(100) == b"WATCHDOG=1"  # it is back
+    assert service.end() == 0
+
+
+def test_nothing_is_imported_from_the_folder_it_is_started_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "poisoned"
+    folder.mkdir()
+    for name in ("msgspec", "numpy", "zenoh", "rerun", "service", "signal"):
+        (folder / f"{name}.py").write_text(f"open('{folder}/run', 'a').write('{name}')\nraise SystemExit(9)\n")
+    monkeypatch.chdir(folder)
+    service = Service(tmp_path)
+    service.wait_up()
+    assert service.end() == 0
+    assert not (folder / "run").exists()

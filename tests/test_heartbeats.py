@@ -1,0 +1,37 @@
+"""Signs of life, counted by who watches: in its own turns, from the first beat to the last."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.heartbeats import PROCESSES, Heartbeats, Watch
+
+
+def test_each_process_has_its_own_and_all_share_them() -> None:
+    one = Heartbeats.create()
+    other = Heartbeats(one.descriptor)
+    for name in PROCESSES:
+        assert other.of(name).count == 0
+        one.of(name).beat()
+        assert other.of(name).count == 1
+    one.of("loop").rest()
+    assert [other.of(name).count for name in PROCESSES] == [0, 1]
+
+
+@given(patience=st.integers(1, 10), turns=st.lists(st.sampled_from(["beat", "rest", ""]), max_size=60))
+def test_it_is_silent_after_more_turns_than_there_is_patience(patience: int, turns: list[str]) -> None:
+    heart = Heartbeats.create().of("gateway")
+    watch = Watch(heart, patience)
+    silence: int | None = None
+    for turn in turns:
+        if turn == "beat":
+            heart.beat()
+            silence = 0
+        elif turn == "rest":
+            heart.rest()
+            silence = None
+        elif silence is not None:
+            silence += 1
+        assert watch.silent() == (silence is not None and silence > patience)
+        assert watch.heard == (turn == "beat")

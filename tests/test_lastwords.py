@@ -1,0 +1,96 @@
+"""What is said in the place of a loop that has died: each goal that it had ends once, numbered after its last event."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.lastwords import LastWords
+from service.messages import Event, PoseGoal
+from service.packets import Farewell, GoalRequest, Happened, Input, Situation
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def request(goal_id: str) -> GoalRequest:
+    return GoalRequest(1, "ann", goal_id, PoseGoal(0.0, 0.0, 0.0), 0)
+
+
+def ended(seq: int, goal_id: str) -> Happened:
+    return Happened(Event(seq, 0.0, 1, 0.0, "goal", "info", "", id=goal_id, outcome="done"))
+
+
+@pytest.mark.parametrize(
+    ("silent", "said"), [(0.02, "the loop has died"), (0.8, "the loop was frozen and has been killed")]
+)
+def test_the_goal_under_way_is_faulted(silent: float, said: str) -> None:
+    clock = Clock()
+    words = LastWords(0.001, clock)
+    words.heard()
+    words.take(ended(7, "before"))
+    words.take(Input(1, 3, 0, request("g-1")))
+    clock.now += silent
+    reason = f"{said}: the drives stop by their own watchdogs"
+    assert words.reason == reason
+    events = words.events(250)
+    assert [(event.seq, event.kind, event.message) for event in events] == [
+        (8, "fault", reason),
+        (9, "goal", f"goal g-1 faulted: {reason}"),
+        (10, "mode", f"fault: {reason}"),
+    ]
+    assert (events[1].id, events[1].outcome, events[1].user, events[1].t) == ("g-1", "faulted", "ann", 0.25)
+
+
+def test_a_slow_loop_is_not_taken_for_frozen() -> None:
+    clock = Clock()
+    words = LastWords(1.0, clock)
+    words.heard()
+    clock.now += 1.0
+    assert "has died" in words.reason
+
+
+def test_nothing_is_added_to_an_end_as_it_should_be() -> None:
+    words = LastWords(0.001)
+    words.heard()
+    words.take(request("g-1"))
+    words.take(Farewell())
+    assert (words.reason, words.events(1)) == ("", [])
+
+
+def test_a_loop_that_never_turned_says_by_itself_why() -> None:
+    assert LastWords(0.001).events(0) == []
+
+
+IDS = st.sampled_from("abcd")
+
+
+@given(
+    st.lists(
+        st.one_of(
+            IDS.map(lambda name: ("asked", name)),
+            IDS.map(lambda name: ("under way", name)),
+            IDS.map(lambda name: ("ended", name)),
+        )
+    )
+)
+def test_every_goal_ends_once(history: list[tuple[str, str]]) -> None:
+    words = LastWords(0.001)
+    words.heard()
+    begun: set[str] = set()
+    over: set[str] = set()
+    for what, name in history:
+        if what == "ended":
+            words.take(ended(1, name))
+            over.add(name)
+        else:
+            words.take(request(name) if what == "asked" else Situation(name, 1.0, None))
+            begun.add(name)
+    said = [event.id for event in words.events(1) if event.outcome]
+    assert sorted(filter(None, said)) == sorted(begun - over)

@@ -1,0 +1,299 @@
+"""No motion beyond a limit of sliders or platform: every kind of goal, at every override, and at the last gate."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from conftest import CONFIG, Rig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from test_control import GOAL, PERIOD, ROBOT, assert_within_limits, refusal
+
+from service.checks import PLATFORM_LAWS
+from service.kinematics import inverse
+from service.limits import EDGE, EXCESS, PLATFORM_EXCESS, Bounds, told_apart
+from service.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from service.modes import Mode
+from service.motion import MotionState, rest
+from service.packets import Accepted
+
+LIMITS = CONFIG.limits
+PLATFORM = np.array([LIMITS.platform.velocity, LIMITS.platform.acceleration, LIMITS.platform.jerk])
+BETWEEN = 0.01
+"""What may lie between the moments at which a path is looked at."""
+
+
+class Watched(Rig):
+    """Keeps the platform's commanded motion of every cycle."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.platform: list[MotionState] = []
+
+    def cycle(self, request: object = None) -> None:
+        super().cycle(request)  # type: ignore[arg-type]
+        self.platform.append(self.control.commanded)
+
+    def used(self) -> NDArray[np.float64]:
+        """Greatest velocity, acceleration and jerk (3,) as shares of the platform's limits."""
+        motion = np.array(self.platform)
+        jerk = np.diff(motion[:, 2], axis=0) / PERIOD
+        rates = motion[:, 1], motion[:, 2], jerk
+        return np.array([(np.abs(rate) / limit).max() for rate, limit in zip(rates, PLATFORM, strict=True)])
+
+
+def sliders_at(*pose: float) -> tuple[float, float, float]:
+    a, b, c = inverse(ROBOT, np.array(pose)).position.tolist()
+    return a, b, c
+
+
+def points(*rows: tuple[float, float]) -> tuple[TrajectoryPoint, ...]:
+    return tuple(TrajectoryPoint(t, x, 0.0, 0.0) for t, x in rows)
+
+
+KINDS: dict[str, Goal] = {
+    "pose": PoseGoal(0.1, 0.02, 0.3),
+    "pose at half speed": PoseGoal(0.1, 0.02, 0.3, speed=0.5),
+    "sliders": SlidersGoal(sliders_at(0.1, 0.02, 0.3)),
+    "jog": VelocityGoal(0.9, 0.3, -0.2, timeout=0.5),
+    "trajectory": TrajectoryGoal(points((0.0, 0.0), (0.3, 0.1)), stretch=True),
+}
+
+
+@pytest.mark.parametrize("override", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_platforms_limits_bind_every_kind_at_every_override(kind: str, override: float) -> None:
+    rig = Watched()
+    rig.enable()
+    rig.command("override", override)
+    assert isinstance(rig.send("g1", KINDS[kind]), Accepted)
+    rig.until(rig.holds)
+    ramps = np.array(PLATFORM_LAWS) if kind == "jog" else 1.0  # nobody renews it: it brakes on its path
+    assert (rig.used() <= ramps + BETWEEN).all()
+    rate = (rig.used() ** (1.0, 1.0 / 2.0, 1.0 / 3.0)).max()
+    assert rate >= 0.9 * min(1.0, override * (0.5 if "half" in kind else 1.0))  # nor slower than they must
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
+def test_an_override_takes_back_a_goals_own_slowness(rig: Rig) -> None:
+    rig.enable()
+    rig.command("override", 2.0)
+    rig.goal("g1", 0.05, 0.0, 0.0, speed=0.5)
+    taken = rig.until(rig.holds)
+    rig.goal("g2", 0.0, 0.0, 0.0)
+    assert rig.until(rig.holds) == pytest.approx(taken, abs=5)
+
+
+STEP = st.tuples(
+    st.one_of(
+        GOAL,
+        GOAL,
+        st.builds(
+            lambda x, t: TrajectoryGoal(points((0.0, 0.0), (t, x)), stretch=True),
+            st.floats(-0.1, 0.1),
+            st.floats(0.05, 1.0),
+        ),
+        st.sampled_from(["stop", "pause", "resume", 0.0, 0.3, 1.0, 2.0]),
+    ),
+    st.integers(1, 300),
+)
+
+
+@settings(max_examples=40)
+@given(st.lists(STEP, min_size=2, max_size=10))
+def test_no_sequence_takes_the_platform_beyond_its_limits(steps: list[tuple[object, int]]) -> None:
+    """Beyond them by PLATFORM_LAWS where the rate along a path changes, and by what lies between two looks."""
+    rig = Watched()
+    rig.enable()
+    for number, (what, wait) in enumerate(steps):
+        if isinstance(what, str):
+            rig.order(what)
+        elif isinstance(what, float):
+            rig.order("override", what)
+        else:
+            rig.post(f"g{number}", what)  # type: ignore[arg-type]
+        rig.cycles(wait)
+    rig.order("override", 1.0)
+    rig.order("stop")
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    assert rig.control.fault is None
+    assert (rig.used() <= np.array(PLATFORM_LAWS) + BETWEEN).all()
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
+# ---------------------------------------------------------------------- what is slowed
+
+
+SPEED = st.floats(-0.2, 0.2)
+
+
+@settings(max_examples=50)
+@given(st.lists(st.tuples(st.floats(0.002, 0.05), SPEED, SPEED, SPEED), min_size=1, max_size=4))
+def test_a_stretched_trajectory_fits_at_its_final_speed(steps: list[tuple[float, float, float, float]]) -> None:
+    made = [TrajectoryPoint(0.0, 0.0, 0.0, 0.0)]
+    for after, vx, vy, w in steps:
+        t, x, y, phi = made[-1].t, made[-1].x, made[-1].y, made[-1].phi
+        made.append(TrajectoryPoint(t + after, x + vx * after, y + vy * after, phi + 5.0 * w * after))
+    rig = Watched()
+    rig.enable()
+    rig.send("g1", TrajectoryGoal(tuple(made), stretch=True))
+    rig.until(rig.holds, 100_000)
+    assert rig.control.fault is None
+    assert (rig.used() <= 1.0 + BETWEEN).all()
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
+def test_a_jerk_too_short_to_be_seen_before_it_is_slowed(rig: Rig) -> None:
+    rig.enable()
+    made = points((0.0, 0.0), (0.05, 0.002), (0.052, 0.0022), (0.1, 0.004))
+    assert isinstance(rig.send("g1", TrajectoryGoal(made, stretch=True)), Accepted)
+    rig.until(rig.holds)
+    assert rig.control.fault is None
+    assert_within_limits(rig)
+
+
+def test_too_fast_says_for_what_and_what_would_be_right(rig: Rig) -> None:
+    rig.enable()
+    answer = refusal(rig.send("g1", TrajectoryGoal(points((0.0, 0.0), (0.5, 0.1)))))
+    assert answer.code == "too_fast"
+    assert answer.value is not None
+    assert f"times too fast for the platform's x: let it take {0.5 * answer.value:.3g} s" in answer.message
+
+
+# ---------------------------------------------------------------------- the last gate
+
+BOUNDS = Bounds(LIMITS, PERIOD, EDGE)
+SLIDER = LIMITS.slider
+STANDS = [[0.0] * 3 for _ in range(4)]
+HAIR = 1e-6
+
+
+def rows(leg: int, **values: float) -> list[list[float]]:
+    made = [list(row) for row in STANDS]
+    for row, name in enumerate(("position", "velocity", "acceleration", "passive")):
+        made[row][leg] = values.get(name, 0.0)
+    return made
+
+
+@pytest.mark.parametrize("leg", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("quantity", "limit", "slack"),
+    [
+        ("velocity", SLIDER.velocity, SLIDER.velocity * EXCESS),
+        ("acceleration", SLIDER.acceleration, SLIDER.acceleration * EXCESS),
+        ("position", SLIDER.position, EDGE),
+        ("passive", SLIDER.passive, EDGE),
+    ],
+)
+def test_the_gates_slack(
+    leg: int, sign: float, quantity: str, limit: float | tuple[float, float], slack: float
+) -> None:
+    edge = sign * limit if isinstance(limit, float) else limit[sign > 0.0]
+    inside, beyond = edge + sign * slack * (1.0 - HAIR), edge + sign * slack * (1.0 + HAIR)
+    assert BOUNDS.setpoint(rows(leg, **{quantity: inside})) is None
+    violation = BOUNDS.setpoint(rows(leg, **{quantity: beyond}))
+    assert violation is not None
+    assert (violation.what, violation.value, violation.limit) == ("ABC"[leg], beyond, edge)
+    assert BOUNDS.setpoint(rows(leg, **{quantity: math.nan})) is not None
+
+
+@pytest.mark.parametrize("leg", range(3))
+def test_the_gate_knows_how_far_a_slider_goes_in_a_cycle(leg: int) -> None:
+    velocity = SLIDER.velocity
+    before, most = rows(leg, velocity=velocity), velocity * (1.0 + EXCESS) * PERIOD
+    assert BOUNDS.step(rows(leg, velocity=velocity, position=velocity * PERIOD), before) is None
+    violation = BOUNDS.step(rows(leg, velocity=velocity, position=most * (1.0 + HAIR)), before)
+    assert violation is not None
+    assert (violation.what, violation.quantity) == ("ABC"[leg], "step in one cycle")
+
+
+@pytest.mark.parametrize("leg", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_gate_knows_jerk_by_what_each_row_tells(leg: int, sign: float) -> None:
+    most = sign * SLIDER.jerk * (1.0 + EXCESS)
+    for share, refused in ((1.0 - HAIR, False), (1.0 + 1e-4, True)):
+        j = share * most
+        told = (
+            rows(leg, acceleration=j * PERIOD, velocity=j * PERIOD**2 / 2.0, position=j * PERIOD**3 / 6.0),
+            rows(leg, velocity=j * PERIOD**2 / 2.0, position=j * PERIOD**3 / 4.0),
+            rows(leg, position=j * PERIOD**3 / 4.0 + sign * 1e-9),
+        )
+        for now in told:
+            violation = BOUNDS.step(now, STANDS)
+            assert (violation is not None) is refused
+            if violation is not None:
+                assert (violation.what, violation.quantity, violation.limit) == ("ABC"[leg], "jerk", SLIDER.jerk)
+    assert BOUNDS.step(rows(leg, acceleration=math.nan), STANDS) is not None
+
+
+@pytest.mark.parametrize("n", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_gate_knows_the_platforms_velocity_acceleration_and_jerk(n: int, sign: float) -> None:
+    for row, quantity in enumerate(("velocity", "acceleration", "jerk")):
+        most = sign * PLATFORM[row, n] * (1.0 + PLATFORM_EXCESS[row])
+        for share, refused in ((1.0 - HAIR, False), (1.0 + HAIR, True)):
+            now, before = [[0.0] * 3 for _ in range(3)], [[0.0] * 3 for _ in range(3)]
+            if quantity == "jerk":
+                now[2][n], now[1][n] = share * most * PERIOD, share * most * PERIOD**2 / 2.0
+            else:
+                now[1 + row][n] = before[1 + row][n] = share * most
+            if quantity == "velocity":
+                now[0][n] = share * most * PERIOD
+            if quantity == "acceleration":
+                now[1][n], now[0][n] = share * most * PERIOD, share * most * PERIOD**2 / 2.0
+            violation = BOUNDS.platform(now, before)
+            assert (violation is not None) is refused, (quantity, violation)
+            if violation is not None:
+                assert (violation.what, violation.quantity) == (("x", "y", "phi")[n], quantity)
+
+
+@pytest.mark.parametrize(
+    ("later", "said"),
+    [
+        (lambda m: m._replace(velocity=(0.1, 0.0, 0.0)), "jerk"),
+        (lambda m: m._replace(acceleration=(1.5, 0.0, 0.0)), "jerk"),
+        (lambda m: m._replace(pose=(m.pose[0] + 5e-5, *m.pose[1:])), "jerk"),
+    ],
+)
+def test_a_step_in_any_row_is_a_fault_before_it_is_sent(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, later: object, said: str
+) -> None:
+    rig.enable()
+    rig.goal("g1", 0.1, 0.0, 0.0)
+    rig.cycles(20)
+    stepped = later(rig.control.commanded)  # type: ignore[operator]
+    monkeypatch.setattr(rig.control._course.runs[0], "state", lambda *_: stepped)
+    rig.cycle()
+    assert rig.mode is Mode.FAULT
+    assert "setpoint refused: " in (rig.control.fault or "")
+    assert said in (rig.control.fault or "")
+    assert not any(message.arbitration_id - 0x300 in (1, 2, 3) for message in rig.sent)
+
+
+def test_a_motion_that_ends_at_once_is_a_fault(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig.enable()
+    rig.goal("g1", 0.1, 0.0, 0.0)
+    rig.cycles(100)
+    monkeypatch.setattr(rig.control._course.runs[0], "state", lambda *_: rest(rig.control.commanded.pose))
+    rig.cycle()
+    assert "jerk" in (rig.control.fault or "")
+
+
+@given(st.floats(-1.0, 1.0), st.floats(-1e-3, 1e-3))
+def test_a_value_is_shown_with_the_digits_that_tell_it_from_its_limit(limit: float, beyond: float) -> None:
+    shown, bound = told_apart(limit + beyond, limit)
+    assert (shown != bound) is (limit + beyond != limit)
+    assert float(bound) == pytest.approx(limit, rel=1e-5)
+
+
+def test_a_position_just_beyond_its_limit_is_told_from_it(rig: Rig) -> None:
+    rig.enable()
+    answer = refusal(rig.send("g1", SlidersGoal((-0.1700001, 0.0, 0.0))))
+    assert "position -0.1700001 m is beyond its limit -0.17 m" in answer.message

@@ -1,0 +1,87 @@
+"""What is made of the drives' answers: where none of a slider can be so soon is not taken for its place."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import CONFIG
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from drivers.interface import Feedback, PowerState
+from service.config import geometry
+from service.kinematics import forward, inverse
+from service.measured import Measured
+
+PERIOD = CONFIG.period
+ROBOT = geometry(CONFIG.geometry)
+STEP = CONFIG.limits.slider.velocity * PERIOD
+ON = (PowerState.OPERATION_ENABLED,) * 3
+Triple = tuple[float, float, float]
+
+
+def standing(position: Triple) -> Measured:
+    measured = Measured(ROBOT.packed(), PERIOD, STEP)
+    measured.start(Feedback(position, ON, None))
+    measured.take(Feedback(position, ON, None))
+    return measured
+
+
+PLACES = st.tuples(*[st.floats(-0.03, 0.03)] * 2, st.floats(-0.2, 0.2))
+SHARES = st.floats(-1.999, 1.999) | st.floats(2.001, 60.0) | st.floats(-60.0, -2.001)
+"""Of the way that a slider goes in a cycle at most."""
+
+
+@example(place=(0.0, 0.0, 0.0), shares=(2.001, 0.0, 0.0))
+@example(place=(0.0, 0.0, 0.0), shares=(0.0, -2.001, 0.0))
+@given(place=PLACES, shares=st.tuples(SHARES, SHARES, SHARES))
+def test_only_a_slider_that_goes_twice_as_far_as_one_can_has_jumped(place: Triple, shares: Triple) -> None:
+    a, b, c = inverse(ROBOT, place).position.tolist()
+    measured = standing((a, b, c))
+    before = measured.pose
+    moved = (a + shares[0] * STEP, b + shares[1] * STEP, c + shares[2] * STEP)
+    measured.take(Feedback(moved, ON, None))
+    assert measured.jumps == tuple(abs(share) > 2.0 for share in shares)
+    if any(measured.jumps):
+        assert measured.pose == before
+    else:
+        assert measured.pose == pytest.approx(forward(ROBOT, moved, near=before), abs=1e-9)
+    assert measured.velocity == pytest.approx([share * STEP / PERIOD for share in shares], abs=1e-9)
+
+
+def test_before_the_first_answer_nothing_has_jumped() -> None:
+    assert Measured(ROBOT.packed(), PERIOD, STEP).jumps == (False, False, False)
+
+
+POSITION = st.floats(-0.01, 0.01)
+TRIPLES = st.tuples(POSITION, POSITION, POSITION)
+
+
+@given(
+    written=st.lists(TRIPLES, min_size=1, max_size=12),
+    position=TRIPLES,
+    age=st.tuples(*[st.integers(0, 3)] * 3),
+    follows=st.tuples(*[st.booleans()] * 3),
+)
+def test_following_error_is_to_the_setpoint_that_was_due_at_the_sync_of_the_position(
+    written: list[Triple], position: Triple, age: tuple[int, int, int], follows: tuple[bool, bool, bool]
+) -> None:
+    """A setpoint is taken up at the SYNC after it was written, and reached at the one after that."""
+    first = (0.001, -0.002, 0.003)
+    measured = standing(first)
+    for setpoint in written:
+        measured.note(setpoint)
+    measured.take(Feedback(position, ON, None, age=age, follows=follows))
+    due = [first] * 6 + written
+    expected = [due[-2 - age[n]][n] - position[n] if follows[n] else 0.0 for n in range(3)]
+    assert measured.following_error == pytest.approx(expected, abs=1e-15)
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_a_robot_is_powered_while_any_drive_can_move_its_slider(index: int) -> None:
+    measured = standing((0.0, 0.0, 0.0))
+    can_move = {PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE}
+    for state in PowerState:
+        states = [PowerState.SWITCH_ON_DISABLED] * 3
+        states[index] = state
+        measured.take(Feedback((0.0, 0.0, 0.0), (states[0], states[1], states[2]), None))
+        assert measured.powered == (state in can_move)

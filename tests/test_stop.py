@@ -1,0 +1,371 @@
+"""Stop is never deaf: whatever is planned or waits, a stop is carried out at once, and nobody's key moves the robot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import CONFIG, Rig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.config import Config
+from service.goals import Motion
+from service.messages import PoseGoal, SlidersGoal, VelocityGoal
+from service.modes import Event, Mode
+from service.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
+from service.steps import Steps
+
+PERIOD = CONFIG.period
+PROMPT = round(0.05 / PERIOD)
+"""What a stop may take beside braking [cycles]."""
+
+
+def answer_to(rig: Rig, ticket: int) -> Answer | None:
+    return next((answer for answer in rig.answers if getattr(answer, "ticket", None) == ticket), None)
+
+
+def confirmed_after(rig: Rig, name: str, within: int) -> int:
+    """Send a command beside what waits; return after how many cycles it is confirmed."""
+    ticket = 10**6 + len(rig.rows)
+    rig.cycle(CommandRequest(ticket, "bob", name))
+    for number in range(within):
+        answer = answer_to(rig, ticket)
+        if answer is not None:
+            assert isinstance(answer, Confirmed), answer
+            return number
+        rig.cycle()
+    raise AssertionError(f"{name} is not confirmed within {within} cycles; the mode is {rig.mode}")
+
+
+def braking(config: Config) -> int:
+    """Cycles from full speed to rest, at the platform's acceleration and jerk, and once more for those of a path."""
+    platform = config.limits.platform
+    rows = zip(platform.velocity, platform.acceleration, platform.jerk, strict=True)
+    return round(2.0 * max(v / a + a / j for v, a, j in rows) / config.period)
+
+
+@pytest.mark.parametrize("name", ["stop", "quick_stop", "disable", "override"])
+def test_goals_that_wait_at_override_zero_deafen_nothing(rig: Rig, name: str) -> None:
+    rig.enable()
+    rig.command("override", 0.0)
+    for number, (x, y) in enumerate([(0.01, 0.0), (0.02, 0.01), (0.03, 0.0), (0.03, 0.02)]):
+        rig.post(f"g{number}", PoseGoal(x, y, 0.0, blend=0.05))
+    rig.cycles(100)
+    assert [type(answer) for answer in rig.answers[-4:]] == [Accepted] * 4
+    assert confirmed_after(rig, name, PROMPT + round(CONFIG.drives.stop_timeout / PERIOD)) <= PROMPT
+    if name != "override":
+        assert {outcome for _, outcome in rig.outcomes()} == {"faulted" if name == "quick_stop" else "stopped"}
+
+
+def test_goals_blended_at_override_zero_are_run_when_it_is_raised(rig: Rig) -> None:
+    rig.enable()
+    rig.command("override", 0.0)
+    for number, (x, y) in enumerate([(0.01, 0.0), (0.02, 0.01), (0.03, 0.0)]):
+        rig.post(f"g{number}", PoseGoal(x, y, 0.0, blend=0.005))
+    rig.cycles(200)
+    rig.command("override", 1.0)
+    rig.until(rig.holds)
+    assert rig.control.commanded.pose == pytest.approx((0.03, 0.0, 0.0))
+    assert rig.outcomes() == [("g0", "done"), ("g1", "done"), ("g2", "done")]
+
+
+def test_a_plan_that_does_not_end_is_refused(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def endless(*_: object) -> object:
+        while True:
+            yield
+
+    rig.enable()
+    monkeypatch.setattr(rig.control._goals, "plan", endless)
+    rig.post("g1", PoseGoal(0.01, 0.0, 0.0))
+    assert confirmed_after(rig, "override", 3) <= 1
+    rig.until(lambda: bool(rig.outcomes()), 600)
+    assert rig.outcomes() == [("g1", "rejected")]
+    refused = rig.answers[-1]
+    assert isinstance(refused, Refused)
+    assert refused.code == "no_plan"
+
+
+# ---------------------------------------------------------------------- what has been sent but not begun
+
+
+FAR = PoseGoal(0.03, 0.02, 0.1)
+
+
+@pytest.fixture
+def slow(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    """A robot that is enabled, and thinks for 20 cycles about every goal."""
+    plan = rig.control._goals.plan
+
+    def slowly(*arguments: Any) -> Steps[Motion]:
+        for _ in range(20):
+            yield
+        return (yield from plan(*arguments))
+
+    rig.enable()
+    monkeypatch.setattr(rig.control._goals, "plan", slowly)
+    return rig
+
+
+def planned(rig: Rig, goal: PoseGoal, name: str) -> None:
+    """Move, and send a goal whose planning is not over."""
+    rig.goal("running", -0.12, 0.0, 0.0)
+    rig.cycles(150)
+    rig.post(name, goal)
+    assert not rig.control.dispatch.idle
+
+
+@pytest.mark.parametrize("event", [Event.GATEWAY_LOST, Event.LATE, Event.SHUTDOWN])
+def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: Rig, event: Event) -> None:
+    planned(slow, FAR, "g1")
+    slow.control.happen(event, "gone")
+    slow.until(lambda: slow.mode in (Mode.HOLDING, Mode.DISABLED))
+    pose = slow.control.commanded.pose
+    slow.cycles(200)
+    assert slow.control.commanded.pose == pytest.approx(pose, abs=1e-4)  # a disabled robot follows what is measured
+    assert slow.outcomes() == [("g1", "stopped"), ("running", "stopped")]
+
+
+def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow: Rig) -> None:
+    slow.post("g1", FAR)
+    slow.control.happen(Event.GATEWAY_LOST, "gone")
+    slow.cycles(100)
+    assert slow.mode is Mode.HOLDING
+    assert slow.outcomes() == [("g1", "stopped")]
+
+
+def test_stop_of_the_running_goal_stops_the_robot_and_what_waits(slow: Rig) -> None:
+    planned(slow, FAR, "g1")
+    slow.cycle(CommandRequest(99, "ann", "stop", goal="running"))
+    slow.until(slow.holds)
+    assert slow.outcomes() == [("g1", "stopped"), ("running", "stopped")]
+
+
+@pytest.mark.parametrize("waiting", ["planned", "behind it"])
+def test_stop_of_a_goal_that_has_not_begun_leaves_the_others(slow: Rig, waiting: str) -> None:
+    planned(slow, FAR, "g1")
+    slow.post("g2", PoseGoal(0.0, 0.03, 0.0))
+    slow.cycle(CommandRequest(99, "ann", "stop", goal="g1" if waiting == "planned" else "g2"))
+    assert (
+        isinstance(answer_to(slow, 99), Confirmed) or slow.until(lambda: isinstance(answer_to(slow, 99), Confirmed)) < 3
+    )
+    slow.until(lambda: slow.holds() and slow.control.dispatch.idle)
+    assert sorted(slow.outcomes()) == [
+        ("g1", "stopped" if waiting == "planned" else "done"),
+        ("g2", "done" if waiting == "planned" else "stopped"),
+        ("running", "preempted"),
+    ]
+
+
+def test_a_goal_that_has_ended_cannot_be_stopped(rig: Rig) -> None:
+    rig.enable()
+    rig.goal("g1", 0.01, 0.0, 0.0)
+    rig.until(rig.holds)
+    rig.cycle(CommandRequest(99, "ann", "stop", goal="g1"))
+    answer = answer_to(rig, 99)
+    assert isinstance(answer, Refused)
+    assert answer.code == "no_goal"
+    assert rig.outcomes() == [("g1", "done")]
+
+
+def test_a_goal_that_runs_for_longer_than_it_was_valid_arrives(rig: Rig) -> None:
+    rig.enable()
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0, valid_for=0.1))
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g1", "done")]
+
+
+def test_what_was_sent_before_a_pause_does_not_begin(slow: Rig) -> None:
+    planned(slow, FAR, "g1")
+    slow.post("g2", FAR)
+    slow.command("pause")
+    slow.cycles(300)
+    assert slow.holds()
+    assert [outcome for outcome in slow.outcomes() if outcome[0] != "running"] == [("g1", "stopped"), ("g2", "stopped")]
+    tickets = [answer.ticket for answer in slow.answers if isinstance(answer, Refused)]
+    assert len(tickets) == len(set(tickets)) == 2  # each is answered once
+
+
+def test_a_goal_that_is_sent_to_a_paused_robot_begins(slow: Rig) -> None:
+    slow.goal("running", -0.05, 0.0, 0.0)
+    slow.cycles(60)
+    slow.command("pause")
+    slow.send("g2", PoseGoal(0.0, 0.03, 0.0))
+    slow.until(lambda: slow.holds() and slow.control.dispatch.idle)
+    assert dict(slow.outcomes()) == {"running": "preempted", "g2": "done"}
+
+
+# ---------------------------------------------------------------------- the dead man
+
+
+def stands_from(rig: Rig) -> int:
+    """Return the cycle after which no setpoint has moved."""
+    position = rig.setpoints()[:, 0]
+    moved = np.flatnonzero((np.abs(np.diff(position, axis=0)) > 1e-12).any(axis=1))
+    return int(moved[-1]) + 1 if len(moved) else 0
+
+
+@pytest.mark.parametrize("override", [0.0, 0.02, 0.1, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("timeout", [0.05, 0.2, 1.0])
+def test_a_jog_that_nobody_renews_is_over_in_real_time(rig: Rig, override: float, timeout: float) -> None:
+    rig.enable()
+    rig.command("override", override)
+    sent = len(rig.rows)
+    rig.post("j1", VelocityGoal(0.05, 0.0, 0.1, timeout=timeout))
+    rig.cycles(round(timeout / PERIOD) + braking(CONFIG) + PROMPT)
+    assert rig.mode is Mode.HOLDING
+    assert rig.outcomes() == [("j1", "done")]
+    assert stands_from(rig) <= sent + round(timeout / PERIOD) + braking(CONFIG) + PROMPT
+    rig.command("override", 1.0)
+    pose = rig.control.commanded.pose
+    rig.cycles(300)
+    assert rig.control.commanded.pose == pose
+
+
+@pytest.mark.parametrize("override", [0.1, 1.0, 2.0])
+def test_a_jog_lasts_as_long_as_it_is_renewed(rig: Rig, override: float) -> None:
+    rig.enable()
+    rig.command("override", override)
+    for _ in range(30):
+        assert isinstance(rig.send("j1", VelocityGoal(0.02, 0.0, 0.0, timeout=0.06)), Accepted)
+        rig.cycles(20)
+    assert rig.mode is Mode.MOVING
+    assert rig.control.commanded.velocity[0] == pytest.approx(0.02 * min(override, 1.0), rel=1e-6)
+    assert rig.outcomes() == []
+
+
+def test_a_jog_that_was_let_go_does_not_come_back(rig: Rig) -> None:
+    rig.enable()
+    rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.1))
+    rig.until(lambda: rig.mode is Mode.STOPPING)
+    answer = rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.1))
+    assert isinstance(answer, Refused)
+    assert answer.code == "jog_over"
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("j1", "done")]
+
+
+def test_another_goal_may_follow_a_jog_that_brakes(rig: Rig) -> None:
+    rig.enable()
+    rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.1))
+    rig.until(lambda: rig.mode is Mode.STOPPING)
+    assert isinstance(rig.goal("g1", 0.0, 0.0, 0.0), Accepted)
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("j1", "preempted"), ("g1", "done")]
+
+
+def test_a_pause_ends_a_jog(rig: Rig) -> None:
+    rig.enable()
+    rig.send("j1", VelocityGoal(0.1, 0.0, 0.0, timeout=2.0))
+    rig.cycles(300)
+    assert isinstance(rig.command("pause"), Confirmed)
+    assert rig.outcomes() == [("j1", "stopped")]
+    assert isinstance(rig.command("resume"), Refused)
+    stood = stands_from(rig)
+    assert isinstance(rig.send("j1", VelocityGoal(0.1, 0.0, 0.0, timeout=2.0)), Refused)
+    rig.cycles(300)
+    assert stands_from(rig) == stood
+
+
+def test_nobody_else_renews_a_jog(rig: Rig) -> None:
+    rig.enable()
+    jog = VelocityGoal(0.05, 0.0, 0.0, timeout=0.2)
+    rig.send("j1", jog)
+    for number in range(8):
+        rig.cycle(GoalRequest(500 + number, "bob", "j1", jog, round(rig.now * 1e9)))
+        rig.cycles(60)
+        answer = answer_to(rig, 500 + number)
+        assert isinstance(answer, Refused)
+        assert answer.code == "duplicate_id"
+    assert rig.mode is Mode.HOLDING
+    assert rig.outcomes() == [("j1", "done")]
+
+
+def test_a_jog_that_waited_too_long_does_not_begin(rig: Rig) -> None:
+    rig.enable()
+    rig.cycle(GoalRequest(500, "ann", "j1", VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), round((rig.now - 0.3) * 1e9)))
+    assert rig.mode is Mode.HOLDING
+    assert rig.outcomes() == [("j1", "expired")]
+
+
+# ---------------------------------------------------------------------- any sequence, then a stop
+
+
+def fast(velocity: tuple[float, float, float], timeout: float) -> VelocityGoal:
+    x, y, phi = velocity
+    return VelocityGoal(3.0 * x, 3.0 * y, 3.0 * phi, timeout=timeout)
+
+
+POSE = st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-0.5, 0.4))
+BLEND = st.sampled_from([None, 0.0, 0.005, 0.05])
+GOAL = st.one_of(
+    st.builds(lambda pose, blend: PoseGoal(pose[0], pose[1], pose[2], blend=blend), POSE, BLEND),
+    st.builds(lambda pose: PoseGoal(pose[0], pose[1], pose[2], speed=0.1), POSE),
+    st.tuples(*[st.floats(-0.03, 0.03)] * 3).map(SlidersGoal),
+    st.builds(fast, POSE, st.sampled_from([0.05, 2.0])),
+)
+OVERRIDE = st.sampled_from([0.0, 0.0, 0.02, 0.3, 1.0, 2.0])
+STEP = st.tuples(
+    st.one_of(GOAL, GOAL, OVERRIDE, st.sampled_from(["pause", "resume", "cancel", "stop"])),
+    st.sampled_from([0, 1, 5, 30, 200]),
+)
+
+
+def play(rig: Rig, steps: list[tuple[object, int]]) -> None:
+    """Send all of it without waiting for any answer."""
+    for number, (what, wait) in enumerate(steps, start=1):
+        if isinstance(what, float):
+            rig.cycle(CommandRequest(number, "ann", "override", what))
+        elif what == "cancel":
+            rig.cycle(CommandRequest(number, "ann", "stop", goal=f"g{number - 1}"))
+        elif isinstance(what, str):
+            rig.cycle(CommandRequest(number, "ann", what))
+        else:
+            rig.cycle(GoalRequest(number, "ann", f"g{number}", what, round(rig.now * 1e9)))  # type: ignore[arg-type]
+        rig.cycles(wait)
+
+
+@pytest.mark.parametrize("name", ["stop", "disable", "quick_stop"])
+@settings(max_examples=40)
+@given(st.lists(STEP, min_size=1, max_size=14))
+def test_after_any_sequence_a_stop_is_confirmed_in_time(name: str, steps: list[tuple[object, int]]) -> None:
+    rig = Rig()
+    rig.command("enable")
+    rig.answers.clear()
+    play(rig, steps)
+    cycles = confirmed_after(rig, name, braking(CONFIG) + PROMPT + 5000)
+    assert cycles <= braking(CONFIG) + PROMPT
+    if name != "quick_stop":  # whose ramp is the drives'
+        assert rig.control.commanded.at_rest
+    rig.cycles(50)
+    rig.bus.shutdown()
+    goals = {f"g{number}" for number, (what, _) in enumerate(steps, start=1) if not isinstance(what, float | str)}
+    assert sorted(str(goal) for goal, _ in rig.outcomes()) == sorted(goals)  # each ended once
+    answered = [answer.ticket for answer in rig.answers if hasattr(answer, "ticket") and answer.ticket < 10**6]
+    assert sorted(answered) == list(range(1, len(steps) + 1))  # and each was answered once
+
+
+RATES = st.lists(st.tuples(st.one_of(OVERRIDE, st.sampled_from(["pause", "resume"])), st.integers(0, 150)), max_size=8)
+
+
+@settings(max_examples=40)
+@given(st.lists(STEP, max_size=6), POSE, st.sampled_from([0.05, 0.2]), RATES)
+def test_a_robot_whose_last_goal_is_a_jog_stands_when_the_dead_man_is_over(
+    before: list[tuple[object, int]],
+    velocity: tuple[float, float, float],
+    timeout: float,
+    after: list[tuple[object, int]],
+) -> None:
+    """Whatever was sent before, and however the rate is changed: nothing but a renewal keeps a jog alive."""
+    rig = Rig()
+    rig.command("enable")
+    play(rig, [*before, ("stop", 600), (1.0, 0)])
+    sent = len(rig.rows)
+    jog = fast(velocity, timeout)
+    rig.cycle(GoalRequest(900, "ann", "jog", jog, round(rig.now * 1e9)))
+    play(rig, after)
+    rig.cycles(1000)
+    rig.bus.shutdown()
+    assert rig.mode is Mode.HOLDING
+    assert stands_from(rig) <= sent + round(timeout / PERIOD) + braking(CONFIG) + PROMPT

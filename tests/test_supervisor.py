@@ -1,0 +1,136 @@
+"""The supervisor over children that do as they are told: who is killed, who is started again, and what is said."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from service import supervisor
+from service.config import SIM, load
+
+CHILD = """
+import os, sys, time
+from pathlib import Path
+from service.heartbeats import Heartbeats
+
+folder = Path({folder!r})
+_, name, runtime, ready_on, beats, *sockets = sys.argv
+heartbeats = Heartbeats(int(beats))
+sys.stdin.read()
+number = len(list(folder.glob(f"{{name}}-*.begun"))) + 1
+(folder / f"{{name}}-{{number}}.begun").touch()
+
+def ready():
+    os.write(int(ready_on), b"{{}}")
+
+def begun(other):
+    return (folder / f"{{other}}.begun").exists()
+
+def beat_until(condition):
+    while not condition():
+        heartbeats.of(name).beat()
+        time.sleep(0.01)
+
+def never():
+    return os.getppid() == 1
+
+def freeze():
+    while not never():
+        time.sleep(0.1)
+
+def loop_gone():
+    return heartbeats.of("loop").count == 0
+
+exec((folder / f"{{name}}-{{number}}").read_text())
+"""
+TURNING = "ready(); beat_until(never)"
+RECORDING = "ready(); freeze()"
+SERVING = "ready(); beat_until(lambda: heartbeats.of('loop').count); beat_until(loop_gone)"
+
+
+@pytest.fixture
+def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What the supervisor says. Its children do what is written in files of their name and number."""
+    script = tmp_path / "child.py"
+    script.write_text(CHILD.format(folder=str(tmp_path)))
+    monkeypatch.setattr(supervisor, "python", lambda *arguments: [sys.executable, str(script), *arguments[2:]])
+    monkeypatch.setattr(supervisor, "END_WITHIN", 0.5)
+    return []
+
+
+def run(told: list[str], folder: Path, **children: str) -> int:
+    for name, does in children.items():
+        (folder / name.replace("_", "-")).write_text(does)
+    return supervisor.Supervisor(load(SIM), None, told.append).run(lambda _: told.append("up"))
+
+
+def test_a_hung_gateway_is_killed_and_started_again(told: list[str], tmp_path: Path) -> None:
+    code = run(
+        told,
+        tmp_path,
+        loop_1="ready(); beat_until(lambda: begun('gateway-2')); heartbeats.of('loop').rest()",
+        gateway_1="ready(); heartbeats.of(name).beat(); freeze()",
+        gateway_2="ready()",
+        recorder_1=RECORDING,
+    )
+    assert code == 1
+    assert told[:2] == [
+        "up",
+        "the gateway has died (no sign of life for 0.7 s, so it was killed): the loop stops the robot and holds; "
+        "starting it again",
+    ]
+
+
+def test_a_gateway_that_hangs_in_its_start_is_killed(
+    told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "START_WITHIN", 2.0)
+    code = run(
+        told,
+        tmp_path,
+        loop_1="ready(); beat_until(lambda: begun('gateway-3')); heartbeats.of('loop').rest()",
+        gateway_1="ready(); beat_until(lambda: begun('recorder-1'))",
+        gateway_2="freeze()",
+        gateway_3="ready()",
+        recorder_1=RECORDING,
+    )
+    assert code == 1
+    assert "no sign of life for 2 s, so it was killed" in told[2]
+
+
+def test_a_frozen_loop_ends_the_service(told: list[str], tmp_path: Path) -> None:
+    code = run(
+        told,
+        tmp_path,
+        loop_1="ready(); heartbeats.of(name).beat(); freeze()",
+        gateway_1=TURNING,
+        recorder_1="ready(); freeze()",
+    )
+    assert code == 1
+    assert told[1] == (
+        "the loop is dead (no sign of life for 0.7 s, so it was killed): the drives stop by their own watchdogs; ending"
+    )
+
+
+def test_those_that_end_because_the_loop_ends_are_not_started_again(told: list[str], tmp_path: Path) -> None:
+    code = run(
+        told,
+        tmp_path,
+        loop_1="ready(); beat_until(lambda: begun('gateway-1')); time.sleep(0.3); heartbeats.of(name).rest(); "
+        "time.sleep(0.5)",
+        gateway_1=SERVING,
+        recorder_1="ready(); beat = heartbeats.of('loop')\nwhile not beat.count: pass\nwhile beat.count: pass",
+    )
+    assert code == 1
+    assert told == [
+        "up",
+        "the loop is dead (another process sent it SIGTERM): it has stopped the robot and disabled the drives; ending",
+    ]
+
+
+def test_a_loop_that_has_not_begun_has_stopped_nothing(told: list[str], tmp_path: Path) -> None:
+    code = run(told, tmp_path, loop_1="os.kill(os.getpid(), 15)", gateway_1="freeze()", recorder_1="freeze()")
+    assert code == 1
+    assert told == ["the loop is dead (killed by SIGTERM): it had not begun; ending"]

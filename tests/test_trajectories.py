@@ -1,0 +1,100 @@
+"""Trajectories begin as the robot moves and end at rest, or are refused with what would be right."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import CONFIG, Rig
+from hypothesis import given
+from hypothesis import strategies as st
+from test_control import PERIOD, assert_within_limits, refusal
+
+from service.messages import PoseGoal, TrajectoryGoal, TrajectoryPoint
+from service.modes import Mode
+from service.packets import Accepted
+
+STILL = (0.0, 0.0, 0.0)
+
+
+def line(first: tuple[float, float, float] | None, last: tuple[float, float, float] | None) -> TrajectoryGoal:
+    """Return 0.05 m along x in a second, with the velocities given at its ends."""
+    return TrajectoryGoal(
+        (TrajectoryPoint(0.0, 0.0, 0.0, 0.0, velocity=first), TrajectoryPoint(1.0, 0.05, 0.0, 0.0, velocity=last))
+    )
+
+
+@pytest.mark.parametrize("stretch", [False, True])
+@pytest.mark.parametrize(
+    ("goal", "code", "said"),
+    [
+        (line((0.1, 0.0, 0.0), None), "wrong_start", "the trajectory begins with 0.1 m/s in x: let it begin"),
+        (line(None, (0.1, 0.0, 0.0)), "wrong_end", "the trajectory ends with 0.1 m/s in x: let it end at rest"),
+        (line(None, (0.0, 0.0, -0.2)), "wrong_end", "the trajectory ends with -0.2 rad/s in phi: let it end at rest"),
+    ],
+)
+def test_an_end_that_moves_is_refused(rig: Rig, goal: TrajectoryGoal, code: str, said: str, stretch: bool) -> None:
+    rig.enable()
+    answer = refusal(rig.send("g1", TrajectoryGoal(goal.points, stretch=stretch)))
+    assert answer.code == code
+    assert said in answer.message
+    assert answer.limit == 0.0
+    rig.cycles(20)
+    assert rig.control.commanded.at_rest
+
+
+def test_one_that_is_sent_in_motion_is_told_to_wait(rig: Rig) -> None:
+    rig.enable()
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0))
+    rig.cycles(100)
+    x = rig.control.commanded.pose[0]
+    points = TrajectoryPoint(0.0, x, 0.0, 0.0), TrajectoryPoint(1.0, 0.0, 0.0, 0.0)
+    answer = refusal(rig.send("g2", TrajectoryGoal(points)))
+    assert answer.code == "wrong_start"
+    assert "the robot moves: send the trajectory when it stands" in answer.message
+
+
+SPEED = st.floats(-0.5, 0.5)
+
+
+@given(st.tuples(SPEED, SPEED, SPEED), st.tuples(SPEED, SPEED, SPEED), st.booleans())
+def test_whatever_its_ends_the_setpoints_stay_within_the_limits(
+    first: tuple[float, float, float], last: tuple[float, float, float], stretch: bool
+) -> None:
+    """The smallest velocities, that may be rounding, among them."""
+    rig = Rig()
+    rig.enable()
+    for scale in (1.0, 1e-3, 1e-6, 1e-9):
+        points = line(*(tuple(scale * v for v in ends) for ends in (first, last))).points  # type: ignore[arg-type]
+        rig.send(f"g{scale}", TrajectoryGoal(points, stretch=stretch))
+        rig.until(rig.holds, 20_000)
+        rig.send(f"back{scale}", PoseGoal(0.0, 0.0, 0.0))
+        rig.until(rig.holds)
+    assert rig.control.fault is None
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
+def test_rounding_of_a_velocity_is_not_a_motion(rig: Rig) -> None:
+    rig.enable()
+    assert isinstance(rig.send("g1", line((1e-9, 0.0, 0.0), (0.0, -1e-9, 0.0))), Accepted)
+    rig.until(rig.holds)
+    assert rig.mode is Mode.HOLDING
+    assert_within_limits(rig)
+
+
+def test_an_acceleration_at_an_end_is_bound_by_the_jerk_limit_over_one_cycle(rig: Rig) -> None:
+    rig.enable()
+    most = CONFIG.limits.platform.jerk[0] * PERIOD
+    for at in (0, 1):
+        for share, taken in ((0.9, True), (1.1, False)):
+            accelerations = [STILL, STILL]
+            accelerations[at] = (share * most, 0.0, 0.0)
+            points = tuple(
+                TrajectoryPoint(t, x, 0.0, 0.0, velocity=STILL, acceleration=a)
+                for t, x, a in zip((0.0, 1.0), (0.0, 0.04), accelerations, strict=True)
+            )
+            answer = rig.send(f"g{at}{share}", TrajectoryGoal(points))
+            assert isinstance(answer, Accepted) is taken
+            rig.until(rig.holds)
+            rig.goal(f"back{at}{share}", 0.0, 0.0, 0.0)
+            rig.until(rig.holds)
+    assert_within_limits(rig)

@@ -1,0 +1,235 @@
+"""Kill matrix: every process of the service killed, ended and frozen in every mode, with the drives in a process apart.
+
+python tools/chaos.py                   all of it, half an hour
+python tools/chaos.py --sample 10       ten cases, drawn by --seed
+python tools/chaos.py --only moving/loop/KILL
+
+Afterwards drives stand and have no power, no setpoint has jumped, the goal has ended exactly once, no process is left,
+the ports are free, the recording can be read, and the next start works. Exit 1 if any of it does not hold in any case.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import json
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from chaos_rig import PATIENCE, PROCESSES, Failed, Rig, states, wait_for
+
+from service.client import Robot
+from service.errors import TrirailError
+from service.session import key, open_client
+
+MODES = ("disabled", "enabling", "holding", "moving", "stopping", "fault")
+HARM: dict[str, tuple[signal.Signals, float | None]] = {
+    "KILL": (signal.SIGKILL, None),
+    "TERM": (signal.SIGTERM, None),
+    "STOP 2 s": (signal.SIGSTOP, 2.0),
+    "STOP 10 s": (signal.SIGSTOP, 10.0),
+    "STOP": (signal.SIGSTOP, None),
+}
+GOAL = "chaos"
+STANDS_AFTER = 3.0
+"""A robot that nobody can stop any more must stand by then [s]."""
+
+
+class Case(NamedTuple):
+    """One thing that happens."""
+
+    mode: str
+    victim: str
+    harm: str
+
+    @property
+    def ends_the_service(self) -> bool:
+        """Whether the service ends by it."""
+        return self.victim == "loop" or (self.victim == "supervisor" and self.harm in ("KILL", "TERM"))
+
+    @property
+    def stops_the_robot(self) -> bool:
+        """Whether the robot is to stand soon afterwards."""
+        return self.ends_the_service or self.victim == "gateway"
+
+    @property
+    def exit_codes(self) -> tuple[int, ...]:
+        """What the service may exit with in the end."""
+        if self.victim == "supervisor":
+            return (0,) if self.harm not in {"KILL", "STOP"} else (-signal.SIGKILL,)
+        if self.victim == "loop":
+            return (1,)
+        # A recorder that is frozen for ever is killed when the service ends: what it had is lost, which is a failure.
+        return (1,) if (self.victim, self.harm) == ("recorder", "STOP") else (0,)
+
+    def __str__(self) -> str:
+        return "/".join(self)
+
+
+CASES = [Case(*case) for case in itertools.product(MODES, PROCESSES, HARM)]
+
+
+def bring_to(mode: str, rig: Rig, robot: Robot, ask: Callable[[str], object]) -> None:
+    """Bring a robot that is disabled to a mode; the goal that is sent for it is GOAL.
+
+    `ask` sends a command and does not wait until it has been carried out.
+    """
+    if mode == "disabled":
+        return
+    if mode == "enabling":
+        rig.fault("A drop rpdo1")  # and so drive A does not hear that it is to power up
+        ask("enable")
+        states(robot, lambda state: state.mode == "enabling")
+        return
+    robot.enable()
+    if mode == "holding":
+        return
+    there = -1.0 if robot.state().pose[0] > 0.0 else 1.0
+    robot.move_to(x=0.1 * there, y=0.02, phi=0.3 * there, speed=0.3, id=GOAL)
+    states(robot, lambda state: state.goal is not None and state.goal.progress > 0.2)
+    if mode == "stopping":
+        ask("stop")
+        states(robot, lambda state: state.mode == "stopping")
+    elif mode == "fault":
+        robot.quick_stop()
+
+
+def run(rig: Rig, case: Case) -> None:
+    """Let a case happen to a service that is up and disabled, and check what becomes of it. Raises Failed."""
+    heard: list[str] = []
+    victim = rig.process(case.victim)
+    number, seconds = HARM[case.harm]
+    with rig.robot() as robot, open_client(rig.locator) as session:
+        bring_to(case.mode, rig, robot, lambda name: session.get(key("demo", "cmd", "chaos", name)))
+        os.kill(victim, number)
+    if seconds is not None:
+        time.sleep(seconds)
+        with contextlib.suppress(ProcessLookupError):  # it may have been killed for being frozen
+            os.kill(victim, signal.SIGCONT)
+    rig.fault("clear")
+    if case.ends_the_service:
+        _wait_end(rig)
+    else:
+        heard = _go_on(rig, case)
+        if case.victim == "supervisor" and case.harm == "STOP":
+            rig.service.kill()
+        else:
+            rig.service.send_signal(signal.SIGTERM)
+        _wait_end(rig)
+    if rig.service.returncode not in case.exit_codes:
+        raise Failed(f"exit code {rig.service.returncode}, expected was {case.exit_codes[0]}")
+    wait_for(lambda: not rig.remains(), "all processes have ended")
+    rig.check_rest()
+    rig.check_unpowered()
+    rig.check_setpoints()
+    if not rig.ports_are_free():
+        raise Failed("a port is not free")
+    _check_goal(rig, case, heard)
+
+
+def _go_on(rig: Rig, case: Case) -> list[str]:
+    """Check that the service goes on and can be told to stop; return what has been heard of the goal's end."""
+    if case.stops_the_robot:
+        time.sleep(STANDS_AFTER)
+        rig.check_rest()
+    with rig.served() as robot:
+        robot.stop()
+        if case.mode == "fault":
+            robot.reset()
+        robot.disable()
+        told = robot.events(history=True, timeout=1.0)
+        return [str(event.outcome) for event in told if event.id == GOAL and event.outcome]
+
+
+def _wait_end(rig: Rig) -> None:
+    with contextlib.suppress(Exception):
+        rig.service.wait(PATIENCE)
+    if rig.service.poll() is None:
+        rig.service.kill()
+        rig.service.wait()
+        raise Failed("the service does not end")
+
+
+def _check_goal(rig: Rig, case: Case, heard: list[str]) -> None:
+    """Check that the recording can be read and that the goal has ended once in it."""
+    recorded: dict[int, str] = {}
+    sent = False
+    for recording in rig.recordings():
+        sent = sent or any(getattr(what.given, "id", "") == GOAL for what in recording.requests)
+        for line in recording.events:
+            if line.event is not None and line.event.id == GOAL and line.event.outcome:
+                recorded[line.event.seq] = line.event.outcome
+    if case.mode in ("disabled", "enabling", "holding"):
+        return
+    if len(heard) > 1 or len(recorded) > 1:
+        raise Failed(f"the goal has ended more than once: {heard} {recorded}")
+    # What happens while there is no recorder is in no recording.
+    if not recorded and (case.victim != "recorder" or not heard):
+        raise Failed("how the goal has ended is in no recording")
+
+
+def attempt(rig: Rig, case: Case) -> str:
+    """Return "ok" or what failed; leave a service that is up and disabled."""
+    found = "ok"
+    try:
+        run(rig, case)
+    except (Failed, TrirailError) as failure:
+        rig.service.terminate()
+        found = " ".join(f"{failure}; warnings: {rig.warnings()}".split())
+    finally:
+        rig.fault("clear")
+    try:
+        rig.clean_up()
+        rig.start()
+        with rig.served() as robot:
+            if robot.state().mode == "fault":
+                robot.reset()
+            robot.enable()
+            robot.disable()
+    except (Failed, TrirailError) as failure:
+        return f"{found}; the next start: {' '.join(str(failure).split())}"
+    return found
+
+
+def main() -> int:
+    """Run the cases that are asked for; print a table, or with --json one object."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--sample", type=int, help="so many cases, by chance")
+    arguments.add_argument("--seed", type=int, default=0, help="of the chance")
+    arguments.add_argument("--only", default="", help="cases whose mode/victim/signal contains this")
+    arguments.add_argument("--json", action="store_true", help="print one JSON object")
+    options = arguments.parse_args()
+    cases = [case for case in CASES if options.only in str(case)]
+    if options.sample is not None and options.sample < len(cases):
+        cases = random.Random(options.seed).sample(cases, options.sample)
+    results: dict[str, str] = {}
+    with tempfile.TemporaryDirectory(prefix="trirail-chaos-") as folder:
+        rig = Rig(Path(folder))
+        try:
+            rig.start()
+            for case in cases:
+                results[str(case)] = result = attempt(rig, case)
+                if not options.json:
+                    print(f"{case.mode:9} {case.victim:11} {case.harm:10} {result}", flush=True)
+        finally:
+            rig.clean_up()
+            rig.close()
+    counts = Counter(result == "ok" for result in results.values())
+    if options.json:
+        print(json.dumps({"ok": counts[True], "failed": counts[False], "cases": results}))
+    else:
+        print(f"{counts[True]} of {len(results)} cases ok")
+    return 1 if counts[False] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,286 @@
+"""What tools/chaos.py does its harm to: drives in a process of their own, a service beside them, and who listens."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import socket
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import numpy as np
+
+from drivers import frames
+from drivers.unixbus import UnixBus
+from service import spawned
+from service.client import Robot
+from service.config import SIM, load
+from service.errors import ServiceError, TrirailError
+from service.interpreter import child
+from service.messages import State
+from service.reading import Recording, read
+from service.sinks import HOST, free_port
+
+ROOT = Path(__file__).parents[1]
+PATIENCE = 20.0
+"""How long anything may take that has to come [s]."""
+PROCESSES = ("supervisor", "gateway", "loop", "recorder")
+NODES = (1, 2, 3)
+# Three processes share what may be a slow machine: a rate and watchdogs that leave them time.
+CHANGES = {
+    "rate_hz": "100",
+    "missed_syncs": "30",
+    "heartbeat": "0.3",
+    "following_error": "0.05",
+    "enable_timeout": "60.0",
+}
+
+
+class Failed(Exception):
+    """Something is not as it has to be."""
+
+
+def wait_for(condition: Callable[[], bool], what: str, within: float = PATIENCE) -> None:
+    """Wait until something holds. Raises Failed."""
+    deadline = time.monotonic() + within
+    while not condition():
+        if time.monotonic() > deadline:
+            raise Failed(f"not within {within:g} s: {what}")
+        time.sleep(0.01)
+
+
+class Rig:
+    """Drives on a bus between processes, and one service after the other on it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.bus_path = folder / "bus"
+        self.ports = free_port(), free_port()
+        self.config = folder / "robot.toml"
+        self.config.write_text(self._configuration(), encoding="utf-8")
+        self.period = load(self.config).period
+        self.limits = load(self.config).limits.slider
+        self.counts = load(self.config).drives.A.counts_per_metre
+        self._drives = subprocess.Popen(
+            [*_python("tools/virtual_drives.py"), str(self.config), "--interface", "unix", "--channel", self.bus_path],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+        )
+        wait_for(self.bus_path.exists, "virtual drives")
+        self._bus = UnixBus(str(self.bus_path))
+        self._lock = threading.Lock()
+        self._heard: list[can.Message] = []
+        self._closing = False
+        self._listener = threading.Thread(target=self._listen, name="bus", daemon=True)
+        self._listener.start()
+
+    def _configuration(self) -> str:
+        text = SIM.read_text(encoding="utf-8")
+        zenoh, live = self.ports
+        changes = CHANGES | {
+            "interface": f'"unix"\nchannel = "{self.bus_path}"',
+            "listen": f'["tcp/{HOST}:{zenoh}"]',
+            "live_port": str(live),
+            "directory": f'"{self.folder}/recordings"',
+        }
+        for key, value in changes.items():
+            text, found = re.subn(rf"^{key} = [^#\n]*", f"{key} = {value} ", text, flags=re.MULTILINE)
+            if not found:
+                raise Failed(f"{SIM} has no key {key}")
+        return text
+
+    def close(self) -> None:
+        """End the drives."""
+        self._closing = True
+        self._drives.terminate()
+        self._drives.wait(PATIENCE)
+        self._listener.join(PATIENCE)
+        self._bus.shutdown()
+
+    # ------------------------------------------------------------------ the service
+
+    def start(self) -> None:
+        """Start a service, and wait until it is up."""
+        self._heard = []
+        runtime = self.folder / "runtime"
+        runtime.mkdir(exist_ok=True)
+        self._log = (self.folder / "service.log").open("w+b")
+        self.service = spawned.start(self.config, self._log, XDG_RUNTIME_DIR=str(runtime))
+
+    @property
+    def locator(self) -> str:
+        """Where the service is."""
+        return f"tcp/{HOST}:{self.ports[0]}"
+
+    def robot(self) -> Robot:
+        """A client."""
+        return Robot("demo", self.locator, user="chaos")
+
+    def served(self) -> Robot:
+        """A client of a service that answers, by and by."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            robot: Robot | None = None
+            try:
+                robot = self.robot()
+                robot.state()
+            except TrirailError as error:
+                if robot is not None:
+                    robot.close()
+                if time.monotonic() > deadline:
+                    raise Failed(f"nobody answers: {error}") from error
+            else:
+                return robot
+
+    def process(self, name: str) -> int:
+        """Process id of one of PROCESSES."""
+        return self.service.pid if name == "supervisor" else child(self.service.pid, name)
+
+    def fault(self, line: str) -> None:
+        """Tell the drives of a fault: drivers.simulated.faultlines."""
+        if self._drives.stdin is not None:
+            self._drives.stdin.write(line.encode() + b"\n")
+            self._drives.stdin.flush()
+
+    def remains(self) -> list[int]:
+        """Process ids of the service's processes that are still there."""
+        mark, found = str(self.folder).encode(), []
+        for entry in Path("/proc").glob("[0-9]*/cmdline"):
+            with contextlib.suppress(OSError):
+                command = entry.read_bytes()
+                if mark in command and b"virtual_drives" not in command:
+                    found.append(int(entry.parent.name))
+        return found
+
+    def clean_up(self) -> None:
+        """Leave nothing of a service to the next one."""
+        for process in self.remains():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+        self.service.wait()
+        wait_for(lambda: not self.remains(), "killed processes are gone")
+        for file in (self.folder / "recordings").glob("*"):
+            file.unlink()
+        self._log.close()
+
+    def recordings(self) -> list[Recording]:
+        """All that the service has recorded; Failed where a file cannot be read."""
+        files = sorted((self.folder / "recordings").glob("*.rrd"))
+        try:
+            return [read(file) for file in files if not file.name.startswith("fault-")]
+        except ServiceError as error:
+            raise Failed(str(error)) from error
+
+    def warnings(self) -> str:
+        """What the service has warned of, for people who look for the cause of a failure."""
+        with contextlib.suppress(Failed):
+            lines = [line for recording in self.recordings() for line in recording.events]
+            return " | ".join(f"{line.t:.2f} s {line.text}" for line in lines if line.level != "INFO")
+        return ""
+
+    def ports_are_free(self) -> bool:
+        """Whether both ports can be listened on."""
+        for port in self.ports:
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                try:
+                    probe.bind((HOST, port))
+                except OSError:
+                    return False
+        return True
+
+    # ------------------------------------------------------------------ the bus
+
+    def _listen(self) -> None:
+        while not self._closing:
+            try:
+                message = self._bus.recv(0.1)
+            except can.CanOperationError:  # the drives have ended
+                return
+            if message is not None:
+                with self._lock:
+                    self._heard.append(message)
+
+    def ask(self, node: int, index: int) -> int:
+        """Ask a drive for an object, by SDO."""
+        with self._lock:
+            begin = len(self._heard)
+        request = struct.pack("<BHB4x", 0x40, index, 0)
+        self._bus.send(can.Message(arbitration_id=frames.SDO_REQUEST + node, data=request, is_extended_id=False))
+
+        def answers() -> list[int]:
+            with self._lock:
+                new = self._heard[begin:]
+            return [
+                int.from_bytes(m.data[4:8], "little", signed=True)
+                for m in new
+                if m.arbitration_id == frames.SDO_ANSWER + node and int.from_bytes(m.data[1:3], "little") == index
+            ]
+
+        wait_for(lambda: bool(answers()), f"drive {node} answers")
+        return answers()[0]
+
+    def check_rest(self) -> None:
+        """Failed where a drive moves."""
+        before = [self.ask(node, 0x6064) for node in NODES]
+        time.sleep(0.2)
+        moved = [self.ask(node, 0x6064) - position for node, position in zip(NODES, before, strict=True)]
+        if max(map(abs, moved)) > 1e-6 * self.counts:
+            raise Failed(f"the drives move: {moved} counts in 0.2 s")
+
+    def check_unpowered(self) -> None:
+        """Failed where a drive follows setpoints still."""
+        words = [self.ask(node, 0x6041) & 0x6F for node in NODES]
+        if 0x27 in words:
+            raise Failed(f"drives are enabled still: statuswords {words}")
+
+    def check_setpoints(self) -> None:
+        """Failed where the setpoints step, in position or in velocity."""
+        for node in NODES:
+            for setpoints in self._followed(node):
+                step, bend = (np.abs(np.diff(setpoints, order)).max(initial=0.0) for order in (1, 2))
+                if step > self.limits.velocity * self.period * 1.01:
+                    raise Failed(f"drive {node}: a setpoint steps by {step * 1e3:.2f} mm in a cycle")
+                if bend > self.limits.acceleration * self.period**2 * 1.05 + 1e-6:
+                    raise Failed(f"drive {node}: the velocity of setpoints steps by {bend / self.period:.3f} m/s")
+
+    def _followed(self, node: int) -> list[np.ndarray[tuple[int], np.dtype[np.float64]]]:
+        """The setpoints of a drive while it was told to follow them [m]: else they are what is measured."""
+        runs: list[list[float]] = []
+        told = 0
+        with self._lock:
+            heard = list(self._heard)
+        for message in heard:
+            if message.arbitration_id == frames.RPDO1 + node:
+                before, told = told, frames.CONTROLWORD.unpack(message.data[:2])[0] & frames.ENABLE_OPERATION
+                if told == frames.ENABLE_OPERATION != before:
+                    runs.append([])
+            elif message.arbitration_id == frames.RPDO2 + node and told == frames.ENABLE_OPERATION:
+                runs[-1].append(frames.SETPOINT.unpack(message.data)[0] / self.counts)
+        return [np.array(run) for run in runs]
+
+
+def _python(*arguments: str) -> list[str]:
+    from service.interpreter import python
+
+    # A tool finds its neighbours by its own folder, which -P would leave out; the current one is not on its path.
+    return [python()[0], *arguments]
+
+
+def states(robot: Robot, condition: Callable[[State], bool]) -> State:
+    """Return the first state for which something holds. Raises Failed."""
+    deadline = time.monotonic() + PATIENCE
+    for state in robot.states(timeout=PATIENCE):
+        if condition(state):
+            return state
+        if time.monotonic() > deadline:
+            break
+    raise Failed("a state that had to come has not come")
