@@ -39,6 +39,7 @@ from service.packets import (
     told,
 )
 from service.records import LAYOUT, Part, Record, pack_into
+from service.text import quoted
 
 BATCHES_PER_SECOND = 50
 REQUESTS_A_CYCLE = 4
@@ -311,7 +312,8 @@ class Loop:
         """Tell what records do not say, where that has changed."""
         control, goal = self.control, self.control.desk.goal
         goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
-        situation = message(Situation(goal_id, control.override, control.fault, control.target, self._bus_load, counts))
+        fault = quoted(control.fault) if control.fault else None
+        situation = message(Situation(goal_id, control.override, fault, control.target, self._bus_load, counts))
         if situation != self._situation:
             self._situation = situation
             self._gateway.send(situation)

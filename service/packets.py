@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Annotated
 
-from msgspec import Meta, Struct, msgpack, structs
+from msgspec import Struct, msgpack, structs
 
 from drivers.interface import Counts
 from service.messages import Event, Goal, Level, Triple
@@ -105,7 +104,7 @@ class Situation(Struct, frozen=True, tag=True):
 
     goal: str | None
     override: float
-    fault: Annotated[str, Meta(max_length=512)] | None
+    fault: str | None
     target: Triple | None = None
     """The pose that the goal leads to; None for a jog."""
     bus_load: float = 0.0

@@ -68,18 +68,18 @@ def test_a_goal_that_has_waited_too_long_does_not_begin(rig: Rig, monkeypatch: p
 def test_many_commands_are_refused_but_never_a_stop(rig: Rig) -> None:
     gateway, link = rig
     for _ in range(UNDER_WAY + 3):
-        command(gateway, "pause")
-    for name in ("stop", "quick_stop", "disable"):
+        command(gateway, "resume")
+    for name in ("stop", "quick_stop", "disable", "pause"):
         command(gateway, name)
     passed = [request.name for request in link.sent if isinstance(request, CommandRequest)]
-    assert passed == ["pause"] * UNDER_WAY + ["stop", "quick_stop", "disable"]
-    gateway._hear(packets.message(Confirmed(1, "pause", "holding")), lambda: None)
-    for ticket in (UNDER_WAY + 1, UNDER_WAY + 2, UNDER_WAY + 3):
+    assert passed == ["resume"] * UNDER_WAY + ["stop", "quick_stop", "disable", "pause"]
+    gateway._hear(packets.message(Confirmed(1, "resume", "holding")), lambda: None)
+    for ticket in (UNDER_WAY + 1, UNDER_WAY + 2, UNDER_WAY + 3, UNDER_WAY + 4):
         gateway._hear(packets.message(Confirmed(ticket, "stop", "holding")), lambda: None)
-    command(gateway, "resume")
+    command(gateway, "reset")
     last = link.sent[-1]
     assert isinstance(last, CommandRequest)
-    assert last.name == "resume"
+    assert last.name == "reset"
 
 
 def test_an_error_of_its_own_is_told_and_does_not_end_it(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

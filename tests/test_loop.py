@@ -255,6 +255,21 @@ def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
     assert shell.loop.control.state.mode is Mode.HOLDING
 
 
+def test_whatever_the_fault_says_the_gateway_and_the_recorder_can_read_it(shell: Shell) -> None:
+    """It is told anew whenever one of them is started again: one that it ended would end for good."""
+    shell.enabled()
+    shell.received()
+    shell.loop.control.trip("x" * 200_000 + "\n\x1b[2J")
+    shell.cycles(60)
+    for link in (shell.gateway, shell.recorder):
+        said = [decode_answer(packet[1:]) for packet in shell.received(link) if packet[0] == Kind.MESSAGE]
+        (told,) = [answer.event for answer in said if isinstance(answer, Happened) and answer.event.kind == "fault"]
+        assert told.message.startswith("xxx")
+        faults = [answer.fault for answer in said if isinstance(answer, Situation) and answer.fault]
+        assert all(fault.startswith("xxx") and fault.isprintable() for fault in faults)
+        assert faults
+
+
 def answered(packets: list[bytes]) -> list[int]:
     """Tickets of the commands that are confirmed, in order."""
     said = [decode_answer(packet[1:]) for packet in packets if packet[0] == Kind.MESSAGE]

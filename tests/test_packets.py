@@ -62,6 +62,6 @@ def test_a_record_has_its_fields_where_readers_look_for_them() -> None:
     given = {name: next(numbers) if n == 1 else [next(numbers) for _ in range(n)] for name, n in sizes.items()}
     buffer = bytearray(5 + LAYOUT.size)
     pack_into(buffer, 5, Record(**given))  # type: ignore[arg-type]
-    (row,) = unpack(buffer[5:])
+    (row,) = unpack(bytes(buffer[5:]))
     for name, value in given.items():
         assert row[name].tolist() == value
