@@ -295,4 +295,4 @@ def test_only_enable_powers_up() -> None:
 
 @pytest.mark.parametrize("state", STATES)
 def test_a_goal_is_under_way_in_motion_and_while_it_is_paused(state: State) -> None:
-    assert state.has_goal == (state in (MOVING, PAUSING, PAUSED))
+    assert state.has_goal == (state in (MOVING, PAUSING, PAUSED, RELEASING))
