@@ -156,7 +156,7 @@ class Robot:
         self._connect = connect
         self._session = session.open_client(connect)
         # Also at the end of a program that does not close it: Zenoh's threads must not outlive the interpreter.
-        self._close = weakref.finalize(self, self._session.close)
+        self._close = weakref.finalize(self, session.close, self._session)
         self._listener = Listener()
         self._goals: dict[str, Goal] = {}
         self._goals_lock = threading.Lock()

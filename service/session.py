@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -64,6 +65,12 @@ def open_client(locator: str) -> zenoh.Session:
         f"no service at {locator}",
         "start one with: trirail run configs/sim.toml, or name its address with --connect",
     )
+
+
+def close(opened: zenoh.Session) -> None:
+    """Close a session; one that is stuck is left to the end of the process."""
+    with contextlib.suppress(zenoh.ZError):
+        opened.close()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
 
 
 def _open(settings: dict[str, Any], failure: str, remedy: str) -> zenoh.Session:

@@ -11,7 +11,9 @@ import argparse
 import contextlib
 import itertools
 import json
+import logging
 import math
+import multiprocessing
 import os
 import random
 import socket
@@ -21,6 +23,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -102,16 +105,13 @@ class Flood:
         self._ports = ports
         self._pause = SENDERS / rate
         self._over = threading.Event()
-        self._stack = contextlib.ExitStack()
         self._threads: list[threading.Thread] = []
 
     def __enter__(self) -> Flood:
-        sessions = [self._stack.enter_context(session.open_client(self._locator)) for _ in range(SESSIONS)]
-        deaf = [one.declare_subscriber("trirail/**", zenoh.handlers.FifoChannel(1)) for one in sessions[:DEAF]]
-        self._stack.callback(deaf.clear)
-        share = (SESSIONS - DEAF) // SENDERS
+        sessions = [session.open_client(self._locator) for _ in range(SESSIONS - DEAF)]
+        share = len(sessions) // SENDERS
         for number in range(SENDERS):
-            own = sessions[DEAF + number * share :][:share]
+            own = sessions[number * share :][:share]
             self._begin(lambda own=own, number=number: self._send(own, random.Random(number)))  # type: ignore[misc]
         for port in self._ports:
             self._begin(lambda port=port: self._half_open(port, random.Random(port)))  # type: ignore[misc]
@@ -121,7 +121,6 @@ class Flood:
         self._over.set()
         for thread in self._threads:
             thread.join()
-        self._stack.close()
 
     def _begin(self, what: Callable[[], None]) -> None:
         thread = threading.Thread(target=what, daemon=True)
@@ -164,11 +163,27 @@ class Flood:
             connection.close()
 
 
+def _flood(locator: str, ports: tuple[int, ...], rate: float, seconds: float, deaf: bool, said: Connection) -> None:
+    """Flood from a process of its own: readers that never read block Zenoh's threads in the whole process."""
+    if deaf:
+        kept = [session.open_client(locator) for _ in range(DEAF)]
+        subscribed = [one.declare_subscriber("trirail/**", zenoh.handlers.FifoChannel(1)) for one in kept]
+        time.sleep(seconds)
+        said.send((Counter({"deaf": len(subscribed)}), 0))
+        os._exit(0)  # closing what is stuck would wait
+    flood = Flood(locator, ports, rate)
+    with flood:
+        time.sleep(seconds)
+    said.send((flood.sent, flood.answered))
+    os._exit(0)
+
+
 def processes(supervisor: int) -> dict[str, int]:
     """Return a service's processes by their names."""
     found = {"supervisor": supervisor}
     for entry in Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split():
-        found[Path(f"/proc/{entry}/cmdline").read_text().split("\0")[3]] = int(entry)
+        words = Path(f"/proc/{entry}/cmdline").read_text().split("\0")
+        found[words[words.index("service.process") + 1]] = int(entry)
     return found
 
 
@@ -217,11 +232,20 @@ def run(seconds: float, rate: float) -> list[str]:
         with Robot("demo", locator, user="ann") as robot:
             robot.enable()
             before = memory(pids)
-            with Flood(locator, ports, rate) as flood:
-                taken, stops = use(locator, seconds)
+            context = multiprocessing.get_context("spawn")
+            heard, said = context.Pipe(duplex=False)
+            floods = [
+                context.Process(target=_flood, args=(locator, ports, rate, seconds, deaf, said), daemon=True)
+                for deaf in (False, True)
+            ]
+            for one in floods:
+                one.start()
+            taken, stops = use(locator, seconds)
+            sent, answered = max((heard.recv() for _ in floods), key=lambda told: sum(told[0].values()))
+            for one in floods:
+                one.join()
             after = memory(pids)
-            kinds = sum(flood.sent.values())
-            print(f"{kinds} messages of {len(flood.sent)} kinds in {seconds:g} s, {flood.answered} answers")
+            print(f"{sum(sent.values())} messages of {len(sent)} kinds in {seconds:g} s, {answered} answers")
             print(f"{taken} goals taken, {len(stops)} stops, the slowest answered in {max(stops):.2f} s")
             for process in pids:
                 print(f"{process:12}{before[process]:7.0f} MB before, {after[process]:7.0f} MB after")
@@ -256,6 +280,7 @@ def main() -> int:
     parser.add_argument("seconds", type=float)
     parser.add_argument("--rate", type=float, default=3000.0, help="messages a second at most, of all sessions")
     arguments = parser.parse_args()
+    logging.getLogger("trirail").disabled = True  # every client would say what it skips
     failures = run(arguments.seconds, arguments.rate)
     for failure in failures:
         print(f"does not hold: {failure}")
