@@ -15,16 +15,15 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
-
-from drivers import frames
-from drivers.bus import PROTOCOLS
-from drivers.simulated import SimulatedDrive, simulated_bus
-from service.config import SIM, Config, load
-from service.control import Control, Given
-from service.desk import Happening
-from service.messages import Goal, PoseGoal
-from service.modes import Mode
-from service.packets import Answer, CommandRequest, GoalRequest, Request
+from trirail.config import SIM, Config, load
+from trirail.control.control import Control, Given
+from trirail.control.desk import Happening
+from trirail.wire.messages import Goal, PoseGoal
+from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
+from trirail.wire.vocabulary import Mode
+from trirail_drivers import frames
+from trirail_drivers.bus import PROTOCOLS
+from trirail_drivers.simulated import SimulatedDrive, simulated_bus
 
 CONFIG = load(SIM)
 

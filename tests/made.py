@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from drivers.interface import PowerState
-from service.geometry import Geometry
-from service.kinematics import inverse
-from service.modes import MODES, Mode
-from service.records import DTYPE
+from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.kinematics import inverse
+from trirail.wire.records import DTYPE
+from trirail.wire.vocabulary import MODES, Mode
+from trirail_drivers.interface import PowerState
 
 RATE_HZ = 1000
 MONOTONIC_NS = 5_000_000_000_000

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import pytest
-
-from drivers import frames
-from drivers.axis402 import Axis
-from drivers.interface import DriveFault, PowerState
-from drivers.scaling import Scale
+from trirail_drivers import frames
+from trirail_drivers.cia402.axis402 import Axis
+from trirail_drivers.interface import DriveFault, PowerState
+from trirail_drivers.scaling import Scale
 
 P = PowerState
 ENABLED, READY, FAULT = b"\x37\x02", b"\x31\x02", b"\x18\x02"

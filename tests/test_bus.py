@@ -8,12 +8,11 @@ from pathlib import Path
 import can
 import msgspec
 import pytest
-
-from drivers import bus
-from drivers.cia402 import Cia402
-from drivers.config import Can, Drive, Drives
-from drivers.errors import BusError, DriveError
-from drivers.odrive import Odrive
+from trirail_drivers import bus
+from trirail_drivers.cia402.cia402 import Cia402
+from trirail_drivers.config import Can, Drive, Drives
+from trirail_drivers.errors import BusError, DriveError
+from trirail_drivers.odrive.odrive import Odrive
 
 DRIVES = Drives(
     protocol="cia402",

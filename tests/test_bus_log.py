@@ -8,9 +8,8 @@ from pathlib import Path
 import bus_log
 import pytest
 from bus_log import Frame
-
-from drivers import frames as layout
-from service.config import SIM, load
+from trirail.config import SIM, load
+from trirail_drivers import frames as layout
 
 CONFIG = load(SIM.parent / "socketcan.toml")
 PERIOD = CONFIG.period

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-
-from service import calibration, config
-from service.calibration import DOUBT, PARAMETERS, CalibrationError, corrected, identify, pose_derivatives
-from service.geometry import LEGS, Geometry, Leg
-from service.kinematics import forward, inverse
+from trirail import config
+from trirail.kinematics import calibration
+from trirail.kinematics.calibration import DOUBT, PARAMETERS, CalibrationError, corrected, identify, pose_derivatives
+from trirail.kinematics.geometry import LEGS, Geometry, Leg
+from trirail.kinematics.kinematics import forward, inverse
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,7 @@ import re
 
 import can
 import pytest
-
-from drivers.canerrors import Gravity, cannot_send, error_number, queue_is_full, report
+from trirail_drivers.canerrors import Gravity, cannot_send, error_number, queue_is_full, report
 
 
 def frame(kind: int, *data: int, length: int = 8) -> can.Message:

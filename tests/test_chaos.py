@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from chaos import CASES, HARM, MODES
 from chaos_rig import NODES, PROCESSES, Failed, Rig
-
-from drivers import frames
-from service import modes
-from service.config import SIM, load
+from trirail.config import SIM, load
+from trirail.wire import vocabulary
+from trirail_drivers import frames
 
 
 def test_it_has_every_mode_process_and_harm() -> None:
     assert len(set(CASES)) == len(MODES) * len(PROCESSES) * len(HARM) == 120
-    assert set(MODES) == {*map(str, modes.MODES)} - {"homing"}  # its drives have absolute encoders
+    assert set(MODES) == {*map(str, vocabulary.MODES)} - {"homing"}  # its drives have absolute encoders
 
 
 def heard(setpoints: list[float], told: int = frames.ENABLE_OPERATION) -> Rig:

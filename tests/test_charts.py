@@ -8,11 +8,12 @@ import made
 import numpy as np
 import pytest
 from rich.style import Style
-
-from service import charts, palette, sessions, terminal
-from service.config import SIM, load
-from service.modes import MODES, Mode
-from service.recorder import Recorder
+from trirail.analysis import charts
+from trirail.cli import sessions, terminal
+from trirail.config import SIM, load
+from trirail.telemetry import palette
+from trirail.telemetry.recorder import Recorder
+from trirail.wire.vocabulary import MODES, Mode
 
 
 def test_every_mode_has_a_colour_of_its_own_wherever_it_is_shown() -> None:

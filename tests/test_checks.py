@@ -6,11 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 from conftest import CONFIG
-
-from service.checks import Checker
-from service.config import geometry
-from service.limits import Bounds
-from service.paths import FOR_EVER, Path
+from trirail.config import geometry
+from trirail.motion.checks import Checker
+from trirail.motion.limits import Bounds
+from trirail.motion.paths import FOR_EVER, Path
 
 PERIOD = CONFIG.period
 PLATFORM = msgspec.structs.replace(CONFIG.limits.platform, jerk=(1e3, 1e3, 1e3))

@@ -11,17 +11,16 @@ import can
 import canopen
 import msgspec
 import pytest
-
-from drivers import frames
-from drivers.cia402 import Cia402
-from drivers.config import Drive, Drives, Homing
-from drivers.eds import SERVO
-from drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
-from drivers.interface import Feedback, PowerState, Triple
-from drivers.scaling import scale_of
-from drivers.settings402 import interpolation_period, settings_of
-from drivers.simulated import Servo, SimulatedBus, SimulatedDevice, SimulatedDrive
-from drivers.simulated.dictionary import Entry
+from trirail_drivers import frames
+from trirail_drivers.cia402.cia402 import Cia402
+from trirail_drivers.cia402.eds import SERVO
+from trirail_drivers.cia402.settings402 import interpolation_period, settings_of
+from trirail_drivers.config import Drive, Drives, Homing
+from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
+from trirail_drivers.interface import Feedback, PowerState, Triple
+from trirail_drivers.scaling import scale_of
+from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDevice, SimulatedDrive
+from trirail_drivers.simulated.dictionary import Entry
 
 P = PowerState
 PERIOD = 0.001

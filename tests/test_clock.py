@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
-
-from service.clock import Ticker
+from trirail.processes.clock import Ticker
 
 PERIOD = 1_000_000
 

@@ -13,13 +13,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec import Meta, Struct
 from msgspec.structs import fields
-
-from drivers.errors import LONGEST, BusError
-from service import provenance
-from service.config import SIM, Config, load, parse
-from service.errors import ConfigError
-from service.messages import PoseGoal
-from service.modes import Mode
+from trirail.config import SIM, Config, load, parse
+from trirail.errors import ConfigError
+from trirail.telemetry import provenance
+from trirail.wire.messages import PoseGoal
+from trirail.wire.vocabulary import Mode
+from trirail_drivers.errors import LONGEST, BusError
 
 TEXT = SIM.read_text()
 CONFIGS = sorted(SIM.parent.glob("*.toml"))

@@ -13,15 +13,15 @@ from conftest import CONFIG, Delay, Rig, changed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-
-from drivers import frames
-from drivers.interface import PowerState
-from service.config import Config, geometry
-from service.kinematics import forward, inverse
-from service.messages import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
-from service.modes import Event, Mode
-from service.motion import MotionState, rest
-from service.packets import Accepted, Answer, Confirmed, GoalRequest, Refused
+from trirail.config import Config, geometry
+from trirail.control.modes import Event
+from trirail.kinematics.kinematics import forward, inverse
+from trirail.motion.motion import MotionState, rest
+from trirail.wire.messages import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.packets import Accepted, Answer, Confirmed, GoalRequest, Refused
+from trirail.wire.vocabulary import Mode
+from trirail_drivers import frames
+from trirail_drivers.interface import PowerState
 
 PERIOD = CONFIG.period
 ROBOT = geometry(CONFIG.geometry)

@@ -8,12 +8,11 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from service.desk import REMEMBERED_IDS, Desk
-from service.errors import RefusedError
-from service.messages import PoseGoal, VelocityGoal
-from service.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest
-from service.pilot import Taken
+from trirail.control.desk import REMEMBERED_IDS, Desk
+from trirail.control.pilot import Taken
+from trirail.errors import RefusedError
+from trirail.wire.messages import PoseGoal, VelocityGoal
+from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest
 
 POSE = PoseGoal(x=0.0, y=0.0, phi=0.0, blend=0.01)
 JOG = VelocityGoal(x=0.01, y=0.0, phi=0.0)

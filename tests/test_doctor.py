@@ -13,15 +13,14 @@ import msgspec
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-
-from drivers.bus import PROTOCOLS
-from drivers.errors import BusError
-from drivers.simulated import simulated_bus
-from service import doctor, probes
-from service.clock import Tick
-from service.config import SIM, Config, load
-from service.doctor import Check, Machine
-from service.errors import ServiceError
+from trirail.cli import doctor, probes
+from trirail.cli.doctor import Check, Machine
+from trirail.config import SIM, Config, load
+from trirail.errors import ServiceError
+from trirail.processes.clock import Tick
+from trirail_drivers.bus import PROTOCOLS
+from trirail_drivers.errors import BusError
+from trirail_drivers.simulated import simulated_bus
 
 CONFIGS = SIM.parent
 SIMULATED = load(SIM)
@@ -205,7 +204,7 @@ def test_ticks_are_those_of_the_period(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("json_wanted", [True, False], ids=["json", "words"])
 def test_the_command(json_wanted: bool) -> None:
-    command = [sys.executable, "-m", "service", "doctor", str(SIM), *(["--json"] if json_wanted else [])]
+    command = [sys.executable, "-m", "trirail", "doctor", str(SIM), *(["--json"] if json_wanted else [])]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.stderr == ""
     if json_wanted:

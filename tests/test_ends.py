@@ -21,11 +21,10 @@ from test_service import (
     service,
     until,
 )
-
-from service.errors import ServiceError
-from service.messages import Event
-from service.modes import MODES, Mode
-from service.reading import Recording, read
+from trirail.errors import ServiceError
+from trirail.telemetry.reading import Recording, read
+from trirail.wire.messages import Event
+from trirail.wire.vocabulary import MODES, Mode
 
 __all__ = ["service"]
 
@@ -174,7 +173,7 @@ def test_the_watchdog_is_fed_while_loop_and_gateway_are_alive(told: socket.socke
 def test_nothing_is_imported_from_the_folder_it_is_started_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "poisoned"
     folder.mkdir()
-    for name in ("msgspec", "numpy", "zenoh", "rerun", "service", "signal"):
+    for name in ("msgspec", "numpy", "zenoh", "rerun", "trirail", "signal"):
         (folder / f"{name}.py").write_text(f"open('{folder}/run', 'a').write('{name}')\nraise SystemExit(9)\n")
     monkeypatch.chdir(folder)
     service = Service(tmp_path)

@@ -12,14 +12,13 @@ from pathlib import Path
 
 import can
 import pytest
-
-from drivers import frames
-from drivers.errors import DriveError
-from drivers.interface import PowerState
-from drivers.simulated import Servo, SimulatedBus, SimulatedDrive
-from drivers.simulated.faultlines import HELP, ODRIVE, Condition, FaultSyntaxError, parse
-from drivers.simulated.faults import Faults
-from drivers.unixbus import UnixBus
+from trirail_drivers import frames
+from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import PowerState
+from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
+from trirail_drivers.simulated.faultlines import HELP, ODRIVE, Condition, FaultSyntaxError, parse
+from trirail_drivers.simulated.faults import Faults
+from trirail_drivers.unixbus import UnixBus
 
 ROOT = Path(__file__).parents[1]
 WAIT = 20.0
@@ -142,7 +141,7 @@ def test_a_wrong_line_is_answered_with_what_would_be_right(line: str, right: str
 
 
 def test_help_names_every_word() -> None:
-    from drivers.simulated import faultlines
+    from trirail_drivers.simulated import faultlines
 
     names = (*faultlines.CANOPEN, *faultlines.ODRIVE)
     for word in (*faultlines._KINDS, *names, *faultlines.CONDITIONS, "at", "when", "with", "for"):

@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 from conftest import CONFIG, Rig, changed
 from test_homing import incremental
-
-from drivers import frames
-from drivers.interface import PowerState
-from service.config import Config
-from service.modes import Mode
-from service.packets import CommandRequest, Confirmed, Refused
+from trirail.config import Config
+from trirail.wire.packets import CommandRequest, Confirmed, Refused
+from trirail.wire.vocabulary import Mode
+from trirail_drivers import frames
+from trirail_drivers.interface import PowerState
 
 REAL = changed(CONFIG, missed_syncs=3)
 """Drives that miss SYNC as soon as real ones do."""

@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-
-from drivers import files
-from drivers.errors import LONGEST, FileError, TrirailError, shortened
-from service import cli
-from service.config import SIM
+from trirail.cli import cli
+from trirail.config import SIM
+from trirail_drivers import files
+from trirail_drivers.errors import LONGEST, FileError, TrirailError, shortened
 
 pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 
@@ -74,7 +73,7 @@ def test_what_is_no_regular_file_is_refused(kind: str, command: list[str], tmp_p
 
 def test_a_fifo_that_nobody_writes_to_is_refused_by_the_program(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "x.rrd")
-    command = [sys.executable, "-m", "service", "report", str(tmp_path / "x.rrd")]
+    command = [sys.executable, "-m", "trirail", "report", str(tmp_path / "x.rrd")]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (ended.returncode, ended.stderr.count("\n")) == (1, 1)
 
@@ -132,7 +131,9 @@ CONTENTS = (
 @example(content=b"\xff\xfe")
 @example(content=b"")
 def test_any_content_is_read_or_refused(suffix: str, content: bytes, tmp_path: Path) -> None:
-    from service import config, reading, trajectory
+    from trirail import config
+    from trirail.client import trajectory
+    from trirail.telemetry import reading
 
     readers: dict[str, Callable[[Path], object]] = {".toml": config.load, ".rrd": reading.read}
     path = tmp_path / f"x{suffix}"

@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from drivers import frames
-from drivers.interface import PowerState
+from trirail_drivers import frames
+from trirail_drivers.interface import PowerState
 
 P = PowerState
 

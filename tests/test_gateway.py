@@ -12,11 +12,10 @@ from pathlib import Path
 
 import pytest
 from conftest import CONFIG
-
-from service import boundary, packets, session
-from service.gateway import PATIENCE, UNDER_WAY, Gateway
-from service.inbox import Incoming
-from service.packets import Accepted, CommandRequest, Confirmed, GoalRequest, RefusedRequest, Request
+from trirail.processes.gateway import PATIENCE, UNDER_WAY, Gateway
+from trirail.processes.inbox import Incoming
+from trirail.wire import boundary, packets, session
+from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, RefusedRequest, Request
 
 
 class FakeLink:
@@ -101,7 +100,7 @@ def test_an_error_of_its_own_is_told_and_does_not_end_it(rig: Rig, monkeypatch: 
 
 STUCK = """
 import sys, threading, zenoh
-from service.session import open_client
+from trirail.wire.session import open_client
 session = open_client(sys.argv[1])
 never = threading.Event()
 stuck = zenoh.handlers.Callback(lambda reply: never.wait(), indirect=False)

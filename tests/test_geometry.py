@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-
-from service.errors import KinematicsError
-from service.geometry import Geometry, Leg, singular_angles
-from service.kinematics import jacobians
+from trirail.errors import KinematicsError
+from trirail.kinematics.geometry import Geometry, Leg, singular_angles
+from trirail.kinematics.kinematics import jacobians
 
 L0 = 0.3
 SYMMETRIC = Geometry.symmetric(L0)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
-
-from service.heartbeats import PROCESSES, Heartbeats, Watch
+from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
 
 
 def test_each_process_has_its_own_and_all_share_them() -> None:

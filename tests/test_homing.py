@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from canopen.profiles.p402 import BaseNode402
 from conftest import CONFIG, Delay, Rig, changed
-
-from drivers import config, frames
-from drivers.eds import SERVO
-from drivers.interface import PowerState
-from drivers.simulated import Servo, SimulatedBus, SimulatedDrive
-from service.config import Config, geometry
-from service.kinematics import inverse
-from service.modes import Event, Mode
-from service.packets import Accepted, Answer, CommandRequest, Confirmed, Refused
+from trirail.config import Config, geometry
+from trirail.control.modes import Event
+from trirail.kinematics.kinematics import inverse
+from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused
+from trirail.wire.vocabulary import Mode
+from trirail_drivers import config, frames
+from trirail_drivers.cia402.eds import SERVO
+from trirail_drivers.interface import PowerState
+from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 
 PERIOD = CONFIG.period
 HOMES = (-0.01, 0.012, 0.02)

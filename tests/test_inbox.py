@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 import zenoh
-
-from service import session
-from service.inbox import UNREAD, Inbox, Incoming
-from service.sizes import MAX_MESSAGE, MAX_UNREAD
+from trirail.processes.inbox import UNREAD, Inbox, Incoming
+from trirail.wire import session
+from trirail.wire.sizes import MAX_MESSAGE, MAX_UNREAD
 
 
 @pytest.fixture

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-
-from service import journal
-from service.journal import EVENTS, REQUESTS, Entry
-from service.messages import Event, Level, PoseGoal
-from service.packets import CommandRequest, GoalRequest, Input
+from trirail.telemetry import journal
+from trirail.telemetry.journal import EVENTS, REQUESTS, Entry
+from trirail.wire.messages import Event, Level, PoseGoal
+from trirail.wire.packets import CommandRequest, GoalRequest, Input
 
 SAID = 1_700_000_000_500_000_000
 EVENT = Event(7, 1.25, 1250, 1_700_000_000.5, "goal", "warning", "goal g expired", id="g")

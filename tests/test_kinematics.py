@@ -13,10 +13,9 @@ from hypothesis import assume, given, reject, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-
-from service.errors import KinematicsError
-from service.geometry import Geometry, Leg, singular_angles
-from service.kinematics import forward, forward_into, inverse, inverse_into, jacobians, warm_up
+from trirail.errors import KinematicsError
+from trirail.kinematics.geometry import Geometry, Leg, singular_angles
+from trirail.kinematics.kinematics import forward, forward_into, inverse, inverse_into, jacobians, warm_up
 
 Array = NDArray[np.float64]
 

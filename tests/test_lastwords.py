@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from service.lastwords import LastWords
-from service.messages import Event, PoseGoal
-from service.packets import Farewell, GoalRequest, Happened, Input, Situation
+from trirail.processes.lastwords import LastWords
+from trirail.wire.messages import Event, PoseGoal
+from trirail.wire.packets import Farewell, GoalRequest, Happened, Input, Situation
 
 
 class Clock:

@@ -11,17 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from test_control import GOAL, PERIOD, ROBOT, assert_within_limits, refusal
-
-from drivers.interface import Feedback, PowerState
-from service.checks import PLATFORM_LAWS
-from service.kinematics import inverse
-from service.limits import EDGE, EXCESS, PLATFORM_EXCESS, Bounds, told_apart
-from service.measured import Measured
-from service.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
-from service.modes import Mode
-from service.motion import MotionState, rest
-from service.packets import Accepted
-from service.planning import START
+from trirail.control.measured import Measured
+from trirail.kinematics.kinematics import inverse
+from trirail.motion.checks import PLATFORM_LAWS
+from trirail.motion.limits import EDGE, EXCESS, PLATFORM_EXCESS, Bounds, told_apart
+from trirail.motion.motion import MotionState, rest
+from trirail.motion.planning import START
+from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.packets import Accepted
+from trirail.wire.vocabulary import Mode
+from trirail_drivers.interface import Feedback, PowerState
 
 LIMITS = CONFIG.limits
 PLATFORM = np.array([LIMITS.platform.velocity, LIMITS.platform.acceleration, LIMITS.platform.jerk])

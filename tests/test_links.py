@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from service import links
-from service.links import Closed, Port
+from trirail.wire import links
+from trirail.wire.links import Closed, Port
 
 
 @pytest.fixture

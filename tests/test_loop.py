@@ -7,15 +7,13 @@ from pathlib import Path
 
 import pytest
 from conftest import Rig
-
-from service import links
-from service.clock import Tick
-from service.heartbeats import Heartbeats, Watch
-from service.links import Link, Port
-from service.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop
-from service.messages import PoseGoal
-from service.modes import Mode
-from service.packets import (
+from trirail.processes.clock import Tick
+from trirail.processes.heartbeats import Heartbeats, Watch
+from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop
+from trirail.wire import links
+from trirail.wire.links import Link, Port
+from trirail.wire.messages import PoseGoal
+from trirail.wire.packets import (
     CommandRequest,
     Confirmed,
     DrivesFault,
@@ -30,7 +28,8 @@ from service.packets import (
     decode_answer,
     message,
 )
-from service.records import unpack
+from trirail.wire.records import unpack
+from trirail.wire.vocabulary import Mode
 
 
 class Shell:

@@ -6,11 +6,10 @@ import pytest
 from conftest import CONFIG
 from hypothesis import example, given
 from hypothesis import strategies as st
-
-from drivers.interface import Feedback, PowerState
-from service.config import geometry
-from service.kinematics import forward, inverse
-from service.measured import Measured
+from trirail.config import geometry
+from trirail.control.measured import Measured
+from trirail.kinematics.kinematics import forward, inverse
+from trirail_drivers.interface import Feedback, PowerState
 
 PERIOD = CONFIG.period
 ROBOT = geometry(CONFIG.geometry)

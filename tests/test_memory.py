@@ -13,9 +13,9 @@ FEED = """
 import sys
 from pathlib import Path
 import made, msgspec, numpy as np
-from service.config import SIM, load
-from service.recorder import Recorder
-from service.sinks import free_port
+from trirail.config import SIM, load
+from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.sinks import free_port
 
 def taken():
     (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("RssAnon"))

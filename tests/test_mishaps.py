@@ -7,13 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from test_loop import Shell, shell
-
-from service.messages import PoseGoal
-from service.modes import MODES, Mode
-from service.packets import CommandRequest, GoalRequest, Input, Kind, decode_answer, message
-from service.reading import Recording
-from service.records import unpack
-from service.replay import again
+from trirail.analysis.replay import again
+from trirail.telemetry.reading import Recording
+from trirail.wire.messages import PoseGoal
+from trirail.wire.packets import CommandRequest, GoalRequest, Input, Kind, decode_answer, message
+from trirail.wire.records import unpack
+from trirail.wire.vocabulary import MODES, Mode
 
 __all__ = ["shell"]
 

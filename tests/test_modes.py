@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import pytest
-
-from service import palette, terminal
-from service.modes import (
+from trirail.cli import terminal
+from trirail.control.modes import (
     DISABLED,
     ENABLING,
     FAULT,
@@ -20,12 +19,13 @@ from service.modes import (
     STOPPING_TO_DISABLE,
     Action,
     Event,
-    Mode,
     Refusal,
     State,
     Step,
     step,
 )
+from trirail.telemetry import palette
+from trirail.wire.vocabulary import Mode
 
 REFUSED = None
 

@@ -14,19 +14,18 @@ from conftest import CONFIG, Rig
 from numpy.typing import NDArray
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal, slower
-
-from service.config import Config
-from service.course import Course
-from service.errors import KinematicsError
-from service.goals import LEAD, Goals, Motion
-from service.kinematics import forward, inverse
-from service.limits import LEGS
-from service.messages import Goal, OwnLimits, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
-from service.modes import Mode
-from service.packets import Accepted, Answer, CommandRequest, GoalRequest
-from service.planning import TOO_FAST_IN_MOTION
-from service.quintic import Point, quintic
-from service.steps import Steps
+from trirail.config import Config
+from trirail.errors import KinematicsError
+from trirail.kinematics.kinematics import forward, inverse
+from trirail.motion.course import Course
+from trirail.motion.goals import LEAD, Goals, Motion
+from trirail.motion.limits import LEGS
+from trirail.motion.planning import TOO_FAST_IN_MOTION
+from trirail.motion.quintic import Point, quintic
+from trirail.motion.steps import Steps
+from trirail.wire.messages import Goal, OwnLimits, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.packets import Accepted, Answer, CommandRequest, GoalRequest
+from trirail.wire.vocabulary import Mode
 
 MEDIUM = slower(CONFIG, velocity=0.3, acceleration=4.5, jerk=120.0)
 """Sliders for which the platform's motions are a little too fast."""

@@ -16,17 +16,16 @@ from conftest import Rig as ControlRig
 from conftest import changed
 from numpy.typing import NDArray
 from test_cia402 import Bus, Clock
-
-from drivers import odrive_frames as frames
-from drivers.config import Drive, Drives
-from drivers.errors import BusError, DriveError, DriveTimeout
-from drivers.interface import Feedback, PowerState, Triple
-from drivers.odrive import SETTLING, Odrive
-from drivers.odrive_frames import AxisState, Error, Result
-from drivers.simulated import Servo, SimulatedOdrive
-from drivers.simulated.faultlines import FaultSyntaxError
-from service.config import Config
-from service.modes import Mode
+from trirail.config import Config
+from trirail.wire.vocabulary import Mode
+from trirail_drivers.config import Drive, Drives
+from trirail_drivers.errors import BusError, DriveError, DriveTimeout
+from trirail_drivers.interface import Feedback, PowerState, Triple
+from trirail_drivers.odrive import odrive_frames as frames
+from trirail_drivers.odrive.odrive import SETTLING, Odrive
+from trirail_drivers.odrive.odrive_frames import AxisState, Error, Result
+from trirail_drivers.simulated import Servo, SimulatedOdrive
+from trirail_drivers.simulated.faultlines import FaultSyntaxError
 
 P = PowerState
 PERIOD = 0.001
@@ -190,7 +189,7 @@ class TestConfigure:
             new.drives.configure(PERIOD)
 
     def test_firmware_of_another_layout(self, new: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("drivers.simulated.odrive.FIRMWARE", (0, 5, 6))
+        monkeypatch.setattr("trirail_drivers.simulated.odrive.FIRMWARE", (0, 5, 6))
         with pytest.raises(DriveError, match=r"drive A: its firmware is 0\.5\.6; wanted 0\.6\.0"):
             new.drives.configure(PERIOD)
 

@@ -24,17 +24,16 @@ from test_faults import (
     assert_stops_until_reset,
 )
 from test_odrive import odrives
-
-from drivers import odrive_frames as frames
-from drivers.interface import PowerState
-from drivers.odrive import SETTLING
-from drivers.odrive_frames import AxisState
-from drivers.ramp import braked
-from drivers.simulated import SimulatedOdrive
-from drivers.wire import UNSENT_CYCLES
-from service.config import Config
-from service.modes import Mode
-from service.packets import Confirmed, Refused, Request
+from trirail.config import Config
+from trirail.wire.packets import Confirmed, Refused, Request
+from trirail.wire.vocabulary import Mode
+from trirail_drivers.interface import PowerState
+from trirail_drivers.odrive import odrive_frames as frames
+from trirail_drivers.odrive.odrive import SETTLING
+from trirail_drivers.odrive.odrive_frames import AxisState
+from trirail_drivers.ramp import braked
+from trirail_drivers.simulated import SimulatedOdrive
+from trirail_drivers.wire import UNSENT_CYCLES
 
 ODRIVES = odrives(REAL)
 PERIOD = ODRIVES.period

@@ -12,9 +12,8 @@ import pytest
 from cantools.database.can import Database
 from hypothesis import given
 from hypothesis import strategies as st
-
-from drivers import odrive_frames as frames
-from drivers.frames import frame_bits
+from trirail_drivers.frames import frame_bits
+from trirail_drivers.odrive import odrive_frames as frames
 
 LOADED = cantools.database.load_file(Path(__file__).with_name("data") / "odrive-cansimple.dbc")
 assert isinstance(LOADED, Database)

@@ -11,13 +11,12 @@ import pytest
 from cyclopts import App, CycloptsError
 from matplotlib.image import imread
 from numpy.testing import assert_allclose
-
-from service import offline
-from service.config import SIM
-from service.errors import KinematicsError, TrirailError
-from service.geometry import Geometry
-from service.kinematics import inverse
-from service.singularity import conditioning, sensitivity
+from trirail.cli import offline
+from trirail.config import SIM
+from trirail.errors import KinematicsError, TrirailError
+from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.kinematics import inverse
+from trirail.workspace.singularity import conditioning, sensitivity
 
 PAPER = Geometry.symmetric(0.3)
 
@@ -196,8 +195,8 @@ def test_a_plot_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_without_matplotlib_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delitem(sys.modules, "service.plots", raising=False)
-    monkeypatch.delattr("service.plots", raising=False)
+    monkeypatch.delitem(sys.modules, "trirail.workspace.plots", raising=False)
+    monkeypatch.delattr("trirail.workspace.plots", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(TrirailError, match=r"pip install 'trirail\[analysis\]'"):
         call(f"workspace --plot {tmp_path / 'a.png'}")

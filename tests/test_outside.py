@@ -19,13 +19,12 @@ import msgspec
 import pytest
 import zenoh
 from test_service import Service, trirail, until
-
-from service import boundary
-from service.client import Robot
-from service.errors import RefusedError
-from service.messages import Event, TrajectoryGoal, TrajectoryPoint
-from service.session import open_client
-from service.sizes import MAX_MESSAGE, MAX_POINTS, MAX_TRANSPORT
+from trirail.client.client import Robot
+from trirail.errors import RefusedError
+from trirail.wire import boundary
+from trirail.wire.messages import Event, TrajectoryGoal, TrajectoryPoint
+from trirail.wire.session import open_client
+from trirail.wire.sizes import MAX_MESSAGE, MAX_POINTS, MAX_TRANSPORT
 
 pytestmark = pytest.mark.slow
 
@@ -251,7 +250,7 @@ def test_an_asker_that_is_frozen_holds_up_nobody(shared: tuple[Service, Robot, z
     service, robot, _ = shared
     script = """
 import sys
-from service.session import open_client
+from trirail.wire.session import open_client
 session = open_client(sys.argv[1])
 print("ready", flush=True)
 while True:  # asks, and is stopped in the middle of it
@@ -344,7 +343,7 @@ def test_what_was_forged_is_shown_as_what_it_is(shared: tuple[Service, Robot, ze
 @contextlib.contextmanager
 def events(service: Service, *arguments: str) -> Iterator[Callable[[], str]]:
     """Follow the events on a terminal; gives what reads a line of it."""
-    command = [sys.executable, "-m", "service", *arguments, "--connect", service.locator]
+    command = [sys.executable, "-m", "trirail", *arguments, "--connect", service.locator]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as shown:
         assert shown.stdout is not None
         yield lambda: shown.stdout.readline().rstrip("\n") if shown.stdout else ""
@@ -361,7 +360,7 @@ def test_a_program_that_never_closes_its_robot_ends_all_the_same(
     service, _, _ = shared
     script = f"""
 import sys, threading
-from service.client import Robot
+from trirail.client.client import Robot
 robot = Robot("demo", {service.locator!r}, user="careless")
 states = robot.states()
 next(states)

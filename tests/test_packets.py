@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import pytest
-
-from service import packets
-from service.messages import Event, PoseGoal
-from service.packets import (
+from trirail.wire import packets
+from trirail.wire.messages import Event, PoseGoal
+from trirail.wire.packets import (
     Accepted,
     Answer,
     CommandRequest,
@@ -20,7 +19,7 @@ from service.packets import (
     Situation,
     Welcome,
 )
-from service.records import FIELDS, LAYOUT, Record, pack_into, unpack
+from trirail.wire.records import FIELDS, LAYOUT, Record, pack_into, unpack
 
 
 @pytest.mark.parametrize(

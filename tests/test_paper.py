@@ -14,9 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from paper_motions import EXAMPLES, QUANTITIES, Curves, computed
 from paper_service import Driven
-
-from service.errors import RefusedError
-from service.palette import SLIDERS
+from trirail.errors import RefusedError
+from trirail.telemetry.palette import SLIDERS
 
 PANELS = [f"figure_{number:02}" for number in range(3, 12)]
 

@@ -13,16 +13,15 @@ import paper_service
 import pytest
 from paper_motions import DURATION, EXAMPLES, QUANTITIES, Example, computed, greatest_difference, platform
 from paper_service import REACHED, driven, points
-
-from service import spawned
-from service.config import SIM, load
-from service.errors import RefusedError, ServiceError
-from service.messages import TrajectoryGoal
-from service.modes import MODES, Mode
-from service.packets import Accepted
-from service.reading import Line, Recording
-from service.records import DTYPE
-from service.sizes import MAX_MESSAGE
+from trirail.client import spawned
+from trirail.config import SIM, load
+from trirail.errors import RefusedError, ServiceError
+from trirail.telemetry.reading import Line, Recording
+from trirail.wire.messages import TrajectoryGoal
+from trirail.wire.packets import Accepted
+from trirail.wire.records import DTYPE
+from trirail.wire.sizes import MAX_MESSAGE
+from trirail.wire.vocabulary import MODES, Mode
 
 PERIOD = 1e-3
 BOUNDS = (1e-14, 5e-14, 1e-11)

@@ -14,16 +14,15 @@ import numpy as np
 import pytest
 import rerun as rr
 from numpy.typing import NDArray
-
-from service.columns import Column, Timelines, chunks, structs
-from service.config import SIM, load
-from service.errors import ServiceError
-from service.messages import Event
-from service.reading import read
-from service.recorder import Recorder
-from service.records import DTYPE
-from service.scene import FIELDS, Scene
-from service.subject import Subject
+from trirail.config import SIM, load
+from trirail.errors import ServiceError
+from trirail.telemetry.columns import Column, Timelines, chunks, structs
+from trirail.telemetry.reading import read
+from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.scene import FIELDS, Scene
+from trirail.telemetry.subject import Subject
+from trirail.wire.messages import Event
+from trirail.wire.records import DTYPE
 
 WALL_NS = 1_795_245_300_000_000_000
 BATCH = 50

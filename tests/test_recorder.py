@@ -16,16 +16,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rerun.chunk import Chunk, RrdReader
-
-from drivers.capture import FRAME, REMOTE
-from service.config import SIM, Config, load
-from service.errors import ServiceError
-from service.messages import Event
-from service.recorder import Recorder
-from service.records import DTYPE
-from service.show import Show
-from service.sinks import BACKLOG, Archive, Relay, free_port
-from service.subject import Subject
+from trirail.config import SIM, Config, load
+from trirail.errors import ServiceError
+from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.show import Show
+from trirail.telemetry.sinks import BACKLOG, Archive, Relay, free_port
+from trirail.telemetry.subject import Subject
+from trirail.wire.messages import Event
+from trirail.wire.records import DTYPE
+from trirail_drivers.capture import FRAME, REMOTE
 
 WALL_NS = 1_795_245_300_000_000_000
 

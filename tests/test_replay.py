@@ -12,16 +12,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-
-from service import provenance, spawned
-from service.client import Robot
-from service.config import Config, load
-from service.errors import RefusedError, ServiceError
-from service.messages import VelocityGoal
-from service.packets import CommandRequest, GoalRequest, Mishap
-from service.reading import Recording, join, read
-from service.replay import again
-from service.summary import summary
+from trirail.analysis.replay import again
+from trirail.analysis.summary import summary
+from trirail.client import spawned
+from trirail.client.client import Robot
+from trirail.config import Config, load
+from trirail.errors import RefusedError, ServiceError
+from trirail.telemetry import provenance
+from trirail.telemetry.reading import Recording, join, read
+from trirail.wire.messages import VelocityGoal
+from trirail.wire.packets import CommandRequest, GoalRequest, Mishap
 
 pytestmark = pytest.mark.slow
 
@@ -194,7 +194,7 @@ def test_errors_are_those_of_enabled_drives(recording: Recording) -> None:
 
 
 def trirail(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "service", *map(str, arguments)]
+    command = [sys.executable, "-m", "trirail", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 

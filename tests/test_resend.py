@@ -6,12 +6,11 @@ from typing import Any, cast
 
 import numpy as np
 from made import records
-
-from service.client import Goal, Result, Robot
-from service.messages import Event, PoseGoal
-from service.packets import CommandRequest, GoalRequest, Input, Request
-from service.reading import Line, Recording
-from service.resend import _send
+from trirail.analysis.resend import _send
+from trirail.client.client import Goal, Result, Robot
+from trirail.telemetry.reading import Line, Recording
+from trirail.wire.messages import Event, PoseGoal
+from trirail.wire.packets import CommandRequest, GoalRequest, Input, Request
 
 
 class Heard:

@@ -7,10 +7,9 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from drivers.config import Drive
-from drivers.errors import DriveError
-from drivers.scaling import INT32_MAX, UINT32_MAX, Scale, scale_of, unsigned
+from trirail_drivers.config import Drive
+from trirail_drivers.errors import DriveError
+from trirail_drivers.scaling import INT32_MAX, UINT32_MAX, Scale, scale_of, unsigned
 
 drives = st.builds(
     Drive,

@@ -11,18 +11,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
-
-from service.config import SIM, LegTable, load
-from service.gateway import _info
-from service.geometry import Geometry, Leg
-from service.mechanism import Mechanism, sliders
-from service.messages import Info
-from service.modes import MODES, Mode
-from service.outlook import Outlook
-from service.records import DTYPE
-from service.scene import Scene
-from service.singularity import distance_to_singularity
-from service.subject import Subject
+from trirail.config import SIM, LegTable, load
+from trirail.kinematics.geometry import Geometry, Leg
+from trirail.processes.gateway import _info
+from trirail.telemetry.scene import Scene
+from trirail.telemetry.subject import Subject
+from trirail.wire.messages import Info
+from trirail.wire.records import DTYPE
+from trirail.wire.vocabulary import MODES, Mode
+from trirail.workspace.mechanism import Mechanism, sliders
+from trirail.workspace.outlook import Outlook
+from trirail.workspace.singularity import distance_to_singularity
 
 CONFIG = load(SIM)
 WALL_OFFSET_NS = 1_700_000_000_000_000_000

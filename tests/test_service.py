@@ -25,18 +25,18 @@ import numpy as np
 import pytest
 import zenoh
 from can import CanutilsLogReader
-
-from drivers import frames, odrive_frames
-from service import provenance
-from service.client import Robot
-from service.config import SIM, load
-from service.errors import RefusedError, ServiceError
-from service.interpreter import child, python
-from service.messages import Event, GoalReply, OwnLimits, State
-from service.modes import MODES, Mode
-from service.reading import read
-from service.remote import RemoteView
-from service.session import open_client
+from trirail.cli.remote import RemoteView
+from trirail.client.client import Robot
+from trirail.config import SIM, load
+from trirail.errors import RefusedError, ServiceError
+from trirail.processes.interpreter import child, python
+from trirail.telemetry import provenance
+from trirail.telemetry.reading import read
+from trirail.wire.messages import Event, GoalReply, OwnLimits, State
+from trirail.wire.session import open_client
+from trirail.wire.vocabulary import MODES, Mode
+from trirail_drivers import frames
+from trirail_drivers.odrive import odrive_frames
 
 pytestmark = pytest.mark.slow
 
@@ -96,13 +96,13 @@ class Service:
 
 
 def run(*arguments: object, **options: Any) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(python("-m", "service", "run", *map(str, arguments)), **options)
+    return subprocess.Popen(python("-m", "trirail", "run", *map(str, arguments)), **options)
 
 
 def trirail(*arguments: object, locator: str = "") -> subprocess.CompletedProcess[str]:
     """Run a command to its end."""
     environment = os.environ | ({"TRIRAIL_CONNECT": locator} if locator else {})
-    command = [sys.executable, "-m", "service", *map(str, arguments)]
+    command = [sys.executable, "-m", "trirail", *map(str, arguments)]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
 
 

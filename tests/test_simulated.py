@@ -7,11 +7,10 @@ from struct import pack, unpack
 
 import can
 import pytest
-
-from drivers import config
-from drivers.interface import PowerState
-from drivers.simulated import Servo, SimulatedBus, SimulatedDrive, simulated_bus
-from drivers.simulated.drive import EDS
+from trirail_drivers import config
+from trirail_drivers.interface import PowerState
+from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive, simulated_bus
+from trirail_drivers.simulated.drive import EDS
 
 NODE = 5
 PERIOD = 0.001

@@ -13,13 +13,12 @@ from collections.abc import Callable, Iterator
 
 import can
 import pytest
-
-from drivers import bus, frames
-from drivers.cia402 import Cia402
-from drivers.config import Can, Drive, Drives, Simulated
-from drivers.errors import BusError
-from drivers.interface import Feedback, PowerState
-from drivers.simulated import simulated_bus
+from trirail_drivers import bus, frames
+from trirail_drivers.cia402.cia402 import Cia402
+from trirail_drivers.config import Can, Drive, Drives, Simulated
+from trirail_drivers.errors import BusError
+from trirail_drivers.interface import Feedback, PowerState
+from trirail_drivers.simulated import simulated_bus
 
 NAME = f"vcan{os.getpid() % 100_000}"
 SECTION = Can(interface="socketcan", channel=NAME, simulated=Simulated(missed_syncs=1000))

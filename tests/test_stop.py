@@ -9,13 +9,13 @@ import pytest
 from conftest import CONFIG, Rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from service.config import Config
-from service.goals import Motion
-from service.messages import PoseGoal, SlidersGoal, VelocityGoal
-from service.modes import Event, Mode
-from service.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
-from service.steps import Steps
+from trirail.config import Config
+from trirail.control.modes import Event
+from trirail.motion.goals import Motion
+from trirail.motion.steps import Steps
+from trirail.wire.messages import PoseGoal, SlidersGoal, VelocityGoal
+from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
+from trirail.wire.vocabulary import Mode
 
 PERIOD = CONFIG.period
 PROMPT = round(0.05 / PERIOD)

@@ -6,14 +6,13 @@ import sys
 from pathlib import Path
 
 import pytest
-
-from service import supervisor
-from service.config import SIM, load
+from trirail.config import SIM, load
+from trirail.processes import supervisor
 
 CHILD = """
 import os, sys, time
 from pathlib import Path
-from service.heartbeats import Heartbeats
+from trirail.processes.heartbeats import Heartbeats
 
 folder = Path({folder!r})
 _, name, runtime, ready_on, beats, *sockets = sys.argv

@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from service.heartbeats import PROCESSES, Heartbeats
-from service.systemd import FEEDS, Watchdog, notify
+from trirail.processes.heartbeats import PROCESSES, Heartbeats
+from trirail.processes.systemd import FEEDS, Watchdog, notify
 
 UNIT = Path(__file__).parents[1] / "configs" / "trirail.service"
 

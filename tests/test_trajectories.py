@@ -7,10 +7,9 @@ from conftest import CONFIG, Rig
 from hypothesis import given
 from hypothesis import strategies as st
 from test_control import PERIOD, assert_within_limits, refusal
-
-from service.messages import PoseGoal, TrajectoryGoal, TrajectoryPoint
-from service.modes import Mode
-from service.packets import Accepted
+from trirail.wire.messages import PoseGoal, TrajectoryGoal, TrajectoryPoint
+from trirail.wire.packets import Accepted
+from trirail.wire.vocabulary import Mode
 
 STILL = (0.0, 0.0, 0.0)
 

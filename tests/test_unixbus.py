@@ -11,9 +11,8 @@ from pathlib import Path
 
 import can
 import pytest
-
-from drivers.errors import BusError
-from drivers.unixbus import UnixBus
+from trirail_drivers.errors import BusError
+from trirail_drivers.unixbus import UnixBus
 
 ROOT = Path(__file__).parents[1]
 WAIT = 5.0

@@ -6,12 +6,11 @@ from itertools import product
 
 import pytest
 from conftest import CONFIG
-
-from drivers.interface import DriveFault, Feedback, PowerState
-from service.config import geometry
-from service.measured import Measured
-from service.modes import Mode
-from service.verdicts import still_powered, verdict
+from trirail.config import geometry
+from trirail.control.measured import Measured
+from trirail.control.verdicts import still_powered, verdict
+from trirail.wire.vocabulary import Mode
+from trirail_drivers.interface import DriveFault, Feedback, PowerState
 
 P = PowerState
 OFF, ON = P.SWITCH_ON_DISABLED, P.OPERATION_ENABLED

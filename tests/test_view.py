@@ -23,11 +23,10 @@ import screenshot
 from chromium import chromium
 from PIL import Image
 from rerun.chunk import Chunk, RrdReader
-
-from service import view
-from service.config import SIM, load
-from service.recorder import Recorder
-from service.sinks import free_port
+from trirail.cli import view
+from trirail.config import SIM, load
+from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.sinks import free_port
 
 VIEWS = {
     "demo: 3-PRP planar robot",
@@ -86,7 +85,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 @pytest.mark.viewer
 @needs_vulkan
 def test_the_viewer_shows_every_view_without_complaint(recording: Path, tmp_path: Path) -> None:
-    from service import palette
+    from trirail.telemetry import palette
 
     with screenshot.viewer(recording, 1280, 800) as client:
         views = {shown.name: shown for shown in client.get_state().views}
@@ -101,7 +100,7 @@ def test_the_viewer_shows_every_view_without_complaint(recording: Path, tmp_path
 @contextmanager
 def trirail_view(*arguments: object) -> Iterator[str]:
     """Run `trirail view --web`, yield the page's address, and see that it ends well."""
-    command = [sys.executable, "-m", "service", "view", "--web", "--json", *map(str, arguments)]
+    command = [sys.executable, "-m", "trirail", "view", "--web", "--json", *map(str, arguments)]
     environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as process:
         assert process.stdout is not None
@@ -116,7 +115,7 @@ def trirail_view(*arguments: object) -> Iterator[str]:
 @pytest.mark.viewer
 @needs_chromium
 def test_the_browser_shows_a_recording(recording: Path, tmp_path: Path) -> None:
-    from service import palette
+    from trirail.telemetry import palette
 
     with trirail_view(recording) as url, chromium("chromium", tmp_path) as page:
         page.open(f"{url}&renderer=webgl")

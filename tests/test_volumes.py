@@ -15,17 +15,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
-
-from service import provenance, shelf
-from service.blackbox import AFTER, BEFORE, BlackBox
-from service.config import SIM, Config, load, parse
-from service.loop import BATCHES_PER_SECOND
-from service.messages import Event, PoseGoal
-from service.modes import Mode
-from service.packets import GoalRequest, Input
-from service.reading import Recording, join, read
-from service.recorder import Recorder
-from service.recording import GATHER
+from trirail.config import SIM, Config, load, parse
+from trirail.processes.loop import BATCHES_PER_SECOND
+from trirail.processes.recording import GATHER
+from trirail.telemetry import provenance, shelf
+from trirail.telemetry.blackbox import AFTER, BEFORE, BlackBox
+from trirail.telemetry.reading import Recording, join, read
+from trirail.telemetry.recorder import Recorder
+from trirail.wire.messages import Event, PoseGoal
+from trirail.wire.packets import GoalRequest, Input
+from trirail.wire.vocabulary import Mode
 
 WALL_NS = 1_795_245_300_000_000_000
 BATCH = 20
@@ -194,7 +193,7 @@ LIMITED = """
 import os, resource, sys
 from pathlib import Path
 import made, test_volumes as here
-from service.volumes import RETRY
+from trirail.telemetry.volumes import RETRY
 told, time = [], here.Time()
 config = here.configured()
 recording = here.recorder(Path(sys.argv[1]), time, config, warn=told.append)

@@ -9,10 +9,9 @@ import can
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from drivers import frames
-from drivers.interface import DriveFault
-from drivers.wire import Wire
+from trirail_drivers import frames
+from trirail_drivers.interface import DriveFault
+from trirail_drivers.wire import Wire
 
 FULL = can.CanOperationError("Transmit buffer full", errno.ENOBUFS)
 ERROR_FRAME = {"is_error_frame": True, "is_extended_id": False}

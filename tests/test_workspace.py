@@ -11,13 +11,18 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-
-from service.config import SIM, Limits, load
-from service.errors import KinematicsError
-from service.geometry import Geometry, Leg, singular_angles
-from service.kinematics import inverse, jacobians
-from service.singularity import characteristic_length, conditioning, distance_to_singularity, range_of_j1, sensitivity
-from service.workspace import area, permitted, reachable, survey, violations
+from trirail.config import SIM, Limits, load
+from trirail.errors import KinematicsError
+from trirail.kinematics.geometry import Geometry, Leg, singular_angles
+from trirail.kinematics.kinematics import inverse, jacobians
+from trirail.workspace.singularity import (
+    characteristic_length,
+    conditioning,
+    distance_to_singularity,
+    range_of_j1,
+    sensitivity,
+)
+from trirail.workspace.workspace import area, permitted, reachable, survey, violations
 
 Array = NDArray[np.float64]
 

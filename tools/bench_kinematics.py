@@ -8,11 +8,10 @@ import timeit
 from collections.abc import Callable
 
 import numpy as np
-
-from service.algebra import Array
-from service.closure import inverse_batch
-from service.geometry import Geometry
-from service.kinematics import forward_into, inverse, inverse_into, warm_up
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.closure import inverse_batch
+from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.kinematics import forward_into, inverse, inverse_into, warm_up
 
 L0 = 0.3
 POSE = np.array([0.02, -0.01, 0.15])

@@ -21,12 +21,11 @@ from typing import Any
 import numpy as np
 from moving import keep_moving
 from numpy.typing import NDArray
-
-from service.client import Robot
-from service.config import SIM, load
-from service.errors import ServiceError
-from service.interpreter import python
-from service.records import PARTS, unpack
+from trirail.client.client import Robot
+from trirail.config import SIM, load
+from trirail.errors import ServiceError
+from trirail.processes.interpreter import python
+from trirail.wire.records import PARTS, unpack
 
 QUANTILES = (50.0, 99.0, 99.9, 100.0)
 HEADER = f"{'':28}{'p50':>9}{'p99':>9}{'p99.9':>9}{'max':>9}   µs"
@@ -65,7 +64,7 @@ def measure(seconds: float) -> dict[str, Any]:
 
 
 def _start(*arguments: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(python("-m", "service", *arguments), stdout=subprocess.DEVNULL)
+    return subprocess.Popen(python("-m", "trirail", *arguments), stdout=subprocess.DEVNULL)
 
 
 def _connect(name: str, locator: str, service: subprocess.Popen[bytes]) -> Robot:

@@ -9,13 +9,12 @@ from collections.abc import Callable
 
 import numpy as np
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
-
-from service.config import SIM, geometry, load
-from service.course import Course
-from service.errors import RefusedError
-from service.goals import Goals
-from service.messages import Goal, PoseGoal, SlidersGoal, VelocityGoal
-from service.motion import rest
+from trirail.config import SIM, geometry, load
+from trirail.errors import RefusedError
+from trirail.motion.course import Course
+from trirail.motion.goals import Goals
+from trirail.motion.motion import rest
+from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, VelocityGoal
 
 GOALS = 1500
 AIM = 300.0

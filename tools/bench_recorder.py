@@ -15,12 +15,11 @@ import time
 from pathlib import Path
 
 from moving import keep_moving
-
-from service import spawned
-from service.client import Robot
-from service.config import load
-from service.interpreter import child
-from service.sinks import HOST, free_port
+from trirail.client import spawned
+from trirail.client.client import Robot
+from trirail.config import load
+from trirail.processes.interpreter import child
+from trirail.telemetry.sinks import HOST, free_port
 
 CPU_LIMIT = 0.03
 """Share of one processor."""

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from can import CanutilsLogReader
-
-from drivers import frames as layout
-from drivers.config import Drive
-from drivers.interface import NAMES
-from service.config import Config
+from trirail.config import Config
+from trirail_drivers import frames as layout
+from trirail_drivers.config import Drive
+from trirail_drivers.interface import NAMES
 
 HELD = {
     "SYNC": "every SYNC is a tick of the period: none too early, none in a burst, none but the missed ones lacking",

@@ -3,7 +3,7 @@
 python tools/calibrate.py poses.csv --config robot.toml --output geometry.toml
 
 The file has the columns x, y, phi, A, B, C: where an outside instrument saw the platform, and what the sliders
-read there, in metres and radians. service.calibration has the mathematics. The report goes to standard error.
+read there, in metres and radians. kinematics.calibration has the mathematics. The report goes to standard error.
 Needs trirail[analysis].
 """
 
@@ -19,13 +19,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-
-from drivers import files
-from service import config
-from service.algebra import Array
-from service.calibration import PARAMETERS, Calibration, CalibrationError, identify
-from service.errors import TrirailError
-from service.geometry import LEGS, Geometry, singular_angles
+from trirail import config
+from trirail.errors import TrirailError
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.calibration import PARAMETERS, Calibration, CalibrationError, identify
+from trirail.kinematics.geometry import LEGS, Geometry, singular_angles
+from trirail_drivers import files
 
 COLUMNS = ("x", "y", "phi", *LEGS)
 COORDINATES = (("x", "µm", 1e6), ("y", "µm", 1e6), ("phi", "mrad", 1e3))

@@ -26,10 +26,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from chaos_rig import PATIENCE, PROCESSES, Failed, Rig, states, wait_for
-
-from service.client import Robot
-from service.errors import TrirailError
-from service.session import key, open_client
+from trirail.client.client import Robot
+from trirail.errors import TrirailError
+from trirail.wire.session import key, open_client
 
 MODES = ("disabled", "enabling", "holding", "moving", "stopping", "fault")
 HARM: dict[str, tuple[signal.Signals, float | None]] = {

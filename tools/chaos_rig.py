@@ -16,17 +16,16 @@ from pathlib import Path
 
 import can
 import numpy as np
-
-from drivers import frames
-from drivers.unixbus import UnixBus
-from service import spawned
-from service.client import Robot
-from service.config import SIM, load
-from service.errors import ServiceError, TrirailError
-from service.interpreter import child
-from service.messages import State
-from service.reading import Recording, read
-from service.sinks import HOST, free_port
+from trirail.client import spawned
+from trirail.client.client import Robot
+from trirail.config import SIM, load
+from trirail.errors import ServiceError, TrirailError
+from trirail.processes.interpreter import child
+from trirail.telemetry.reading import Recording, read
+from trirail.telemetry.sinks import HOST, free_port
+from trirail.wire.messages import State
+from trirail_drivers import frames
+from trirail_drivers.unixbus import UnixBus
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 20.0
@@ -145,7 +144,7 @@ class Rig:
         return self.service.pid if name == "supervisor" else child(self.service.pid, name)
 
     def fault(self, line: str) -> None:
-        """Tell the drives of a fault: drivers.simulated.faultlines."""
+        """Tell the drives of a fault: trirail_drivers.simulated.faultlines."""
         if self._drives.stdin is not None:
             self._drives.stdin.write(line.encode() + b"\n")
             self._drives.stdin.flush()
@@ -269,7 +268,7 @@ class Rig:
 
 
 def _python(*arguments: str) -> list[str]:
-    from service.interpreter import python
+    from trirail.processes.interpreter import python
 
     # A tool finds its neighbours by its own folder, which -P would leave out; the current one is not on its path.
     return [python()[0], *arguments]

@@ -28,12 +28,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import zenoh
-
-from service import boundary, session, spawned
-from service.client import Robot
-from service.errors import RefusedError, ServiceError, TrirailError
-from service.sinks import free_port
-from service.sizes import MAX_MESSAGE
+from trirail.client import spawned
+from trirail.client.client import Robot
+from trirail.errors import RefusedError, ServiceError, TrirailError
+from trirail.telemetry.sinks import free_port
+from trirail.wire import boundary, session
+from trirail.wire.sizes import MAX_MESSAGE
 
 SESSIONS = 200
 DEAF = 20
@@ -183,7 +183,7 @@ def processes(supervisor: int) -> dict[str, int]:
     found = {"supervisor": supervisor}
     for entry in Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split():
         words = Path(f"/proc/{entry}/cmdline").read_text().split("\0")
-        found[words[words.index("service.process") + 1]] = int(entry)
+        found[words[words.index("trirail.processes.process") + 1]] = int(entry)
     return found
 
 

@@ -23,8 +23,7 @@ from typing import Any
 import bus_log
 from hil_machine import ROOT, heard, machine, pack, prepare
 from hil_needs import Failed, install, last, requirements
-
-from service.config import Config, load
+from trirail.config import Config, load
 
 CHANGES = {
     # The emulated processor is ten to twenty times slower than the real one.

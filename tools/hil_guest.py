@@ -17,10 +17,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from service.client import Result, Robot
-from service.config import Config, load
-from service.errors import RefusedError, TrirailError
-from service.messages import State
+from trirail.client.client import Result, Robot
+from trirail.config import Config, load
+from trirail.errors import RefusedError, TrirailError
+from trirail.wire.messages import State
 
 ROOT = Path(__file__).parents[1]
 WITHIN = 300.0
@@ -101,7 +101,7 @@ class Machine:
 
     def doctor(self) -> str:
         """What `trirail doctor` says of can0. Raises Failed unless all of it is well."""
-        command = (sys.executable, "-P", "-m", "service", "doctor", self._folder / "robot.toml", "--json")
+        command = (sys.executable, "-P", "-m", "trirail", "doctor", self._folder / "robot.toml", "--json")
         said = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=False)
         can0 = [check for check in json.loads(said.stdout)["checks"] if check["name"].startswith("can0")]
         if len(can0) != 3 or any(check["verdict"] != "ok" for check in can0):

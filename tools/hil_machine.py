@@ -22,11 +22,18 @@ PRECEDENCE = "-10"
 PORTABLE = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 """Compiled code for any x86-64: the emulated processor has not what this one has, and compiles for minutes."""
 
+COMPILE = "from trirail.processes import gateway, loop, recording; from trirail.client import client"
+
 
 def prepare(folder: Path) -> None:
     """Compile the kinematics here, for the machine to load."""
     done = subprocess.run(
-        (sys.executable, "-P", "-c", "import service.loop, service.gateway, service.recording, service.client"),
+        (
+            sys.executable,
+            "-P",
+            "-c",
+            COMPILE,
+        ),
         cwd=ROOT,
         env=os.environ | PORTABLE | {"NUMBA_CACHE_DIR": str(folder / "numba")},
         capture_output=True,

@@ -6,8 +6,8 @@ import random
 import sys
 import time
 
-from service.client import Robot
-from service.errors import TrirailError
+from trirail.client.client import Robot
+from trirail.errors import TrirailError
 
 SPAN = (0.05, 0.05, 0.4)
 """Goals lie so far from the middle [m, m, rad]."""

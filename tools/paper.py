@@ -29,9 +29,8 @@ from paper_motions import (
     tabulated,
 )
 from paper_service import Driven, drive
-
-from service.config import SIM, load
-from service.errors import ServiceError, TrirailError
+from trirail.config import SIM, load
+from trirail.errors import ServiceError, TrirailError
 
 
 class Comparison(NamedTuple):

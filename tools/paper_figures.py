@@ -22,10 +22,9 @@ from paper_motions import (
     figures,
     greatest_difference,
 )
-
-from service.errors import ServiceError
-from service.geometry import LEGS
-from service.palette import SLIDERS
+from trirail.errors import ServiceError
+from trirail.kinematics.geometry import LEGS
+from trirail.telemetry.palette import SLIDERS
 
 STYLE: dict[Any, Any] = {
     "figure.facecolor": "white",

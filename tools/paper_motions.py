@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-
-from service.algebra import Array
-from service.errors import ServiceError
-from service.geometry import LEGS, Geometry
-from service.kinematics import inverse
+from trirail.errors import ServiceError
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.geometry import LEGS, Geometry
+from trirail.kinematics.kinematics import inverse
 
 L0 = 0.3
 """Centre to summit of the fixed triangle [m]."""

@@ -15,15 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 from paper_motions import DURATION, EXAMPLES, Curves, Example, platform
-
-from service import spawned
-from service.algebra import Array
-from service.client import Goal, Robot
-from service.config import SIM, load
-from service.errors import RefusedError, ServiceError
-from service.messages import TrajectoryPoint
-from service.modes import MODES, Mode
-from service.reading import Recording, read
+from trirail.client import spawned
+from trirail.client.client import Goal, Robot
+from trirail.config import SIM, load
+from trirail.errors import RefusedError, ServiceError
+from trirail.kinematics.algebra import Array
+from trirail.telemetry.reading import Recording, read
+from trirail.wire.messages import TrajectoryPoint
+from trirail.wire.vocabulary import MODES, Mode
 
 SPACING = 0.02
 """Between the points of a trajectory [s]. The remainder of the service's quintics between them is
@@ -35,7 +34,7 @@ WITHIN = 60.0
 USER = "paper"
 REACHED = 2
 """Cycles from the one that writes a setpoint to the SYNC at which a drive should have reached it: it takes the setpoint
-up at the SYNC between (service.control.Control.observe)."""
+up at the SYNC between (trirail.control.control.Control.observe)."""
 
 
 class Driven(NamedTuple):
@@ -81,7 +80,7 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     """Cut the motion to a goal out of a recording, in time with equation (5). Raises ServiceError.
 
     Nothing is fitted. The log names the goal and the cycle that set the robot in motion for it. In that cycle the
-    motion advanced by one period for the first time (service.control.Control.advance), so its setpoints
+    motion advanced by one period for the first time (trirail.control.control.Control.advance), so its setpoints
     are those of t = 1 period, those of the k-th cycle of motion t = k periods, and t = 0 is the standstill before.
     That time ran like this throughout is checked by the progress in each record.
     """

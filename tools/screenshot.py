@@ -18,9 +18,8 @@ from pathlib import Path
 
 from PIL import Image
 from rerun.experimental import ViewerClient
-
-from service.interpreter import python
-from service.sinks import free_port
+from trirail.processes.interpreter import python
+from trirail.telemetry.sinks import free_port
 
 TIMEOUT = 60.0
 SETTLE = 2.0

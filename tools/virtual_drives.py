@@ -18,14 +18,13 @@ from pathlib import Path
 from types import FrameType
 
 import can
-
-from drivers.config import Drives
-from drivers.interface import NAMES
-from drivers.simulated import SimulatedBus, simulated_bus
-from drivers.simulated.faultlines import HELP, FaultSyntaxError
-from drivers.unixbus import UnixBus
-from service.config import load
-from service.errors import TrirailError
+from trirail.config import load
+from trirail.errors import TrirailError
+from trirail_drivers.config import Drives
+from trirail_drivers.interface import NAMES
+from trirail_drivers.simulated import SimulatedBus, simulated_bus
+from trirail_drivers.simulated.faultlines import HELP, FaultSyntaxError
+from trirail_drivers.unixbus import UnixBus
 
 _POLLS = 5
 """So many times a cycle the drives' own timers are looked at, if no frame comes."""

@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-
-from service import trajectory
-from service.config import SIM, Config, load
-from service.errors import ConfigError, ServiceError, TrirailError
-from service.reading import read
+from trirail.client import trajectory
+from trirail.config import SIM, Config, load
+from trirail.errors import ConfigError, ServiceError, TrirailError
+from trirail.telemetry.reading import read
 
 LINES = SIM.read_text(encoding="utf-8").splitlines()
 VALUES = ("0", "-1", "1e-310", "1e300", "nan", "inf", '""', '"x"', "[]", "{}", "true", "1979-05-27", "[[1]]", "9" * 400)

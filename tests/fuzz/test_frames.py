@@ -7,9 +7,8 @@ import pytest
 from conftest import CONFIG, Rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from service.config import SIM, Config, parse
-from service.modes import Mode
+from trirail.config import SIM, Config, parse
+from trirail.wire.vocabulary import Mode
 
 _CHANGES = {'protocol = "cia402"': 'protocol = "odrive"', "counts_per_metre = 1e7": "counts_per_metre = 25.0"}
 _TEXT = SIM.read_text(encoding="utf-8")

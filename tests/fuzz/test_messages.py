@@ -16,18 +16,17 @@ import pytest
 from conftest import CONFIG, Rig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-
-from service import boundary, links, packets, session, text
-from service.errors import RefusedError
-from service.gateway import Gateway
-from service.inbox import Incoming, Kind
-from service.links import Port, TooLarge
-from service.messages import CommandReply, Event, Goal, Info, Override, PoseGoal, State, Stop, TrajectoryGoal
-from service.messages import TrajectoryPoint as Point
-from service.modes import Mode
-from service.packets import Accepted, GoalRequest, Happened, RefusedRequest
-from service.records import DTYPE, LAYOUT
-from service.sizes import MAX_MESSAGE, MAX_NAME, MAX_PACKET, MAX_POINTS
+from trirail.errors import RefusedError
+from trirail.processes.gateway import Gateway
+from trirail.processes.inbox import Incoming, Kind
+from trirail.wire import boundary, links, packets, session, text
+from trirail.wire.links import Port, TooLarge
+from trirail.wire.messages import CommandReply, Event, Goal, Info, Override, PoseGoal, State, Stop, TrajectoryGoal
+from trirail.wire.messages import TrajectoryPoint as Point
+from trirail.wire.packets import Accepted, GoalRequest, Happened, RefusedRequest
+from trirail.wire.records import DTYPE, LAYOUT
+from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_PACKET, MAX_POINTS
+from trirail.wire.vocabulary import Mode
 
 KINDS: tuple[Any, ...] = (Goal, Stop | None, Override, State, Event, Info, CommandReply)
 ENCODINGS = ("", "zenoh/bytes", "application/json;v=1", boundary.JSON, boundary.MSGPACK)

@@ -1,0 +1,103 @@
+"""Opens the configured CAN bus, and the drives on it."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+
+from trirail_drivers import canerrors, config
+from trirail_drivers.capture import Capture, CapturedBus
+from trirail_drivers.cia402.cia402 import Cia402
+from trirail_drivers.errors import BusError, DriveError
+from trirail_drivers.interface import Drives
+from trirail_drivers.odrive.odrive import Odrive
+from trirail_drivers.simulated import simulated_bus
+from trirail_drivers.unixbus import UnixBus
+
+# What python-can would say of a failure is in the BusError; standard error is for that one line.
+logging.getLogger("can").addHandler(logging.NullHandler())
+
+PROTOCOLS: dict[str, Callable[[can.BusABC, int, config.Drives, Callable[[], float]], Drives]] = {
+    "cia402": Cia402,
+    "odrive": Odrive,
+}
+"""The driver of each protocol that [drives] may name."""
+NETWORK_INTERFACES = Path("/sys/class/net")
+IFF_UP = 0x1
+"""Flag of a network interface that is up (linux/if.h)."""
+
+
+def open_bus(section: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic) -> can.BusABC:
+    """The bus that section [can] names; BusError with the remedy if there is none.
+
+    `drives` and `clock` make the simulated drives, where the bus is "simulated".
+    """
+    if section.interface == "simulated":
+        return simulated_bus(section, drives, clock)
+    if section.interface == "unix":
+        return UnixBus(section.channel)
+    if section.interface not in can.VALID_INTERFACES:
+        known = ", ".join(sorted({"simulated", "unix", *can.VALID_INTERFACES}))
+        raise BusError(f'can.interface "{section.interface}" is unknown; known are {known}')
+    try:
+        # Our configuration alone decides: none of python-can's own files and environment variables.
+        bus = can.Bus(
+            interface=section.interface,
+            channel=section.channel,
+            bitrate=section.bitrate,
+            ignore_config=True,
+        )
+    except (can.CanError, OSError, ImportError, TypeError, ValueError) as error:
+        raise BusError(_explained(section, error)) from error
+    if section.interface == "socketcan" and _is_down(section.channel):
+        bus.shutdown()
+        raise BusError(f'CAN interface "{section.channel}" is down; {_bring_up(section)}')
+    return bus
+
+
+def connect(
+    section: config.Can,
+    drives: config.Drives,
+    clock: Callable[[], float] = time.monotonic,
+    capture: Capture | None = None,
+) -> Drives:
+    """The three drives on their bus, not set up yet; DriveError if there is no bus. `capture` notes every frame."""
+    bus = open_bus(section, drives, clock)
+    if capture is not None:
+        bus = CapturedBus(bus, capture)
+    try:
+        return PROTOCOLS[drives.protocol](bus, section.bitrate, drives, clock)
+    except DriveError:
+        bus.shutdown()
+        raise
+
+
+def _explained(section: config.Can, error: Exception) -> str:
+    """One line that says why the bus did not open and what to do about it."""
+    number = canerrors.error_number(error)
+    if number == errno.EAFNOSUPPORT:
+        return "this kernel has no SocketCAN (address family AF_CAN); load it with: modprobe can_raw"
+    if section.interface == "socketcan" and number == errno.ENODEV:
+        return f'there is no CAN interface "{section.channel}"; {_bring_up(section)}'
+    reason = " ".join(str(error).split())
+    return f'cannot open CAN interface {section.interface}, channel "{section.channel}": {reason}'
+
+
+def _bring_up(section: config.Can) -> str:
+    if section.channel.startswith("vcan"):
+        return f"make it with: ip link add {section.channel} type vcan && ip link set {section.channel} up"
+    return f"bring it up with: ip link set {section.channel} up type can bitrate {section.bitrate}"
+
+
+def _is_down(interface: str) -> bool:
+    """Whether Linux knows the interface and has it down; frames could not be sent."""
+    try:
+        flags = int((NETWORK_INTERFACES / interface / "flags").read_text(), 16)
+    except (OSError, ValueError):
+        return False
+    return not flags & IFF_UP

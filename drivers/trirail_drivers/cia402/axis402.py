@@ -1,0 +1,195 @@
+"""One CiA 402 drive as its frames tell of it: position, state, and what is wrong with it."""
+
+from __future__ import annotations
+
+import math
+
+from trirail_drivers import axis, frames
+from trirail_drivers.interface import DriveFault, PowerState
+from trirail_drivers.scaling import Scale
+
+MISSED_STATUSES = 3
+RESET_TIME = 2 * frames.STATUS_PERIOD
+"""How long a drive may take to leave fault after a fault reset, in which it tells its state twice [s]."""
+
+_NMT_STATES = {frames.STOPPED: "stopped", frames.PRE_OPERATIONAL: "pre-operational"}
+_IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
+_WITHOUT_POWER = (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.SWITCH_ON_DISABLED)
+
+
+class Axis(axis.Axis):
+    """One drive's newest feedback; the `on_` methods take a frame's data or raise struct.error."""
+
+    __slots__ = (
+        "_operational",
+        "_restarted",
+        "actual",
+        "command_age",
+        "controlword",
+        "cyclic",
+        "error_code",
+        "follows",
+        "held",
+        "homed",
+        "left_operational",
+        "mode_bits",
+        "mute",
+        "reset_until",
+        "sdo_answer",
+        "seen_clear",
+        "state",
+        "status_heard",
+        "statusword",
+    )
+
+    def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
+        super().__init__(name, node, scale, heartbeat)
+        self.actual = 0
+        """Actual position [counts]."""
+        self.statusword = 0
+        """The newest one."""
+        self.seen_clear = 0
+        """Statusword bits that have been 0 since somebody began to watch."""
+        self.state = PowerState.NOT_READY_TO_SWITCH_ON
+        self.controlword = frames.DISABLE_VOLTAGE
+        """The last one sent."""
+        self.command_age = 0
+        """SYNCs since it was sent."""
+        self.mode_bits = 0
+        """Controlword bits that go with "enable operation"."""
+        self.held: int | None = None
+        """The position [counts] that it gets in place of setpoints."""
+        self.cyclic = True
+        """It is in cyclic synchronous position mode for sure."""
+        self.follows = True
+        """It follows setpoints, or soon will: those that come are to hold it."""
+        self.homed = True
+        """Its position is counted from a known place."""
+        self.sdo_answer: bytes | None = None
+        """The newest answer about an object."""
+        self.error_code = 0
+        """What the drive last gave as the reason of its fault; 0 once it said that is over."""
+        self.status_heard = math.inf
+        """Time of the last statusword [s]."""
+        self.reset_until = -math.inf
+        """Until when a fault reset is under way [s]."""
+        self.mute = False
+        """Its last heartbeat was that of a drive that sends no PDO: its state has to be asked for."""
+        self.left_operational = False
+        """It said that it is operational no more, and was not started again since."""
+        self._operational = self._restarted = False
+
+    def on_position(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
+        """TPDO2: the position sampled at a SYNC."""
+        (counts,) = frames.POSITION.unpack(data)
+        self.take_position(counts)
+        self.answers.come()
+        self._operational = True  # CiA 301: PDOs are sent in NMT operational only
+
+    def take_position(self, counts: int) -> None:
+        """Note an actual position."""
+        self.actual = counts
+        self.position = self.scale.metres(counts)
+
+    def on_sdo(self, data: bytes | bytearray, now: float) -> None:
+        """An SDO server's answer; one that is not eight bytes long is none (CiA 301)."""
+        if len(data) != 8:
+            return
+        self.sdo_answer = bytes(data)
+        if self.sdo_answer[:4] == frames.STATUSWORD_UPLOADED:
+            self.on_status(data[4:6], now)
+
+    def on_status(self, data: bytes | bytearray, now: float) -> None:
+        """TPDO1: the statusword, when it changes and from time to time."""
+        (statusword,) = frames.STATUSWORD.unpack(data)
+        self.status_heard = now
+        self.take_status(statusword)
+
+    def take_status(self, statusword: int) -> None:
+        """Note the state in a statusword."""
+        self.statusword = statusword
+        self.seen_clear |= ~statusword
+        state = frames.power_state(statusword)
+        if state is None:
+            self.tell("state", 0, f"statusword {statusword:04X} is that of no CiA 402 state")
+            return
+        if state is PowerState.OPERATION_ENABLED:
+            self.powered_up = True
+        if state not in _IN_FAULT:
+            if self.state in _IN_FAULT:
+                self.error_code = 0  # it was the fault's reason
+            self.reset_until = -math.inf
+        self.state = state
+
+    def on_emergency(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
+        """EMCY: an error code, of which 00xxh say that errors are over (CiA 301)."""
+        code, register, _ = frames.EMERGENCY.unpack(data)
+        if code & 0xFF00 == 0:
+            self.error_code = 0
+            return
+        self.error_code = code
+        self.tell("emcy", code, f"emergency {code:04X}, error register {register:02X}")
+
+    def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
+        """Heartbeat or boot-up: the drive lives, and should be operational."""
+        (state,) = frames.NMT_STATE.unpack(data)
+        self.heard = now
+        if state == frames.OPERATIONAL:
+            self._operational = True
+        elif state == frames.BOOT_UP:
+            self._restarted = True
+            self.state = PowerState.NOT_READY_TO_SWITCH_ON
+            # Takes the place of an earlier event, for it is the one that a reset cannot help.
+            self.event = self.made("state", 0, "has restarted and lost its set-up; restart the service")
+        elif self._operational:  # before that, it is a heartbeat from before the drive was started
+            self._operational = False
+            self.left_operational = True
+            # Unknown until it answers, which stopped ones do not; by 6007h it stops when it leaves operational.
+            self.state = PowerState.NOT_READY_TO_SWITCH_ON
+            self.tell("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
+        self.mute = self.left_operational and state != frames.OPERATIONAL
+
+    def forgive(self, now: float) -> None:
+        """Forget what happened, but not what lasts, and allow time for a fault reset."""
+        if not self._restarted:
+            self.event = None
+        if self.state is PowerState.FAULT or self.left_operational:  # not operational, it did not tell of a fault
+            self.reset_until = now + RESET_TIME
+        if self.left_operational:
+            self.left_operational = False
+            self.answers.forgive()
+            self.status_heard = now
+
+    def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
+        """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not.
+
+        A drive in fault, or that is not operational, has a fault of its own to tell.
+        """
+        if self.state in _WITHOUT_POWER or self.state in _IN_FAULT:
+            return None
+        text = f"is {self.state} {seconds:g} s after {wanted}; switch on disabled was expected"
+        return self.made("timeout", 0, text)
+
+    def fault(self, now: float, wanted: frames.Wanted) -> DriveFault | None:
+        """What is wrong with the drive at time `now`, given what it was asked for."""
+        if self.event is not None:
+            return self.event
+        if self.state in _IN_FAULT:
+            if now >= self.reset_until:
+                reason = f", error {self.error_code:04X}" if self.error_code else ""
+                if self.reset_until > -math.inf:
+                    reason += f", still {RESET_TIME:g} s after a fault reset"
+                return self.made("fault", self.error_code, f"{self.state}{reason}")
+        elif self.error_code:  # CiA 301: in force until the drive sends "error reset", code 00xxh
+            return self.made("emcy", self.error_code, f"emergency {self.error_code:04X} is still in force")
+        elif silent := self.silence(now):
+            return silent
+        elif now - self.status_heard > MISSED_STATUSES * frames.STATUS_PERIOD:
+            return self.made("silent", 0, f"no statusword for {now - self.status_heard:.3g} s")
+        elif (
+            self.powered_up
+            and wanted is PowerState.OPERATION_ENABLED
+            and self.state is not PowerState.OPERATION_ENABLED
+        ):
+            return self.made("state", 0, f"left operation enabled unasked: {self.state}")
+        return None

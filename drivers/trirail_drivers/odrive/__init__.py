@@ -1,0 +1,1 @@
+"""ODrives on CANSimple."""

@@ -1,0 +1,370 @@
+"""Three ODrives on CANSimple in position control: trirail_drivers.interface.Drives.
+
+CANSimple has no SYNC. What stands for it is the beginning of the cycle, `sync`: there the setpoints of the cycle
+before are sent, one after the other, and then the positions are asked for. So a setpoint is in force from the same
+moment of the cycle on as with CiA 402, but drive B takes it up one frame and drive C two frames after drive A: at
+1 Mbit/s 0.14 and 0.27 ms, in every cycle alike. At 0.1 m/s this puts the sliders 27 µm apart that were to move as one.
+
+Positions are asked for rather than pushed by the drives (`encoder_msg_rate_ms`): pushed ones come by the drives' own
+clocks, none or two of them in a cycle now and then, and nobody could tell their age.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import struct
+import time
+from collections import deque
+from collections.abc import Callable
+
+import can
+
+from trirail_drivers import config, load
+from trirail_drivers.axis import MISSED_ANSWERS
+from trirail_drivers.interface import NAMES, DriveFault, Feedback, Triple
+from trirail_drivers.odrive import odrive_frames as frames
+from trirail_drivers.odrive import odrive_setup
+from trirail_drivers.odrive.odrive_axis import OdriveAxis
+from trirail_drivers.odrive.odrive_frames import AxisState
+from trirail_drivers.ramp import braked
+from trirail_drivers.scaling import scale_of
+from trirail_drivers.wire import Wire
+
+SETTLING = 0.05
+"""How long a drive holds at the end of a quick stop before its power is taken off, for its servo to catch up [s]."""
+
+Clock = Callable[[], float]
+
+
+class Odrive:
+    """Three drives on one CAN bus; see trirail_drivers.interface.Drives.
+
+    A fault of one drive is a fault of the robot: what is latched takes all three down their quick-stop ramps
+    beginning in the same cycle, and `enable` does nothing until `reset`.
+
+    An ODrive has no quick stop of its own. Its Estop and its idle state let the motor coast, and to put it into
+    velocity control with a ramp is to change modes under power, which ODrive advises against, to a ramp that CANSimple
+    cannot set (`vel_ramp_rate`, by default 1 turn/s²). So the driver itself leads the setpoints down the ramp
+    `quick_stop_deceleration`, holds until the servos have settled, and then takes the power off. Where the host dies
+    in the middle of it, the drives' watchdogs disarm them. Nor has an ODrive a following error window: the driver
+    watches `following_error` as well.
+    """
+
+    def __init__(self, bus: can.BusABC, bitrate: int, drives: config.Drives, clock: Clock = time.monotonic) -> None:
+        odrive_setup.check_nodes(drives)
+        self.bus_load = 0.0
+        self._bitrate = bitrate
+        self._drives = drives
+        self._clock = clock
+        self._axes = tuple(
+            OdriveAxis(name, drive.node, scale_of(name, drive), drives.heartbeat)
+            for name, drive in zip(NAMES, drives.each, strict=True)
+        )
+        self._wire = Wire(bus, self._stop)
+        for axis in self._axes:
+            for number, handler in (
+                (frames.GET_VERSION, axis.on_version),
+                (frames.HEARTBEAT, axis.on_heartbeat),
+                (frames.GET_ERROR, axis.on_errors),
+                (frames.GET_ENCODER_ESTIMATES, axis.on_estimates),
+            ):
+                self._wire.listen(frames.identifier(axis.node, number), axis, handler)
+        self._requests = tuple(frames.request(axis.node, frames.GET_ENCODER_ESTIMATES) for axis in self._axes)
+        self._error_requests = itertools.cycle(frames.request(axis.node, frames.GET_ERROR) for axis in self._axes)
+        self._errors_due: float | None = None
+        self._period = 0.0
+        self._enabled = False
+        self._braking: float | None = None
+        """Time since a quick stop has brought the setpoints to a standstill [s]; None where none is under way."""
+        self._next: tuple[Triple, Triple] | None = None
+        """Setpoints [m], [m/s] to be sent at the next SYNC."""
+        self._sent: tuple[Triple, Triple] | None = None
+        """Setpoints sent last; None where no drive has been sent any since enabling."""
+        self._in_force: list[float] = []
+        """Positions that the bus has taken last [m]."""
+        self._due: deque[Triple | None] = deque([None] * MISSED_ANSWERS, maxlen=MISSED_ANSWERS)
+        """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
+        self._off_by = math.inf
+        """When the drives must have lost their power [s]; inf where that was not asked for, or has been told of."""
+        self._asked = ""
+        """By what that was asked for."""
+        self._synced = 0.0
+        self._closed = False
+
+    @property
+    def traffic(self) -> int:
+        """Bits of all frames on the bus since the start, each with worst-case stuffing."""
+        return self._wire.traffic
+
+    def configure(self, period: float) -> None:
+        """Find the drives and leave them without power, for a cycle of `period` seconds.
+
+        Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout for a drive that is not there.
+        A drive with errors is not an error here; feedback tells of it and `reset` clears it.
+        """
+        rate = 1.0 / period
+        self.bus_load = load.checked(rate, self._bitrate, self._drives)
+        self._period = period
+        odrive_setup.configure(self._wire, self._axes, self._drives, self._clock)
+        if warning := load.warning(rate, self.bus_load):
+            self._wire.warn(warning)
+
+    def sync(self) -> None:
+        """Send the setpoints written since the last cycle, which are in force on arrival; ask for the positions.
+
+        What has arrived is taken in before: positions among it answer what was asked in the cycle before.
+        """
+        now = self._synced = self._clock()
+        self._wire.begin()
+        if self._errors_due is None:
+            # The watching begins with the first cycle, however long ago the set-up was.
+            self._errors_due = now
+            for axis in self._axes:
+                axis.heard = now
+                axis.answers.forgive()
+        self._wire.receive(now)
+        self._due.append(self._sent[0] if self._sent is not None else None)
+        if self._braking is not None:
+            self._brake()
+        # Without power none is sent: a drive that has missed losing it is to stay where the ramp has ended.
+        if self._next is not None and (self._enabled or self._braking is not None):
+            self._set(*self._next)
+        self._command()
+        for axis, request in zip(self._axes, self._requests, strict=True):
+            self._wire.send(request)
+            axis.answers.sync_sent()
+        if now >= self._errors_due:
+            self._errors_due = now + frames.ERROR_PERIOD
+            self._wire.send(next(self._error_requests))
+
+    def read(self) -> Feedback:
+        """Take in every frame that has arrived."""
+        now = self._clock()
+        self._wire.receive(now)
+        for axis in self._axes:
+            axis.answers.read_over()
+        if self._wire.fault is None:
+            fault = self._found(now)
+            if fault is not None:
+                self._wire.fail(fault)
+        if now >= self._off_by:
+            self._take_power_off()
+        a, b, c = self._axes
+        on = self._enabled
+        return Feedback(
+            (a.position, b.position, c.position),
+            (a.power(on), b.power(on), c.power(on)),
+            self._wire.fault,
+            (a.counts, b.counts, c.counts),
+            self._wire.warnings(),
+            (a.answers.age, b.answers.age, c.answers.age),
+        )
+
+    def write(self, position: Triple, velocity: Triple) -> None:
+        """Take setpoints [m] and velocity feed-forward [m/s], to be sent at the next SYNC once enabled.
+
+        Setpoints that are not finite, or beyond what a message holds, are not sent but a fault of cause "setpoint".
+        During a quick stop they are left aside.
+        """
+        if self._braking is not None:
+            return
+        for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
+            if not self._sendable(axis, metres, rate):
+                text = f"drive {axis.name}: cannot take setpoint {metres:g} m, {rate:g} m/s"
+                self._wire.fail(DriveFault(axis.name, "setpoint", 0, text))
+                return
+        self._next = position, velocity
+        if self._clock() - self._synced > self._period:
+            for axis in self._axes:
+                axis.setpoints_late += 1
+
+    def enable(self) -> None:
+        """Begin to power up, after the setpoints of the next SYNC; the feedback's states tell when it is done.
+
+        Does nothing while a fault is latched. A drive tells its state with its heartbeat: that long it takes.
+        """
+        if self._wire.fault is not None or self._enabled:
+            return
+        self._enabled = True
+        self._braking = self._sent = None
+        self._in_force = []
+        self._off_by = math.inf
+        for axis in self._axes:
+            axis.powered_up = False
+            axis.requested = None
+
+    def home(self) -> None:
+        """Do nothing: the configuration takes no homing for ODrives, so none has to be homed."""
+
+    def stop_homing(self) -> None:
+        """Do nothing: there is no homing."""
+
+    def disable(self) -> None:
+        """Take power off; meant for a robot at standstill. A drive that keeps it is a fault, of cause "timeout"."""
+        self._give_time_to_stop("disable")
+        self._enabled = False
+        self._braking = None
+        self._command()
+
+    def quick_stop(self) -> None:
+        """Begin to stop every drive by the quick-stop ramp, in this cycle; it ends without power.
+
+        A drive that has it after `stop_timeout` is told to lose it at once, and is a fault, of cause "timeout", that
+        takes the place of the one that stopped it.
+        """
+        if self._braking is not None:
+            return
+        self._give_time_to_stop("quick stop")
+        powering = self._enabled or any(axis.powered for axis in self._axes)
+        self._enabled = False
+        if self._sent is None or not powering:
+            self._command()
+            return
+        self._braking = 0.0
+        # The position in force stays; what the drives are to run on with is less from now on.
+        a, b, c = self._in_force
+        _, slower = self._braked(self._sent[1])
+        self._set((a, b, c), slower)
+        self._next = None
+
+    def reset(self) -> None:
+        """Forget the fault and clear the drives' own; never powers them up. What persists is found again."""
+        self._wire.reset()
+        now = self._clock()
+        if not self._enabled:
+            self._give_time_to_stop("reset")
+        for axis in self._axes:
+            axis.forgive(now)
+            if axis.errors:
+                self._wire.send(frames.command(axis.node, frames.CLEAR_ERRORS, frames.CLEAR.pack(0)))
+
+    def close(self) -> None:
+        """Leave the drives without power, and let go of the bus.
+
+        Drives that still have power are first brought to a standstill by the ramp.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        with contextlib.suppress(can.CanError, OSError):
+            self._wait_for_standstill()
+        idle = frames.AXIS_STATE.pack(AxisState.IDLE)
+        for axis in self._axes:
+            self._wire.send(frames.command(axis.node, frames.SET_AXIS_STATE, idle))
+        with contextlib.suppress(can.CanError, OSError):
+            self._wire.bus.shutdown()
+
+    def _stop(self) -> None:
+        """Drives that have power, or are getting it, are stopped with the first fault."""
+        if self._enabled:
+            self.quick_stop()
+
+    def _give_time_to_stop(self, asked: str) -> None:
+        self._off_by, self._asked = self._clock() + self._drives.stop_timeout, asked
+
+    def _take_power_off(self) -> None:
+        """Tell of a drive that has not stopped in time, once; none is led down the ramp any longer."""
+        self._off_by = math.inf
+        self._braking = None
+        for axis in self._axes:
+            fault = axis.late_for(self._asked, self._drives.stop_timeout)
+            if fault is not None:
+                self._wire.fault = fault
+                return
+
+    def _found(self, now: float) -> DriveFault | None:
+        """The first thing that is wrong."""
+        for number, axis in enumerate(self._axes):
+            fault = axis.fault(now, self._enabled)
+            if fault is not None:
+                return fault
+            due = self._due[-1 - min(axis.answers.age, MISSED_ANSWERS - 1)]
+            if due is None or not (self._enabled and axis.powered_up):
+                continue
+            error = due[number] - axis.position
+            if not abs(error) <= self._drives.following_error:
+                return axis.made(
+                    "fault",
+                    0,
+                    f"following error {error * 1e3:.3f} mm is beyond its window "
+                    f"{self._drives.following_error * 1e3:g} mm",
+                )
+        return None
+
+    def _sendable(self, axis: OdriveAxis, metres: float, rate: float) -> bool:
+        try:
+            frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
+        except (ValueError, OverflowError, struct.error):
+            return False
+        return math.isfinite(metres)  # a float that is not a number is packed like any other
+
+    def _set(self, position: Triple, velocity: Triple) -> None:
+        """Send setpoints; each is in force when it arrives."""
+        self._sent = sent = position, velocity
+        self._in_force = self._in_force or list(position)
+        for number, (axis, metres, rate) in enumerate(zip(self._axes, position, velocity, strict=True)):
+            data = frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
+            if self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
+                self._in_force[number] = metres
+            else:
+                axis.setpoints_lost += 1
+            if self._sent is not sent:
+                return  # what could not be sent has begun a quick stop, whose setpoints are newer
+
+    def _command(self) -> None:
+        """Ask drives for the state they should be in, once, and again where a heartbeat shows another."""
+        for axis in self._axes:
+            wanted = self._wanted()  # anew for each: a frame that cannot be sent begins a quick stop
+            if wanted is None or axis.requested is wanted:
+                continue
+            if wanted is AxisState.CLOSED_LOOP_CONTROL:  # with every power-up, for a drive may have restarted
+                mode = frames.CONTROLLER_MODE.pack(frames.POSITION_CONTROL, frames.PASSTHROUGH)
+                if not self._wire.send(frames.command(axis.node, frames.SET_CONTROLLER_MODE, mode)):
+                    return
+            if self._wire.send(frames.command(axis.node, frames.SET_AXIS_STATE, frames.AXIS_STATE.pack(wanted))):
+                axis.ask(wanted)
+
+    def _wanted(self) -> AxisState | None:
+        """The state that drives should be in now; None leaves them as they are."""
+        if not self._enabled:
+            return AxisState.IDLE if self._braking is None else None
+        return AxisState.CLOSED_LOOP_CONTROL if self._sent is not None else None
+
+    def _brake(self) -> None:
+        """One period further down the ramp; at its end, power off.
+
+        Where the bus takes no setpoint the time goes on, but the place does not: a drive that hears nothing stands
+        soon, and is not to catch up with the ramp when the bus is back.
+        """
+        if self._sent is None or self._braking is None:
+            return
+        _, velocity = self._sent
+        self._next = self._braked(velocity)
+        if any(velocity):
+            return
+        self._braking += self._period
+        if self._braking > SETTLING:
+            self._braking = None
+
+    def _braked(self, velocity: Triple) -> tuple[Triple, Triple]:
+        """Setpoints one period further down the ramp from those in force, of this velocity."""
+        deceleration, period = self._drives.quick_stop_deceleration, self._period
+        (a, da), (b, db), (c, dc) = (
+            braked(place, rate, deceleration, period) for place, rate in zip(self._in_force, velocity, strict=True)
+        )
+        return (a, b, c), (da, db, dc)
+
+    def _wait_for_standstill(self) -> None:
+        """Go on with the cycle until no drive has power, for as long as a stop may take."""
+        if not any(axis.powered for axis in self._axes):
+            return
+        self.quick_stop()
+        deadline = self._clock() + self._drives.stop_timeout
+        while any(axis.powered for axis in self._axes) and (now := self._clock()) < deadline:
+            self.sync()
+            while (left := now + self._period - self._clock()) > 0.0:
+                message = self._wire.bus.recv(left)
+                if message is not None:
+                    self._wire.take(message, self._clock())

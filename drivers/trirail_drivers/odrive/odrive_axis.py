@@ -1,0 +1,168 @@
+"""One ODrive as its messages tell of it: position, state, errors, and what is wrong with it."""
+
+from __future__ import annotations
+
+import math
+
+from trirail_drivers.axis import Axis
+from trirail_drivers.interface import DriveFault, PowerState
+from trirail_drivers.odrive import odrive_frames as frames
+from trirail_drivers.odrive.odrive_frames import AxisState, Result
+from trirail_drivers.scaling import Scale
+
+RESET_TIME = 3 * 3 * frames.ERROR_PERIOD
+"""How long errors may be told of after they were cleared, in which each drive is asked three times [s]."""
+STALE_HEARTBEATS = 1
+"""So many heartbeats after a request may still be from before it."""
+
+
+class OdriveAxis(Axis):
+    """One drive's newest feedback; the `on_` methods take a message's data or raise struct.error."""
+
+    __slots__ = (
+        "_beats",
+        "_initialised",
+        "_restarted",
+        "_result",
+        "errors",
+        "firmware",
+        "requested",
+        "reset_until",
+        "state",
+        "told",
+    )
+
+    def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
+        super().__init__(name, node, scale, heartbeat)
+        self.state: int = AxisState.UNDEFINED
+        """Axis state of the newest heartbeat."""
+        self.errors = 0
+        """Active errors, and why it was disarmed."""
+        self.told = False
+        """It has answered what its errors are."""
+        self.firmware: tuple[int, int, int] | None = None
+        """Version of its firmware, once it told."""
+        self.requested: AxisState | None = None
+        """The state it was asked for last; None makes the driver ask anew."""
+        self.reset_until = -math.inf
+        """Until when clearing the errors is under way [s]."""
+        self._beats = 0
+        self._initialised = False
+        self._restarted = False
+        self._result: int = Result.SUCCESS
+
+    def on_version(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
+        """Get_Version."""
+        *_, major, minor, revision, _ = frames.VERSION.unpack(data)
+        self.firmware = major, minor, revision
+
+    def on_estimates(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
+        """Get_Encoder_Estimates: the position when the request came."""
+        turns, _ = frames.ESTIMATES.unpack(data)
+        self.answers.come()
+        if math.isfinite(turns):
+            self.position = self.scale.metres(turns)
+        else:
+            self.tell("frame", 0, f"position estimate is {turns}: has its encoder been calibrated?")
+
+    def on_errors(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
+        """Get_Error: active errors and disarm reason."""
+        active, reason = frames.ERRORS.unpack(data)
+        self.told = True
+        self._take_errors(active | reason)
+
+    def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
+        """Heartbeat: the drive lives; its state, errors and how the last procedure ended."""
+        errors, self.state, self._result, _ = frames.BEAT.unpack(data)
+        self.heard = now
+        self._beats += 1
+        self._take_errors(errors)
+        if self.state == AxisState.CLOSED_LOOP_CONTROL:
+            if self.requested is AxisState.CLOSED_LOOP_CONTROL:
+                self.powered_up = True
+            elif self.obeys:
+                self.requested = None  # it still has power: tell it again
+        elif self.requested is AxisState.CLOSED_LOOP_CONTROL and self.obeys and not self.powered_up:
+            self._watch_refusal()
+
+    def ask(self, state: AxisState) -> None:
+        """Note that the drive was asked for a state."""
+        self.requested = state
+        self._beats = 0
+
+    def forgive(self, now: float) -> None:
+        """Forget what happened, but not what lasts, and allow time for errors to be cleared."""
+        if not self._restarted:
+            self.event = None
+        if self.errors:
+            self.reset_until = now + RESET_TIME
+
+    def power(self, follows: bool) -> PowerState:
+        """The state as CiA 402 has it; `follows` tells whether it is to follow setpoints, rather than to stop."""
+        match self.state:
+            case AxisState.UNDEFINED:
+                return PowerState.NOT_READY_TO_SWITCH_ON
+            case AxisState.IDLE:
+                return PowerState.FAULT if self.errors else PowerState.SWITCH_ON_DISABLED
+            case AxisState.CLOSED_LOOP_CONTROL if self.errors:
+                return PowerState.FAULT_REACTION_ACTIVE
+            case AxisState.CLOSED_LOOP_CONTROL:
+                return PowerState.OPERATION_ENABLED if follows else PowerState.QUICK_STOP_ACTIVE
+            case _:
+                return PowerState.SWITCHED_ON
+
+    @property
+    def powered(self) -> bool:
+        """Whether there may be current in its motor."""
+        return self.state not in (AxisState.UNDEFINED, AxisState.IDLE)
+
+    def fault(self, now: float, follows: bool) -> DriveFault | None:
+        """What is wrong with the drive at time `now`, given whether it is to follow setpoints."""
+        if self.event is not None:
+            return self.event
+        if self.errors and now >= self.reset_until:
+            return self.made("fault", self.errors, frames.error_names(self.errors))
+        if silent := self.silence(now):
+            return silent
+        if self.state in frames.PROCEDURES:
+            return self.made("state", 0, f"is in {frames.state_name(self.state)}, on whoever's command")
+        if follows and self.powered_up and self.state != AxisState.CLOSED_LOOP_CONTROL:
+            return self.made("state", 0, f"left closed loop control unasked: {frames.state_name(self.state)}")
+        return None
+
+    def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
+        """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not."""
+        if not self.powered:
+            return None
+        text = f"is in {frames.state_name(self.state)} {seconds:g} s after {wanted}; idle was expected"
+        return self.made("timeout", 0, text)
+
+    @property
+    def obeys(self) -> bool:
+        """Enough heartbeats have come since the last request for the newest to be an answer to it."""
+        return self._beats > STALE_HEARTBEATS
+
+    def _take_errors(self, errors: int) -> None:
+        self.errors = errors
+        if not errors:
+            self.reset_until = -math.inf
+        self._watch_restart()
+
+    def _watch_restart(self) -> None:
+        """A drive that begins anew may have lost count of its turns."""
+        begins = self.state == AxisState.UNDEFINED or bool(self.errors & frames.Error.INITIALIZING)
+        if not begins:
+            self._initialised = True
+        elif self._initialised:
+            self._restarted = True
+            # Takes the place of an earlier event, for it is the one that a reset cannot help.
+            self.event = self.made("state", 0, "has restarted and may have lost its position; restart the service")
+
+    def _watch_refusal(self) -> None:
+        if self._result in (Result.SUCCESS, Result.BUSY):
+            return
+        try:
+            result = Result(self._result).name.lower().replace("_", " ")
+        except ValueError:
+            result = f"procedure result {self._result}"
+        self.tell("state", 0, f"refuses closed loop control: {result}")

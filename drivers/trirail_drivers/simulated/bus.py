@@ -1,0 +1,167 @@
+"""A CAN bus inside the process, with simulated drives on it and without threads."""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import can
+
+from trirail_drivers import config
+from trirail_drivers.axis import MISSED_HEARTBEATS
+from trirail_drivers.simulated.devices import SimulatedDevice
+from trirail_drivers.simulated.drive import SimulatedDrive
+from trirail_drivers.simulated.faults import Faults
+from trirail_drivers.simulated.odrive import SimulatedOdrive
+from trirail_drivers.simulated.servo import Servo
+
+_STEP = 0.0005
+"""How long a waiting receiver sleeps before it looks at the drives again [s]."""
+FRICTION = 2.0
+"""How an ODrive's slider slows down that coasts [m/s²]."""
+
+
+class SimulatedBus(can.BusABC):
+    """Carries frames between one python-can user and the drives, which live by its `send` and `recv`."""
+
+    def __init__(
+        self,
+        drives: Sequence[SimulatedDevice],
+        clock: Callable[[], float] = time.monotonic,
+        faults: Faults | None = None,
+    ) -> None:
+        """`faults`, if there are to be any, are those of the same drives."""
+        self.drives = tuple(drives)
+        self.faults = faults or Faults(self.drives, [1.0] * len(self.drives))
+        self.channel_info = "simulated drives"
+        self._clock = clock
+        self._arrived: deque[can.Message] = deque()
+        super().__init__(channel=self.channel_info)
+        now = clock()
+        self.faults.connect(self._arrived.append, clock)
+        everyone = range(len(self.drives))
+        self._everyone = tuple(everyone)
+        for index, drive in enumerate(self.drives):
+            others = tuple(other for other in everyone if other != index)
+            drive.connect(partial(self._from_drive, index, others), now)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
+        """Bring a frame to every drive; their answers can be received at once.
+
+        Raises can.CanOperationError while the controller is bus-off, as the system would of its full queue.
+        """
+        if msg.is_extended_id or msg.is_error_frame:
+            return
+        now = self._clock()
+        if not self.faults.idle:
+            self.faults.poll(now)
+            if self.faults.bus_off:
+                raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
+        if msg.is_remote_frame:
+            self._request(msg.arbitration_id, now)
+        else:
+            self._to_drives(self._everyone, msg.arbitration_id, bytes(msg.data))
+
+    def _request(self, can_id: int, now: float) -> None:
+        """Bring a remote frame to every drive, unless faults have it otherwise."""
+        for index in self._everyone:
+            if self.faults.idle:
+                self.drives[index].receive_remote(can_id, now)
+            else:
+                self.faults.carry(index, True, can_id, b"", partial(self._hand_request_in, index, can_id))
+
+    def _to_drives(self, indices: Sequence[int], can_id: int, data: bytes) -> None:
+        """Bring a frame to some drives, unless faults have it otherwise."""
+        if self.faults.idle:
+            now = self._clock()
+            for index in indices:
+                self.drives[index].receive(can_id, data, now)
+        else:
+            for index in indices:
+                self.faults.carry(index, True, can_id, data, partial(self._hand_in, index, can_id))
+
+    def _hand_request_in(self, index: int, can_id: int, _data: bytes) -> None:
+        self.drives[index].receive_remote(can_id, self._clock())
+
+    def _hand_in(self, index: int, can_id: int, data: bytes) -> None:
+        self.drives[index].receive(can_id, data, self._clock())
+
+    def _from_drive(self, index: int, others: Sequence[int], can_id: int, data: bytes) -> None:
+        """Bring a drive's frame to the user and the other drives, unless faults have it otherwise."""
+        if self.faults.idle:
+            self._hand_out(others, can_id, data)
+        else:
+            self.faults.carry(index, False, can_id, data, partial(self._hand_out, others, can_id))
+
+    def _hand_out(self, others: Sequence[int], can_id: int, data: bytes) -> None:
+        self._arrived.append(can.Message(timestamp=time.time(), arbitration_id=can_id, is_extended_id=False, data=data))
+        self._to_drives(others, can_id, data)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while not self._arrived:
+            now = self._clock()
+            if not self.faults.idle:
+                self.faults.poll(now)
+            for drive in self.drives:
+                drive.poll(now)
+            if self._arrived:
+                break
+            remaining = _STEP if deadline is None else deadline - time.monotonic()
+            if remaining <= 0.0:
+                return None, False
+            time.sleep(min(remaining, _STEP))
+        return self._arrived.popleft(), False
+
+
+def simulated_bus(can: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic) -> SimulatedBus:
+    """The three drives of a configuration on a bus of their own, at rest where `can.simulated.start` says.
+
+    A drive that is to be homed does not know where that is: it counts from 0 at power-on, and has its home switch
+    at the position that the configuration gives for zero counts.
+    """
+    make = {"cia402": _servo_drive, "odrive": _odrive}[drives.protocol]
+    starts = zip(drives.each, can.simulated.start, strict=True)
+    devices = [make(can.simulated, drives, drive, start) for drive, start in starts]
+    scales = [drive.direction * drive.counts_per_metre for drive in drives.each]
+    return SimulatedBus(devices, clock, Faults(devices, scales))
+
+
+def _servo_drive(
+    simulated: config.Simulated,
+    drives: config.Drives,  # noqa: ARG001  one signature for both
+    drive: config.Drive,
+    start: float,
+) -> SimulatedDevice:
+    counts = round(_counts(drive, start))
+    switch = None if drive.homing is None else -counts
+    servo = _servo(simulated, drive, counts if switch is None else 0)
+    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch)
+
+
+def _odrive(simulated: config.Simulated, drives: config.Drives, drive: config.Drive, start: float) -> SimulatedDevice:
+    return SimulatedOdrive(
+        drive.node,
+        _servo(simulated, drive, _counts(drive, start)),
+        heartbeat=drives.heartbeat,
+        friction=FRICTION * drive.counts_per_metre,
+        # As long as a CiA 402 drive waits for its master: CANSimple has no way to tell a drive.
+        watchdog=MISSED_HEARTBEATS * drives.heartbeat,
+    )
+
+
+def _counts(drive: config.Drive, position: float) -> float:
+    return drive.direction * (position - drive.offset) * drive.counts_per_metre
+
+
+def _servo(simulated: config.Simulated, drive: config.Drive, counts: float) -> Servo:
+    return Servo(
+        counts,
+        time_constant=simulated.time_constant,
+        feed_forward_gain=simulated.feed_forward_gain,
+        max_velocity=simulated.max_velocity * drive.counts_per_metre,
+        max_acceleration=simulated.max_acceleration * drive.counts_per_metre,
+    )

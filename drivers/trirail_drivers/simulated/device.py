@@ -1,0 +1,270 @@
+"""A CANopen device as CiA 301 has it: NMT, heartbeat, SYNC, PDO, SDO and EMCY, in no thread of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import IntEnum
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from trirail_drivers.simulated.dictionary import Dictionary, Entry
+from trirail_drivers.simulated.emergency import Emergencies
+from trirail_drivers.simulated.pdo import ReceivePdo, TransmitPdo
+from trirail_drivers.simulated.sdo import SdoServer
+
+CONNECTION_LOST = 0x8100
+HEARTBEAT_LOST = 0x8130
+PDO_TOO_SHORT = 0x8210
+PDO_TOO_LONG = 0x8220
+SYNC_LENGTH = 0x8240
+
+_SYNC = 0x080
+_COMMUNICATION = range(0x1000, 0x2000)
+_ALL = range(0x10000)
+
+
+class Nmt(IntEnum):
+    """NMT states, as a heartbeat carries them."""
+
+    INITIALISING = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+
+_ON_ERROR: Final = {0: Nmt.PRE_OPERATIONAL, 2: Nmt.STOPPED}
+"""Where 1029h:01 sends an OPERATIONAL device on a communication error; 1 leaves it there."""
+
+
+def _discard(can_id: int, data: bytes) -> None:
+    """Where a device that is on no bus sends."""
+
+
+class Device:
+    """A node on a CAN bus. Whoever owns it brings frames and the time to it with `receive` and `poll`."""
+
+    def __init__(self, node: int, eds: Path) -> None:
+        self.node = node
+        self.objects = Dictionary(eds, node)
+        self.nmt = Nmt.INITIALISING
+        self.fault = 0
+        """Code of the error that the device profile holds on to until it is reset; 0 for none."""
+        self.silent = False
+        """True cuts the wire: nothing is heard or sent any more, while the device itself goes on."""
+        self._now = 0.0
+        self._transmit: Callable[[int, bytes], None] = _discard
+        self._handlers: dict[int, Callable[[bytes], None]] = {}
+        self.errors = Emergencies(self.objects, partial(self._send, 0x80 + node))
+        self._sdo = SdoServer(self.objects, partial(self._send, 0x580 + node))
+        self._rpdos = [ReceivePdo(self.objects, 0x1400 + n, 0x1600 + n, self._route) for n in range(2)]
+        self._tpdos = [TransmitPdo(self.objects, 0x1800 + n, 0x1A00 + n, self._route) for n in range(2)]
+        self._sync_rpdos: list[ReceivePdo] = []
+        self._sync_tpdos: list[TransmitPdo] = []
+        self._event_tpdos: list[TransmitPdo] = []
+        self._heartbeat_due = self._consumer_due = self._sync_due = math.inf
+        self._last_sync = -math.inf
+        self._sync_period = self.objects[0x1006, 0]
+        self._sync_window = self.objects[0x1007, 0]
+        self._consumer = self.objects[0x1016, 1]
+        self._producer = self.objects[0x1017, 0]
+        self.objects.on_write(0x1016, self._consumer_written)
+        self.objects.on_write(0x1017, self._producer_written)
+
+    def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
+        """Put the device on a bus, that it sends to by `transmit(can_id, data)`, and switch it on."""
+        self._transmit = transmit
+        self._now = now
+        self._reset(_ALL)
+
+    def restart(self, now: float) -> None:
+        """Lose supply and get it back at time `now` [s]."""
+        self._now = now
+        self._reset(_ALL)
+
+    def receive(self, can_id: int, data: bytes, now: float) -> None:
+        """Take in a data frame at time `now` [s]."""
+        if can_id not in self._handlers or self.silent:
+            return
+        self.poll(now)  # what was due before the frame came may also decide whether it is heard
+        handler = self._handlers.get(can_id)
+        if handler is not None:
+            handler(data)
+        if self._event_tpdos:
+            self._send_events()
+
+    def receive_remote(self, can_id: int, now: float) -> None:
+        """Take in a remote frame at time `now` [s]: it asks for a TPDO."""
+        if self.silent:
+            return
+        self.poll(now)
+        for pdo in self._tpdos:
+            if self.nmt is Nmt.OPERATIONAL and pdo.valid and pdo.remote and pdo.can_id == can_id:
+                self._send(can_id, pdo.pack())
+
+    def poll(self, now: float) -> None:
+        """Do what is due at time `now` [s]."""
+        self._now = now
+        if now >= self._sync_due:
+            due, self._sync_due = self._sync_due, math.inf
+            self.sync_lost(due)
+        if now >= self._consumer_due:
+            self._consumer_due = math.inf
+            self._heartbeat_lost()
+        if now >= self._heartbeat_due:
+            self._send_heartbeat()
+        self.time_passed(now)
+        if self._event_tpdos:
+            self._send_events()
+
+    # What a device profile adds.
+
+    def before_sync(self) -> None:
+        """A SYNC has come: bring the values up to date that TPDOs are about to sample."""
+
+    def time_passed(self, now: float) -> None:
+        """It is `now`; with or without frames."""
+
+    def sync_timeout(self) -> float:
+        """How long the device waits for the next SYNC [s]; inf for ever."""
+        return math.inf
+
+    def sync_lost(self, at: float) -> None:
+        """No SYNC for `sync_timeout` seconds, as of time `at`."""
+
+    def connection_lost(self, code: int) -> None:
+        """The master's heartbeat is gone, or the device is about to leave OPERATIONAL: EMCY `code`."""
+
+    def restarted(self) -> None:
+        """The objects have their power-on values: begin anew."""
+
+    # NMT and heartbeat.
+
+    def _reset(self, indices: range) -> None:
+        """Reset node (all objects) or communication (1000h to 1FFFh), boot up, enter PRE-OPERATIONAL."""
+        if self.nmt is Nmt.OPERATIONAL:
+            self.connection_lost(CONNECTION_LOST)
+        self.nmt = Nmt.INITIALISING
+        self.objects.restore(indices)
+        if indices is _ALL:
+            self._sync_due = math.inf
+            self.restarted()
+        self.errors.forget(but=self.fault)
+        self._heartbeat_due = self._consumer_due = math.inf
+        for pdo in (*self._rpdos, *self._tpdos):
+            pdo.refresh()
+        self._send(0x700 + self.node, bytes([Nmt.INITIALISING]))
+        self._enter(Nmt.PRE_OPERATIONAL)
+
+    def _nmt_command(self, data: bytes) -> None:
+        if len(data) != 2 or data[1] not in (0, self.node):
+            return
+        match data[0]:
+            case 1:
+                self._enter(Nmt.OPERATIONAL)
+            case 2:
+                self._enter(Nmt.STOPPED)
+            case 128:
+                self._enter(Nmt.PRE_OPERATIONAL)
+            case 129:
+                self._reset(_ALL)
+            case 130:
+                self._reset(_COMMUNICATION)
+
+    def _enter(self, state: Nmt) -> None:
+        if state is self.nmt:
+            return
+        if self.nmt is Nmt.OPERATIONAL:
+            self.connection_lost(CONNECTION_LOST)
+        self.nmt = state
+        self._sdo.reset()
+        for pdo in (*self._rpdos, *self._tpdos):
+            pdo.reset()
+        self._route()
+        self.errors.mute(state is Nmt.STOPPED)
+
+    def _route(self) -> None:
+        """Decide which frames are heard: CiA 301, NMT states and communication object relation."""
+        operational = self.nmt is Nmt.OPERATIONAL
+        rpdos = [pdo for pdo in self._rpdos if operational and pdo.valid]
+        tpdos = [pdo for pdo in self._tpdos if operational and pdo.valid]
+        handlers: dict[int, Callable[[bytes], None]] = {pdo.can_id: partial(self._receive_pdo, pdo) for pdo in rpdos}
+        handlers[0x000] = self._nmt_command
+        node, milliseconds = divmod(self._consumer.value, 1 << 16)
+        if node and milliseconds:
+            handlers[0x700 + node] = self._heartbeat
+        if self.nmt is not Nmt.STOPPED:
+            handlers[0x600 + self.node] = self._sdo.request
+            handlers[_SYNC] = self._sync
+        self._sync_rpdos = [pdo for pdo in rpdos if pdo.synchronous]
+        self._sync_tpdos = [pdo for pdo in tpdos if pdo.synchronous]
+        self._event_tpdos = [pdo for pdo in tpdos if not pdo.synchronous]
+        self._handlers = handlers
+
+    def _producer_written(self, entry: Entry, _old: int) -> None:
+        self._heartbeat_due = self._now if entry.value else math.inf
+
+    def _send_heartbeat(self) -> None:
+        self._send(0x700 + self.node, bytes([self.nmt]))
+        period = self._producer.value * 1e-3
+        self._heartbeat_due += period
+        if self._heartbeat_due <= self._now:  # too late for that one as well: leave it out
+            self._heartbeat_due = self._now + period
+
+    def _consumer_written(self, _entry: Entry, _old: int) -> None:
+        self._consumer_due = math.inf
+        self._route()
+
+    def _heartbeat(self, _data: bytes) -> None:
+        """CiA 301: watching begins with the first heartbeat, and after a loss with the next one."""
+        self._consumer_due = self._now + (self._consumer.value & 0xFFFF) * 1e-3
+        if self.fault != HEARTBEAT_LOST:
+            self.errors.clear(HEARTBEAT_LOST)
+
+    def _heartbeat_lost(self) -> None:
+        self.errors.report(HEARTBEAT_LOST)
+        self.connection_lost(HEARTBEAT_LOST)
+        if self.nmt is Nmt.OPERATIONAL:
+            self._enter(_ON_ERROR.get(self.objects[0x1029, 1].value, self.nmt))
+
+    # SYNC and PDO.
+
+    def _sync(self, data: bytes) -> None:
+        if data:
+            self.errors.report(SYNC_LENGTH)
+            return
+        if self.errors:
+            self.errors.clear(SYNC_LENGTH)
+        self._last_sync = self._now
+        self.before_sync()
+        for tpdo in self._sync_tpdos:
+            sample = tpdo.at_sync()
+            if sample is not None:
+                self._send(tpdo.can_id, sample)
+        for rpdo in self._sync_rpdos:
+            rpdo.take_up()
+        self._sync_due = self._now + self.sync_timeout()
+
+    def _receive_pdo(self, pdo: ReceivePdo, data: bytes) -> None:
+        if len(data) < pdo.layout.size:
+            self.errors.report(PDO_TOO_SHORT, pdo.number)
+            return
+        if len(data) > pdo.layout.size:  # CiA 301: the mapped bytes are taken, the rest is reported
+            self.errors.report(PDO_TOO_LONG, pdo.number)
+        elif self.errors:
+            self.errors.clear(PDO_TOO_SHORT, pdo.number)
+            self.errors.clear(PDO_TOO_LONG, pdo.number)
+        window = self._sync_window.value * 1e-6
+        if not (window and pdo.synchronous and self._now > self._last_sync + window):
+            pdo.receive(data)
+
+    def _send_events(self) -> None:
+        for pdo in self._event_tpdos:
+            data = pdo.on_event(self._now)
+            if data is not None:
+                self._send(pdo.can_id, data)
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        if not self.silent:
+            self._transmit(can_id, data)

@@ -1,0 +1,90 @@
+"""Errors in force: error register, error history and emergency messages (CiA 301, EMCY; 1001h, 1003h)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from struct import Struct
+from typing import Final
+
+from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, Entry, SdoAbort
+
+_EMERGENCY: Final = Struct("<HBH3x")
+_HISTORY = 8
+
+_GENERIC, _COMMUNICATION, _PROFILE = 0x01, 0x10, 0x20
+_REGISTER_BITS: Final = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x7: _PROFILE, 0x8: _COMMUNICATION, 0xF: 0x80}
+"""Bits of the error register by the first digit of the error code."""
+
+
+class Emergencies:
+    """Which errors a device has, and what it tells of them."""
+
+    def __init__(self, objects: Dictionary, send: Callable[[bytes], None]) -> None:
+        self._send = send
+        self._register = objects[0x1001, 0]
+        self._count = objects[0x1003, 0]
+        self._history = [objects[0x1003, n] for n in range(1, _HISTORY + 1)]
+        self._active: set[tuple[int, int]] = set()
+        self._muted = False
+        self._held_back: bytes | None = None
+        objects.on_write(0x1003, self._history_written)
+
+    def __bool__(self) -> bool:
+        """Whether there is any error."""
+        return bool(self._active)
+
+    def report(self, code: int, detail: int = 0) -> None:
+        """An error has come up, told of once while it lasts; `detail` goes with it in EMCY and history."""
+        if (code, detail) in self._active:
+            return
+        self._active.add((code, detail))
+        self._update_register()
+        self._count.value = min(self._count.value + 1, _HISTORY)
+        for older, newer in zip(self._history[:0:-1], self._history[-2::-1], strict=True):
+            older.value = newer.value
+        self._history[0].value = detail << 16 | code
+        self._tell(code, detail)
+
+    def clear(self, code: int, detail: int = 0) -> None:
+        """An error is over; with the last one goes "error reset" (code 0)."""
+        if (code, detail) not in self._active:
+            return
+        self._active.remove((code, detail))
+        self._update_register()
+        if not self._active:
+            self._tell(0, 0)
+
+    def forget(self, but: int) -> None:
+        """After a reset: no error but the one with code `but`, and nothing told of it."""
+        self._active = {key for key in self._active if key[0] == but}
+        self._update_register()
+        self._held_back = None
+
+    def mute(self, muted: bool) -> None:
+        """CiA 301: in STOPPED no EMCY is sent; the newest one is on leaving it."""
+        self._muted = muted
+        if not muted and self._held_back is not None:
+            emergency, self._held_back = self._held_back, None
+            self._send(emergency)
+
+    def _update_register(self) -> None:
+        self._register.value = 0
+        for code, _ in self._active:
+            self._register.value |= _register_bits(code)
+
+    def _tell(self, code: int, detail: int) -> None:
+        emergency = _EMERGENCY.pack(code, self._register.value, detail)
+        if self._muted:
+            self._held_back = emergency
+        else:
+            self._send(emergency)
+
+    def _history_written(self, entry: Entry, _old: int) -> None:
+        if entry.value:  # CiA 301, 1003h: only 0, which empties it
+            raise SdoAbort(INVALID_VALUE)
+
+
+def _register_bits(code: int) -> int:
+    if code >> 8 == 0x86:  # positioning controller: CiA 402's, not communication
+        return _GENERIC | _PROFILE
+    return _GENERIC | _REGISTER_BITS.get(code >> 12, 0)

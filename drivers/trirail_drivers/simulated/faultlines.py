@@ -1,0 +1,287 @@
+"""The language of faults on demand: one fault a line.
+
+    [at SECONDS] [when DRIVE CONDITION] [with CHANCE] [A|B|C|all] FAULT [VALUE] [FRAMES …] [for SECONDS | for N frames]
+
+`HELP` tells the words. What is not in the language is refused with one line that says what would be right.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from trirail_drivers import frames
+from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import NAMES
+from trirail_drivers.odrive import odrive_frames
+
+HELP: Final = """\
+[at SECONDS] [when DRIVE CONDITION] [with CHANCE] [DRIVE] FAULT [VALUE] [FRAMES ...] [for SECONDS | for N frames]
+  at 2.5 A silent for 0.5        when B moving B emcy 4310        with 0.01 C drop tpdo2
+
+faults of frames, to and from a drive (FRAMES: all where none are named):
+  drop · duplicate · corrupt (one bit) · delay SECONDS · dlc LENGTH
+  FRAMES  to the drive: to, nmt sync rpdo1 rpdo2 sdo-request; from it: from, heartbeat, emcy tpdo1 tpdo2 sdo-answer;
+          to an ODrive: set_axis_state set_controller_mode set_input_pos clear_errors position-request;
+          from it: get_version get_error get_encoder_estimates; or an identifier: 0x181
+faults of a drive:
+  silent            nothing is heard or sent      emcy CODE     an emergency, without more (hexadecimal)
+  fault CODE        breaks down with an EMCY      reboot        loses its supply and its set-up
+  stuck             the slider does not move      lag SECONDS   the slider is so far behind
+  runaway SPEED     the slider moves with SPEED [m/s] whatever it is told, until it has no power
+faults of the bus (no DRIVE):
+  bus-off           the master's controller leaves the bus        error-passive   ... is about to
+  babble ID         a node sends this identifier without pause; what has a higher one does not get through
+DRIVE is A, B, C or all. CONDITION is enabled, moving, stopping or fault; DRIVE before it may be any.
+at     seconds after the line is read        for   how long; else until clear (emcy, fault, reboot: at once over)
+with   chance for each frame; for faults of a drive or the bus, for each second
+Commands: list · clear (ends all faults) · help"""
+
+
+class FaultSyntaxError(DriveError):
+    """A line is not in the language of faults; the message says what would be right."""
+
+
+class Frames(NamedTuple):
+    """Some of the frames between the bus and a drive."""
+
+    to_drive: bool | None
+    """Direction; None for both."""
+    identifier: int | None
+    """That of node 0; None for all."""
+    per_node: int = 0
+    """What each further node id adds to the identifier; 0 where it is the same for all."""
+
+    def match(self, to_drive: bool, identifier: int, node: int) -> bool:
+        """Whether a frame to or from the drive `node` is one of them."""
+        if self.to_drive is not None and self.to_drive is not to_drive:
+            return False
+        return self.identifier is None or identifier == self.identifier + self.per_node * node
+
+
+class Condition(NamedTuple):
+    """What a drive must be doing for a fault to begin."""
+
+    drive: int | None
+    """Index of the drive; None for any."""
+    state: str
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One line, understood."""
+
+    line: str
+    name: str
+    drives: tuple[int, ...] = ()
+    """Indices of the drives it strikes; empty for the bus."""
+    value: float = 0.0
+    """Its VALUE; codes and identifiers are whole numbers."""
+    frames: tuple[Frames, ...] = ()
+    delay: float = 0.0
+    """Seconds from the line to the fault."""
+    condition: Condition | None = None
+    chance: float = 1.0
+    duration: float = math.inf
+    """How long it lasts [s]."""
+    number: int | None = None
+    """How many frames it strikes; None for all."""
+
+
+_EITHER: Final = {"to": Frames(True, None), "from": Frames(False, None)}
+CANOPEN: Final = {
+    "nmt": Frames(True, frames.NMT),
+    "sync": Frames(True, frames.SYNC),
+    "rpdo1": Frames(True, frames.RPDO1, 1),
+    "rpdo2": Frames(True, frames.RPDO2, 1),
+    "sdo-request": Frames(True, frames.SDO_REQUEST, 1),
+    "emcy": Frames(False, frames.EMCY, 1),
+    "tpdo1": Frames(False, frames.TPDO1, 1),
+    "tpdo2": Frames(False, frames.TPDO2, 1),
+    "sdo-answer": Frames(False, frames.SDO_ANSWER, 1),
+    "heartbeat": Frames(False, frames.HEARTBEAT, 1),
+} | _EITHER
+"""Names of the frames of CANopen drives."""
+_NODE: Final = odrive_frames.identifier(1, 0)
+ODRIVE: Final = {
+    "set_axis_state": Frames(True, odrive_frames.SET_AXIS_STATE, _NODE),
+    "set_controller_mode": Frames(True, odrive_frames.SET_CONTROLLER_MODE, _NODE),
+    "set_input_pos": Frames(True, odrive_frames.SET_INPUT_POS, _NODE),
+    "clear_errors": Frames(True, odrive_frames.CLEAR_ERRORS, _NODE),
+    "position-request": Frames(True, odrive_frames.GET_ENCODER_ESTIMATES, _NODE),
+    "get_version": Frames(False, odrive_frames.GET_VERSION, _NODE),
+    "get_error": Frames(False, odrive_frames.GET_ERROR, _NODE),
+    "get_encoder_estimates": Frames(False, odrive_frames.GET_ENCODER_ESTIMATES, _NODE),
+    "heartbeat": Frames(False, odrive_frames.HEARTBEAT, _NODE),
+} | _EITHER
+"""Names of the frames of ODrives, as their manual has them."""
+CONDITIONS: Final = ("enabled", "moving", "stopping", "fault")
+_DRIVES: Final = {name: (index,) for index, name in enumerate(NAMES)} | {"all": tuple(range(len(NAMES)))}
+
+
+def _decimal(word: str) -> float:
+    value = float(word)
+    if not math.isfinite(value):
+        raise ValueError
+    return value
+
+
+def _time(word: str) -> float:
+    value = _decimal(word)
+    if value < 0.0:
+        raise ValueError
+    return value
+
+
+def _between(low: int, high: int, base: int) -> Callable[[str], float]:
+    def read(word: str) -> float:
+        value = int(word, base)
+        if not low <= value <= high:
+            raise ValueError
+        return value
+
+    return read
+
+
+class _Kind(NamedTuple):
+    """What a fault's name wants after it."""
+
+    wants: str = ""
+    """Its VALUE in words; empty where it has none."""
+    read: Callable[[str], float] | None = None
+    example: str = ""
+    momentary: bool = False
+
+
+_OF_FRAMES: Final = {
+    "drop": _Kind(),
+    "duplicate": _Kind(),
+    "corrupt": _Kind(),
+    "delay": _Kind("seconds", _time, "0.002"),
+    "dlc": _Kind("a length from 0 to 8", _between(0, 8, 10), "3"),
+}
+_CODE: Final = _Kind("an error code, four hexadecimal digits", _between(1, 0xFFFF, 16), "4310", momentary=True)
+_OF_DRIVES: Final = {
+    "silent": _Kind(),
+    "emcy": _CODE,
+    "fault": _CODE,
+    "reboot": _Kind(momentary=True),
+    "stuck": _Kind(),
+    "lag": _Kind("seconds", _time, "0.05"),
+    "runaway": _Kind("a speed in m/s", _decimal, "0.2"),
+}
+_OF_BUS: Final = {
+    "bus-off": _Kind(),
+    "error-passive": _Kind(),
+    "babble": _Kind("an identifier, hexadecimal", _between(0, 0x7FF, 16), "001"),
+}
+_KINDS: Final = _OF_FRAMES | _OF_DRIVES | _OF_BUS
+
+
+class _Words:
+    """The words of a line, taken one by one."""
+
+    def __init__(self, line: str) -> None:
+        self.left = line.split()
+
+    def next_is(self, *words: str) -> bool:
+        return bool(self.left) and self.left[0] in words
+
+    def take(self, after: str, wants: str, example: str) -> str:
+        if not self.left:
+            raise FaultSyntaxError(f"after {after} comes {wants}, as in: {example}")
+        return self.left.pop(0)
+
+    def value(self, after: str, wants: str, example: str, read: Callable[[str], float]) -> float:
+        word = self.take(after, wants, example)
+        try:
+            return read(word)
+        except ValueError:
+            raise FaultSyntaxError(f"{after} {word}: after {after} comes {wants}, as in: {example}") from None
+
+
+def parse(line: str, known_frames: Mapping[str, Frames] = CANOPEN) -> Fault:
+    """Read one line for drives whose frames have these names. Raises FaultSyntaxError, which says what is right."""
+    words = _Words(line)
+    delay, chance, condition = 0.0, 1.0, None
+    while words.next_is("at", "when", "with"):
+        match words.left.pop(0):
+            case "at":
+                delay = words.value("at", "seconds", "at 2.5 A silent", _time)
+            case "with":
+                chance = words.value("with", "a chance above 0, at most 1", "with 0.01 A drop tpdo2", _chance)
+            case "when":
+                condition = _condition(words)
+    drives = _DRIVES[words.left.pop(0)] if words.next_is(*_DRIVES) else ()
+    if not words.left:
+        raise FaultSyntaxError(f"a fault is missing at the end, as in: A silent; known are {', '.join(_KINDS)}")
+    name = words.left.pop(0)
+    if name not in _KINDS:
+        known = (*_KINDS, *(() if drives else _DRIVES))
+        raise FaultSyntaxError(_unknown("fault", name, known))
+    kind = _KINDS[name]
+    if bool(drives) is (name in _OF_BUS):
+        right = "the bus: name no drive" if drives else f"a drive: name it, as in: A {name}"
+        raise FaultSyntaxError(f"{name} is a fault of {right}")
+    who = "A " if drives else ""
+    value = words.value(name, kind.wants, f"{who}{name} {kind.example}", kind.read) if kind.read else 0.0
+    chosen = []
+    while words.left and not words.next_is("for"):
+        word = words.left.pop(0)
+        if name not in _OF_FRAMES:
+            raise FaultSyntaxError(f'"{word}" after {name}: only for can follow, as in: {who}{name} for 0.5')
+        chosen.append(_frames(word, known_frames))
+    duration, number = _lasting(words, name, kind.momentary)
+    return Fault(line, name, drives, value, tuple(chosen), delay, condition, chance, duration, number)
+
+
+def _chance(word: str) -> float:
+    value = _decimal(word)
+    if not 0.0 < value <= 1.0:
+        raise ValueError
+    return value
+
+
+def _condition(words: _Words) -> Condition:
+    example = "when B moving A silent"
+    drive = words.take("when", "A, B, C or any", example)
+    if drive not in (*NAMES, "any"):
+        raise FaultSyntaxError(f"when {drive}: after when comes A, B, C or any, as in: {example}")
+    state = words.take(f"when {drive}", ", ".join(CONDITIONS), example)
+    if state not in CONDITIONS:
+        raise FaultSyntaxError(_unknown("condition", state, CONDITIONS))
+    return Condition(None if drive == "any" else NAMES.index(drive), state)
+
+
+def _frames(word: str, known: Mapping[str, Frames]) -> Frames:
+    if word in known:
+        return known[word]
+    try:
+        identifier = int(word, 16) if word.startswith("0x") else -1
+    except ValueError:
+        identifier = -1
+    if not 0 <= identifier <= 0x7FF:
+        raise FaultSyntaxError(_unknown("frames", word, (*known, "0x181")))
+    return Frames(None, identifier)
+
+
+def _lasting(words: _Words, name: str, momentary: bool) -> tuple[float, int | None]:
+    if not words.left:
+        return (0.0 if momentary else math.inf), None
+    words.left.pop(0)
+    example = "for 0.5, or for 3 frames" if name in _OF_FRAMES else "for 0.5"
+    value = words.value("for", "seconds", example, _time)
+    if not words.left:
+        return value, None
+    if name not in _OF_FRAMES or words.left not in (["frames"], ["frame"]) or value != round(value) or value < 1:
+        raise FaultSyntaxError(f'"{" ".join(words.left)}" after for {value:g}: a line ends as in: {example}')
+    return math.inf, round(value)
+
+
+def _unknown(what: str, word: str, known: tuple[str, ...]) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
+    return f'unknown {what} "{word}"; {hint}'

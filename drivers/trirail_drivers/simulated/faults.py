@@ -1,0 +1,299 @@
+"""Faults on demand: disturbs the frames between a bus and its simulated drives, and the drives themselves."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+import can
+
+from trirail_drivers import canerrors, files
+from trirail_drivers.errors import DriveError, FileError
+from trirail_drivers.interface import NAMES, PowerState
+from trirail_drivers.simulated.devices import SimulatedDevice
+from trirail_drivers.simulated.drive import SimulatedDrive
+from trirail_drivers.simulated.emergency import Emergencies
+from trirail_drivers.simulated.faultlines import CANOPEN, ODRIVE, Condition, Fault, FaultSyntaxError, Frames, parse
+from trirail_drivers.simulated.odrive import SimulatedOdrive
+
+MOVING: Final = 1e-3
+"""A slider moves from this speed on [m/s]."""
+BABBLED: Final = 7000.0
+"""Frames a second of a node that takes all of a bus of 1 Mbit/s."""
+MOST_BABBLED: Final = 100
+"""Frames of it at a time, for somebody who did not listen for long."""
+
+_STOPPING = (PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
+_FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
+_EVERY = (Frames(None, None),)
+
+Deliver = Callable[[bytes], None]
+
+
+def _to_nobody(_said: object) -> None:
+    """Where faults are told, and frames sent, that nobody listens to."""
+
+
+class _Active:
+    """A fault that waits for its time, or is in force."""
+
+    def __init__(self, fault: Fault, since: float) -> None:
+        self.fault = fault
+        self.since = since
+        self.begun = False
+        self.struck = 0
+
+    @property
+    def over(self) -> bool:
+        return self.fault.number is not None and self.struck >= self.fault.number
+
+    def strikes(self, index: int, to_drive: bool, can_id: int, node: int) -> bool:
+        if not self.begun or self.over or index not in self.fault.drives:
+            return False
+        return any(frames.match(to_drive, can_id, node) for frames in self.fault.frames or _EVERY)
+
+
+class Faults:
+    """The faults of one bus. Chance comes from a seed: the same calls bring the same faults."""
+
+    def __init__(
+        self,
+        drives: Sequence[SimulatedDevice],
+        counts_per_metre: Sequence[float],
+        seed: int = 0,
+        tell: Callable[[str], None] = _to_nobody,
+    ) -> None:
+        """`counts_per_metre`: negative where counts fall as the slider rises. `tell`: hears what begins and ends."""
+        self.tell = tell
+        self._drives = drives
+        self._names = ODRIVE if any(isinstance(drive, SimulatedOdrive) for drive in drives) else CANOPEN
+        self._scales = counts_per_metre
+        self._random = random.Random(seed)
+        self._active: list[_Active] = []
+        self._held: list[tuple[float, int, Deliver, bytes]] = []
+        self._order = itertools.count()
+        self._clock: Callable[[], float] = lambda: 0.0
+        self._now = 0.0
+        self._emit: Callable[[can.Message], None] = _to_nobody
+
+    def connect(self, emit: Callable[[can.Message], None], clock: Callable[[], float]) -> None:
+        """Tell where frames go that no drive sent, and what tells the time [s]."""
+        self._emit = emit
+        self._clock = clock
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to do."""
+        return not self._active and not self._held
+
+    @property
+    def bus_off(self) -> bool:
+        """Whether the master's controller can neither send nor receive."""
+        return any(active.begun and active.fault.name == "bus-off" for active in self._active)
+
+    def seed(self, value: int) -> None:
+        """Begin chance anew."""
+        self._random.seed(value)
+
+    def add(self, line: str) -> None:
+        """Take up a line. Raises FaultSyntaxError."""
+        fault = parse(line, self._names)
+        if fault.name == "emcy":
+            for index in fault.drives:
+                if not isinstance(self._drives[index], SimulatedDrive):
+                    raise FaultSyntaxError(f"{line}: drive {NAMES[index]} has no EMCY; as in: {NAMES[index]} fault 200")
+        if self.idle:
+            self._now = self._clock()
+        self._active.append(_Active(fault, self._now))
+
+    def load(self, path: Path) -> None:
+        """Take up a file, one fault a line; # begins a comment. Raises DriveError with file and line."""
+        try:
+            text = files.text(path)
+        except FileError as error:
+            raise DriveError(f"cannot read faults: {error}") from error
+        for number, line in enumerate(text.splitlines(), start=1):
+            words = line.partition("#")[0].strip()
+            if words:
+                try:
+                    self.add(words)
+                except FaultSyntaxError as error:
+                    raise FaultSyntaxError(f"{path}:{number}: {error}") from error
+
+    def clear(self) -> None:
+        """End all faults, and forget those to come."""
+        ended, self._active = self._active, []
+        for active in ended:
+            if active.begun:
+                self._end(active)
+        self._break_drives()
+
+    def lines(self) -> list[str]:
+        """Each fault in force or to come, as it was given."""
+        return [f"{active.fault.line}{'' if active.begun else '  (to come)'}" for active in self._active]
+
+    def poll(self, now: float) -> None:
+        """Do what is due at time `now` [s]."""
+        elapsed, self._now = now - self._now, now
+        for active in tuple(self._active):
+            fault = active.fault
+            if not active.begun:
+                if self._is_due(active, elapsed):
+                    self._begin(active)
+            elif active.over or now - active.since >= fault.duration:
+                self._active.remove(active)
+                self._break_drives()
+                self._end(active)
+            elif fault.name == "fault":
+                self._fail(fault)
+            elif fault.name == "babble":
+                self._babble(round(fault.value), elapsed)
+        while self._held and self._held[0][0] <= now:
+            _, _, deliver, data = heapq.heappop(self._held)
+            deliver(data)
+
+    def carry(self, index: int, to_drive: bool, can_id: int, data: bytes, deliver: Deliver) -> None:
+        """Bring a frame to or from a drive: `deliver` it as often, as late and with such data as faults have it."""
+        if self.bus_off or self._is_talked_down(can_id):
+            return
+        copies, wait = 1, 0.0
+        for active in self._active:
+            fault = active.fault
+            if not active.strikes(index, to_drive, can_id, self._drives[index].node) or not self._chance(fault):
+                continue
+            active.struck += 1
+            match fault.name:
+                case "drop":
+                    return
+                case "duplicate":
+                    copies += 1
+                case "delay":
+                    wait += fault.value
+                case "corrupt":
+                    data = self._corrupted(data)
+                case "dlc":
+                    data = data.ljust(round(fault.value), b"\0")[: round(fault.value)]
+        for _ in range(copies):
+            if wait > 0.0:
+                heapq.heappush(self._held, (self._now + wait, next(self._order), deliver, data))
+            else:
+                deliver(data)
+
+    # When faults begin and end.
+
+    def _is_due(self, active: _Active, elapsed: float) -> bool:
+        fault = active.fault
+        if self._now - active.since < fault.delay or (fault.condition and not self._holds(fault.condition)):
+            return False
+        # With a chance, a fault of frames waits for its frames; others for their second, of which this is a part.
+        return bool(fault.chance == 1.0 or self._strikes_frames(fault)) or (
+            self._random.random() < 1.0 - (1.0 - fault.chance) ** elapsed
+        )
+
+    def _holds(self, condition: Condition) -> bool:
+        drives = range(len(self._drives)) if condition.drive is None else (condition.drive,)
+        return any(self._is(index, condition.state) for index in drives)
+
+    def _is(self, index: int, state: str) -> bool:
+        drive = self._drives[index]
+        match state:
+            case "enabled":
+                return drive.power is PowerState.OPERATION_ENABLED
+            case "moving":
+                return abs(drive.servo.velocity / self._scales[index]) >= MOVING
+            case "stopping":
+                return drive.power in _STOPPING
+            case _:
+                return drive.power in _FAULTY
+
+    def _begin(self, active: _Active) -> None:
+        fault = active.fault
+        active.begun = True
+        active.since = self._now
+        self.tell(f"begins: {fault.line}")
+        self._break_drives()
+        match fault.name:
+            case "emcy":
+                for errors in self._emergencies(fault):
+                    errors.report(round(fault.value))
+            case "fault":
+                self._fail(fault)
+            case "reboot":
+                for index in fault.drives:
+                    self._drives[index].restart(self._now)
+            case "bus-off":
+                self._emit_error(canerrors.BUS_OFF)
+            case "error-passive":
+                self._emit_error(canerrors.CONTROLLER, canerrors.PASSIVE)
+        if fault.duration == 0.0:
+            self._active.remove(active)
+            self._break_drives()
+            self._end(active)
+
+    def _end(self, active: _Active) -> None:
+        fault = active.fault
+        self.tell(f"is over: {fault.line}" + (f" ({active.struck} frames)" if self._strikes_frames(fault) else ""))
+        match fault.name:
+            case "emcy":
+                for errors in self._emergencies(fault):
+                    errors.clear(round(fault.value))
+            case "reboot":
+                for index in fault.drives:
+                    self._drives[index].restart(self._now)
+            case "bus-off":
+                self._emit_error(canerrors.RESTARTED)
+            case "error-passive":
+                self._emit_error(canerrors.CONTROLLER, canerrors.ACTIVE)
+        if fault.chance < 1.0 and fault.number is None and not self._strikes_frames(fault):
+            self._active.append(_Active(fault, self._now))
+
+    @staticmethod
+    def _strikes_frames(fault: Fault) -> bool:
+        return fault.name in ("drop", "duplicate", "corrupt", "delay", "dlc")
+
+    # What faults do.
+
+    def _break_drives(self) -> None:
+        """Make every drive as sound or defect as the faults now in force have it."""
+        for index, (drive, scale) in enumerate(zip(self._drives, self._scales, strict=True)):
+            fault = {a.fault.name: a.fault for a in self._active if a.begun and index in a.fault.drives}
+            drive.silent = "silent" in fault or "reboot" in fault
+            drive.servo.lag = fault["lag"].value if "lag" in fault else None
+            drive.servo.forced_velocity = fault["runaway"].value * scale if "runaway" in fault else None
+            if "stuck" in fault:
+                drive.servo.forced_velocity = 0.0
+
+    def _emergencies(self, fault: Fault) -> list[Emergencies]:
+        struck = (self._drives[index] for index in fault.drives)
+        return [drive.errors for drive in struck if isinstance(drive, SimulatedDrive)]
+
+    def _fail(self, fault: Fault) -> None:
+        for index in fault.drives:
+            self._drives[index].fail(round(fault.value))
+
+    def _babble(self, can_id: int, elapsed: float) -> None:
+        for _ in range(min(MOST_BABBLED, round(BABBLED * elapsed))):
+            self._emit(can.Message(arbitration_id=can_id, is_extended_id=False, data=bytes(8)))
+
+    def _is_talked_down(self, can_id: int) -> bool:
+        """Whether a babbling node wins every arbitration against this frame."""
+        return any(a.begun and a.fault.name == "babble" and can_id > a.fault.value for a in self._active)
+
+    def _emit_error(self, kind: int, detail: int = 0) -> None:
+        data = bytes((0, detail, 0, 0, 0, 0, 0, 0))
+        self._emit(can.Message(arbitration_id=kind, is_extended_id=False, is_error_frame=True, data=data))
+
+    def _chance(self, fault: Fault) -> bool:
+        return fault.chance == 1.0 or self._random.random() < fault.chance
+
+    def _corrupted(self, data: bytes) -> bytes:
+        if not data:
+            return data
+        bit = self._random.randrange(8 * len(data))
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        return bytes(flipped)

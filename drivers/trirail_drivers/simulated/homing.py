@@ -1,0 +1,105 @@
+"""Homing as a drive does it by itself: CiA 402-2, homing mode, to the edge of a switch or to where it stands."""
+
+from __future__ import annotations
+
+from enum import Enum, auto
+from typing import Final
+
+from trirail_drivers.simulated.servo import Servo
+
+EDGES: Final = {17: 1, 18: -1, 19: -1, 20: 1, 21: 1, 22: -1}
+"""Methods 6098h without index pulse, and in which direction each at last crosses the edge of its switch."""
+STANDING: Final = (35, 37)
+"""Methods whose home is where the drive stands."""
+
+
+class Phase(Enum):
+    """What the axis is doing."""
+
+    IDLE = auto()
+    SEARCH = auto()
+    """Towards the edge, fast, until it is crossed."""
+    RETREAT = auto()
+    """Back across the edge, fast."""
+    APPROACH = auto()
+    """Over the edge, slowly; where it is crossed is home."""
+    HALT = auto()
+    """Braking behind the edge."""
+
+
+class Homing:
+    """Finds home with one servo; velocities in counts/s, accelerations in counts/s²."""
+
+    def __init__(self, servo: Servo, switch: float | None) -> None:
+        self.switch = switch
+        """Where the switch has its edge [counts]; None for nowhere."""
+        self.attained = False
+        self.failed = False
+        """True is a homing error; it ends with the next start."""
+        self.phase = Phase.IDLE
+        self._servo = servo
+        self._direction = 1
+        self._fast = self._slow = self._acceleration = 1.0
+        self._offset = 0
+
+    @property
+    def under_way(self) -> bool:
+        """Whether it was started, and is neither over nor interrupted."""
+        return self.phase is not Phase.IDLE
+
+    def forget(self) -> None:
+        """Begin anew, as when the mode is entered."""
+        self.attained = self.failed = False
+        self.phase = Phase.IDLE
+
+    def start(self, method: int, fast: float, slow: float, acceleration: float, offset: int) -> None:
+        """Begin with `method`; afterwards the position at home is `offset` [counts]."""
+        self.forget()
+        self._fast, self._slow, self._acceleration, self._offset = fast, slow, acceleration, offset
+        if method in STANDING and self._servo.velocity == 0.0:
+            self._refer(self._servo.position)
+        elif method in EDGES and min(fast, slow, acceleration) > 0.0:
+            self._direction = EDGES[method]
+            self.phase = Phase.RETREAT if self._beyond() else Phase.SEARCH
+        else:
+            self.failed = True
+
+    def interrupt(self) -> None:
+        """Give up; to brake is the drive's."""
+        self.phase = Phase.IDLE
+
+    def move(self, step: float, halted: bool) -> None:
+        """Move for `step` seconds; `halted` only brakes, and what is under way goes on afterwards."""
+        servo = self._servo
+        before = self._beyond()
+        speed = 0.0 if halted else self._speed()
+        servo.run(speed, self._acceleration, step)
+        if self.phase is Phase.HALT and servo.velocity == 0.0 and self.switch is not None:
+            self._refer(self.switch)
+        crossed = self._beyond() is not before
+        if crossed and self.phase in (Phase.SEARCH, Phase.RETREAT, Phase.APPROACH):
+            self.phase = Phase(self.phase.value + 1)
+
+    def _speed(self) -> float:
+        match self.phase:
+            case Phase.SEARCH:
+                return self._direction * self._fast
+            case Phase.RETREAT:
+                return -self._direction * self._fast
+            case Phase.APPROACH:
+                return self._direction * self._slow
+            case _:
+                return 0.0
+
+    def _beyond(self) -> bool:
+        """Whether the axis is where it comes to when it crosses the edge in the last direction."""
+        return self.switch is not None and self._direction * (self._servo.position - self.switch) >= 0.0
+
+    def _refer(self, home: float) -> None:
+        """Count from home on."""
+        shift = self._offset - home
+        self._servo.shift(shift)
+        if self.switch is not None:
+            self.switch += shift
+        self.phase = Phase.IDLE
+        self.attained = True

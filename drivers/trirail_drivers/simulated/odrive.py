@@ -1,0 +1,194 @@
+"""An ODrive on CANSimple, simulated with its axis, in no thread of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+from collections.abc import Callable
+from typing import Final
+
+from trirail_drivers.interface import PowerState
+from trirail_drivers.odrive import odrive_frames as frames
+from trirail_drivers.odrive.odrive_frames import AxisState, Error, Result
+from trirail_drivers.simulated.servo import Servo
+
+FIRMWARE: Final = (0, 6, 10)
+VELOCITY_CONTROL: Final = 2
+NEVER: Final = float("inf")
+BOOT: Final = 0.25
+"""How long a restarted drive says that it initialises [s]."""
+
+_REQUESTS: Final = (frames.GET_VERSION, frames.GET_ERROR, frames.GET_ENCODER_ESTIMATES)
+
+
+def _discard(can_id: int, data: bytes) -> None:
+    """Where a device that is on no bus sends."""
+
+
+class SimulatedOdrive:
+    """An ODrive axis. Whoever owns it brings frames and the time to it with `receive` and `poll`.
+
+    It moves with the time, and follows each setpoint from its arrival on. Disarmed, it coasts: no brake holds it, and
+    `friction` [turns/s²] brings it to rest. Its watchdog disarms it where no message has come for `watchdog` seconds.
+    By itself it sends heartbeats only.
+    """
+
+    def __init__(self, node: int, servo: Servo, *, heartbeat: float, friction: float, watchdog: float = NEVER) -> None:
+        self.node = node
+        self.servo = servo
+        self.axis_state = AxisState.IDLE
+        self.errors = Error(0)
+        """Active errors."""
+        self.disarm_reason = Error(0)
+        self.result = Result.SUCCESS
+        self.calibrated = True
+        """Without calibration it refuses closed loop control."""
+        self.silent = False
+        """True cuts the wire: nothing is heard or sent any more, while the device itself goes on."""
+        self.modes = (VELOCITY_CONTROL, frames.PASSTHROUGH)
+        """Control mode and input mode; at first whatever somebody else has left there."""
+        self._input = (servo.position, 0.0)
+        self._heartbeat = heartbeat
+        self._watchdog = watchdog
+        self._friction = friction
+        self._fed = self._moved_at = 0.0
+        self._booted = NEVER
+        self._heartbeat_due = NEVER
+        self._transmit: Callable[[int, bytes], None] = _discard
+        self._handlers: dict[int, Callable[[bytes], None]] = {
+            frames.ESTOP: self._estop,
+            frames.SET_AXIS_STATE: self._set_state,
+            frames.SET_CONTROLLER_MODE: self._set_mode,
+            frames.SET_INPUT_POS: self._set_input,
+            frames.CLEAR_ERRORS: self._clear,
+        }
+
+    @property
+    def state(self) -> str:
+        """The axis state in words, and why it was disarmed."""
+        name = frames.state_name(self.axis_state)
+        return f"{name}, {frames.error_names(self.disarm_reason)}" if self.disarm_reason else name
+
+    @property
+    def power(self) -> PowerState:
+        """Its state as CiA 402 has it."""
+        if self._armed:
+            return PowerState.OPERATION_ENABLED
+        return PowerState.FAULT if self._told else PowerState.SWITCH_ON_DISABLED
+
+    def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
+        """Put the drive on a bus, that it sends to by `transmit(can_id, data)`, and switch it on."""
+        self._transmit = transmit
+        self._moved_at = self._heartbeat_due = now
+
+    def receive(self, can_id: int, data: bytes, now: float) -> None:
+        """Take in a data frame at time `now` [s]; an empty one is a request as well, a wrong length does nothing."""
+        node, command = divmod(can_id, 1 << 5)
+        if node != self.node or self.silent:
+            return
+        self.poll(now)  # what was due before the frame came
+        self._fed = now
+        if command in _REQUESTS:
+            if not data:
+                self._answer(command)
+        elif command in self._handlers:
+            with contextlib.suppress(struct.error):
+                self._handlers[command](data)
+
+    def receive_remote(self, can_id: int, now: float) -> None:
+        """Take in a remote frame at time `now` [s]."""
+        self.receive(can_id, b"", now)
+
+    def poll(self, now: float) -> None:
+        """Do what is due at time `now` [s]."""
+        if now > self._moved_at:
+            self._move(now - self._moved_at)
+            self._moved_at = now
+        if now >= self._booted:
+            self._booted = NEVER
+            self.axis_state, self.errors = AxisState.IDLE, Error(0)
+        if self._armed and now >= self._fed + self._watchdog:
+            self.fail(Error.WATCHDOG_TIMER_EXPIRED)
+        if now >= self._heartbeat_due:
+            self._send(frames.HEARTBEAT, frames.BEAT.pack(self._told, self.axis_state, self.result, 0))
+            self._heartbeat_due += self._heartbeat
+            if self._heartbeat_due <= now:  # too late for that one as well: leave it out
+                self._heartbeat_due = now + self._heartbeat
+
+    def fail(self, errors: int) -> None:
+        """Disarm with these errors."""
+        self.errors |= Error(errors)
+        if self._armed:
+            self.disarm_reason |= Error(errors)
+            self.result = Result.DISARMED
+            self.axis_state = AxisState.IDLE
+
+    def restart(self, now: float) -> None:
+        """Lose power for a moment: it comes back idle, without what it had not saved."""
+        self.axis_state, self.modes = AxisState.UNDEFINED, (VELOCITY_CONTROL, frames.PASSTHROUGH)
+        self.errors, self.disarm_reason, self.result = Error.INITIALIZING, Error(0), Result.SUCCESS
+        self._booted = now + BOOT
+
+    @property
+    def _armed(self) -> bool:
+        return self.axis_state is AxisState.CLOSED_LOOP_CONTROL
+
+    @property
+    def _told(self) -> int:
+        return self.errors | self.disarm_reason
+
+    def _move(self, step: float) -> None:
+        if not self._armed:
+            self.servo.roll(self._friction, step)
+        elif self.modes == (frames.POSITION_CONTROL, frames.PASSTHROUGH):
+            self.servo.chase(*self._input, step)
+
+    def _answer(self, command: int) -> None:
+        if command == frames.GET_VERSION:
+            data = frames.VERSION.pack(2, 4, 4, 58, *FIRMWARE, 0)
+        elif command == frames.GET_ERROR:
+            data = frames.ERRORS.pack(self.errors, self.disarm_reason)
+        else:
+            data = frames.ESTIMATES.pack(self.servo.position, self.servo.velocity)
+        self._send(command, data)
+
+    def _estop(self, _data: bytes) -> None:
+        self.fail(Error.ESTOP_REQUESTED)
+
+    def _set_state(self, data: bytes) -> None:
+        (state,) = frames.AXIS_STATE.unpack(data)
+        if self.axis_state is AxisState.UNDEFINED:
+            return
+        if state == AxisState.IDLE:
+            self.axis_state = AxisState.IDLE
+        elif state == AxisState.CLOSED_LOOP_CONTROL and not self._armed:
+            if self.errors:
+                self.result = Result.DISARMED
+            elif not self.calibrated:
+                self.result = Result.NOT_CALIBRATED
+            else:
+                self.result, self.axis_state = Result.SUCCESS, AxisState.CLOSED_LOOP_CONTROL
+                self.disarm_reason = Error(0)
+                # It begins where it stands (axis.cpp of the firmware's published source).
+                self._input = self.servo.position, 0.0
+
+    def _set_mode(self, data: bytes) -> None:
+        control, way = frames.CONTROLLER_MODE.unpack(data)
+        self.modes = control, way
+
+    def _set_input(self, data: bytes) -> None:
+        position, velocity, _ = frames.INPUT_POS.unpack(data)
+        if math.isfinite(position):
+            self._input = position, velocity * frames.VELOCITY_STEP
+        else:
+            self.fail(Error.MISSING_INPUT)
+
+    def _clear(self, data: bytes) -> None:
+        frames.CLEAR.unpack(data)
+        self.errors &= Error.INITIALIZING
+        self.disarm_reason = Error(0)
+
+    def _send(self, command: int, data: bytes) -> None:
+        if not self.silent:
+            self._transmit(frames.identifier(self.node, command), data)

@@ -1,0 +1,87 @@
+"""The CiA 402 power state machine as values: commands, transitions and the statusword of each state."""
+
+from __future__ import annotations
+
+from enum import Enum, auto
+from typing import Final
+
+from trirail_drivers.interface import PowerState
+
+SWITCH_ON_DISABLED = PowerState.SWITCH_ON_DISABLED
+READY_TO_SWITCH_ON = PowerState.READY_TO_SWITCH_ON
+SWITCHED_ON = PowerState.SWITCHED_ON
+OPERATION_ENABLED = PowerState.OPERATION_ENABLED
+QUICK_STOP_ACTIVE = PowerState.QUICK_STOP_ACTIVE
+FAULT_REACTION_ACTIVE = PowerState.FAULT_REACTION_ACTIVE
+FAULT = PowerState.FAULT
+
+FAULT_RESET = 0x80
+"""The controlword's bit 7; its rising edge is the command."""
+
+STATUS: Final = {
+    PowerState.NOT_READY_TO_SWITCH_ON: 0x0000,
+    SWITCH_ON_DISABLED: 0x0040,
+    READY_TO_SWITCH_ON: 0x0021,
+    SWITCHED_ON: 0x0023,
+    OPERATION_ENABLED: 0x0027,
+    QUICK_STOP_ACTIVE: 0x0007,
+    FAULT_REACTION_ACTIVE: 0x000F,
+    FAULT: 0x0008,
+}
+"""Bits 0 to 3, 5 and 6 of the statusword (CiA 402-2, 6041h, state coding)."""
+
+
+class Command(Enum):
+    """What a controlword asks for (CiA 402-2, 6040h, command coding)."""
+
+    SHUTDOWN = auto()
+    SWITCH_ON = auto()
+    """In OPERATION ENABLED the same bits are "disable operation"."""
+    ENABLE_OPERATION = auto()
+    DISABLE_VOLTAGE = auto()
+    QUICK_STOP = auto()
+
+
+_CODING: Final = (
+    (0x82, 0x00, Command.DISABLE_VOLTAGE),
+    (0x86, 0x02, Command.QUICK_STOP),
+    (0x87, 0x06, Command.SHUTDOWN),
+    (0x8F, 0x07, Command.SWITCH_ON),
+    (0x8F, 0x0F, Command.ENABLE_OPERATION),
+)
+"""Mask, value under the mask, command; bits outside the mask do not matter."""
+
+_TRANSITIONS: Final = {
+    (SWITCH_ON_DISABLED, Command.SHUTDOWN): READY_TO_SWITCH_ON,  # 2
+    (READY_TO_SWITCH_ON, Command.SWITCH_ON): SWITCHED_ON,  # 3
+    (READY_TO_SWITCH_ON, Command.ENABLE_OPERATION): OPERATION_ENABLED,  # 3 and at once 4
+    (SWITCHED_ON, Command.ENABLE_OPERATION): OPERATION_ENABLED,  # 4
+    (OPERATION_ENABLED, Command.SWITCH_ON): SWITCHED_ON,  # 5
+    (SWITCHED_ON, Command.SHUTDOWN): READY_TO_SWITCH_ON,  # 6
+    (READY_TO_SWITCH_ON, Command.QUICK_STOP): SWITCH_ON_DISABLED,  # 7
+    (READY_TO_SWITCH_ON, Command.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 7
+    (OPERATION_ENABLED, Command.SHUTDOWN): READY_TO_SWITCH_ON,  # 8
+    (OPERATION_ENABLED, Command.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 9
+    (SWITCHED_ON, Command.QUICK_STOP): SWITCH_ON_DISABLED,  # 10
+    (SWITCHED_ON, Command.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 10
+    (OPERATION_ENABLED, Command.QUICK_STOP): QUICK_STOP_ACTIVE,  # 11
+    (QUICK_STOP_ACTIVE, Command.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 12
+    (QUICK_STOP_ACTIVE, Command.ENABLE_OPERATION): OPERATION_ENABLED,  # 16
+}
+"""By command; transitions 0, 1, 13, 14 are the drive's own and 15 is the fault reset."""
+
+
+def command(controlword: int) -> Command | None:
+    """The command in `controlword`, None where its bits are none."""
+    for mask, value, meaning in _CODING:
+        if controlword & mask == value:
+            return meaning
+    return None
+
+
+def commanded(state: PowerState, controlword: int, resumes: bool) -> PowerState:
+    """The state after `controlword`; whether a quick stop `resumes` (transition 16) is for 605Ah to say."""
+    order = command(controlword)
+    if order is None or (state, order, resumes) == (QUICK_STOP_ACTIVE, Command.ENABLE_OPERATION, False):
+        return state
+    return _TRANSITIONS.get((state, order), state)

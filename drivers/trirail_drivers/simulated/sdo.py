@@ -1,0 +1,130 @@
+"""An SDO server: expedited and segmented transfers (CiA 301, service data object protocol)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from struct import Struct
+from typing import Final
+
+from trirail_drivers.simulated.dictionary import (
+    NO_DATA,
+    READ_ONLY,
+    TOO_LONG,
+    WRITE_ONLY,
+    WRONG_LENGTH,
+    Dictionary,
+    Entry,
+    SdoAbort,
+)
+
+TOGGLE_NOT_ALTERNATED = 0x05030000
+UNKNOWN_COMMAND = 0x05040001
+
+_HEADER: Final = Struct("<BHB4s")
+_ABORT: Final = Struct("<BHBI")
+
+
+class SdoServer:
+    """Serves one dictionary to one client, one transfer at a time."""
+
+    def __init__(self, objects: Dictionary, respond: Callable[[bytes], None]) -> None:
+        self._objects = objects
+        self._respond = respond
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the transfer under way."""
+        self._key = (0, 0)
+        self._toggle = 0
+        self._upload: bytes | None = None
+        self._download: bytearray | None = None
+
+    def request(self, data: bytes) -> None:
+        """Answer one frame of the client; one that is not eight bytes long is none (CiA 301)."""
+        if len(data) != 8:
+            return
+        try:
+            match data[0] >> 5:
+                case 0:
+                    self._download_segment(data)
+                case 1:
+                    self._start_download(data)
+                case 2:
+                    self._start_upload(data)
+                case 3:
+                    self._upload_segment(data)
+                case 4:
+                    self.reset()
+                case _:
+                    self._refuse_block(data)
+        except SdoAbort as abort:
+            key = self._key
+            self.reset()
+            self._respond(_ABORT.pack(0x80, *key, abort.code))
+
+    def _start(self, data: bytes) -> tuple[Entry, bytes]:
+        self.reset()
+        _, index, subindex, payload = _HEADER.unpack(data)
+        self._key = index, subindex
+        return self._objects[index, subindex], payload
+
+    def _start_upload(self, data: bytes) -> None:
+        entry, _ = self._start(data)
+        if not entry.readable:
+            raise SdoAbort(WRITE_ONLY)
+        if entry.index == 0x1003 and entry.subindex > self._objects[0x1003, 0].value:
+            raise SdoAbort(NO_DATA)  # CiA 301, 1003h: no such error in the history
+        content = entry.encode()
+        if len(content) <= 4:
+            command = 0x43 | (4 - len(content)) << 2
+            self._respond(_HEADER.pack(command, *self._key, content))
+        else:
+            self._upload = content
+            self._respond(_HEADER.pack(0x41, *self._key, len(content).to_bytes(4, "little")))
+
+    def _upload_segment(self, data: bytes) -> None:
+        if self._upload is None:
+            raise SdoAbort(UNKNOWN_COMMAND)
+        toggle = self._take_toggle(data)
+        segment, self._upload = self._upload[:7], self._upload[7:] or None
+        last = self._upload is None
+        self._respond(bytes([toggle | (7 - len(segment)) << 1 | last]) + segment.ljust(7, b"\0"))
+
+    def _start_download(self, data: bytes) -> None:
+        entry, payload = self._start(data)
+        if not entry.writable:
+            raise SdoAbort(READ_ONLY)
+        expedited, sized = data[0] & 0x02, data[0] & 0x01
+        if expedited:
+            length = 4 - (data[0] >> 2 & 0x03) if sized else entry.size
+            entry.write(entry.decode(payload[:length]))
+        else:
+            self._download = bytearray()
+            if sized and int.from_bytes(payload, "little") != entry.size:
+                raise SdoAbort(WRONG_LENGTH)
+        self._respond(_HEADER.pack(0x60, *self._key, b""))
+
+    def _download_segment(self, data: bytes) -> None:
+        if self._download is None:
+            raise SdoAbort(UNKNOWN_COMMAND)
+        toggle = self._take_toggle(data)
+        self._download += data[1 : 8 - (data[0] >> 1 & 0x07)]
+        entry = self._objects[self._key]
+        if len(self._download) > entry.size:
+            raise SdoAbort(TOO_LONG)
+        if data[0] & 0x01:
+            content, self._download = bytes(self._download), None
+            entry.write(entry.decode(content))
+        self._respond(bytes([0x20 | toggle]).ljust(8, b"\0"))
+
+    def _refuse_block(self, data: bytes) -> None:
+        """Block transfers are optional (CiA 301) and not offered."""
+        self._start(data)
+        raise SdoAbort(UNKNOWN_COMMAND)
+
+    def _take_toggle(self, data: bytes) -> int:
+        toggle = data[0] & 0x10
+        if toggle != self._toggle:
+            raise SdoAbort(TOGGLE_NOT_ALTERNATED)
+        self._toggle ^= 0x10
+        return toggle

@@ -1,0 +1,157 @@
+"""A CAN bus between processes of one machine, for kernels without SocketCAN."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import time
+from collections import deque
+from pathlib import Path
+from struct import Struct
+from typing import Final
+
+import can
+
+from trirail_drivers.errors import BusError
+
+_FRAME: Final = Struct("=IB3x8s")
+"""Linux `struct can_frame`: CAN-ID with flags, length, data; one a packet."""
+_EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
+
+
+class UnixBus(can.BusABC):
+    """One end of a bus over an AF_UNIX SOCK_SEQPACKET socket at the path `channel`.
+
+    The end that listens makes the bus: whenever it receives, it relays each frame to all its peers but the
+    sender. Any number of others connect. A peer that does not read loses frames, like a full CAN controller.
+    """
+
+    def __init__(self, channel: str, listen: bool = False, **kwargs: object) -> None:
+        self.channel_info = f"unix {channel}"
+        self._path = Path(channel)
+        self._peers: dict[int, socket.socket] = {}
+        self._listener: socket.socket | None = None
+        self._arrived: deque[can.Message] = deque()
+        self._epoll = select.epoll()
+        try:
+            if listen:
+                self._listener = self._listen()
+                self._epoll.register(self._listener, select.EPOLLIN)
+            else:
+                self._add(_connect(self._path))
+        except OSError as error:
+            self._epoll.close()
+            raise BusError(_remedy(self._path, listen)) from error
+        super().__init__(channel, **kwargs)  # type: ignore[arg-type]
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
+        """Send to the peers; raises can.CanOperationError where the listening end is gone or too slow."""
+        if msg.is_fd:
+            raise can.CanOperationError(f"{self.channel_info}: classical CAN frames only, not CAN FD")
+        can_id = msg.arbitration_id
+        can_id |= _EXTENDED * msg.is_extended_id | _REMOTE * msg.is_remote_frame | _ERROR * msg.is_error_frame
+        packet = _FRAME.pack(can_id, msg.dlc, bytes(msg.data))
+        if self._listener is None:
+            try:
+                next(iter(self._peers.values())).send(packet)
+            except (StopIteration, OSError) as error:
+                raise can.CanOperationError(f"{self.channel_info}: cannot send, {error!r}") from error
+        else:
+            self._relay(packet)
+
+    def fileno(self) -> int:
+        """Readable when a frame or a new peer may be there."""
+        return self._epoll.fileno()
+
+    def shutdown(self) -> None:
+        """Leave the bus; the listening end ends it for all."""
+        if self._is_shutdown:
+            return
+        super().shutdown()
+        for peer in self._peers.values():
+            peer.close()
+        if self._listener is not None:
+            self._listener.close()
+            self._path.unlink(missing_ok=True)
+        self._epoll.close()
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._arrived:
+            for descriptor, _ in self._epoll.poll(timeout):
+                peer = self._peers.get(descriptor)
+                if peer is not None:
+                    self._take(peer)
+                elif self._listener is not None:
+                    self._add(self._listener.accept()[0])
+        return (self._arrived.popleft() if self._arrived else None), False
+
+    def _listen(self) -> socket.socket:
+        with contextlib.suppress(OSError):
+            _connect(self._path).close()
+            raise BusError(f"{self.channel_info}: somebody listens there already; stop it or take another path")
+        if self._path.is_socket():
+            self._path.unlink()  # left behind by one that died
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        try:
+            listener.bind(str(self._path))
+            listener.listen()
+        except OSError:
+            listener.close()
+            raise
+        return listener
+
+    def _add(self, peer: socket.socket) -> None:
+        peer.setblocking(False)
+        self._peers[peer.fileno()] = peer
+        self._epoll.register(peer, select.EPOLLIN)
+
+    def _take(self, peer: socket.socket) -> None:
+        """Read one frame, or the end, of a peer."""
+        try:
+            packet = peer.recv(_FRAME.size)
+        except ConnectionError:
+            packet = b""
+        if len(packet) != _FRAME.size:
+            self._epoll.unregister(peer)
+            del self._peers[peer.fileno()]
+            peer.close()
+            if self._listener is None:
+                raise can.CanOperationError(f"{self.channel_info}: the listening end is gone")
+            return
+        self._relay(packet, peer)
+        can_id, length, data = _FRAME.unpack(packet)
+        message = can.Message(
+            timestamp=time.time(),
+            arbitration_id=can_id & (0x1FFFFFFF if can_id & _EXTENDED else 0x7FF),
+            is_extended_id=bool(can_id & _EXTENDED),
+            is_remote_frame=bool(can_id & _REMOTE),
+            is_error_frame=bool(can_id & _ERROR),
+            dlc=length,
+            data=None if can_id & _REMOTE else data[:length],
+        )
+        self._arrived.append(message)
+
+    def _relay(self, packet: bytes, sender: socket.socket | None = None) -> None:
+        if self._listener is None:
+            return
+        for peer in self._peers.values():
+            if peer is not sender:
+                with contextlib.suppress(OSError):  # full, or about to be found closed
+                    peer.send(packet)
+
+
+def _connect(path: Path) -> socket.socket:
+    peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        peer.connect(str(path))
+    except OSError:
+        peer.close()
+        raise
+    return peer
+
+
+def _remedy(path: Path, listen: bool) -> str:
+    if listen:
+        return f"unix {path}: cannot listen there; is the folder writable, the path under 108 bytes?"
+    return f"unix {path}: nobody listens there; start tools/virtual_drives.py --interface unix --channel {path}"

@@ -1,5 +1,0 @@
-"""`python -m service` is `trirail`."""
-
-from service.cli import main
-
-main()

@@ -1,0 +1,5 @@
+"""`python -m trirail` is `trirail`."""
+
+from trirail.cli.cli import main
+
+main()

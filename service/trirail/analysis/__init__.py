@@ -1,0 +1,1 @@
+"""Recordings looked at afterwards: summaries, charts, replays."""

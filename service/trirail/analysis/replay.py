@@ -1,0 +1,229 @@
+"""A recorded session again, in process and without waiting: the same control, given the same, cycle by cycle.
+
+What the control decides depends on its configuration, on what the drives say at each SYNC, and on what it is given:
+goals, commands and mishaps. All of that is in a recording, with the cycle that it belongs to, so the setpoints must
+come out the same to the last bit. With another configuration the drives' recorded answers mean nothing any more: then
+simulated drives take their place, on a clock that goes on by one period a cycle.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from trirail_drivers.bus import connect
+from trirail_drivers.interface import DriveFault, Drives, Feedback, PowerState, Triple
+
+from trirail.config import Config
+from trirail.control.control import Control
+from trirail.errors import ServiceError
+from trirail.telemetry.reading import Recording
+from trirail.wire.packets import DrivesFault, Input
+from trirail.wire.vocabulary import MODES, Mode
+
+SETPOINTS = ("commanded_position", "commanded_velocity")
+"""The fields of a record that were sent to the drives."""
+_FLAGS = (("age", int), ("follows", bool), ("homed", bool))
+
+
+class Comparison(NamedTuple):
+    """How a session's setpoints came out again."""
+
+    cycles: int
+    """So many were compared."""
+    lacking: int
+    """So many at the end were not, since what came before them is not in the recording."""
+    requests: int
+    """Goals, commands and mishaps that were given."""
+    differing: int
+    """Cycles whose setpoints or mode are not the same to the last bit."""
+    first: int | None
+    """The first of them."""
+    position: Triple
+    """Greatest difference of a setpoint, of each slider [m]."""
+    velocity: Triple
+    """Greatest difference of the velocity feed-forward, of each slider [m/s]."""
+
+
+def again(recording: Recording, config: Config, *, simulated: bool) -> Comparison:
+    """Run a session once more and compare.
+
+    The drives are those of the recording or, if `simulated`, those of the configuration's simulation. Raises
+    ServiceError where the recording does not begin with a robot without power: what it did before is not known.
+    """
+    records, given = _whole(recording)
+    _check(recording, records, config)
+    clock = _Clock(config.period)
+    drives = _simulated(records, config, clock) if simulated else _Recorded(records)
+    try:
+        made, modes = _run(Control(config, drives), drives, clock, records, given)
+    finally:
+        clock.run()
+        drives.close()
+    sent = np.stack([records[name] for name in SETPOINTS], axis=1)
+    differs = (made.view(np.int64) != sent.view(np.int64)).any(axis=(1, 2)) | (modes != records["mode"])
+    greatest = np.abs(made - sent).max(axis=0).tolist()
+    return Comparison(
+        cycles=len(records),
+        lacking=len(recording.records) - len(records),
+        requests=len(given),
+        differing=int(differs.sum()),
+        first=int(records["cycle"][np.argmax(differs)]) if differs.any() else None,
+        position=tuple(greatest[0]),
+        velocity=tuple(greatest[1]),
+    )
+
+
+def _run(
+    control: Control, drives: Drives, clock: _Clock, records: NDArray[np.void], given: Sequence[Input]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return what is sent to the drives in each cycle, (N, 2, 3), and the modes, (N,)."""
+    clock.step()
+    drives.sync()
+    control.start(drives.read())
+    control.cycles = int(records["cycle"][0]) - 1
+    waiting = deque(given)
+    made = np.zeros((len(records), 2, 3))
+    modes = np.zeros(len(records), np.uint8)
+    for row in range(len(records)):
+        clock.step()
+        drives.sync()
+        _cycle(control, drives, list(_due(waiting, control.cycles + 1)))
+        made[row] = control.setpoints.rows[:2]
+        modes[row] = MODES.index(control.state.mode)
+    return made, modes
+
+
+def _cycle(control: Control, drives: Drives, given: Sequence[Input]) -> None:
+    """Do what the loop does in a cycle after its SYNC."""
+    if isinstance(drives, _Recorded):
+        for what in given:
+            if isinstance(what.given, DrivesFault):
+                drives.fail(what.given.message)
+    control.cycle(
+        drives.read(), [(what.given, what.now_ns) for what in given if not isinstance(what.given, DrivesFault)]
+    )
+    control.desk.answers.clear()
+    control.desk.happenings.clear()
+
+
+def _due(waiting: deque[Input], cycle: int) -> Iterator[Input]:
+    while waiting and waiting[0].cycle <= cycle:
+        yield waiting.popleft()
+
+
+def _whole(recording: Recording) -> tuple[NDArray[np.void], list[Input]]:
+    """Return the records up to the first gap, in them or in what the control was given, and what it was given."""
+    records, given = recording.records, recording.requests
+    steps = np.diff(records["cycle"]) != 1
+    length = int(np.argmax(steps)) + 1 if steps.any() else len(records)
+    first, last = int(records["cycle"][0]), int(records["cycle"][length - 1])
+    known = [what for place, what in enumerate(given) if what.seq - given[0].seq == place]
+    if len(known) < len(given):  # something was given after the last one that is known, nobody knows when
+        last = max(first, min(last, known[-1].cycle))
+    return records[: last - first + 1], [what for what in known if first <= what.cycle <= last]
+
+
+def _check(recording: Recording, records: NDArray[np.void], config: Config) -> None:
+    begins, cycle = MODES[int(records["mode"][0])], int(records["cycle"][0])
+    if begins is not Mode.DISABLED:
+        raise ServiceError(
+            f"the recording begins at cycle {cycle} in mode {begins}, and what led there is not in it: "
+            "a replay needs one that begins disabled; give all files of the session"
+        )
+    rate = round(1.0 / float(np.median(np.diff(recording.t[:1000])))) if len(recording.t) > 1 else 0
+    if rate and rate != config.loop.rate_hz:
+        raise ServiceError(f"loop.rate_hz = {config.loop.rate_hz}: the recording has {rate} cycles a second")
+
+
+class _Recorded:
+    """Drives that say what they said in the recording, and take anything: trirail_drivers.interface.Drives."""
+
+    bus_load = 0.0
+    traffic = 0
+
+    def __init__(self, records: NDArray[np.void]) -> None:
+        positions: list[Any] = records["position"].tolist()
+        flags: list[Any] = [map(tuple, records[name].astype(kind).tolist()) for name, kind in _FLAGS]
+        homing = records["homing"].astype(bool).tolist()
+        states: list[Any] = [tuple(map(PowerState, state)) for state in records["drive_state"].tolist()]
+        self._said = [
+            Feedback(tuple(position), state, None, age=age, follows=follows, homed=homed, homing=now)
+            for position, state, age, follows, homed, now in zip(positions, states, *flags, homing, strict=True)
+        ]
+        self._row = -1
+        self._fault: DriveFault | None = None
+
+    def fail(self, message: str | None) -> None:
+        """Say from now on that something is wrong; with None, that nothing is."""
+        self._fault = DriveFault("", "recorded", 0, message) if message is not None else None
+
+    def sync(self) -> None:
+        """Go on by a cycle."""
+        self._row += 1
+
+    def read(self) -> Feedback:
+        """Return what was said in this one; before the first cycle, what is said in it."""
+        return self._said[max(0, self._row - 1)]._replace(fault=self._fault)
+
+    def configure(self, period: float) -> None:
+        """See trirail_drivers.interface.Drives."""
+
+    def write(self, position: Triple, velocity: Triple) -> None:
+        """See trirail_drivers.interface.Drives."""
+
+    def enable(self) -> None:
+        """See trirail_drivers.interface.Drives."""
+
+    def home(self) -> None:
+        """See trirail_drivers.interface.Drives."""
+
+    def stop_homing(self) -> None:
+        """See trirail_drivers.interface.Drives."""
+
+    def disable(self) -> None:
+        """See trirail_drivers.interface.Drives."""
+
+    def quick_stop(self) -> None:
+        """See trirail_drivers.interface.Drives."""
+
+    def reset(self) -> None:
+        """See trirail_drivers.interface.Drives."""
+
+    def close(self) -> None:
+        """See trirail_drivers.interface.Drives."""
+
+
+class _Clock:
+    """The simulated drives' time, which a cycle moves on by one period; it runs by itself once that is over."""
+
+    def __init__(self, period: float) -> None:
+        self._now = 0.0
+        self._period = period
+        self._over: float | None = None
+
+    def __call__(self) -> float:
+        return self._now if self._over is None else self._now + time.monotonic() - self._over
+
+    def step(self) -> None:
+        """Go on by a period."""
+        self._now += self._period
+
+    def run(self) -> None:
+        """Run from now on: drives that are let go of have to come to stand."""
+        self._over = time.monotonic()
+
+
+def _simulated(records: NDArray[np.void], config: Config, clock: _Clock) -> Drives:
+    """Return simulated drives that stand where the recorded ones stood."""
+    start: Any = tuple(records["position"][0].tolist())
+    behaviour = msgspec.structs.replace(config.can.simulated, start=start)
+    can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives
+    drives = connect(can, config.drives, clock)
+    drives.configure(config.period)
+    return drives

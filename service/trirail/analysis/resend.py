@@ -1,0 +1,193 @@
+"""A recorded session's goals and commands, sent once more to a running service; its setpoints beside the recorded ones.
+
+Requests go out with the spacing that they had. Every motion that began at rest is compared from its first cycle on, as
+the logs of both sessions name it; how goals that interrupt each other come out depends on the moment, to a cycle.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from trirail.client.client import Goal, Robot
+from trirail.errors import RefusedError, ServiceError
+from trirail.telemetry.reading import Recording
+from trirail.wire.messages import Event, Override, Stop
+from trirail.wire.messages import Goal as Message
+from trirail.wire.packets import CommandRequest, GoalRequest
+from trirail.wire.records import unpack
+from trirail.wire.vocabulary import MODES, Mode
+
+NEAR = 1e-3
+"""How far the sliders may stand from where the session began [m]."""
+END_WITHIN = 60.0
+"""How long the last goals may take to end [s]."""
+HEARD_WITHIN = 2.0
+"""How much later than a goal's end its last records may come [s]."""
+_BEGAN = re.compile(rf"{Mode.MOVING}: goal (?P<id>\S+) of ")
+_MOVING = MODES.index(Mode.MOVING)
+
+Triple = tuple[float, float, float]
+
+
+class Motion(NamedTuple):
+    """One motion, as recorded and as it was now."""
+
+    id: str
+    """The goal that it began with."""
+    outcome: str
+    """How that ended now; "refused" where it was not taken, "unknown" where that was not heard."""
+    cycles: int
+    """So many were compared."""
+    lacking: int
+    """By so many cycles one of the two was longer."""
+    position: Triple
+    """Greatest difference of a setpoint, of each slider [m]."""
+
+
+def resend(recording: Recording, robot: Robot, say: Callable[[str], None]) -> list[Motion]:
+    """Send a session again and compare. Raises ServiceError where the robot does not stand where it began."""
+    _check_start(recording, robot)
+    heard = _Heard(robot)
+    with heard.listening():
+        renamed, goals = _send(recording, robot, say)
+        _await(goals.values())
+        time.sleep(HEARD_WITHIN)
+    now = heard.records()
+    return [
+        _compared(
+            name, goals.get(name), _motion(recording.records, began), _motion(now, heard.began.get(renamed[name]))
+        )
+        for name, began in _beginnings(recording)
+        if name in renamed
+    ]
+
+
+class _Heard:
+    """What a service publishes meanwhile: its records, and the cycles in which motions began."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.began: dict[str, int] = {}
+        self._robot = robot
+        self._batches: list[bytes] = []
+        self._over = threading.Event()
+
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        """Listen as long as the context lasts."""
+        thread = threading.Thread(target=self._listen, name="events", daemon=True)
+        thread.start()
+        with self._robot.records(self._batches.append):
+            yield
+        self._over.set()
+        thread.join()
+
+    def records(self) -> NDArray[np.void]:
+        """Return the records so far."""
+        return unpack(b"".join(self._batches))
+
+    def _listen(self) -> None:
+        while not self._over.is_set():
+            for event in self._robot.events(timeout=0.5):
+                self._take(event)
+
+    def _take(self, event: Event) -> None:
+        if found := _BEGAN.match(event.message):
+            self.began[found["id"]] = event.cycle
+
+
+def _check_start(recording: Recording, robot: Robot) -> None:
+    stood, stands = recording.records["position"][0], np.array(robot.state().sliders.position)
+    if np.abs(stood - stands).max() > NEAR:
+        began, now = (", ".join(f"{value * 1e3:.1f}" for value in place) for place in (stood, stands))
+        raise ServiceError(f"the session began with the sliders at {began} mm, they are at {now} mm: go there first")
+
+
+def _send(recording: Recording, robot: Robot, say: Callable[[str], None]) -> tuple[dict[str, str], dict[str, Goal]]:
+    """Send the requests in their time; return the goals' new names, and those that were taken.
+
+    None goes before the goals have ended that had ended before it: a service that misses ticks takes longer for them.
+    """
+    cycles, t = recording.records["cycle"], recording.t
+    period = float(t[-1] - t[0]) / float(cycles[-1] - cycles[0])
+    suffix, begins = uuid.uuid4().hex[:6], time.monotonic()
+    renamed: dict[str, str] = {}
+    goals: dict[str, Goal] = {}
+    said = [line.event for line in recording.events if line.event is not None and line.event.outcome]
+    ends = {event.id: event.cycle for event in said}
+    first = recording.requests[0].cycle if recording.requests else 0
+    for what in recording.requests:
+        since = (what.cycle - first) * period
+        time.sleep(max(0.0, begins + since - time.monotonic()))
+        _await([goal for name, goal in goals.items() if ends.get(name, math.inf) <= what.cycle])
+        begins = max(begins, time.monotonic() - since)
+        given = what.given
+        try:
+            if isinstance(given, GoalRequest):
+                renamed[given.id] = f"{given.id[:50]}-{suffix}"
+                goal = msgspec.structs.replace(given.goal, id=renamed[given.id])
+                goals[given.id] = robot.send(_given(goal), renamed[given.id])
+                say(f"goal {given.id}: {goals[given.id].expected}")
+            elif isinstance(given, CommandRequest):
+                robot.command(given.name, _content(given, renamed))
+                say(given.name)
+        except RefusedError as error:
+            say(f"refused: {error}")
+    return renamed, goals
+
+
+def _given(goal: Message) -> Callable[[str], Message]:
+    return lambda _: goal
+
+
+def _content(request: CommandRequest, renamed: dict[str, str]) -> bytes | None:
+    if request.value is not None:
+        return msgspec.json.encode(Override(100.0 * request.value))
+    return msgspec.json.encode(Stop(renamed.get(request.goal, request.goal))) if request.goal is not None else None
+
+
+def _await(goals: Iterable[Goal]) -> None:
+    """Wait for goals to end, but not for ever."""
+    deadline = time.monotonic() + END_WITHIN
+    for goal in goals:
+        with contextlib.suppress(TimeoutError):
+            goal.wait(max(0.0, deadline - time.monotonic()))
+
+
+def _beginnings(recording: Recording) -> list[tuple[str, int]]:
+    """Return the goals with which motions began, each with its cycle."""
+    cycles = recording.records["cycle"]
+    found = ((_BEGAN.match(line.text), line.t) for line in recording.events)
+    return [
+        (match["id"], int(cycles[min(len(cycles) - 1, int(np.searchsorted(recording.t, t - 1e-6)))]))
+        for match, t in found
+        if match
+    ]
+
+
+def _motion(records: NDArray[np.void], began: int | None) -> NDArray[np.float64]:
+    """Return the setpoints of a motion that began in a cycle, (N, 3): as long as the robot moves, without a gap."""
+    if began is None or not len(records):
+        return np.zeros((0, 3))
+    rows = records[int(np.searchsorted(records["cycle"], began)) :]
+    whole = (rows["mode"] == _MOVING) & (rows["cycle"] == began + np.arange(len(rows)))
+    length = int(np.argmin(np.append(whole, False)))
+    setpoints: NDArray[np.float64] = rows["commanded_position"][:length]
+    return setpoints
+
+
+def _compared(name: str, goal: Goal | None, then: NDArray[np.float64], now: NDArray[np.float64]) -> Motion:
+    length = min(len(then), len(now))
+    a, b, c = np.abs(then[:length] - now[:length]).max(axis=0, initial=0.0).tolist()
+    outcome = "refused" if goal is None else goal.result.outcome if goal.result else "unknown"
+    return Motion(name, outcome, length, abs(len(then) - len(now)), (a, b, c))

@@ -1,0 +1,141 @@
+"""`trirail demo`: the whole service on simulated drives, driven by a client from outside as a user would."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from trirail.cli.terminal import out, percentiles, plain
+from trirail.client import spawned
+from trirail.client.client import Result, Robot
+from trirail.config import SIM, load
+from trirail.errors import RefusedError
+from trirail.wire.messages import State
+
+GOAL_WITHIN = 15.0
+
+
+class Leg(NamedTuple):
+    """One goal of the tour: a name, x, y [m], phi [rad] and the speed."""
+
+    name: str
+    x: float
+    y: float
+    phi: float
+    speed: float = 1.0
+
+
+CENTRE = (0.0, 0.0, 0.0)
+TOUR = (
+    Leg("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.18),
+    Leg("back to the centre", *CENTRE),
+    Leg("paper: 50 mm along x", 0.05, 0.0, 0.0, 0.13),
+    Leg("back to the centre", *CENTRE),
+    Leg("paper: 50 mm along y", 0.0, 0.05, 0.0, 0.13),
+    Leg("back to the centre", *CENTRE),
+    Leg("tour: right, turned left", 0.06, 0.02, 0.35),
+    Leg("tour: top", 0.0, 0.07, -0.4),
+    Leg("tour: left, turned right", -0.06, 0.02, -0.7),
+    Leg("tour: bottom left", -0.04, -0.05, 0.2),
+    Leg("tour: bottom right, slowly", 0.04, -0.05, -0.2, 0.5),
+    Leg("tour: home", *CENTRE),
+)
+
+
+class _Row(NamedTuple):
+    leg: Leg
+    result: Result
+    seconds: float
+
+
+def run(*, stay: bool, record: Path | None) -> int:
+    """Run the demo; return 0 if every goal ended `done` and the service ended well."""
+    config = load(SIM)
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    recording = record or Path(config.telemetry.directory) / f"demo-{stamp}.rrd"
+    locator = config.zenoh.listen[0]
+    out.print(
+        f"[bold]trirail demo[/]: starting the service on {SIM.name}, simulated drives at {config.loop.rate_hz} Hz"
+    )
+    with contextlib.ExitStack() as stack:
+        with out.status("starting the service (the very first time compiles the kinematics, some seconds)"):
+            service = stack.enter_context(spawned.service(SIM, recording))
+        with Robot(config.robot.name, locator, user="demo") as robot:
+            robot.enable()
+            rows = list(_tour(robot))
+            state = robot.state()
+            if stay and all(row.result.outcome == "done" for row in rows):
+                _report(rows, state, recording)
+                _stay()
+            robot.disable()
+        code = spawned.end(service)
+    if not stay:
+        _report(rows, state, recording)
+    if code:
+        out.print(f"[bold red]the service ended with exit code {code}[/]")
+    return 0 if code == 0 and all(row.result.outcome == "done" for row in rows) else 1
+
+
+def _tour(robot: Robot) -> Iterator[_Row]:
+    columns = (
+        TextColumn("{task.description:28}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=out) as progress:
+        task = progress.add_task("the tour", total=len(TOUR), note="")
+        for number, leg in enumerate(TOUR, 1):
+            began = time.monotonic()
+            try:
+                goal = robot.move_to(x=leg.x, y=leg.y, phi=leg.phi, speed=leg.speed, id=f"tour-{number}")
+            except RefusedError as error:
+                result = Result("", "rejected", str(error))
+            else:
+                for state in robot.states(2.0):
+                    x, y, phi = state.pose
+                    pose = f"x {x * 1e3:6.1f} mm  y {y * 1e3:6.1f} mm  φ {math.degrees(phi):6.1f}°"
+                    progress.update(task, description=leg.name, note=pose)
+                    if goal.result or time.monotonic() - began > GOAL_WITHIN:
+                        break
+                result = goal.result or Result(goal.id, "unknown", f"no end within {GOAL_WITHIN:g} s")
+            progress.advance(task)
+            seconds = time.monotonic() - began
+            colour = "green" if result.outcome == "done" else "red"
+            progress.console.print(
+                f"  [{colour}]{result.outcome:9}[/] {leg.name:28} {seconds:5.2f} s"
+                + ("" if result.outcome == "done" else f"  {plain(result.message)}")
+            )
+            yield _Row(leg, result, seconds)
+
+
+def _report(rows: list[_Row], state: State, recording: Path) -> None:
+    done = sum(row.result.outcome == "done" for row in rows)
+    loop = state.loop
+    error = max(state.sliders.following_error_max)
+    out.print()
+    out.print(f"[bold]goals[/]            {done} of {len(rows)} done")
+    out.print(f"[bold]following error[/]  {error * 1e6:.0f} µm at most")
+    out.print(f"[bold]loop[/]             {loop.cycles} cycles at {loop.rate_hz} Hz, {loop.overruns} missed")
+    out.print(f"[bold]lateness[/]         {percentiles(loop.lateness_us)}")
+    out.print(f"[bold]cycle time[/]       {percentiles(loop.cycle_us)}")
+    for lack in loop.lacking:
+        out.print(f"[bold yellow]without[/]          {plain(lack)}", soft_wrap=True)
+    out.print(f"[bold]recording[/]        {plain(str(recording))}", soft_wrap=True)
+    out.print(f"[bold]look at it[/]       .venv/bin/trirail view {plain(str(recording))}", soft_wrap=True)
+
+
+def _stay() -> None:
+    out.print()
+    out.print("The service stays up, enabled. In another terminal: trirail goto 0.03 0.02 0.2 --wait")
+    out.print("Live view: trirail view, or in the browser: trirail view --web")
+    out.print("Ctrl-C ends it.")
+    with contextlib.suppress(KeyboardInterrupt):
+        signal.pause()

@@ -1,0 +1,214 @@
+"""Judges a machine and a configuration: each check is a function of what was read, see trirail.cli.probes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from msgspec import Struct
+from trirail_drivers.load import HIGH, bus_load, highest_rate
+
+from trirail.config import Config
+from trirail.processes.clock import Tick
+
+Verdict = Literal["ok", "warning", "failure"]
+
+RELIABLE_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "riscv_clocksource")
+"""Clock sources that are read without leaving the processor, or its virtual machine."""
+COARSE = 1e-6
+"""A clock of a coarser resolution cannot wake anybody in time [s]."""
+FRAMES_A_CYCLE = 8
+"""That the service sends at most: SYNC, heartbeat, three setpoints, three controlwords."""
+LATE = 0.1
+"""Share of the period by which one tick in a thousand may be late."""
+
+
+class Check(Struct, frozen=True):
+    """What was looked at, what is so, and what to do about it."""
+
+    name: str
+    verdict: Verdict
+    found: str
+    remedy: str = ""
+
+
+class Machine(Struct, frozen=True):
+    """What was read of the machine; None where it does not say."""
+
+    release: str
+    preempt_rt: bool
+    af_can: bool
+    lacking: tuple[str, ...]
+    """Real-time rights that the loop would lack, each with its remedy: trirail.processes.realtime.acquire."""
+    clock_source: str | None
+    resolution: float
+    """Of the monotonic clock [s]."""
+    cpu: int
+    """The processor that the loop would stay on."""
+    governor: str | None
+    isolated: tuple[int, ...]
+    link: dict[str, Any] | None
+    """The CAN interface as `ip -details -json link` has it."""
+    ticks: tuple[Tick, ...]
+
+
+def examine(config: Config, machine: Machine) -> list[Check]:
+    """Return every check, in order."""
+    simulated = config.can.interface in {"simulated", "unix"}
+    return [
+        kernel(machine, simulated=simulated),
+        rights(machine.lacking, config.loop.realtime),
+        clock(machine.clock_source, machine.resolution),
+        governor(machine.cpu, machine.governor),
+        isolation(machine.cpu, machine.isolated, simulated=simulated),
+        *can_interface(config, machine),
+        load(config),
+        lateness(machine.ticks, config),
+    ]
+
+
+def kernel(machine: Machine, *, simulated: bool) -> Check:
+    """PREEMPT_RT bounds how late a tick can be; simulated drives do not mind."""
+    if machine.preempt_rt:
+        return Check("kernel", "ok", f"{machine.release}, PREEMPT_RT")
+    found = f"{machine.release}, without PREEMPT_RT"
+    if simulated:
+        return Check("kernel", "ok", f"{found}: enough for simulated drives")
+    return Check("kernel", "warning", found, "for a bounded lateness boot one with it: Debian's linux-image-rt-amd64")
+
+
+def rights(lacking: tuple[str, ...], realtime: str) -> Check:
+    """What loop.realtime asks for, and whether the loop would get it."""
+    if not lacking:
+        return Check("rights", "ok", "SCHED_FIFO, locked memory, a processor of its own")
+    if realtime == "off":
+        return Check("rights", "warning", lacking[0], 'loop.realtime = "prefer" takes what it gets')
+    found = ", ".join(lack.split(";")[0] for lack in lacking)
+    remedy = "; ".join(lack.split("; ", 1)[1] for lack in lacking)
+    return Check("rights", "failure" if realtime == "enforce" else "warning", f"without {found}", remedy)
+
+
+def clock(source: str | None, resolution: float) -> Check:
+    """The clock that the ticks come from."""
+    if resolution > COARSE:
+        found = f"{source or 'unknown source'}, resolution {resolution * 1e3:g} ms"
+        return Check("clock", "failure", found, "boot a kernel with high-resolution timers (CONFIG_HIGH_RES_TIMERS)")
+    if source is None:
+        return Check("clock", "ok", f"resolution {resolution * 1e9:g} ns; the machine does not name its source")
+    if source in RELIABLE_CLOCKS:
+        return Check("clock", "ok", f"{source}, resolution {resolution * 1e9:g} ns")
+    remedy = "each reading takes microseconds: look in dmesg why the kernel left tsc; clocksource=tsc asks for it"
+    return Check("clock", "warning", f"{source}, resolution {resolution * 1e9:g} ns", remedy)
+
+
+def governor(cpu: int, name: str | None) -> Check:
+    """A processor that sleeps or slows down wakes late."""
+    if name is None:
+        return Check("governor", "ok", f"processor {cpu} has no frequency scaling to be seen")
+    if name == "performance":
+        return Check("governor", "ok", f"processor {cpu}: performance")
+    return Check("governor", "warning", f"processor {cpu}: {name}", "cpupower frequency-set --governor performance")
+
+
+def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
+    """The loop's processor, for it alone."""
+    if cpu in isolated:
+        return Check("processor", "ok", f"{cpu}, isolated")
+    if simulated:
+        return Check("processor", "ok", f"{cpu}, shared: enough for simulated drives")
+    elsewhere = f"loop.cpu = {isolated[0]} is isolated; name it" if isolated else "none is isolated"
+    remedy = f"boot with isolcpus={cpu} nohz_full={cpu} and set loop.cpu = {cpu}"
+    return Check("processor", "warning", f"{cpu}, shared; {elsewhere}", "" if isolated else remedy)
+
+
+def can_interface(config: Config, machine: Machine) -> list[Check]:
+    """SocketCAN and the interface, as far as the kernel tells of it."""
+    section = config.can
+    if section.interface in {"simulated", "unix"}:
+        return [Check("CAN", "ok", f"{section.interface}: no hardware is used")]
+    if section.interface != "socketcan":
+        found = f"{section.interface}, channel {section.channel or 'by default'}: its state cannot be read"
+        return [Check("CAN", "warning", found, "look at it with its maker's tools; SocketCAN tells its state")]
+    if not machine.af_can:
+        return [Check("CAN", "failure", "this kernel has no SocketCAN", "modprobe can_raw")]
+    return [Check("CAN", "ok", "SocketCAN"), *_link(section.channel, section.bitrate, machine.link)]
+
+
+def _link(name: str, bitrate: int, link: dict[str, Any] | None) -> list[Check]:
+    virtual = name.startswith("vcan")
+    up = f"ip link set {name} up" + ("" if virtual else f" type can bitrate {bitrate}")
+    if link is None:
+        make = f"ip link add {name} type vcan && {up}" if virtual else "plug the adapter in, load its driver"
+        return [Check(name, "failure", "no such interface", make)]
+    if "UP" not in link.get("flags", ()):
+        return [Check(name, "failure", "down", up)]
+    info = link.get("linkinfo", {})
+    if info.get("info_kind") == "vcan":
+        return [Check(name, "ok", "up; virtual, without bitrate and error states")]
+    data = info.get("info_data", {})
+    return [_bitrate(name, bitrate, data, up), _state(name, data, up), _queue(name, link.get("txqlen"))]
+
+
+def _bitrate(name: str, bitrate: int, data: dict[str, Any], up: str) -> Check:
+    found = data.get("bittiming", {}).get("bitrate")
+    if found == bitrate:
+        return Check(f"{name} bitrate", "ok", f"{bitrate} bit/s")
+    remedy = f"ip link set {name} down && {up}; the drives must have the same"
+    return Check(f"{name} bitrate", "failure", f"{found} bit/s; can.bitrate is {bitrate}", remedy)
+
+
+def _state(name: str, data: dict[str, Any], up: str) -> Check:
+    """The controller's state, ISO 11898-1: a node that sees too many errors leaves the bus."""
+    state = str(data.get("state", "unknown")).lower()
+    errors = data.get("berr_counter", {})
+    counted = f"; errors sent {errors['tx']}, received {errors['rx']}" if errors else ""
+    wiring = "look at termination (60 ohm across the bus without power), cable, and the bitrate of every node"
+    if state == "error-active":
+        return Check(f"{name} state", "ok", f"{state}{counted}")
+    if state == "bus-off":
+        return Check(f"{name} state", "failure", state, f"{wiring}; then ip link set {name} down && {up}")
+    verdict: Verdict = "warning" if state in {"error-warning", "error-passive"} else "failure"
+    return Check(f"{name} state", verdict, f"{state}{counted}", wiring)
+
+
+def _queue(name: str, length: int | None) -> Check:
+    """The kernel's queue must take two cycles' frames, for a late one and the next on time come together."""
+    wanted = 2 * FRAMES_A_CYCLE
+    if length is None or length >= wanted:
+        return Check(f"{name} queue", "ok", f"{length or 'unknown number of'} frames")
+    found = f"{length} frames; two cycles may come together and take {wanted}"
+    return Check(f"{name} queue", "warning", found, f"ip link set {name} txqueuelen 100")
+
+
+def load(config: Config) -> Check:
+    """The share of the bus that the cycle takes at worst, as the driver counts it."""
+    rate, bitrate, drives = config.loop.rate_hz, config.can.bitrate, config.drives
+    share = bus_load(rate, bitrate, drives)
+    found = f"{share:.0%} of {bitrate} bit/s at {rate} Hz"
+    if share <= HIGH:
+        return Check("bus load", "ok", found)
+    remedy = f"loop.rate_hz below {HIGH * highest_rate(bitrate, drives):.0f}, or a higher bitrate"
+    return Check("bus load", "failure" if share > 1.0 else "warning", found, remedy)
+
+
+def lateness(ticks: Sequence[Tick], config: Config) -> Check:
+    """How late ticks come on this machine, as it is now."""
+    late = sorted(tick.lateness_ns / 1000.0 for tick in ticks)
+    missed, in_a_row = sum(tick.missed for tick in ticks), _longest_streak(ticks)
+    p50, p99, p999 = (late[min(len(late) - 1, int(share * len(late)))] for share in (0.5, 0.99, 0.999))
+    found = f"p50 {p50:.0f}, p99 {p99:.0f}, p99.9 {p999:.0f}, max {late[-1]:.0f} µs in {len(ticks)} ticks"
+    found += f", {missed} missed" if missed else ""
+    remedy = "see the lines above; end other programs, or isolate a processor; or lower loop.rate_hz"
+    if in_a_row > config.watchdogs.max_overruns:
+        return Check("lateness", "failure", f"{found}, {in_a_row} in a row: the service would stop", remedy)
+    if missed or p999 > LATE * 1e6 * config.period:
+        return Check("lateness", "warning", found, remedy)
+    return Check("lateness", "ok", found)
+
+
+def _longest_streak(ticks: Sequence[Tick]) -> int:
+    longest = streak = 0
+    for tick in ticks:
+        streak = streak + tick.missed if tick.missed else 0
+        longest = max(longest, streak)
+    return longest

@@ -1,0 +1,98 @@
+"""Reads what trirail.cli.doctor judges: kernel, rights, clock, CAN interface, and how late ticks come."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import socket
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+from msgspec import structs
+
+from trirail.cli.doctor import Machine
+from trirail.config import Config, Loop
+from trirail.errors import ServiceError
+from trirail.processes import realtime
+from trirail.processes.clock import Tick, Ticker
+
+SYSTEM = Path("/sys")
+MEASURED = 2.0
+"""How long ticks are measured [s]."""
+
+
+def machine(config: Config) -> Machine:
+    """Read everything. This process has the loop's rights, and its processor, from here on."""
+    lacking = realtime.acquire(structs.replace(config.loop, realtime=_wished(config.loop)))
+    cpu = max(os.sched_getaffinity(0)) if config.loop.cpu is None else config.loop.cpu
+    processor = SYSTEM / f"devices/system/cpu/cpu{cpu}"
+    return Machine(
+        release=platform.release(),
+        preempt_rt=_text(SYSTEM / "kernel/realtime") == "1" or "PREEMPT_RT" in platform.version(),
+        af_can=_has_can(),
+        lacking=lacking,
+        clock_source=_text(SYSTEM / "devices/system/clocksource/clocksource0/current_clocksource"),
+        resolution=time.clock_getres(time.CLOCK_MONOTONIC),
+        cpu=cpu,
+        governor=_text(processor / "cpufreq/scaling_governor"),
+        isolated=processors(_text(SYSTEM / "devices/system/cpu/isolated") or ""),
+        link=link(config.can.channel) if config.can.interface == "socketcan" else None,
+        ticks=ticks(config.period),
+    )
+
+
+def processors(text: str) -> tuple[int, ...]:
+    """Read the kernel's way to write a set of processors: "2-4,7"."""
+    found: list[int] = []
+    for part in filter(None, text.split(",")):
+        first, _, last = part.partition("-")
+        found += range(int(first), int(last or first) + 1)
+    return tuple(found)
+
+
+def link(name: str) -> dict[str, Any] | None:
+    """What the kernel says of a network interface, None if it has no such. Raises ServiceError without `ip`."""
+    if not (SYSTEM / "class/net" / name).exists():
+        return None
+    command = ("ip", "-details", "-json", "link", "show", "dev", name)
+    try:
+        said = subprocess.run(command, capture_output=True, check=True)
+    except FileNotFoundError as error:
+        raise ServiceError(
+            "the program ip, which tells a CAN interface's state, is missing: install iproute2"
+        ) from error
+    except subprocess.CalledProcessError as error:
+        raise ServiceError(f"{' '.join(command)}: {error.stderr.decode(errors='replace').strip()}") from error
+    (found,) = json.loads(said.stdout)
+    return dict(found)
+
+
+def ticks(period: float) -> tuple[Tick, ...]:
+    """Tick for a while and do nothing else."""
+    ticker = Ticker(round(period * 1e9))
+    number = max(10, round(MEASURED / period))
+    return tuple(ticker.wait() for _ in range(number))
+
+
+def _wished(loop: Loop) -> Any:
+    # What is missing is for the doctor to say; the loop would refuse to run.
+    return "off" if loop.realtime == "off" else "prefer"
+
+
+def _has_can() -> bool:
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError:
+        return False
+    return True
+
+
+def _text(path: Path) -> str | None:
+    """The content of one of the kernel's files, None where there is none."""
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return None

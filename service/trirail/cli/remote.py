@@ -1,0 +1,126 @@
+"""A live view drawn on this machine, from the records, events and state that a service publishes through Zenoh."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from types import TracebackType
+
+from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
+
+from trirail.client.listener import Listener
+from trirail.errors import ServiceError
+from trirail.telemetry.show import LIVE_HZ, Shortfall, Show
+from trirail.telemetry.sinks import free_port, live_relay, live_server
+from trirail.telemetry.subject import Subject
+from trirail.wire import session
+from trirail.wire.messages import Event, Info, State
+from trirail.wire.records import unpack
+
+HISTORY_MB = 256.0
+"""Memory for what viewers that connect late are shown of the past; nothing else runs in this process [1e6 bytes]."""
+FIRST_WITHIN = 5.0
+"""How long the first records may take [s]."""
+MISSING = "missing so far: {} cycles on the way here, {} batches in this view (viewer too slow)"
+
+
+class RemoteView:
+    """Draws for viewers on this machine while it is open. Raises ServiceError where no records come.
+
+    The wall clock is this machine's at the first record, so it is late by the way through the network.
+    """
+
+    def __init__(self, info: Info, connect: str) -> None:
+        self._queue: queue.SimpleQueue[Event | State | bytes | None] = queue.SimpleQueue()
+        self._lost = 0
+        self._cycle: int | None = None
+        self._bus_load: float | None = None
+        self._session = session.open_client(connect)
+        self._listener = Listener()
+        try:
+            self._subscribe(info.robot)
+            first = self._first(info)
+            offset_ns = time.time_ns() - int(unpack(first)[-1]["deadline_ns"])
+            self._show = Show(Subject.told(info), f"{info.robot} from {connect}", offset_ns)
+            server = live_server(free_port(), HISTORY_MB)
+        except BaseException:
+            self._session.close()  # type: ignore[no-untyped-call]
+            raise
+        self.url = server.uri
+        """Where viewers on this machine connect."""
+        self._relay = live_relay(self._show.open(server))
+        self._show.attach(self._relay, LIVE_HZ)
+        self._missing = Shortfall(self._show, MISSING, lambda: (self._lost, self._relay.skipped))
+        self._records(first)
+        self._thread = threading.Thread(target=self._run, name="records", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> RemoteView:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Draw no more."""
+        self._session.close()  # type: ignore[no-untyped-call]
+        self._queue.put(None)
+        self._thread.join()
+        self._relay.close()
+
+    def _subscribe(self, robot: str) -> None:
+        heard, declare = self._listener, self._session.declare_subscriber
+        self._declared = [
+            declare(session.key(robot, "records"), heard.batches(self._queue.put)),
+            declare(session.key(robot, "state"), heard.messages(State, self._queue.put)),
+            declare_advanced_subscriber(
+                self._session,
+                session.key(robot, "event"),
+                heard.messages(Event, self._queue.put),
+                history=HistoryConfig(detect_late_publishers=True),
+                recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
+            ),
+        ]
+
+    def _first(self, info: Info) -> bytes:
+        """Return the first records; what came before them comes again afterwards."""
+        deadline = time.monotonic() + FIRST_WITHIN
+        before: list[Event | State | None] = []
+        while (left := deadline - time.monotonic()) > 0.0:
+            try:
+                item = self._queue.get(timeout=left)
+            except queue.Empty:
+                break
+            if isinstance(item, bytes):
+                for earlier in before:
+                    self._queue.put(earlier)
+                return item
+            before.append(item)
+        raise ServiceError(
+            f"robot {info.robot!r} answers, but no records come from it within {FIRST_WITHIN:g} s: "
+            "may this user read them, and does every router on the way pass them on?"
+        )
+
+    def _run(self) -> None:
+        while (item := self._queue.get()) is not None:
+            if isinstance(item, bytes):
+                self._records(item)
+            elif isinstance(item, Event):
+                self._show.event(item)
+            else:
+                self._state(item)
+
+    def _records(self, batch: bytes) -> None:
+        cycles = unpack(batch)["cycle"]
+        if self._cycle is not None and cycles[0] > self._cycle:
+            self._lost += int(cycles[0]) - self._cycle - 1
+        self._cycle = int(cycles[-1])
+        self._show.records(batch)
+        self._missing.check()
+        self._show.save()  # those of the past come in one go: each alone would be a batch to skip
+
+    def _state(self, state: State) -> None:
+        self._show.target(state.goal.target if state.goal else None)
+        if state.loop.bus_load != self._bus_load:
+            self._bus_load = state.loop.bus_load
+            self._show.bus_load(state.loop.bus_load)

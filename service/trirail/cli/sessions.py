@@ -1,0 +1,226 @@
+"""Commands on recorded sessions, that need no service: a replay, and a report."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from rich.text import Text
+
+from trirail.cli import terminal
+from trirail.cli.offline import Flag
+from trirail.errors import ServiceError, TrirailError
+
+if TYPE_CHECKING:
+    from trirail.analysis.replay import Comparison
+    from trirail.analysis.summary import GoalSummary, Summary
+    from trirail.telemetry.provenance import Software
+    from trirail.telemetry.reading import Recording
+
+Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")]
+
+OUTCOMES = {"done": "green", "rejected": "yellow", "expired": "yellow", "faulted": "bold red", "unknown": "dim"}
+
+
+def replay(
+    *file: Path,
+    config: Path | None = None,
+    to: str | None = None,
+    robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT")] = "demo",
+    json: Annotated[bool, Flag] = False,
+) -> int:
+    """Give a recorded session to the control once more, cycle by cycle, and compare the setpoints.
+
+    With the recorded configuration and the recorded answers of the drives they come out the same to the last
+    bit: exit 1 if they do not, and the software is the same. With --to, its goals and commands are sent to a
+    running service instead, which moves that robot.
+
+    Parameters
+    ----------
+    file
+        Recording, or all files of one that was rotated.
+    config
+        Configuration to try instead of the recorded one; the drives are then simulated ones.
+    to
+        Zenoh locator of a service to send the session to.
+    robot
+        Name of its robot.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail.analysis.replay import again
+    from trirail.config import load
+    from trirail.telemetry import provenance
+
+    recording = _read(file)
+    if to is not None:
+        return _resend(recording, robot, to, json)
+    settings = load(config) if config else provenance.configuration(recording.texts)
+    if settings is None:
+        raise ServiceError(f"{file[0]}: its configuration is not in it: was it made by an older version? Use --config")
+    by, here = provenance.recorded_by(recording.texts), provenance.software()
+    compared = again(recording, settings, simulated=config is not None)
+    if json:
+        same = {"same_software": by == here, "simulated_drives": config is not None}
+        terminal.json({"name": recording.name} | compared._asdict() | same)
+    else:
+        _print_comparison(recording, compared, by, here, config)
+    return 1 if compared.differing and by == here and config is None else 0
+
+
+def report(*file: Path, plot: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
+    """Sum a recorded session up: goals and outcomes, tracking error, timing, faults, and what is missing.
+
+    Parameters
+    ----------
+    file
+        Recording, or all files of one that was rotated.
+    plot
+        Picture to draw. Its suffix is its format: .png, .svg, .pdf.
+    json
+        Print one JSON object, in SI units, instead of words.
+    """
+    from trirail.analysis.summary import summary
+
+    recording = _read(file)
+    summed = summary(recording)
+    if plot:
+        _draw(plot, recording, summed)
+    if json:
+        terminal.json(summed)
+        return 0
+    _print_summary(summed)
+    if plot:
+        terminal.say("")
+        terminal.say(f"drawn to {plot}")
+    return 0
+
+
+def _resend(recording: Recording, name: str, locator: str, json: bool) -> int:
+    from trirail.analysis.resend import resend
+    from trirail.client.client import Robot
+
+    with Robot(name, locator) as robot:
+        motions = resend(recording, robot, (lambda _: None) if json else terminal.say)
+    if json:
+        terminal.json([motion._asdict() for motion in motions])
+        return 0
+    lines = _Lines()
+    for motion in motions:
+        longer = f", one is {motion.lacking} cycles longer" if motion.lacking else ""
+        lines.add(terminal.plain(motion.id), f"{motion.outcome}, {motion.cycles} cycles compared{longer}")
+        lines.add("  differ at most", _each(motion.position, 1e6, "µm"))
+    lines.show()
+    return 0
+
+
+def _read(files: tuple[Path, ...]) -> Recording:
+    from trirail.telemetry.reading import join, read
+
+    if not files:
+        raise ServiceError("name a recording, or all files of one that was rotated")
+    return join([read(path) for path in files])
+
+
+def _draw(file: Path, recording: Recording, summed: Summary) -> None:
+    try:
+        from trirail.analysis import charts
+    except ImportError as error:
+        raise TrirailError("--plot needs matplotlib: pip install 'trirail[analysis]'") from error
+    try:
+        charts.draw(file, recording, summed)
+    except (OSError, ValueError) as error:
+        raise TrirailError(f"cannot draw to {file}: {error}") from error
+
+
+def _print_comparison(
+    recording: Recording, compared: Comparison, by: Software | None, here: Software, config: Path | None
+) -> None:
+    drives = f"simulated drives, {config}" if config else "the drives' recorded answers"
+    lines = _Lines()
+    lines.add("session", terminal.plain(recording.name))
+    lines.add("replayed", f"{compared.cycles} cycles, {compared.requests} requests, on {drives}")
+    lines.add("recorded by", terminal.plain(str(by)) if by else "[yellow]unknown software[/]")
+    if by != here:
+        lines.add("[yellow]replayed by[/]", f"{terminal.plain(str(here))}: other software may plan otherwise")
+    if compared.lacking:
+        lines.add("[yellow]not replayed[/]", f"{compared.lacking} cycles: what came before them is not recorded")
+    if compared.first is None:
+        lines.add("setpoints", "[bold green]the same to the last bit[/], in every cycle")
+    else:
+        share = compared.differing / compared.cycles
+        lines.add("setpoints", f"[bold red]differ[/] in {compared.differing} cycles ({share:.1%})")
+        lines.add("  first", f"in cycle {compared.first}")
+        lines.add("  at most", _each(compared.position, 1e6, "µm"))
+        lines.add("", _each(compared.velocity, 1e3, "mm/s"))
+    lines.show()
+
+
+def _print_summary(summed: Summary) -> None:
+    lines = _Lines()
+    lines.add("session", f"[bold]{terminal.plain(summed.name)}[/], {summed.began}")
+    lines.add("recorded by", terminal.plain(summed.software))
+    modes = ", ".join(f"{name} {_seconds(time)}" for name, time in summed.modes.items())
+    lines.add("duration", f"{_seconds(summed.duration)}: {modes}")
+    lines.add("moved", _each(summed.distance, 1.0, "m", 3))
+    missed = f"[yellow]{summed.missed} missed[/]" if summed.missed else "none missed"
+    lacking = f"[yellow]{summed.lacking} lack[/] in the recording" if summed.lacking else "all recorded"
+    lines.add("cycles", f"{summed.cycles} at {summed.rate_hz} Hz, {missed}, {lacking}")
+    lines.add("lateness", terminal.percentiles(summed.lateness_us))
+    lines.add("cycle time", terminal.percentiles(summed.cycle_us))
+    for tracking in summed.tracking:
+        rms = f"rms {tracking.rms * 1e6:7.1f} µm, in motion {tracking.moving_rms * 1e6:7.1f} µm"
+        lines.add(f"error of {tracking.slider}", f"max {tracking.max * 1e6:7.1f} µm, {rms}")
+    commands = ", ".join(f"{name} {count}×" if count > 1 else name for name, count in summed.commands.items())
+    lines.add("commands", commands or "none")
+    outcomes = [goal.outcome for goal in summed.goals]
+    counts = ", ".join(f"{outcomes.count(outcome)} {outcome}" for outcome in dict.fromkeys(outcomes))
+    lines.add("goals", counts or "none")
+    lines.show()
+    if summed.goals:
+        _print_goals(summed.goals)
+    for title, colour, incidents in (("faults", "bold red", summed.faults), ("warnings", "yellow", summed.warnings)):
+        if incidents:
+            terminal.out.print(f"\n[{colour}]{title}[/]")
+        for incident in incidents:
+            terminal.out.print(f"  {incident.t:9.3f} s  {terminal.plain(incident.message)}", soft_wrap=True)
+
+
+def _print_goals(goals: list[GoalSummary]) -> None:
+    """Print a goal on a line, none of them cut where the terminal is narrow."""
+    longest = max(len(goal.id) for goal in goals)
+    for goal in goals:
+        took = "" if goal.ended is None else f"{goal.ended - goal.given:.3f} s"
+        colour = OUTCOMES.get(goal.outcome, "cyan")
+        name = terminal.plain(f"{goal.id:{longest}}")
+        words = "" if goal.outcome == "done" else f": {terminal.plain(goal.message)}"
+        line = f"  {goal.given:9.3f} s  {took:>9}  [{colour}]{goal.outcome:9}[/]  {name}  {goal.kind} of "
+        terminal.out.print(f"{line}{terminal.plain(goal.user)}{words}", soft_wrap=True)
+
+
+class _Lines:
+    """Lines with a name before each, that are not cut where the terminal is narrow."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[str, str]] = []
+
+    def add(self, name: str, words: str) -> None:
+        self._rows.append((name, words))
+
+    def show(self) -> None:
+        for name, words in self._rows:
+            padding = " " * (14 - len(Text.from_markup(name)))
+            terminal.out.print(f"{name}{padding}{words}", soft_wrap=True)
+
+
+def _each(values: tuple[float, float, float], scale: float, unit: str, digits: int = 4) -> str:
+    return "   ".join(f"{name} {value * scale:.{digits}g} {unit}" for name, value in zip("ABC", values, strict=True))
+
+
+def _seconds(time: float) -> str:
+    if time < 120.0:
+        return f"{time:.1f} s"
+    minutes, seconds = divmod(time, 60.0)
+    return f"{math.floor(minutes)} min {seconds:.0f} s"

@@ -1,0 +1,188 @@
+"""What the commands print for people, and for programs with --json."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+from rich.console import Console
+from rich.live import Live
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.table import Table
+from trirail_drivers.errors import shortened
+
+from trirail.client.client import Goal, Jog, Result, Robot
+from trirail.errors import ServiceError
+from trirail.telemetry import palette
+from trirail.wire.messages import Event, GoalReply, Percentiles, State
+from trirail.wire.text import json_printable, printable
+
+if TYPE_CHECKING:
+    from trirail.cli.doctor import Check
+    from trirail.config import Config
+
+out = Console(highlight=False, emoji=False)
+err = Console(stderr=True, highlight=False, emoji=False)
+
+COLOURS = {mode.value: palette.code(colour) for mode, colour in palette.MODES.items()}
+LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}
+VERDICTS = {"ok": "green", "warning": "yellow", "failure": "bold red"}
+SILENT = 3.0
+"""A service from which nothing is heard for so long is taken for gone [s]."""
+
+
+def plain(words: str) -> str:
+    """Return words from outside for the console: nothing in them is markup, steers it or begins a line."""
+    return escape(printable(words))
+
+
+def say(words: str) -> None:
+    """Print a line."""
+    out.print(plain(words), soft_wrap=True)
+
+
+def complain(words: str) -> None:
+    """Print an error as one line of bounded length on standard error."""
+    err.print(f"trirail: {plain(shortened(' '.join(words.split())))}", soft_wrap=True)
+
+
+def json(content: object) -> None:
+    """Print one JSON object on a line of its own, at once."""
+    sys.stdout.write(json_printable(msgspec.json.encode(content).decode()) + "\n")
+    sys.stdout.flush()
+
+
+def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
+    """Say that the service is up, where it is, and what it lacks."""
+    loop, recorder = ready["loop"], ready["recorder"]
+    out.print(f"[bold green]up[/]  robot [bold]{config.robot.name}[/] at {config.loop.rate_hz} Hz")
+    out.print(f"    goals      {plain(', '.join(config.zenoh.listen))}", soft_wrap=True)
+    if recorder["live"]:
+        out.print(f"    live view  trirail view  ({recorder['live']})", soft_wrap=True)
+    out.print(f"    recording  {plain(recorder['recording'])}", soft_wrap=True)
+    out.print(f"    bus load   {loop['bus_load']:.0%}")
+    if loop["bus_load"] > 0.8:
+        out.print("    [yellow]warning[/]: above 80 % there is little left for repeated frames; lower loop.rate_hz")
+    for lack in loop["lacking"]:
+        out.print(f"    [yellow]without[/] {plain(lack)}", soft_wrap=True)
+
+
+def notes(reply: GoalReply) -> str:
+    """Say what is out of the ordinary with an accepted goal; nothing where all is as asked."""
+    said = []
+    if reply.slowed > 1.001:
+        said.append(f"slowed {reply.slowed:.2f} times, to stay within the limits")
+    if reply.stops_first:
+        said.append("stops on the old path first")
+    if reply.queued:
+        said.append("waits for the goal before it")
+    return f" ({', '.join(said)})" if said else ""
+
+
+def follow(robot: Robot, goal: Goal, title: str, *, show: bool = True) -> Result:
+    """Wait for a goal's end and show its progress."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[left]}"),
+    )
+    with Progress(*columns, console=out, transient=True, disable=not show) as progress:
+        task = progress.add_task(plain(title) + notes(goal.reply), total=1.0, left="")
+        for state in robot.states(SILENT):
+            if goal.result is not None:
+                return goal.result
+            if state.goal is not None and state.goal.id == goal.id:
+                progress.update(task, completed=state.goal.progress, left=f"{state.goal.remaining:.1f} s left")
+    if goal.result is not None:
+        return goal.result
+    raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
+
+
+def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
+    """Show where a jog leads, until it ends or its time is over."""
+    ends = math.inf if seconds is None else time.monotonic() + seconds
+    with Live(console=out, refresh_per_second=10, transient=True) as live:
+        for state in robot.states(SILENT):
+            if show:
+                live.update(_table(state, robot.name))
+            if time.monotonic() >= ends or jog.error is not None or jog.result is not None:
+                return
+    raise ServiceError("the service has gone silent")
+
+
+def show(state: State, robot: str) -> None:
+    """Print a state."""
+    out.print(_table(state, robot))
+
+
+def watch(robot: Robot) -> None:
+    """Show the state live until Ctrl-C or the service goes silent."""
+    with (
+        Live(console=out, refresh_per_second=10, transient=False) as live,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        for state in robot.states(SILENT):
+            live.update(_table(state, robot.name))
+        raise ServiceError("the service has gone silent")
+
+
+def event(happened: Event) -> None:
+    """Print an event on a line."""
+    level = f"[{LEVELS[happened.level]}]{happened.level:7}[/]"
+    out.print(f"{happened.seq:5}  {happened.t:9.3f} s  {level}  {plain(happened.message)}", soft_wrap=True)
+
+
+def checks(found: Sequence[Check]) -> None:
+    """Print each check on a line, and under it what to do."""
+    for check in found:
+        verdict = f"[{VERDICTS[check.verdict]}]{check.verdict:8}[/]"
+        out.print(f"{verdict} {check.name:13} {plain(check.found)}", soft_wrap=True)
+        if check.remedy:
+            out.print(f"{'':22} {plain(check.remedy)}", soft_wrap=True, style="dim")
+
+
+def _table(state: State, robot: str) -> Table:
+    x, y, phi = state.pose
+    grid = Table.grid(padding=(0, 2))
+    grid.add_row("robot", f"[bold]{robot}[/]  {_coloured(state.mode)}  t {state.t:.2f} s")
+    for fault in state.faults:
+        grid.add_row("fault", f"[bold red]{plain(fault)}[/]")
+    grid.add_row("pose", f"x {x * 1e3:9.3f} mm   y {y * 1e3:9.3f} mm   φ {math.degrees(phi):9.4f}°")
+    if state.goal:
+        grid.add_row("goal", f"{plain(state.goal.id)}  {state.goal.progress:4.0%}  {state.goal.remaining:.1f} s left")
+    sliders = state.sliders
+    for index, name in enumerate("ABC"):
+        grid.add_row(
+            f"slider {name}",
+            f"{sliders.position[index] * 1e3:9.3f} mm {sliders.velocity[index] * 1e3:8.2f} mm/s "
+            f"{sliders.following_error[index] * 1e6:7.1f} µm error  {sliders.status[index]}",
+        )
+        if said := [
+            f"{name.replace('_', ' ')} {n}" for name, n in msgspec.to_builtins(sliders.traffic[index]).items() if n
+        ]:
+            grid.add_row("", f"[yellow]{', '.join(said)}[/]")
+    loop = state.loop
+    words = f"{loop.rate_hz} Hz, {loop.cycles} cycles, {loop.overruns} missed"
+    grid.add_row("loop", f"{words}, bus {loop.bus_load_measured:.0%} of at most {loop.bus_load:.0%}")
+    grid.add_row("lateness", percentiles(loop.lateness_us))
+    grid.add_row("cycle", percentiles(loop.cycle_us))
+    for lack in loop.lacking:
+        grid.add_row("[yellow]without[/]", plain(lack))
+    return grid
+
+
+def _coloured(mode: str) -> str:
+    colour = COLOURS.get(mode)
+    return f"[{colour}]{mode}[/]" if colour else plain(mode)
+
+
+def percentiles(values: Percentiles) -> str:
+    """Write percentiles on a line."""
+    return f"p50 {values.p50:.0f}  p99 {values.p99:.0f}  p99.9 {values.p999:.0f}  max {values.max:.0f} µs"

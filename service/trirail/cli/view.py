@@ -1,0 +1,159 @@
+"""`trirail view`: Rerun's viewer, or a browser, on a service's live view, on its records from afar, or on a file."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import webbrowser
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from urllib.parse import quote, urlsplit
+
+from trirail.client.client import Robot
+from trirail.errors import ServiceError
+from trirail.processes.interpreter import python
+from trirail.telemetry.sinks import HOST, free_port
+
+WEB_PORT = 9090
+"""The web viewer's port, where it is free."""
+START_WITHIN = 20.0
+"""How long the web viewer may take to answer [s]."""
+LOCAL = ("unixsock-stream", "unixpipe")
+"""Protocols that do not leave the machine."""
+
+
+def run(
+    file: Path | None, robot: str, connect: str, *, web: bool, records: bool, say: Callable[[dict[str, str], str], None]
+) -> int:
+    """Open a viewer and wait until it is closed, or for Ctrl-C or SIGTERM; return the exit code.
+
+    Raises ServiceError where there is no display, no service, no live view, or no such file.
+    """
+    if not web and not has_display():
+        raise ServiceError(
+            "no display for the viewer: DISPLAY and WAYLAND_DISPLAY are not set; trirail view --web shows it in a "
+            "browser, and from a machine with a display trirail view --connect tcp/<this machine>:7447 shows it there"
+        )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with _source(file, robot, connect, records) as source, contextlib.suppress(KeyboardInterrupt):
+        if web:
+            _browse(source, say)
+        else:
+            say({"source": source}, f"viewer on {source}; close it or press Ctrl-C to end")
+            with _rerun(*(["--connect", source] if "://" in source else [source]), "--port", "auto") as viewer:
+                viewer.wait()
+    return 0
+
+
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def is_local(locator: str) -> bool:
+    """Whether a Zenoh locator, protocol/address, stays on this machine."""
+    protocol, _, address = locator.partition("/")
+    host = address.partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
+    if protocol in LOCAL or host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+@contextlib.contextmanager
+def _source(file: Path | None, robot: str, connect: str, records: bool) -> Iterator[str]:
+    """Yield the file, or the address of the live view: the service's own, or one that is drawn here from records."""
+    if file is not None:
+        if not file.is_file():
+            raise ServiceError(f"{file} is no file; recordings are .rrd files in the service's telemetry.directory")
+        yield str(file)
+        return
+    with Robot(robot, connect) as service:
+        info = service.info()
+    if records or not is_local(connect):
+        from trirail.cli.remote import RemoteView
+
+        with RemoteView(info, connect) as drawn:
+            yield drawn.url
+        return
+    if not info.live:
+        raise ServiceError(
+            "the service has no live view (telemetry.live_port = 0): "
+            "trirail view --records draws one here from what it publishes"
+        )
+    parts = urlsplit(info.live)
+    try:
+        socket.create_connection((parts.hostname or HOST, parts.port or 0), timeout=2.0).close()
+    except OSError as error:
+        raise ServiceError(
+            f"nothing answers at {info.live} on this machine: "
+            "if the service runs on another, use trirail view --records"
+        ) from error
+    yield info.live
+
+
+def _browse(source: str, say: Callable[[dict[str, str], str], None]) -> None:
+    """Serve the web viewer on this machine's loopback alone until it ends."""
+    port, data_port = _web_port(), free_port()
+    address = source if "://" in source else f"rerun+http://{HOST}:{data_port}/proxy"
+    url = f"http://{HOST}:{port}/?url={quote(address, safe='')}&hide_welcome_screen=1"
+    with _rerun("--serve-web", "--web-viewer-port", str(port), "--port", str(data_port), source) as server:
+        deadline = time.monotonic() + START_WITHIN
+        while not _answers(port):
+            if server.poll() is not None:
+                return
+            if time.monotonic() > deadline:
+                raise ServiceError(f"the web viewer does not answer on port {port} within {START_WITHIN:g} s")
+            time.sleep(0.05)
+        say({"url": url, "source": source}, f"{source} in the browser, on this machine alone, until Ctrl-C: {url}")
+        if has_display():
+            webbrowser.open(url)
+        server.wait()
+
+
+@contextlib.contextmanager
+def _rerun(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run Rerun's viewer, which would listen on every network if it were not told otherwise; end it in any case.
+
+    Raises ServiceError if it has failed by itself.
+    """
+    command = python("-m", "rerun_cli", "--bind", HOST, "--hide-welcome-screen", *arguments)
+    with tempfile.TemporaryFile() as log:
+        viewer = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+        try:
+            yield viewer
+            if viewer.poll():
+                log.seek(0)
+                last = log.read().decode(errors="replace").strip().rpartition("\n")[2]
+                raise ServiceError(f"the viewer failed: {last}; trirail view --web needs no graphics driver here")
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(viewer.pid, signal.SIGTERM)  # `python -m rerun_cli` does not pass signals on
+            viewer.wait()
+
+
+def _web_port() -> int:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, WEB_PORT))
+        except OSError:
+            return free_port()
+    return WEB_PORT
+
+
+def _answers(port: int) -> bool:
+    try:
+        socket.create_connection((HOST, port), timeout=1.0).close()
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,58 @@
+"""What a client hears of what is published: what is no message is skipped, counted, and said once."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import TypeVar
+
+import msgspec
+import zenoh
+
+from trirail.errors import RefusedError
+from trirail.wire import boundary
+from trirail.wire.text import quoted
+
+T = TypeVar("T", bound=msgspec.Struct)
+_LOG = logging.getLogger("trirail")
+
+
+class Listener:
+    """Reads samples for one client. Anybody on the network may publish anything on any key."""
+
+    def __init__(self) -> None:
+        self.skipped = 0
+        """Samples that were no messages."""
+
+    def messages(self, kind: type[T], take: Callable[[T], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
+        """Return what hands over messages of a kind, at once and in the connection's own thread: it must be quick."""
+
+        def read(sample: zenoh.Sample) -> T:
+            what = f"not of kind {kind.__name__.lower()}"
+            message: T = boundary.decode(sample.payload.to_bytes(), kind, what, str(sample.encoding))
+            return message
+
+        return self._handler(read, take)
+
+    def batches(self, take: Callable[[bytes], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
+        """Return what hands over batches of records, likewise."""
+        return self._handler(lambda sample: boundary.batch(sample.payload.to_bytes()), take)
+
+    def _handler(
+        self, read: Callable[[zenoh.Sample], T | bytes], take: Callable[..., None]
+    ) -> zenoh.handlers.Callback[zenoh.Sample]:
+        def on_sample(sample: zenoh.Sample) -> None:
+            try:
+                content = read(sample)
+            except RefusedError as refusal:
+                self._skip(str(sample.key_expr), refusal)
+            else:
+                take(content)
+
+        # Not indirect: that would be a thread of Zenoh's that keeps Python from ending.
+        return zenoh.handlers.Callback(on_sample, indirect=False)
+
+    def _skip(self, key: str, refusal: RefusedError) -> None:
+        self.skipped += 1
+        if self.skipped == 1:
+            _LOG.warning("trirail: skipped on %s: %s; what else is no message is only counted", quoted(key), refusal)

@@ -1,0 +1,105 @@
+"""A service in a process of its own, for programs that bring theirs along: started, waited for, and ended."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+from trirail.config import SIM
+from trirail.errors import RefusedError, ServiceError, TrirailError
+from trirail.processes.interpreter import python
+
+START_WITHIN = 120.0
+"""How long it may take to come up; the very first start compiles the kinematics [s]."""
+END_WITHIN = 20.0
+"""How long it may take to stop the robot and end [s]."""
+
+Process = subprocess.Popen[bytes]
+
+
+@contextlib.contextmanager
+def service(config: Path, recording: Path) -> Iterator[Process]:
+    """Run a service that is up; end it in any case, and show what it said if it fails.
+
+    Raises ServiceError if it cannot start.
+    """
+    with tempfile.TemporaryFile() as log:
+        process = None
+        try:
+            process = start(config, log, "--record", str(recording))
+            yield process
+        except RefusedError:
+            raise  # it works, and has said why not
+        except TrirailError:
+            log.seek(0)
+            sys.stderr.write(log.read().decode())
+            raise
+        finally:
+            if process is not None:
+                end(process)
+
+
+def start(config: Path, log: IO[bytes], *arguments: str, **environment: str) -> Process:
+    """Start a service, and wait until it is up; what it says goes to `log`. Raises ServiceError if it cannot start.
+
+    It is up when it says so, as to systemd. Asking on its port instead could find another service, and move that.
+    """
+    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
+        ready.bind(f"{folder}/ready")
+        ready.settimeout(0.1)
+        process = subprocess.Popen(
+            python("-m", "trirail", "run", str(config), *arguments),
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            env=os.environ | {"NOTIFY_SOCKET": ready.getsockname()} | environment,
+        )
+        try:
+            _wait(process, ready)
+        except BaseException:
+            end(process)
+            raise
+        return process
+
+
+def end(process: Process) -> int:
+    """Tell a service to end, and return its exit code."""
+    process.send_signal(signal.SIGTERM)
+    return process.wait(END_WITHIN)
+
+
+def private(folder: Path, live_port: int = 0) -> tuple[Path, str]:
+    """Write the configuration of the simulated robot for a service that nobody else can reach, nor see without a port.
+
+    Returns the file, in `folder`, and the locator to connect to.
+    """
+    locator = f"unixsock-stream/{folder}/zenoh"
+    text = SIM.read_text(encoding="utf-8")
+    for key, value in {"listen": f'["{locator}"]', "live_port": str(live_port)}.items():
+        text, found = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
+        if found != 1:
+            raise ServiceError(f"{SIM}: {key} was expected once, it is there {found} times")
+    path = folder / SIM.name
+    path.write_text(text, encoding="utf-8")
+    return path, locator
+
+
+def _wait(process: Process, ready: socket.socket) -> None:
+    deadline = time.monotonic() + START_WITHIN
+    while time.monotonic() < deadline:
+        with contextlib.suppress(TimeoutError):
+            if ready.recv(1024) == b"READY=1":
+                return
+        if process.poll() is not None:
+            raise ServiceError("the service could not start, see above")
+    raise ServiceError(f"the service was not up within {START_WITHIN:g} s")

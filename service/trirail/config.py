@@ -1,0 +1,332 @@
+"""The configuration file: typed, strict, refused with file, key, value and what is allowed."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import math
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, get_args
+
+import msgspec
+from msgspec import Meta, Struct
+from trirail_drivers import files
+from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
+from trirail_drivers.errors import DriveError, FileError
+from trirail_drivers.interface import NAMES
+
+from trirail.errors import ConfigError
+from trirail.kinematics.geometry import Geometry, Leg, singular_angles
+
+_PACKAGED = Path(__file__).parent / "configs"
+SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[2] / "configs") / "sim.toml"
+"""The configuration that needs nothing: no hardware, no rights, no other program."""
+
+Angle = Annotated[float, Meta(ge=-2.0 * math.pi, le=2.0 * math.pi)]
+"""[rad]."""
+Jerk = Annotated[float, Meta(ge=1e-3, le=1e6)]
+"""[m/s³] or [rad/s³]."""
+Point = tuple[Coordinate, Coordinate]
+Range = tuple[Coordinate, Coordinate]
+
+
+class Robot(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [robot]."""
+
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+    """The <robot> of every Zenoh key; letters, digits, - and _."""
+
+
+class LegTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """One leg of a robot as built: [[geometry.leg]], metres and radians, as trirail.kinematics.geometry.Leg."""
+
+    anchor: Point
+    rail_angle: Angle
+    home: Coordinate
+    edge_point: Point
+    edge_angle: Angle
+
+
+class GeometryTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [geometry]: the paper's symmetric robot by `l0`, or three measured legs."""
+
+    l0: Annotated[float, Meta(ge=0.001, le=100.0)] | None = None
+    leg: tuple[LegTable, LegTable, LegTable] | None = None
+
+
+class PlatformLimits(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [limits.platform]: for x, y [m] and phi [rad]."""
+
+    velocity: tuple[Velocity, Velocity, Velocity]
+    acceleration: tuple[Acceleration, Acceleration, Acceleration]
+    jerk: tuple[Jerk, Jerk, Jerk]
+    x: Range
+    y: Range
+    phi: tuple[Angle, Angle]
+
+
+class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [limits.slider]: the same for all three."""
+
+    position: Range
+    """Travel of lambda_10 [m]."""
+    passive: Range
+    """Travel of lambda_32 along the platform's edges [m]."""
+    velocity: Velocity
+    acceleration: Acceleration
+    jerk: Jerk
+    following_error: Distance
+    """Setpoint less measured position beyond which everything stops [m]."""
+
+
+class Limits(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [limits]."""
+
+    platform: PlatformLimits
+    slider: SliderLimits
+    singularity_margin: Annotated[float, Meta(ge=0.001, le=1.5)] = 0.1
+    """How near phi may come to a singular angle [rad]."""
+
+
+class Motion(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [motion]."""
+
+    queue: Annotated[int, Meta(ge=0, le=100)] = 8
+    """How many goals may wait for the one under way, where that has a `blend`."""
+
+
+class Loop(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [loop]."""
+
+    rate_hz: Annotated[int, Meta(ge=1, le=4000)]
+    realtime: Literal["off", "prefer", "enforce"] = "prefer"
+    """Whether SCHED_FIFO, locked memory and a pinned processor are done without, wished for, or demanded."""
+    priority: Annotated[int, Meta(ge=1, le=99)] = 80
+    cpu: Annotated[int, Meta(ge=0, le=8191)] | None = None
+    """The processor to stay on; the last one that the process may use when absent."""
+
+
+class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [zenoh]."""
+
+    listen: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=64)] = ("tcp/127.0.0.1:7447",)
+
+
+class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [telemetry]."""
+
+    directory: Name = "recordings"
+    """Where recordings go, relative to where the service was started."""
+    state_hz: Annotated[int, Meta(ge=1, le=200)] = 50
+    live_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
+    """Loopback port of the live Rerun server; 0 for none."""
+    live_mb: Annotated[float, Meta(ge=1.0, le=4096.0)] = 64.0
+    """Memory for what viewers that connect late are shown of the past [1e6 bytes]; beyond that the oldest is let go."""
+    capture_can: bool = False
+    """Write every CAN frame of the session beside the recording, in candump's log format."""
+    rotate_minutes: Annotated[float, Meta(ge=0.01, le=100_000.0)] = 30.0
+    """A recording goes on in another file after so long."""
+    rotate_mb: Annotated[float, Meta(ge=1.0, le=1e6)] = 1000.0
+    """A recording goes on in another file where this one is so large [1e6 bytes]."""
+    keep_mb: Annotated[float, Meta(ge=1.0, le=1e9)] = 20_000.0
+    """How much the recordings in the folder may take together [1e6 bytes]; beyond that the oldest are deleted."""
+
+
+class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [watchdogs]."""
+
+    enable_timeout: Timeout = 2.0
+    """How long the drives may take to power up [s]."""
+    max_overruns: Annotated[int, Meta(ge=1, le=100_000)] = 10
+    """So many missed ticks in a row are a controlled stop."""
+    gateway_timeout: Annotated[float, Meta(ge=0.2, le=10.0)] = 0.3
+    """So long without a sign of life from the gateway, which gives 20 a second, is a controlled stop [s]."""
+
+
+class Config(Struct, frozen=True, forbid_unknown_fields=True):
+    """A whole configuration file."""
+
+    robot: Robot
+    geometry: GeometryTable
+    limits: Limits
+    loop: Loop
+    can: Can
+    drives: Drives
+    zenoh: Zenoh
+    telemetry: Telemetry
+    watchdogs: Watchdogs
+    motion: Motion = Motion()
+
+    @property
+    def period(self) -> float:
+        """The loop's period [s]."""
+        return 1.0 / self.loop.rate_hz
+
+
+def load(path: Path) -> Config:
+    """Read a configuration file. Raises ConfigError with the file, the key, the value and what is allowed."""
+    try:
+        text = files.text(path)
+    except FileError as error:
+        raise ConfigError(f"{error}; configs/sim.toml is one to start from") from error
+    try:
+        return _beside(path, parse(text))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def parse(text: str) -> Config:
+    """Read a configuration from TOML. Raises ConfigError."""
+    try:
+        raw = tomllib.loads(text)
+        leaves = list(_leaves(raw))
+    except RecursionError as error:
+        raise ConfigError("not a configuration: its tables or arrays are nested too deeply") from error
+    except ValueError as error:  # TOMLDecodeError, and Python's own about an integer of thousands of digits
+        raise ConfigError(f"not TOML: {error}") from error
+    for key, value in leaves:
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{key} = {value}: it must be a finite number")
+    try:
+        config = msgspec.convert(raw, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(_explain(str(error), raw)) from error
+    _check(config)
+    return config
+
+
+def _beside(path: Path, config: Config) -> Config:
+    """The configuration with its drives' EDS files where they lie: relative to the configuration file."""
+    drives = config.drives
+    for name, drive in zip(NAMES, drives.each, strict=True):
+        if drive.eds is not None:
+            found = msgspec.structs.replace(drive, eds=str(path.parent / drive.eds))
+            drives = msgspec.structs.replace(drives, **{name: found})
+    return msgspec.structs.replace(config, drives=drives)
+
+
+def geometry(table: GeometryTable) -> Geometry:
+    """Build the robot's geometry from its section. Raises ConfigError."""
+    if (table.l0 is None) == (table.leg is None):
+        raise ConfigError("geometry: give either l0 (the symmetric robot) or three [[geometry.leg]] tables")
+    try:
+        if table.leg is None:
+            return Geometry.symmetric(table.l0 or 0.0)
+        first, second, third = (Leg(**msgspec.structs.asdict(leg)) for leg in table.leg)
+        return Geometry(legs=(first, second, third))
+    except ValueError as error:
+        raise ConfigError(f"geometry: {error}") from error
+
+
+def _leaves(value: object, key: str = "") -> Iterator[tuple[str, object]]:
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _leaves(inner, f"{key}.{name}" if key else name)
+    elif isinstance(value, list):
+        for index, inner in enumerate(value):
+            yield from _leaves(inner, f"{key}[{index}]")
+    else:
+        yield key, value
+
+
+_AT = re.compile(r"^(?P<what>.*?)(?: - at `\$(?P<path>[^`]*)`)?$", re.DOTALL)
+_FIELD = re.compile(r"^Object (?P<how>contains unknown|missing required) field `(?P<name>[^`]*)`")
+
+
+def _explain(error: str, raw: dict[str, Any]) -> str:
+    """Turn msgspec's words into a key, the value found there, and what is allowed."""
+    found = _AT.match(error)
+    what, path = (found["what"], (found["path"] or "").lstrip(".")) if found else (error, "")
+    if field := _FIELD.match(what):
+        key = f"{path}.{field['name']}" if path else field["name"]
+        if field["how"] == "missing required":
+            return f"{key}: missing {'key' if path else 'section'}"
+        allowed = _type_at(path).__struct_fields__
+        close = difflib.get_close_matches(field["name"], allowed, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"allowed are {', '.join(allowed)}"
+        return f"{key}: unknown {'key' if path else 'section'}; {hint}"
+    value: object = raw
+    for part in _parts(path):
+        value = value[int(part) if isinstance(value, list) else part]  # type: ignore[index]
+    if what.startswith("Invalid enum value"):
+        return f"{path} = {value!r}: allowed are {', '.join(map(repr, get_args(_type_at(path))))}"
+    return f"{path} = {value!r}: {what[0].lower()}{what[1:].replace('`', '')}"
+
+
+def _parts(path: str) -> list[str]:
+    return re.findall(r"[^.\[\]]+", path)
+
+
+def _type_at(path: str) -> Any:
+    """The type that the key or table at `path` must have."""
+    kind: Any = Config
+    for part in _parts(path):
+        if part.isdigit():
+            kind = get_args(kind)[0]
+        else:
+            kind = next(field.type for field in msgspec.structs.fields(kind) if field.name == part)
+        if isinstance(kind, UnionType):
+            kind = get_args(kind)[0]
+    return kind
+
+
+def _check(config: Config) -> None:
+    """Refuse what is well-formed but impossible."""
+    from trirail_drivers import config_checks
+
+    robot = geometry(config.geometry)
+    platform, slider = config.limits.platform, config.limits.slider
+    ranges = {
+        "limits.platform.x": platform.x,
+        "limits.platform.y": platform.y,
+        "limits.platform.phi": platform.phi,
+        "limits.slider.position": slider.position,
+        "limits.slider.passive": slider.passive,
+    }
+    for key, (low, high) in ranges.items():
+        if low >= high:
+            raise ConfigError(f"{key} = [{low:g}, {high:g}]: the lower limit must be below the upper one")
+    (low, high), margin = platform.phi, config.limits.singularity_margin
+    # On a robot as built the singular angles move with the centre: linearly in x and y, so the corners bound them.
+    centres = [(0.0, 0.0), *itertools.product(platform.x, platform.y)]
+    for angle in {angle for centre in centres for angle in singular_angles(robot, centre)}:
+        if low - margin < angle < high + margin:
+            raise ConfigError(
+                f"limits.platform.phi = [{low:g}, {high:g}] comes nearer than limits.singularity_margin = {margin:g} "
+                f"to the singular angle {angle:.4f}: keep {'below ' if angle > 0 else 'above '}"
+                f"{angle - math.copysign(margin, angle):.4f}"
+            )
+    nodes = [config.drives.master_node, *(drive.node for drive in config.drives.each)]
+    if len(set(nodes)) < len(nodes):
+        raise ConfigError(
+            f"drives: the node ids of master_node, A, B and C must differ, but are {', '.join(map(str, nodes))}"
+        )
+    # The drives take the period as an integer times a power of ten of a second, object 60C2h.
+    if 1_000_000 % config.loop.rate_hz:
+        raise ConfigError(
+            f"loop.rate_hz = {config.loop.rate_hz}: a cycle must be a whole number of microseconds, "
+            "as with 100, 200, 250, 400, 500, 800, 1000"
+        )
+    if config.drives.protocol == "odrive":
+        _check_canopen_only(config)
+    places = (*slider.position, *(config.can.simulated.start if config.can.interface == "simulated" else ()))
+    motion = config_checks.Motion(config.period, min(places), max(places), slider.velocity, slider.following_error)
+    try:
+        config_checks.check(config.drives, motion)
+    except DriveError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _check_canopen_only(config: Config) -> None:
+    for name, drive in zip(NAMES, config.drives.each, strict=True):
+        if drive.homing is not None:
+            raise ConfigError(
+                f"drives.{name}.homing: homing is CiA 402's, an ODrive must know its position at power-on; "
+                "leave the table out"
+            )
+        if drive.eds is not None:
+            raise ConfigError(f"drives.{name}.eds = {drive.eds}: an ODrive has no object dictionary; leave it out")

@@ -1,0 +1,400 @@
+"""The robot's control, one cycle at a time, without a clock, a socket or a file.
+
+Each `cycle`: `observe` what the drives said, `handle` what is asked for, `advance` the motion and solve the sliders,
+and `write` the setpoints behind the last gate. What is to be said of it waits at the `desk`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Callable, Iterable
+
+from trirail_drivers.interface import NAMES, Drives, Feedback, PowerState
+
+from trirail.config import Config, geometry
+from trirail.control.desk import Desk
+from trirail.control.dispatch import Dispatch
+from trirail.control.measured import Measured
+from trirail.control.modes import DISABLED, HOLDING, Action, Event, Refusal, State, step
+from trirail.control.pilot import Pilot
+from trirail.control.setpoints import Setpoints
+from trirail.control.verdicts import still_powered, verdict
+from trirail.errors import RefusedError
+from trirail.motion.course import Course
+from trirail.motion.goals import Goals
+from trirail.motion.limits import EDGE, Bounds
+from trirail.motion.motion import STILL, MotionState, Run, rest
+from trirail.motion.steps import finish
+from trirail.wire.messages import Outcome, PoseGoal, SlidersGoal
+from trirail.wire.packets import CommandRequest, GoalRequest, Mishap, Request
+from trirail.wire.records import Part
+from trirail.wire.vocabulary import Mode
+
+Triple = tuple[float, float, float]
+
+Given = tuple[Request | Mishap, int]
+"""What the control is given in a cycle, and when, by the monotonic clock [ns]."""
+
+SETTLE = 0.1
+"""How long the drives may take to leave their fault state after a reset [s]."""
+
+_COMMANDS = {
+    "enable": Event.ENABLE,
+    "disable": Event.DISABLE,
+    "stop": Event.STOP,
+    "quick_stop": Event.QUICK_STOP,
+    "reset": Event.RESET,
+    "pause": Event.PAUSE,
+    "resume": Event.RESUME,
+    "home": Event.HOME,
+}
+_OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.ARRIVED: "done", Event.FAULT: "faulted"}
+"""How a goal ends on an event after which it is not under way; else it is stopped."""
+_GO_ON = (Event.GOAL, Event.STANDSTILL, Event.ARRIVED, Event.POWERED, Event.RESUME, Event.ENABLE, Event.RESET)
+"""Events that leave alone what has been sent but not begun."""
+
+
+class Control:
+    """Modes, motion, kinematics and limits of one robot over one set of drives."""
+
+    def __init__(self, config: Config, drives: Drives) -> None:
+        robot = geometry(config.geometry)
+        self._drives = drives
+        self._period = config.period
+        self._goals = Goals(robot, config.limits, config.period)
+        self._course = Course(rest(STILL), config.period)
+        self._pilot = Pilot(self._goals, self._course, config.period)
+        self.desk = Desk()
+        self.dispatch = Dispatch(self.desk, self._pilot, self._course, config.motion.queue, config.period)
+        legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
+        self.measured = Measured(legs, config.period, step_length)
+        self.setpoints = Setpoints(legs, Bounds(config.limits, config.period, EDGE), self.measured, step_length)
+        self._can_home = any(drive.homing is not None for drive in config.drives.each)
+        self._following_error_limit = config.limits.slider.following_error
+        self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
+        self._settle_cycles = max(3, round(SETTLE / config.period))
+
+        self.cycles = 0
+        self.state: State = DISABLED
+        self.fault: str | None = None
+        self._entered = 0
+
+    def cycle(self, feedback: Feedback, given: Iterable[Given], mark: Callable[[Part], None] = lambda _: None) -> None:
+        """Run one cycle: what the drives said at its SYNC, and what else is given in it; then motion and setpoints.
+
+        `given` is read after the drives have been; `mark` is called at the end of each part. Nothing that goes wrong
+        in it leaves the robot moving.
+        """
+        self.observe(feedback)
+        try:
+            for what, now_ns in given:
+                if isinstance(what, Mishap):
+                    self.happen(Event[what.event], what.reason)
+                else:
+                    self.handle(what, now_ns)
+            mark(Part.MODE)
+            self.advance()
+            mark(Part.MOTION)
+            self.solve()
+        except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
+            self.trip(f"internal error, please report it: {error!r}")
+        mark(Part.KINEMATICS)
+        self.write()
+        mark(Part.WRITE)
+
+    # ------------------------------------------------------------------ the cycle, in its order
+
+    def start(self, feedback: Feedback) -> None:
+        """Take the measured sliders for the commanded ones, before the first cycle."""
+        self.measured.start(feedback)
+        self.setpoints.start()
+        self._follow_measured()
+        # What runs for the first time is slow: plan and check a motion now, not in a cycle.
+        nearby = Course(rest([value + 1e-3 for value in self.measured.pose]), self._period)
+        for goal in (PoseGoal(*self.measured.pose), SlidersGoal(feedback.position)):
+            with contextlib.suppress(RefusedError):
+                nearby.take(finish(self._goals.plan(goal, nearby, 1.0)).runs)
+                finish(self._goals.laws.try_change(nearby.runs[0], 0.0, self.measured.pose))
+
+    def observe(self, feedback: Feedback) -> None:
+        """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
+        self.cycles += 1
+        before = self.measured.feedback
+        self.measured.take(feedback)
+        for warning in feedback.warnings:
+            self.desk.tell("service", "warning", warning)
+        mode = self.state.mode
+        if feedback.fault is not None:
+            if mode is Mode.FAULT and feedback.fault != before.fault:
+                self.desk.tell("fault", "error", feedback.fault.message)  # the first one stays, but this came of it
+            self.trip(feedback.fault.message)
+        elif mode is Mode.ENABLING:
+            self._power_up()
+        elif mode in (Mode.HOMING, Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
+            for name, error in zip(NAMES, self.measured.following_error, strict=True):
+                if not abs(error) <= self._following_error_limit:
+                    self.trip(
+                        f"slider {name}: following error {error * 1e3:.3f} mm is beyond its limit "
+                        f"{self._following_error_limit * 1e3:g} mm"
+                    )
+                    break
+            else:
+                if not feedback.homing:
+                    self._homing_over()
+        self.desk.settle(self._verdict, self.state.mode)
+
+    def handle(self, request: Request, now_ns: int) -> None:
+        """Take a request at a time of the monotonic clock: a command at once, a goal behind those before it."""
+        try:
+            if isinstance(request, GoalRequest):
+                self.dispatch.take(request, now_ns, self.cycles)
+            elif isinstance(request, CommandRequest):
+                self._take_command(request)
+            else:
+                self.desk.tell("refused", "warning", request.message, user=request.user)
+        except RefusedError as refusal:
+            self.desk.refuse(request, refusal)
+
+    def happen(self, event: Event, reason: str) -> None:
+        """Let something happen that nobody asked for: the gateway is lost, ticks are late, the service ends."""
+        self._withdraw(event, reason)
+        decided = step(self.state, event)
+        if isinstance(decided, Refusal) or decided.state == self.state:
+            return
+        self.desk.tell("service", "warning", reason)
+        self._go(event, reason)
+
+    def advance(self) -> None:
+        """End a jog that nobody renews, plan one step further, and move the commanded state on by one period."""
+        released = self.desk.release(self.cycles) if self.state.mode is Mode.MOVING else None
+        if released is not None:
+            self._go(Event.RELEASE, f"goal {released.id} of {released.user} is not renewed")
+        beginning = self.dispatch.think(self.cycles, self._admit)
+        if beginning is not None:
+            self._go(Event.GOAL, f"goal {beginning.id} of {beginning.user}")
+        for _ in range(self._course.advance()):
+            self.desk.pass_on()
+        self.dispatch.expire(self.cycles)
+
+    def solve(self) -> None:
+        """Solve the sliders for the commanded state, by the paper's recursion; pass the last gate, or trip."""
+        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed:
+            self._follow_measured()
+            return
+        refused = self.setpoints.solve(self.commanded)
+        if refused:
+            self.trip(refused)
+            return
+        course = self._course
+        if self.state.mode in (Mode.MOVING, Mode.STOPPING) and course.runs[0].stands and not course.turning:
+            self._stand(course.runs[0])
+
+    def write(self) -> None:
+        """Send the setpoints."""
+        position, velocity, *_ = self.setpoints.rows
+        setpoint = (position[0], position[1], position[2])
+        self.measured.note(setpoint)
+        self._drives.write(setpoint, (velocity[0], velocity[1], velocity[2]))
+
+    # ------------------------------------------------------------------ what others ask of it
+
+    @property
+    def commanded(self) -> MotionState:
+        """The platform's motion commanded in this cycle."""
+        return self._course.commanded
+
+    @property
+    def override(self) -> float:
+        """The rate at which motions are to run."""
+        return self._pilot.override
+
+    @property
+    def progress(self) -> tuple[float, float]:
+        """Share of the time of the goal under way that is over, and what remains of it [s]."""
+        course = self._course
+        if not course.runs or course.turning:
+            return 0.0, course.remaining
+        *stops, run = course.runs
+        return run.progress, run.remaining + sum(stop.ends - stop.time for stop in stops)
+
+    @property
+    def target(self) -> Triple | None:
+        """The pose that the running goal leads to; None without one, and for a jog."""
+        last = self._course.last
+        if self.desk.goal is None or self.desk.goal.is_jog or last is None:
+            return None
+        x, y, phi = last.destination(self.commanded.pose)
+        return (x, y, phi)
+
+    def trip(self, reason: str) -> None:
+        """Stop all three drives in this cycle and latch the reason."""
+        if self.state.mode is Mode.FAULT:
+            return
+        self.fault = reason
+        self.desk.tell("fault", "error", reason)
+        self._withdraw(Event.FAULT, reason)
+        self._go(Event.FAULT, reason)
+
+    # ------------------------------------------------------------------ requests
+
+    def _admit(self) -> bool:
+        """Whether the robot is moving to a goal; RefusedError where it takes none."""
+        decided = step(self.state, Event.GOAL)
+        if isinstance(decided, Refusal):
+            raise RefusedError(decided.code, self._because(decided))
+        if not self.measured.homed:
+            raise RefusedError("not_homed", "it is not known where the sliders are: send home first")
+        return self.state.mode is Mode.MOVING
+
+    def _withdraw(self, event: Event, reason: str) -> None:
+        """End what has been sent but not begun, where the robot is to stand."""
+        if event not in _GO_ON:
+            self.dispatch.withdraw("faulted" if event is Event.FAULT else "stopped", reason)
+
+    def _take_command(self, request: CommandRequest) -> None:
+        if request.name == "override":
+            self._take_override(request)
+            return
+        event = _COMMANDS[request.name]
+        if event is Event.HOME and not self._can_home:
+            raise RefusedError("nothing_to_home", "absolute encoders: there is nothing to home")
+        if request.goal is not None and self.dispatch.stop_alone(request.goal, f"{request.name} by {request.user}"):
+            self.desk.undertake(request, self.cycles)
+            return
+        decided = step(self.state, event)
+        if isinstance(decided, Refusal):
+            raise RefusedError(decided.code, self._because(decided))
+        if event is Event.PAUSE and self.desk.goal is not None and self.desk.goal.is_jog:
+            event = Event.STOP  # nobody would be at the key when it is resumed
+        if decided.action is Action.POWER_UP:
+            self.setpoints.check_rest()
+            if self.measured.homed:
+                self.setpoints.check_start()
+        if decided.action is Action.CLEAR and self.measured.powered:
+            raise RefusedError("stopping", still_powered(self.measured, self.fault))
+        reason = f"{request.name} by {request.user}"
+        if event is Event.QUICK_STOP:
+            self.trip(reason)
+        else:
+            self._withdraw(event, reason)
+            self._go(event, reason)
+        self.desk.undertake(request, self.cycles)
+
+    def _take_override(self, request: CommandRequest) -> None:
+        """Let this motion and those to come run at another rate."""
+        self._pilot.override = request.value if request.value is not None else 1.0
+        if self.state.mode is Mode.MOVING:
+            self._pilot.run_at(self.override)
+        self.desk.tell("service", "info", f"override {self.override:.0%} by {request.user}", user=request.user)
+        self.desk.undertake(request, self.cycles)
+
+    def _because(self, refusal: Refusal) -> str:
+        return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
+
+    def _verdict(self, name: str, since: int) -> str | None:
+        """Say what has become of a command that came in a cycle: trirail.control.verdicts.verdict."""
+        settled = self.cycles - since >= self._settle_cycles
+        return verdict(name, self.state.mode, self.fault, self.measured, settled=settled)
+
+    # ------------------------------------------------------------------ from state to state
+
+    def _go(self, event: Event, reason: str) -> None:  # noqa: PLR0912  a branch for each action
+        """Step the modes and carry out the action."""
+        decided = step(self.state, event)
+        if isinstance(decided, Refusal):
+            return
+        match decided.action:
+            case Action.POWER_UP:
+                self._drives.enable()
+            case Action.POWER_DOWN:
+                self._drives.disable()
+            case Action.QUICK_STOP:
+                self._drives.quick_stop()
+            case Action.CLEAR:
+                self._drives.reset()
+                self.fault = None
+            case Action.BRAKE if decided.state.paused:
+                self._pilot.run_at(0.0)
+            case Action.BRAKE:
+                self._brake()
+            case Action.RESUME:
+                self._pilot.run_at(self.override)
+            case Action.HOME:
+                self._drives.home()
+            case Action.STOP_HOMING:
+                self._drives.stop_homing()
+        before, self.state = self.state, decided.state
+        if self.state.mode is not before.mode:
+            self._entered = self.cycles
+        if not self.state.has_goal:
+            outcome = _OUTCOMES.get(event, "stopped")
+            arrived = "released" if before.released else "arrived"
+            self.desk.end(outcome, arrived if outcome == "done" else reason)
+        if self.state.mode is not before.mode:
+            self.desk.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
+        if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
+            self._course.take(deque())
+            self._pilot.stop_thinking()
+
+    def _brake(self) -> None:
+        """Stop on the path of the motion under way; what was to follow it does not."""
+        course = self._course
+        course.keep()
+        course.forget()
+        if len(course.runs) > 1:  # it is stopping already, for a goal that is not to follow any more
+            course.runs.pop()
+        self._pilot.run_at(0.0)
+
+    def _stand(self, run: Run) -> None:
+        """The motion has ended where it should, or its law has brought it to a standstill on the way."""
+        self._go(Event.ARRIVED if run.arrived else Event.STANDSTILL, "standstill")
+
+    def _power_up(self) -> None:
+        """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""
+        if all(state is PowerState.OPERATION_ENABLED for state in self.measured.feedback.state):
+            if not self.measured.homed:
+                self._go(Event.POWERED, "all drives are enabled; where the sliders are is not known: send home")
+            elif self._rest_at_setpoints():
+                self._go(Event.POWERED, "all drives are enabled")
+        elif self.cycles - self._entered > self._enable_cycles:
+            waiting = [
+                f"drive {name} is {state}"
+                for name, state in zip(NAMES, self.measured.feedback.state, strict=True)
+                if state is not PowerState.OPERATION_ENABLED
+            ]
+            seconds = self._enable_cycles * self._period
+            self.trip(f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected")
+
+    def _homing_over(self) -> None:
+        """Hold where homing has ended, or was stopped."""
+        if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self._course.runs:
+            return  # no homing has been under way
+        if self.measured.homed:
+            try:
+                self.setpoints.check_start()
+            except RefusedError as refusal:
+                self.trip(f"all drives are homed, but {refusal}")
+                return
+            if not self._rest_at_setpoints():
+                return
+        if self.state.mode is Mode.STOPPING:
+            self._go(Event.STANDSTILL, "standstill")
+        else:
+            self._go(Event.HOMED, "all drives are homed")
+
+    def _rest_at_setpoints(self) -> bool:
+        """Command the pose that belongs to the setpoints, at rest; trip where there is none."""
+        a, b, c = self.setpoints.rows[0]
+        pose = self.measured.pose_of((a, b, c))
+        if pose is None:
+            self.trip("the measured sliders belong to no pose")
+            return False
+        self._course.commanded = rest(pose)
+        return True
+
+    def _follow_measured(self) -> None:
+        """Command the pose that is measured, and the sliders to where they are."""
+        stopped_now = self.state.mode is Mode.FAULT and self._entered == self.cycles
+        self._course.commanded = rest(self.measured.pose)
+        self.setpoints.follow(held=self.state.mode not in (Mode.DISABLED, Mode.FAULT), stopped_now=stopped_now)

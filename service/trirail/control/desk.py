@@ -1,0 +1,206 @@
+"""Who asked for what, and what became of it: every goal ends once, every command is answered once."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+from trirail.control.pilot import Taken
+from trirail.errors import RefusedError
+from trirail.wire.messages import Level, Outcome, PoseGoal, VelocityGoal
+from trirail.wire.packets import (
+    Accepted,
+    Answer,
+    CommandRequest,
+    Confirmed,
+    GoalRequest,
+    Refused,
+    RefusedRequest,
+    Request,
+)
+
+REMEMBERED_IDS = 10_000
+"""Goals whose ids may not be used again; older ones are forgotten."""
+
+
+_LEVELS: dict[Outcome, Level] = {"faulted": "error", "rejected": "warning", "expired": "warning"}
+
+
+class Happening(NamedTuple):
+    """Something to tell everyone, in the order in which it happened."""
+
+    kind: str
+    level: Level
+    message: str
+    mode: str | None = None
+    id: str | None = None
+    outcome: Outcome | None = None
+    user: str | None = None
+
+
+class Goal(NamedTuple):
+    """A goal that the robot is moving to, or that is to follow it."""
+
+    id: str
+    user: str
+    is_jog: bool
+    blend: float | None
+    """How far from its end the next goal may begin [m]; None where that preempts it."""
+    expires: float
+    """In which cycle it is too late to begin."""
+    alive_until: float
+    """In which cycle it ends unless it has been renewed, for a jog."""
+    released: bool = False
+    """Whether that has happened: a jog that nobody renewed does not come back."""
+    bound: str | None = None
+    """The limit before which a jog comes to rest."""
+
+
+class Desk:
+    """Keeps the goals and the commands under way; what it has to say waits in `answers` and `happenings`."""
+
+    def __init__(self) -> None:
+        self.goals: deque[Goal] = deque()
+        """The goal that the robot is moving to, and those to follow it."""
+        self.answers: list[Answer] = []
+        self.happenings: list[Happening] = []
+        self._commands: dict[str, deque[tuple[CommandRequest, int]]] = {}
+        self._ended: dict[str, str | None] = {}
+        """Goals that have ended, and the limit at which that was, for a jog."""
+
+    # ------------------------------------------------------------------ goals
+
+    @property
+    def goal(self) -> Goal | None:
+        """The goal that the robot is moving to."""
+        return self.goals[0] if self.goals else None
+
+    def check_id(self, request: GoalRequest) -> None:
+        """Raise RefusedError if the id has been used; a jog's own velocities share one."""
+        goal_id = request.id
+        running = any(goal.id == goal_id for goal in self.goals)
+        if isinstance(request.goal, VelocityGoal) and (bound := self._ended.get(goal_id)):
+            text = f"jog {goal_id!r} has ended at the limit of {bound}: begin a new one, away from it"
+            raise RefusedError("at_limit", text)
+        if goal_id in self._ended or (running and not self.renewed_by(request)):
+            raise RefusedError("duplicate_id", f"goal id {goal_id!r} has been used: every goal needs its own")
+        if self.goal is not None and self.goal.released and self.renewed_by(request):
+            raise RefusedError("jog_over", f"jog {goal_id!r} was not renewed in time and is over: begin a new one")
+
+    def keep_alive(self, request: GoalRequest, until: float) -> None:
+        """Let the jog under way go on until a cycle, if this renews it."""
+        if self.renewed_by(request):
+            self.goals[0] = self.goals[0]._replace(alive_until=until)
+
+    def release(self, cycle: int) -> Goal | None:
+        """Return the jog under way if it has not been renewed in time, the first time that this is so."""
+        goal = self.goal
+        if goal is None or goal.released or cycle <= goal.alive_until:
+            return None
+        self.goals[0] = goal._replace(released=True)
+        return goal
+
+    def begin(self, request: GoalRequest, taken: Taken, expires: float, alive_until: float) -> None:
+        """Accept a goal; those before it are preempted, unless it follows them or is the same jog afresh."""
+        self.answers.append(
+            Accepted(request.ticket, request.id, taken.duration, taken.slowed, taken.stops_first, taken.queued)
+        )
+        if self.renewed_by(request):
+            self.goals[0] = self.goals[0]._replace(bound=taken.bound)
+            return
+        if not taken.queued:
+            self.end("preempted", f"preempted by goal {request.id}")
+        blend = request.goal.blend if isinstance(request.goal, PoseGoal) else None
+        is_jog = isinstance(request.goal, VelocityGoal)
+        self.goals.append(Goal(request.id, request.user, is_jog, blend, expires, alive_until, bound=taken.bound))
+
+    def pass_on(self) -> None:
+        """The first goal is reached, and the one that waited for it has begun."""
+        goal = self.goals.popleft()
+        self._ending(goal.id, goal.user, "done", f"passed on the way to goal {self.goals[0].id}")
+
+    def end(self, outcome: Outcome, reason: str, but: int = 0) -> None:
+        """End the goals, but so many of the first."""
+        kept = [self.goals.popleft() for _ in range(min(but, len(self.goals)))]
+        while self.goals:
+            goal = self.goals.popleft()
+            bound = goal.bound if outcome == "done" and not goal.released else None
+            self._ending(goal.id, goal.user, outcome, f"at the limit of {bound}" if bound else reason, bound)
+        self.goals.extend(kept)
+
+    def withdraw(self, request: GoalRequest, outcome: Outcome, reason: str) -> None:
+        """Answer that a goal has ended before it began."""
+        self.answers.append(Refused(request.ticket, outcome, f"goal {request.id} {outcome} before it began: {reason}"))
+        if not self.renewed_by(request):
+            self._ending(request.id, request.user, outcome, reason)
+
+    def refuse(self, request: Request, refusal: RefusedError) -> None:
+        """Answer that a request is not carried out. A goal that is refused has ended; a used id has its own ending."""
+        if isinstance(request, RefusedRequest):
+            return
+        text = str(refusal)
+        self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))
+        if isinstance(request, CommandRequest):
+            self.tell("refused", "warning", f"{request.name} refused: {text}", user=request.user)
+        elif refusal.code in ("duplicate_id", "at_limit"):
+            self.tell("refused", "warning", text, user=request.user)
+        else:
+            outcome: Outcome = "expired" if refusal.code == "expired" else "rejected"
+            if self.renewed_by(request):
+                self.tell("refused", "warning", text, user=request.user)
+            else:
+                self._ending(request.id, request.user, outcome, text)
+
+    def renewed_by(self, request: GoalRequest) -> bool:
+        """Whether it renews the jog that is under way; only its own user can."""
+        goal = self.goal
+        return (
+            goal is not None
+            and (goal.id, goal.user) == (request.id, request.user)
+            and goal.is_jog
+            and isinstance(request.goal, VelocityGoal)
+        )
+
+    def _ending(self, goal_id: str, user: str, outcome: Outcome, reason: str, bound: str | None = None) -> None:
+        level = _LEVELS.get(outcome, "info")
+        self._ended[goal_id] = bound
+        if len(self._ended) > REMEMBERED_IDS:
+            del self._ended[next(iter(self._ended))]
+        self.tell("goal", level, f"goal {goal_id} {outcome}: {reason}", id=goal_id, outcome=outcome, user=user)
+
+    # ------------------------------------------------------------------ commands
+
+    def undertake(self, request: CommandRequest, cycle: int) -> None:
+        """Take a command on; it is answered once it has been carried out."""
+        self._commands.setdefault(request.name, deque()).append((request, cycle))
+
+    def settle(self, verdict: Callable[[str, int], str | None], mode: str) -> None:
+        """Answer the commands that are done or never will be.
+
+        `verdict`, given a command's name and the cycle it came in, is "" for done, None for not yet, else why not.
+        A command is never done before an earlier one of its name: where that is not, the later ones are not looked at.
+        """
+        for name, under_way in self._commands.items():
+            while under_way and (why := verdict(name, under_way[0][1])) is not None:
+                request, _ = under_way.popleft()
+                if why:
+                    self.answers.append(Refused(request.ticket, "failed", f"{name} failed: {why}"))
+                else:
+                    self.answers.append(Confirmed(request.ticket, name, mode))
+
+    # ------------------------------------------------------------------ everyone
+
+    def tell(
+        self,
+        kind: str,
+        level: Level,
+        message: str,
+        *,
+        mode: str | None = None,
+        id: str | None = None,  # noqa: A002 - the field's name on the wire
+        outcome: Outcome | None = None,
+        user: str | None = None,
+    ) -> None:
+        """Note something that everyone is to know."""
+        self.happenings.append(Happening(kind, level, message, mode, id, outcome, user))

@@ -1,0 +1,1 @@
+"""The paper's recursion, the robot made of it, and its calibration; pure mathematics, compiled."""

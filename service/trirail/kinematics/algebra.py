@@ -1,0 +1,92 @@
+"""Vectors and 3 x 3 matrices as tuples, which compiled code holds in registers: no allocation, no loops."""
+
+from __future__ import annotations
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trirail.kinematics.compiled import compiled
+
+__all__ = [
+    "Array",
+    "Matrix",
+    "Vector",
+    "add",
+    "cross",
+    "dot",
+    "plus_u3",
+    "product",
+    "scale",
+    "subtract",
+    "times",
+    "transposed_times",
+    "turned",
+]
+
+Array: TypeAlias = NDArray[np.float64]
+Vector: TypeAlias = tuple[float, float, float]
+Matrix: TypeAlias = tuple[Vector, Vector, Vector]  # three rows
+
+
+@compiled()
+def add(x: Vector, y: Vector) -> Vector:
+    """Return x + y."""
+    return x[0] + y[0], x[1] + y[1], x[2] + y[2]
+
+
+@compiled()
+def subtract(x: Vector, y: Vector) -> Vector:
+    """Return x - y."""
+    return x[0] - y[0], x[1] - y[1], x[2] - y[2]
+
+
+@compiled()
+def scale(s: float, x: Vector) -> Vector:
+    """Return s x."""
+    return s * x[0], s * x[1], s * x[2]
+
+
+@compiled()
+def plus_u3(x: Vector, s: float) -> Vector:
+    """Return x + s u3, where u3 is the unit vector of the z axis."""
+    return x[0], x[1], x[2] + s
+
+
+@compiled()
+def dot(x: Vector, y: Vector) -> float:
+    """Return xᵀ y."""
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+@compiled()
+def cross(x: Vector, y: Vector) -> Vector:
+    """Return x̃ y, where x̃ is the skew-symmetric matrix associated to x."""
+    return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
+
+
+@compiled()
+def times(q: Matrix, x: Vector) -> Vector:
+    """Return q x."""
+    return dot(q[0], x), dot(q[1], x), dot(q[2], x)
+
+
+@compiled()
+def transposed_times(q: Matrix, x: Vector) -> Vector:
+    """Return qᵀ x."""
+    return add(add(scale(x[0], q[0]), scale(x[1], q[1])), scale(x[2], q[2]))
+
+
+@compiled()
+def product(a: Matrix, q: Matrix) -> Matrix:
+    """Return a q."""
+    return transposed_times(q, a[0]), transposed_times(q, a[1]), transposed_times(q, a[2])
+
+
+@compiled()
+def turned(phi: float, q: Matrix) -> Matrix:
+    """Return q^phi q, with q^phi of (3): on to a frame that is turned by phi [rad] about the z axis."""
+    c, s = math.cos(phi), math.sin(phi)
+    return add(scale(c, q[0]), scale(s, q[1])), subtract(scale(c, q[1]), scale(s, q[0])), q[2]

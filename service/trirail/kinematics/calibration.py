@@ -1,0 +1,216 @@
+"""Calibration: the robot as built, from poses measured from outside and the slider readings at them.
+
+The measured poses are taken to differ from forward(geometry, sliders) by independent normal noise, beside which
+the sliders' encoders are exact. Sought is the geometry for which the weighted squares of the differences are least.
+
+Of the seven numbers of a leg no such data tells more than five combinations: to move the anchor along its rail is
+to change `home`, and to move the edge point along its edge only moves the zero of lambda_32. So there are five
+parameters for each leg, corrections to a starting geometry, whose anchors move across the rails only and whose edge
+points move across the edges only; `across` is to the left, at right angles to where rail and edge pointed at first.
+
+Poses with too little variety tell even less. The combinations of parameters that they leave open show in the
+singular values of each leg's Jacobian; they stay as in the starting geometry, and are named.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares  # type: ignore[import-untyped]
+
+from trirail.errors import KinematicsError, TrirailError
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.geometry import LEGS, Geometry, Leg
+from trirail.kinematics.kinematics import forward, inverse, jacobians
+
+__all__ = ["PARAMETERS", "Calibration", "CalibrationError", "Open", "corrected", "identify", "pose_derivatives"]
+
+PARAMETERS = ("anchor across the rail", "rail_angle", "home", "edge_point across the edge", "edge_angle")
+"""Of each leg, in the order of every array of corrections: metres and radians."""
+DOUBT = np.array([0.01, 0.05, 0.01, 0.01, 0.05])
+"""Standard deviation beyond which a combination of parameters counts as open: drawings tell as much [m, rad]."""
+TAKES_PART = 0.1  # share of a parameter, in units of DOUBT, from which on it is named in an open combination
+MINIMUM = 6  # each pose is one equation for a leg: five for its parameters, and one to contradict
+MISFIT = 3.0  # root mean square of residual over noise from which on the data cannot be that of this robot
+TOLERANCE = 1e-12
+MAX_EVALUATIONS = 200  # a handful are enough for data that fits
+
+
+class CalibrationError(TrirailError):
+    """Data from which no geometry can be identified; `row` counts from 0, None where no single one is at fault."""
+
+    def __init__(self, message: str, *, row: int | None = None) -> None:
+        super().__init__(message)
+        self.row = row
+
+
+class Open(NamedTuple):
+    """What the data cannot separate: so many independent combinations of these parameters of a leg."""
+
+    leg: str
+    parameters: tuple[str, ...]
+    combinations: int
+
+
+class Calibration(NamedTuple):
+    """A geometry identified from N poses. Corrections have the rows A, B, C and the columns of PARAMETERS."""
+
+    geometry: Geometry
+    corrections: Array  # (3, 5), to the starting geometry [m, rad]
+    standard_errors: Array  # (3, 5), by the stated noise; infinite where the parameter is part of what is open
+    open: tuple[Open, ...]
+    residuals: Array  # (N, 3): measured less computed x, y, phi [m, m, rad]
+    misfit: float  # root mean square of residual over noise, per degree of freedom: about 1 if all is well
+
+
+def identify(
+    start: Geometry, poses: Array, sliders: Array, *, position_noise: float = 20e-6, angle_noise: float = 1e-4
+) -> Calibration:
+    """Return the geometry with which measured `poses` and `sliders`, both (N, 3) in m and rad, agree best.
+
+    The noises are standard deviations of a measured coordinate [m] and angle [rad]. CalibrationError if there
+    are too few poses, if the starting geometry has no pose near a measured one, or if no geometry fits.
+    """
+    if len(poses) < MINIMUM:
+        raise CalibrationError(f"{len(poses)} poses are too few: {MINIMUM} are the least, some dozens are good")
+    for name, value in (("position", position_noise), ("angle", angle_noise)):
+        if not (math.isfinite(value) and value > 0.0):
+            raise CalibrationError(f"the {name} noise is {value}: it must be finite and positive")
+    _check(start, poses, sliders)
+    noise: Array = np.array([position_noise, position_noise, angle_noise])
+    basis, unknown = _separate(pose_derivatives(start, start, poses) / noise[:, None, None])
+
+    def geometry(z: Array) -> Geometry:
+        return corrected(start, (basis @ z).reshape(3, 5))
+
+    def residuals(z: Array) -> Array:
+        try:
+            return (_residuals(geometry(z), poses, sliders) / noise).ravel()
+        except KinematicsError:
+            return np.full(poses.size, math.inf)  # a step too far, of which the solver then takes a part
+
+    def jacobian(z: Array) -> Array:
+        reached = forward(geometry(z), sliders, near=poses)
+        derivatives = pose_derivatives(geometry(z), start, reached) / noise[:, None, None]
+        return -derivatives.reshape(poses.size, 15) @ basis
+
+    found = least_squares(
+        residuals,
+        np.zeros(basis.shape[1]),
+        jacobian,
+        ftol=TOLERANCE,
+        xtol=TOLERANCE,
+        gtol=TOLERANCE,
+        max_nfev=MAX_EVALUATIONS,
+    )
+    misfit = math.sqrt(found.fun @ found.fun / (poses.size - basis.shape[1]))
+    if misfit > MISFIT:
+        row, _ = divmod(int(np.argmax(np.abs(found.fun))), 3)
+        raise CalibrationError(
+            f"no geometry fits: the residuals are {misfit:.3g} times the stated noise, and greatest at this pose, "
+            f"{np.max(np.abs(found.fun)):.3g} times; check it, the columns and the units, or state more noise",
+            row=row,
+        )
+    if not found.success:
+        raise CalibrationError(
+            f"no end after {found.nfev} steps: the poses tell too little; vary them more, phi above all"
+        )
+    deviations = (basis @ np.linalg.pinv(found.jac)).reshape(3, 5, -1)
+    errors = np.sqrt(np.sum(deviations**2, axis=2))
+    for leg, names, _ in unknown:
+        errors[LEGS.index(leg), [PARAMETERS.index(name) for name in names]] = math.inf
+    return Calibration(
+        geometry=geometry(found.x),
+        corrections=(basis @ found.x).reshape(3, 5),
+        standard_errors=errors,
+        open=unknown,
+        residuals=found.fun.reshape(-1, 3) * noise,
+        misfit=misfit,
+    )
+
+
+def corrected(start: Geometry, corrections: Array) -> Geometry:
+    """Return the geometry with corrections, (3, 5) in m and rad, to its PARAMETERS. KinematicsError as Geometry."""
+    legs = []
+    for leg, row in zip(start.legs, corrections.tolist(), strict=True):
+        anchor, rail_angle, home, edge_point, edge_angle = row
+        legs.append(
+            Leg(
+                anchor=_across(leg.anchor, leg.rail_angle, anchor),
+                rail_angle=leg.rail_angle + rail_angle,
+                home=leg.home + home,
+                edge_point=_across(leg.edge_point, leg.edge_angle, edge_point),
+                edge_angle=leg.edge_angle + edge_angle,
+            )
+        )
+    return Geometry(legs=(legs[0], legs[1], legs[2]))
+
+
+def pose_derivatives(geometry: Geometry, start: Geometry, poses: Array) -> Array:
+    """Return how corrections to `start` move the platform of `geometry`, sliders at rest: (N, 3, 3, 5).
+
+    Axes: pose from which it moves, of `poses` (N, 3); x, y, phi; leg; PARAMETERS. With n the normal of its edge,
+    the loop of a leg demands F = n . (anchor + (home + lambda_10) u(rail_angle) - G - R edge_point) = 0. The
+    derivatives of F are J1 by lambda_10 and -J2 by the pose, (16), so that J2 d pose = dF. KinematicsError as
+    from inverse.
+    """
+    _, J2 = jacobians(geometry, poses)
+    joints = inverse(geometry, poses)
+    dF = np.empty((len(poses), 3, 5))
+    for i, (leg, first) in enumerate(zip(geometry.legs, start.legs, strict=True)):
+        psi = poses[:, 2] + leg.edge_angle
+        dF[:, i, 0] = -np.cos(psi - first.rail_angle)
+        dF[:, i, 1] = -(leg.home + joints.position[:, i]) * np.cos(psi - leg.rail_angle)
+        dF[:, i, 2] = np.sin(psi - leg.rail_angle)
+        dF[:, i, 3] = np.cos(leg.edge_angle - first.edge_angle)
+        dF[:, i, 4] = -joints.passive_position[:, i]
+    return np.linalg.inv(J2)[..., np.newaxis] * dF[:, np.newaxis]
+
+
+def _check(start: Geometry, poses: Array, sliders: Array) -> None:
+    """Refuse data that the starting geometry cannot follow, by row."""
+    for row, (pose, reading) in enumerate(zip(poses, sliders, strict=True)):
+        try:
+            inverse(start, pose)
+            forward(start, reading, near=pose)
+        except KinematicsError as error:
+            raise CalibrationError(
+                f"out of the starting geometry's reach, or the columns or units are wrong: {error}", row=row
+            ) from error
+
+
+def _residuals(geometry: Geometry, poses: Array, sliders: Array) -> Array:
+    """Return measured less computed poses, (N, 3)."""
+    difference = poses - forward(geometry, sliders, near=poses)
+    difference[:, 2] -= 2.0 * math.pi * np.round(difference[:, 2] / (2.0 * math.pi))
+    return difference
+
+
+def _separate(derivatives: Array) -> tuple[Array, tuple[Open, ...]]:
+    """Return a basis (15, K) of the corrections that the data tells, by the whitened derivatives, and the rest.
+
+    No correction of one leg can make up for that of another: at each pose their effects are independent. So
+    what is open is open leg by leg, and can be named.
+    """
+    columns: list[Array] = []
+    unknown: list[Open] = []
+    for i, leg in enumerate(LEGS):
+        _, values, directions = np.linalg.svd(derivatives[:, :, i].reshape(-1, 5) * DOUBT, full_matrices=False)
+        for direction in directions[values > 1.0]:
+            column = np.zeros((3, 5))
+            column[i] = DOUBT * direction
+            columns.append(column.ravel())
+        if len(rest := directions[values <= 1.0]):
+            shares = np.linalg.norm(rest, axis=0)
+            names = tuple(name for name, share in zip(PARAMETERS, shares, strict=True) if share > TAKES_PART)
+            unknown.append(Open(leg, names, len(rest)))
+    if not columns:
+        raise CalibrationError("with so much noise the poses tell nothing that drawings do not")
+    return np.stack(columns, axis=1), tuple(unknown)
+
+
+def _across(point: tuple[float, float], angle: float, distance: float) -> tuple[float, float]:
+    """Return the point so far to the left of a line at this angle."""
+    return point[0] - distance * math.sin(angle), point[1] + distance * math.cos(angle)

@@ -1,0 +1,178 @@
+"""The 3-PRP robot: inverse and forward kinematics, and both Jacobians.
+
+A pose is (x, y, phi): the platform's centre G in the base frame [m], and its angle [rad]. The sliders are
+lambda_10 of legs A, B, C [m]; the passive joints are lambda_32 of the same legs [m], and phi_21 = phi, (8).
+Arrays hold one pose, shape (3,), or N of them, shape (N, 3).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from trirail.errors import KinematicsError
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.closure import (
+    J2_SINGULAR,
+    LOOPS_OPEN,
+    ROUNDING,
+    forward_batch,
+    forward_into,
+    inverse_batch,
+    inverse_into,
+    jacobians_batch,
+    loop_equation,
+)
+from trirail.kinematics.geometry import LEGS, PARALLEL, Geometry
+
+__all__ = ["Motion", "forward", "forward_into", "inverse", "inverse_into", "jacobians", "warm_up"]
+
+HOME = np.zeros(3)
+
+
+class Motion(NamedTuple):
+    """Motion of the joints of legs A, B, C: each field (3,) or (N, 3), in m, m/s or m/s²."""
+
+    position: Array  # lambda_10, the sliders
+    velocity: Array  # v_10
+    acceleration: Array  # gamma_10
+    passive_position: Array  # lambda_32, along the platform's edges
+    passive_velocity: Array  # v_32
+    passive_acceleration: Array  # gamma_32
+
+
+def inverse(geometry: Geometry, pose: ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0) -> Motion:
+    """Return the motion of all joints for a motion of the platform, by (9) to (19).
+
+    `velocity` and `acceleration` are the time derivatives of the pose, of its shape, or (3,) for all rows.
+    KinematicsError if a number is not finite, or where the edge of a leg is parallel to its rail.
+    """
+    pose = np.asarray(pose, dtype=np.float64)
+    rows = _rows("pose", pose)
+    motion = np.empty((3, rows, 3))
+    motion[0] = pose
+    _fill(motion[1], "velocity", velocity)
+    _fill(motion[2], "acceleration", acceleration)
+    out = np.empty((6, rows, 3))
+    code = inverse_batch(geometry.packed(), motion, out)
+    if code != 0:
+        row, leg = divmod(code - 1, 3)
+        _refuse_pose(geometry, motion[:, row], leg, _place(row, pose))
+    return Motion(*out.reshape(6, *pose.shape))
+
+
+def forward(geometry: Geometry, sliders: ArrayLike, near: ArrayLike | None = None) -> Array:
+    """Return the pose, phi in (-pi, pi], at which the sliders stand as given.
+
+    Of the two poses that close the loops it is the one that can be reached from the pose `near`, (0, 0, 0)
+    if not given, without passing a singularity of J2. `near` has the shape of `sliders`, or (3,) for all
+    rows. The symmetric robot does not need it in its usable range, -2 pi/3 < phi < pi/3. KinematicsError if
+    a number is not finite, if no pose closes the loops, or if that pose or `near` is singular.
+    """
+    sliders = np.asarray(sliders, dtype=np.float64)
+    given, start, pose = np.empty((3, _rows("sliders", sliders), 3))
+    given[:] = sliders
+    _fill(start, "near", HOME if near is None else near)
+    code = forward_batch(geometry.packed(), given, start, pose)
+    if code != 0:
+        row, fault = divmod(code - 1, 5)
+        if fault + 1 in {LOOPS_OPEN, J2_SINGULAR}:
+            _refuse_loops(geometry, given[row], start[row], _place(row, sliders))
+        _refuse_slider(geometry, given[row], pose[row], fault, _place(row, sliders))
+    return pose.reshape(sliders.shape)
+
+
+def jacobians(geometry: Geometry, pose: ArrayLike) -> tuple[Array, Array]:
+    """Return J1 and J2 of (16) to (18), (3, 3) or (N, 3, 3): J1 @ slider velocity = J2 @ platform velocity.
+
+    J1 is diagonal. The last column of J2 is in metres, the rest has no unit. KinematicsError as from inverse.
+    """
+    pose = np.asarray(pose, dtype=np.float64)
+    given = np.empty((_rows("pose", pose), 3))
+    given[:] = pose
+    j1, j2 = np.zeros((2, len(given), 3, 3))
+    code = jacobians_batch(geometry.packed(), given, j1, j2)
+    if code != 0:
+        row, leg = divmod(code - 1, 3)
+        _refuse_pose(geometry, given[row : row + 1], leg, _place(row, pose))
+    return j1.reshape(*pose.shape, 3), j2.reshape(*pose.shape, 3)
+
+
+def warm_up() -> None:
+    """Run once what importing this module compiled or loaded, so that no later call is the first."""
+    geometry = Geometry.symmetric()
+    legs, pose = geometry.packed(), np.zeros(3)
+    inverse_into(legs, np.zeros((3, 3)), np.empty((6, 3)))
+    forward_into(legs, np.zeros(3), HOME, pose)
+    forward(geometry, inverse(geometry, pose).position)
+    jacobians(geometry, pose)
+
+
+def _rows(name: str, array: Array) -> int:
+    """Return how many rows an array has, 1 if it is one."""
+    if array.ndim not in {1, 2} or array.shape[-1] != 3:
+        raise KinematicsError(f"{name} has shape {array.shape}: it must have (3,) or (N, 3)")
+    return len(array) if array.ndim == 2 else 1
+
+
+def _fill(rows: Array, name: str, value: ArrayLike) -> None:
+    array = np.asarray(value, dtype=np.float64)
+    try:
+        rows[:] = array
+    except ValueError as error:
+        message = f"{name} has shape {array.shape}: it must have (3,), or one row for each of {len(rows)}"
+        raise KinematicsError(message) from error
+
+
+def _place(row: int, array: Array) -> str:
+    return f"row {row}: " if array.ndim == 2 else ""
+
+
+def _refuse_pose(geometry: Geometry, motion: Array, leg: int, place: str) -> NoReturn:
+    """Say why a leg cannot follow `motion`: rows pose and, where they matter, velocity and acceleration."""
+    for name, row in zip(("pose", "velocity", "acceleration"), motion, strict=False):
+        for axis, value in zip(("x", "y", "phi"), row, strict=True):
+            if not math.isfinite(value):
+                raise KinematicsError(f"{place}{name} {axis} is {value}: it must be finite", value=float(value))
+    _refuse_angle(geometry, leg, float(motion[0, 2]), place)
+
+
+def _refuse_slider(geometry: Geometry, sliders: Array, pose: Array, leg: int, place: str) -> NoReturn:
+    """Say what is wrong with a slider, or with the angle to which the sliders bring the edge of its leg."""
+    slider = float(sliders[leg])
+    if not math.isfinite(slider):
+        message = f"{place}slider {LEGS[leg]} is {slider}: it must be finite"
+        raise KinematicsError(message, leg=LEGS[leg], value=slider)
+    _refuse_angle(geometry, leg, float(pose[2]), place)
+
+
+def _refuse_angle(geometry: Geometry, leg: int, phi: float, place: str) -> NoReturn:
+    """Say where the edge of a leg is parallel to its rail."""
+    built = geometry.legs[leg]
+    delta = math.remainder(phi + built.edge_angle - built.rail_angle, math.pi)
+    what = "edge parallel to its rail" if abs(delta) <= 2.0 * PARALLEL else "out of all reach"
+    raise KinematicsError(
+        f"{place}leg {LEGS[leg]}: {what} at phi = {phi:.9g} rad (singular at {phi - delta:.9g} rad)",
+        leg=LEGS[leg],
+        value=phi,
+        limit=phi - delta,
+    )
+
+
+def _refuse_loops(geometry: Geometry, sliders: Array, near: Array, place: str) -> NoReturn:
+    """Say by how much the loops fail to close, or that they do so singularly."""
+    A, B, C = loop_equation(geometry.packed(), sliders)
+    reach, needed = math.hypot(A, B), abs(C)
+    given = "{}sliders ({:g}, {:g}, {:g}) m".format(place, *sliders)
+    if needed > reach * (1.0 + ROUNDING):
+        message = f"{given}: no pose closes the loops, which reach {reach:.6g} of the needed {needed:.6g} m"
+        raise KinematicsError(message, value=reach, limit=needed)
+    det = math.sqrt(max((reach - needed) * (reach + needed), 0.0))
+    limit = math.sqrt(ROUNDING) * reach
+    if det > 2.0 * limit:
+        message = "{}: near = ({:g}, {:g}, {:g}) is a singular pose".format(given, *near)
+        raise KinematicsError(message, value=float(near[2]))
+    raise KinematicsError(f"{given}: singular, |det J2| is {det:.3g} m there", value=det, limit=limit)

@@ -1,0 +1,229 @@
+"""The matrix recursion of a planar serial leg of prismatic and revolute joints: the paper's (2) to (20).
+
+Frames and symbols are the paper's, with q for any leg's matrices (a on its leg A). T_0 is the base. Link T_k,
+k = 1 ... n, has its frame at A_k, with the z axis along joint k: a prismatic joint moves along it by
+lambda_{k,k-1} [m], a revolute joint turns about it by phi_{k,k-1} [rad]. The matrix q_{k,k-1} takes
+components from T_{k-1} to T_k, its transpose takes them back. Motion is in the plane x_0 y_0: prismatic axes
+lie in it, revolute axes are normal to it. The last link is the platform or fixed to it; r_n^G leads from A_n
+to its centre G.
+
+A leg is a float64 array of shape (n + 1, 13), made by `serial_leg`, with a row for each joint and one for G:
+
+    column  0        1 for a revolute joint, 0 for a prismatic one
+    columns 1 to 3   the constant part of r_{k,k-1}, in T_{k-1} [m]; in the last row r_n^G, in T_n
+    columns 4 to 12  the constant part of q_{k,k-1}, row by row
+
+A platform moves in (x, y, phi): G in T_0 [m], the turning about z_0 [rad], and their time derivatives.
+What is singular or not finite comes out as an infinity or NaN; whoever closes a loop checks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from trirail.kinematics.algebra import (
+    Array,
+    Matrix,
+    Vector,
+    add,
+    cross,
+    dot,
+    plus_u3,
+    product,
+    scale,
+    subtract,
+    times,
+    transposed_times,
+    turned,
+)
+from trirail.kinematics.compiled import compiled
+
+__all__ = [
+    "AT_REST",
+    "BASE",
+    "Joint",
+    "Link",
+    "LinkMotion",
+    "follow",
+    "joint_motion",
+    "link",
+    "link_motion",
+    "platform_centre",
+    "platform_motion",
+    "serial_leg",
+]
+
+
+class Joint(NamedTuple):
+    """A joint of a leg: its kind and the constant parts of q_{k,k-1} (3, 3) and of r_{k,k-1} (3,) [m]."""
+
+    kind: Literal["prismatic", "revolute"]
+    constant: ArrayLike
+    offset: ArrayLike = (0.0, 0.0, 0.0)
+
+
+class Link(NamedTuple):
+    """Where link T_k is."""
+
+    revolute: bool
+    a: Matrix  # q_{k,k-1}
+    r: Vector  # r_{k,k-1}, in T_{k-1}
+    q: Matrix  # q_k0
+    p: Vector  # A_k, in T_0
+
+
+class LinkMotion(NamedTuple):
+    """How link T_k moves relative to the base, in the components of T_k."""
+
+    omega: Vector  # omega_k0
+    v: Vector  # v_k0, the velocity of A_k
+    epsilon: Vector  # epsilon_k0
+    gamma: Vector  # gamma_k0, the acceleration of A_k
+
+
+ZERO: Vector = (0.0, 0.0, 0.0)
+U3: Vector = (0.0, 0.0, 1.0)
+IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), U3)
+BASE = Link(False, IDENTITY, ZERO, IDENTITY, ZERO)
+AT_REST = LinkMotion(ZERO, ZERO, ZERO, ZERO)
+
+
+def serial_leg(joints: Sequence[Joint], tip: ArrayLike) -> Array:
+    """Return the leg (n + 1, 13) of n joints with r_n^G = tip [m]; ValueError if it leaves the plane."""
+    leg = np.zeros((len(joints) + 1, 13))
+    q_k0 = np.eye(3)  # with all variables at zero; they do not change which axes are normal to the plane
+    for k, (kind, constant, offset) in enumerate(joints):
+        leg[k, 0] = kind == "revolute"
+        leg[k, 1:4] = offset
+        leg[k, 4:13] = np.ravel(constant)
+        q = leg[k, 4:13].reshape(3, 3)
+        if not np.allclose(q @ q.T, np.eye(3), atol=1e-12):
+            raise ValueError(f"joint {k + 1}: its constant matrix is not orthogonal")
+        out_of_plane = leg[k, 1:4] @ q_k0[:, 2]
+        q_k0 = q @ q_k0
+        if abs(abs(q_k0[2, 2]) - leg[k, 0]) > 1e-12 or abs(out_of_plane) > 1e-12:
+            raise ValueError(f"joint {k + 1}: with this axis and offset a {kind} joint leaves the plane")
+    leg[-1, 1:4] = tip
+    return leg
+
+
+@compiled()
+def _constant_vector(leg: Array, k: int) -> Vector:
+    return leg[k, 1], leg[k, 2], leg[k, 3]
+
+
+@compiled()
+def _constant_matrix(leg: Array, k: int) -> Matrix:
+    row = leg[k]
+    return (row[4], row[5], row[6]), (row[7], row[8], row[9]), (row[10], row[11], row[12])
+
+
+@compiled()
+def link(base: Link, leg: Array, k: int, variable: float) -> Link:
+    """Return the link that row k of a leg joins to `base`, with the joint at `variable` [m or rad]."""
+    revolute = leg[k, 0] != 0.0
+    a = _constant_matrix(leg, k)
+    r = _constant_vector(leg, k)
+    if revolute:
+        a = turned(variable, a)  # (2): q_{k,k-1} = q^phi theta
+    else:
+        r = add(r, scale(variable, a[2]))  # (10): lambda_{k,k-1} q_{k,k-1}ᵀ u3
+    q = product(a, base.q)  # (3)
+    p = add(base.p, transposed_times(base.q, r))  # (9)
+    return Link(revolute, a, r, q, p)
+
+
+@compiled()
+def platform_centre(leg: Array, last: Link) -> Vector:
+    """Return G in T_0: the whole left side of (9)."""
+    return add(last.p, transposed_times(last.q, _constant_vector(leg, len(leg) - 1)))
+
+
+@compiled()
+def _spin(omega: Vector, epsilon: Vector, r: Vector) -> Vector:
+    """Return (ω̃ ω̃ + ε̃) r."""
+    return add(cross(omega, cross(omega, r)), cross(epsilon, r))
+
+
+@compiled()
+def link_motion(base: LinkMotion, link: Link, rate: float, acceleration: float) -> LinkMotion:
+    """Return how a link moves on its moving base, for a rate and an acceleration of its joint."""
+    omega_k, v_k = (rate, 0.0) if link.revolute else (0.0, rate)
+    epsilon_k, gamma_k = (acceleration, 0.0) if link.revolute else (0.0, acceleration)
+    a, r = link.a, link.r
+    carried = times(a, base.omega)  # the vector of a ω̃_{k-1,0} aᵀ
+    carried_u3 = (carried[1], -carried[0], 0.0)  # a ω̃_{k-1,0} aᵀ u3
+
+    # (13): the vectors of (12)
+    omega = plus_u3(carried, omega_k)
+    # (14)
+    v = plus_u3(times(a, add(base.v, cross(base.omega, r))), v_k)
+    # (20), first line; the second, for ω̃ ω̃ + ε̃, follows from it and (12)
+    epsilon = plus_u3(add(times(a, base.epsilon), scale(omega_k, carried_u3)), epsilon_k)
+    # (20), last line; its Coriolis term ends in the vector u3, where the paper prints the matrix ũ3
+    gamma = times(a, add(base.gamma, _spin(base.omega, base.epsilon, r)))
+    gamma = plus_u3(add(gamma, scale(2.0 * v_k, carried_u3)), gamma_k)
+    return LinkMotion(omega, v, epsilon, gamma)
+
+
+@compiled()
+def platform_motion(leg: Array, last: Link, motion: LinkMotion) -> tuple[Vector, Vector]:
+    """Return velocity and acceleration (x, y, phi) of the platform that the last link of a leg carries."""
+    r = _constant_vector(leg, len(leg) - 1)
+    vx, vy, _ = transposed_times(last.q, add(motion.v, cross(motion.omega, r)))
+    ax, ay, _ = transposed_times(last.q, add(motion.gamma, _spin(motion.omega, motion.epsilon, r)))
+    _, _, omega = transposed_times(last.q, motion.omega)
+    _, _, epsilon = transposed_times(last.q, motion.epsilon)
+    return (vx, vy, omega), (ax, ay, epsilon)
+
+
+@compiled()
+def follow(leg: Array, joints: Array) -> tuple[Link, LinkMotion]:
+    """Return place and motion of link T_k from rows (variable, rate, acceleration) for joints 1 to k."""
+    place, motion = BASE, AT_REST
+    for k in range(len(joints)):
+        place = link(place, leg, k, joints[k, 0])
+        motion = link_motion(motion, place, joints[k, 1], joints[k, 2])
+    return place, motion
+
+
+@compiled()
+def _unit_velocity(link: Link, centre: Vector) -> Vector:
+    """Return the platform velocity (x, y, phi) that a unit rate of this joint gives: its factors in (15)."""
+    axis = link.q[2]  # q_k0ᵀ u3
+    if link.revolute:
+        x, y, _ = cross(axis, subtract(centre, link.p))
+        return x, y, axis[2]
+    return axis[0], axis[1], 0.0
+
+
+@compiled()
+def joint_motion(leg: Array, variables: Vector, velocity: Vector, acceleration: Vector) -> tuple[Vector, Vector]:
+    """Return rates and accelerations of a leg's three joints from the motion of its platform: (15) and (19).
+
+    Three joints are what it takes to follow any planar motion. The unknowns of (15) and of (19) have the same
+    factors, the unit velocities j. The right side of (19) is what is left of the platform's acceleration
+    without the part that (20) gives for joints at constant rates. For a PRP leg these are the paper's
+    equations, with the factor lambda_32 that its (19) lacks in the omega_21² term, and with epsilon_21 =
+    d²phi/dt².
+    """
+    first = link(BASE, leg, 0, variables[0])
+    second = link(first, leg, 1, variables[1])
+    third = link(second, leg, 2, variables[2])
+    centre = platform_centre(leg, third)
+
+    j1, j2, j3 = _unit_velocity(first, centre), _unit_velocity(second, centre), _unit_velocity(third, centre)
+    adjugate = cross(j2, j3), cross(j3, j1), cross(j1, j2)
+    scaling = 1.0 / dot(j1, adjugate[0])
+    rates = scale(scaling, times(adjugate, velocity))  # (15)
+
+    motion = link_motion(AT_REST, first, rates[0], 0.0)
+    motion = link_motion(motion, second, rates[1], 0.0)
+    motion = link_motion(motion, third, rates[2], 0.0)
+    _, at_constant_rates = platform_motion(leg, third, motion)
+    remainder = subtract(acceleration, at_constant_rates)
+    return rates, scale(scaling, times(adjugate, remainder))  # (19)

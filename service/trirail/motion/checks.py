@@ -1,0 +1,156 @@
+"""A motion held against the limits of sliders and platform: how many times too fast, or where out of reach."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from trirail.config import Limits
+from trirail.errors import RefusedError
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.kinematics import inverse_into
+from trirail.motion.limits import COORDINATES, LEGS, Bounds, Violation
+from trirail.motion.motion import STILL
+from trirail.motion.paths import ROUNDING, Path, advance, constant
+from trirail.motion.steps import Steps
+from trirail.motion.survey import survey
+
+PLANNED = (0.98, 0.98, 0.93)
+"""Share of the sliders' limits of velocity, acceleration and jerk that plans make use of: the rest is for what lies
+between the moments that are looked at, where jerk varies most."""
+LAWS = (0.99, 0.99, 0.98)
+"""Share of the same that changes of a path's rate make use of, on top of what the path itself does."""
+PLATFORM_PLANNED = (1.0 + 1e-6,) * 3
+"""Share of the platform's limits that plans make use of: all of it, but for rounding."""
+PLATFORM_LAWS = (1.0 + 1e-6, 1.01, 1.05)
+"""Share of the same while a path's rate changes: none is planned with room for that, and the robot must stop."""
+GAP = 0.02
+"""Between moments at which a path is looked at, besides its knots [s]."""
+FEWEST, MOST = 16, 64
+"""Such moments, however short or long the path."""
+KNOTS_A_STEP = 48
+"""Knots of a path that are looked at in one step."""
+POWERS = 1.0 / np.arange(1.0, 4.0)
+LONGEST = 600.0
+"""No path is looked at for longer [s]."""
+
+
+class Look(NamedTuple):
+    """What was found along a path."""
+
+    worst: Array
+    """Velocity, acceleration and jerk (4, 3) of the fastest slider, of x, y and phi, as shares of what plans use."""
+    bearable: bool
+    """Whether sliders and platform can bear it, with what is kept for changes of rate."""
+    beyond: float
+    """When it is out of reach [s]; not a number where it never is."""
+
+    @property
+    def excess(self) -> float:
+        """How many times too fast it is."""
+        return excess(self.worst)
+
+    @property
+    def fits(self) -> bool:
+        """Whether a path can be planned so."""
+        return math.isnan(self.beyond) and self.excess <= 1.0
+
+
+def excess(worst: Array) -> float:
+    """Return how many times too fast a motion is, from its shares of the limits.
+
+    The same path k times slower has k times less velocity, k² less acceleration and k³ less jerk.
+    """
+    return float((worst**POWERS).max())
+
+
+def fastest(worst: Array) -> str:
+    """Name what a motion is too fast for."""
+    row = int((worst**POWERS).max(axis=1).argmax())
+    return f"the platform's {COORDINATES[row - 1]}" if row else "a slider"
+
+
+class Checker:
+    """Looks at paths of one robot."""
+
+    def __init__(self, geometry: Geometry, limits: Limits, bounds: Bounds, period: float) -> None:
+        platform, slider = limits.platform, limits.slider
+        each = np.array([[slider.velocity, slider.acceleration, slider.jerk], [0.0] * 3, [0.0] * 3, [0.0] * 3])
+        each[1:] = np.array([platform.velocity, platform.acceleration, platform.jerk]).T
+        self._planned = each * [PLANNED, *[PLATFORM_PLANNED] * 3]
+        self._laws = each * [LAWS, *[PLATFORM_LAWS] * 3] / self._planned * (1.0 + ROUNDING)
+        self.slider_limits = self._planned[0]
+        """Velocity, acceleration and jerk that plans make use of."""
+        self._legs = geometry.packed()
+        self._bounds = bounds
+        self._period = period
+        self._box = np.array([platform.x, platform.y, platform.phi, slider.position, slider.passive]).T.copy()
+
+    def look(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Look:
+        """Look at a path under a law from one time of the law to another [s], from near a pose on."""
+        until = max(first, min(until, first + LONGEST))
+        # A path from standstill may begin with an acceleration: the step into it counts, as the one at the end does.
+        if first == 0.0 and law.pieces[0, 0, 0] == 0.0 and not path.pieces[0, :, 1].any():
+            first = -self._period
+        even = min(max(FEWEST, int((until - first) / GAP)), MOST)
+        worst, start = np.zeros((4, 3)), np.array(pose, dtype=np.float64)
+        beyond = survey(self._legs, *path, *law[:2], first, until, even, self._period, start, self._box, worst)
+        worst /= self._planned
+        return Look(worst, math.isnan(beyond) and self.bears(worst), beyond)
+
+    def bears(self, worst: Array) -> bool:
+        """Whether sliders and platform can bear a motion of such shares, with what is kept for changes of rate."""
+        return bool((worst <= self._laws).all())
+
+    def whole(self, path: Path, pose: Sequence[float]) -> Steps[Array]:
+        """Return Look.worst of a whole path. Raises RefusedError where it leaves the workspace."""
+        law, worst = constant(1.0), np.zeros((4, 3))
+        ends = [*path.knots[KNOTS_A_STEP : -KNOTS_A_STEP // 2 : KNOTS_A_STEP].tolist(), path.duration]
+        for first, until in zip([0.0, *ends[:-1]], ends, strict=True):
+            if first:
+                yield
+            found = self.look(path, law, first, until, pose)
+            if not math.isnan(found.beyond):
+                raise self.refusal(path, found.beyond, pose)
+            np.maximum(worst, found.worst, out=worst)
+        return worst
+
+    def refusal(self, path: Path, time: float, pose: Sequence[float]) -> RefusedError:
+        """Say what is out of reach at a time along a path, and where on it that is."""
+        where = f"the path leads out of the workspace after {max(0.0, time) / path.duration:.0%} of its time"
+        rows = self._rows(path, time, pose)
+        if rows is None:
+            return RefusedError("singular", f"{where}: the robot is singular there")
+        violation = self._beyond(*rows)
+        if violation is None:
+            return RefusedError("out_of_workspace", where)
+        return RefusedError(
+            "out_of_workspace",
+            f"{where}: {violation}",
+            slider=violation.what if violation.what in LEGS else None,
+            value=violation.value,
+            limit=violation.limit,
+        )
+
+    def bound(self, path: Path, time: float, pose: Sequence[float]) -> str:
+        """Name the limit that a path meets at a time along it, where it is out of reach."""
+        rows = self._rows(path, time, pose)
+        violation = self._beyond(*rows) if rows is not None else None
+        return violation.bound if violation is not None else "the workspace"
+
+    def _rows(self, path: Path, time: float, pose: Sequence[float]) -> tuple[Array, Array] | None:
+        """Return the platform's motion and the sliders' at a time along a path; None where the robot is singular."""
+        rows, near, law = np.zeros((6, 3)), np.array(pose, dtype=np.float64), constant(1.0)
+        motion = np.zeros((3, 3))
+        if advance(self._legs, *path, *law[:2], time, near, motion) or inverse_into(self._legs, motion, rows):
+            return None
+        return motion, rows
+
+    def _beyond(self, motion: Array, rows: Array) -> Violation | None:
+        """Return which position is beyond its limit."""
+        still = rows[0].tolist(), STILL, STILL, rows[3].tolist()
+        return self._bounds.pose(motion[0].tolist()) or self._bounds.setpoint(still)

@@ -1,0 +1,81 @@
+"""What the platform is to do: the motion under way, what comes after it, and the state commanded now."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from trirail.motion.motion import MotionState, Run
+
+
+class Course:
+    """Runs, one after the other; each cycle is `advance`."""
+
+    def __init__(self, commanded: MotionState, period: float) -> None:
+        self.commanded = commanded
+        self.runs: deque[Run] = deque()
+        """The motion under way, and those to follow at its end."""
+        self.cycle = 0
+        self._period = period
+        self._later: deque[Run] = deque()
+        self._turn: int | None = None
+
+    @property
+    def turning(self) -> bool:
+        """Whether another motion is soon to take the place of the one under way."""
+        return self._turn is not None
+
+    @property
+    def last(self) -> Run | None:
+        """The run at whose end the robot stands, as far as is decided."""
+        runs = self._later or self.runs
+        return runs[-1] if runs else None
+
+    @property
+    def remaining(self) -> float:
+        """Time until it stands [s]."""
+        if self._turn is not None:
+            waiting = (self._turn - self.cycle) * self._period
+            return waiting + sum(run.ends for run in self._later)
+        return sum(run.ends - run.time for run in self.runs)
+
+    def take(self, runs: deque[Run], turn: int | None = None) -> None:
+        """Go on with other runs, at once or from the cycle `turn` on; they begin with the motion commanded then."""
+        if turn is None or turn <= self.cycle or not self.runs:
+            self.runs, self._later, self._turn = runs, deque(), None
+        else:
+            self._later, self._turn = runs, turn
+            self.forget()
+
+    def forget(self) -> None:
+        """Let the goals on the way go: what is under way leads to none of them."""
+        for run in self.runs:
+            run.seams.clear()
+
+    def keep(self) -> None:
+        """Stay with the motion under way: none is to take its place."""
+        self._later, self._turn = deque(), None
+
+    def advance(self) -> int:
+        """Move the commanded state on by one period; return how many goals have ended where the next one begins."""
+        if self._turn == self.cycle:
+            self.take(self._later)
+        self.cycle += 1
+        if not self.runs:
+            return 0
+        run = self.runs[0]
+        self.commanded = run.state(self._period, self.commanded.pose)
+        run.time += self._period
+        passed = run.pass_seams()
+        if run.stands and len(self.runs) > 1:
+            self.runs.popleft()
+        return passed
+
+    def ahead(self, cycles: int) -> Course:
+        """Return the course as it will be so many cycles later, if nothing happens in between."""
+        other = Course(self.commanded, self._period)
+        other.runs = deque(run.copy() for run in self.runs)
+        other._later = deque(run.copy() for run in self._later)
+        other.cycle, other._turn = self.cycle, self._turn
+        for _ in range(cycles):
+            other.advance()
+        return other

@@ -1,0 +1,324 @@
+"""Paths of motion: jerk-limited, from any state of motion, and looked at along their whole length before they start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
+
+from trirail.config import PlatformLimits, SliderLimits
+from trirail.errors import RefusedError
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.kinematics import inverse_into
+from trirail.motion.checks import Checker, excess, fastest
+from trirail.motion.limits import COORDINATES, LEGS, Bounds, beyond, told_apart
+from trirail.motion.motion import STILL, MotionState, from_ruckig, joined, stretched
+from trirail.motion.paths import Path, constant
+from trirail.motion.quintic import Point, quintic
+from trirail.motion.solver import solved
+from trirail.motion.steps import Steps
+
+GENTLEST = 0.1
+"""Share of any limit below which no plan from motion is tried."""
+TRIES = 3
+"""How often a plan from motion is tried, with lower limits each time."""
+LOOKS = 8
+"""How often a slowed path is looked at, and slowed further, until it fits."""
+ROOM = 0.97
+"""Share of what would just fit that is made use of where rounding must not make it too fast."""
+JOGS = 5
+"""How often a jog is tried slower or shorter before it only brakes."""
+FASTEST_OVERRIDE = 2.0
+"""At how many times its nominal rate the time along a path may be told to run."""
+JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
+"""Ruckig finds no solution just where one kind of profile gives way to another, as for a distance of 2 a³ / j²
+from rest to rest: there a hair less jerk has one."""
+A_HAIR_MORE = 1.0 + 1e-6
+"""What rounding may lose."""
+START = 1e-4
+"""How far a trajectory may begin from where the robot stands [m, rad]."""
+STANDS = 1e-6
+"""Velocity at the ends of a trajectory that counts as rounding, and is taken for none [m/s, rad/s]."""
+
+TOO_FAST_IN_MOTION = RefusedError(
+    "too_fast", "from its present motion the robot cannot take this path within its sliders' limits"
+)
+
+
+class Kinodynamic(NamedTuple):
+    """Greatest velocity, acceleration and jerk in each coordinate [m/s, rad/s, …]."""
+
+    velocity: Sequence[float]
+    acceleration: Sequence[float]
+    jerk: Sequence[float]
+
+
+class Plan(NamedTuple):
+    """A path that the robot can take."""
+
+    path: Path
+    slowed: float = 1.0
+    """How many times slower it is than was asked for, for the limits' sake."""
+    bound: str | None = None
+    """The limit before which a jog comes to rest."""
+
+
+class Planner:
+    """Makes paths within the platform's limits and the sliders'."""
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        platform: PlatformLimits,
+        slider: SliderLimits,
+        bounds: Bounds,
+        checker: Checker,
+        period: float,
+    ) -> None:
+        self._legs = geometry.packed()
+        self._platform = Kinodynamic(platform.velocity, platform.acceleration, platform.jerk)
+        self._sliders = Kinodynamic(*([ROOM * limit] * 3 for limit in checker.slider_limits.tolist()))
+        self._travel = slider.position
+        self._bounds = bounds
+        self._checker = checker
+        self._period = period
+        self._ruckig = Ruckig(3)
+        # How far the platform's edges are: what a turn by one radian moves at most.
+        self._reach = max(math.hypot(*leg.edge_point) for leg in geometry.legs)
+
+    def check_pose(self, target: Sequence[float]) -> None:
+        """Raise RefusedError, with coordinate, value and limit, if a pose is out of the workspace."""
+        if violation := self._bounds.pose(target):
+            raise RefusedError(
+                "out_of_workspace",
+                f"the goal is out of the workspace: {violation}",
+                value=violation.value,
+                limit=violation.limit,
+            )
+
+    def check_sliders(self, target: Sequence[float]) -> None:
+        """Raise RefusedError, with slider, value and limit, if slider positions are beyond their travel."""
+        for name, position in zip(LEGS, target, strict=True):
+            low, high = self._travel
+            if not low <= position <= high:
+                limit = low if position < low else high
+                text = beyond(f"slider {name}: position", position, limit, "m")
+                raise RefusedError("out_of_workspace", text, slider=name, value=position, limit=limit)
+
+    def lowered(
+        self, velocity: Sequence[float] | None, acceleration: Sequence[float] | None, jerk: Sequence[float] | None
+    ) -> Kinodynamic:
+        """Return the platform's limits with a goal's own in their place. RefusedError where these are not lower."""
+        for name, own, limits in zip(Kinodynamic._fields, (velocity, acceleration, jerk), self._platform, strict=True):
+            for coordinate, value, limit in zip(COORDINATES, own or limits, limits, strict=True):
+                if value > limit:
+                    text = "limits.{} of {} is {}: the robot's limit is {}".format(
+                        name, coordinate, *told_apart(value, limit)
+                    )
+                    raise RefusedError("above_limit", text, value=value, limit=limit)
+        return Kinodynamic(
+            velocity or self._platform.velocity,
+            acceleration or self._platform.acceleration,
+            jerk or self._platform.jerk,
+        )
+
+    def to_pose(
+        self, start: MotionState, target: Sequence[float], speed: float = 1.0, limits: Kinodynamic | None = None
+    ) -> Steps[Plan]:
+        """Plan to rest at a pose, straight in pose space from rest; at `speed` 0.5 it takes twice as long.
+
+        A path that is too fast for a slider or the platform is slowed. Raises RefusedError with slider or coordinate,
+        value and limit where it leaves the workspace, or where it cannot be slowed since it starts in motion.
+        """
+        self.check_pose(target)
+        return (yield from self._to_rest(start, start, target, limits or self._platform, speed))
+
+    def to_sliders(self, start: MotionState, target: Sequence[float], speed: float = 1.0) -> Steps[Plan]:
+        """Plan to rest at slider positions, straight in slider space from rest; as to_pose otherwise."""
+        self.check_sliders(target)
+        rows = np.zeros((6, 3))
+        inverse_into(self._legs, np.array(start), rows)
+        sliders = MotionState(*rows[:3].tolist())
+        return (yield from self._to_rest(start, sliders, target, self._sliders, speed, in_sliders=True))
+
+    def jog(self, start: MotionState, velocity: Sequence[float], timeout: float) -> Steps[Plan]:
+        """Plan to a velocity, held until `timeout` is surely over or a limit comes near, and to rest.
+
+        `timeout` is real time, and time along the path runs at up to twice its rate: who ends the jog is the control.
+        Faster than platform or sliders may: as fast as they may. Raises RefusedError where not even braking stays
+        inside.
+        """
+        share, hold, bound = 1.0, FASTEST_OVERRIDE * timeout, None
+        for value, limit in zip(velocity, self._platform.velocity, strict=True):
+            if abs(value) * share > limit:
+                share = limit / abs(value)
+        for _ in range(JOGS):
+            ramp, brake, path = self._jog(start, [share * value for value in velocity], hold)
+            found = self._checker.look(path, constant(1.0), 0.0, path.duration, start.pose)
+            if found.fits or (found.bearable and not start.at_rest):
+                return Plan(path, 1.0 / share, bound)
+            if math.isnan(found.beyond):
+                share *= ROOM / found.excess
+                yield
+                continue
+            bound = self._checker.bound(path, found.beyond, start.pose)
+            if hold > 0.0:
+                hold = max(0.0, found.beyond - ramp - brake)  # to rest where it would have been out of reach
+            else:
+                share /= 2.0
+            yield
+        path = self._to_velocity(start, STILL, self._platform)
+        if not self._checker.bears((yield from self._checker.whole(path, start.pose))):
+            raise TOO_FAST_IN_MOTION
+        return Plan(path, bound=bound)
+
+    def follow(self, start: MotionState, points: Sequence[Point], stretch: bool) -> Steps[Plan]:
+        """Take timed points for a path, quintic between them. Raises RefusedError.
+
+        Too fast is refused, or slowed with `stretch`.
+        """
+        _check_ends(points, start)
+        path = quintic(points, start.pose)
+        yield
+        worst = yield from self._checker.whole(path, start.pose)
+        slower = excess(worst)
+        if slower <= 1.0:
+            return Plan(path)
+        if not stretch:
+            raise RefusedError(
+                "too_fast",
+                f"the trajectory is {slower:.3g} times too fast for {fastest(worst)}: "
+                f'let it take {slower * path.duration:.3g} s, or send it with "stretch": true',
+                value=slower,
+                limit=1.0,
+            )
+        yield
+        path, slower = yield from self._slowed(path, slower, start.pose)
+        return Plan(path, slower)
+
+    def nearness(self, pose: Sequence[float], target: Sequence[float]) -> float:
+        """Return how far a point of the platform is at most from where it is to be [m]."""
+        x, y, phi = (here - there for here, there in zip(pose, target, strict=True))
+        return math.hypot(x, y) + self._reach * abs(phi)
+
+    # ------------------------------------------------------------------ inside
+
+    def _to_rest(
+        self,
+        start: MotionState,
+        begin: MotionState,
+        target: Sequence[float],
+        limits: Kinodynamic,
+        speed: float,
+        in_sliders: bool = False,
+    ) -> Steps[Plan]:
+        """Plan from `begin`, the platform's motion `start` or that of the sliders."""
+        if start.at_rest:
+            path = self._solve(begin, limits, in_sliders, target=target)
+            slower = max(1.0 / speed, excess((yield from self._checker.whole(path, start.pose))))
+            if slower > 1.0:
+                yield
+                path, slower = yield from self._slowed(path, slower, start.pose)
+            return Plan(path, slower * speed)
+        shares = np.full(3, speed)
+        for _ in range(TRIES):
+            lower = Kinodynamic(*(np.array(limits) * shares[:, None]).tolist())
+            path = self._solve(begin, lower, in_sliders, target=target)
+            worst = yield from self._checker.whole(path, start.pose)
+            if self._checker.bears(worst):
+                return Plan(path, speed / float(shares.min()))
+            shares = shares * np.clip(ROOM / worst.max(axis=0), GENTLEST, 1.0)
+            yield
+        raise TOO_FAST_IN_MOTION
+
+    def _slowed(self, path: Path, factor: float, pose: Sequence[float]) -> Steps[tuple[Path, float]]:
+        """Return a path, so many times slower or as many more as it takes to fit, and how many that is.
+
+        Slower it is not the same motion: what was over within a step, as a short jerk, lasts longer.
+        """
+        for _ in range(LOOKS):
+            slow = stretched(path, factor)
+            found = excess((yield from self._checker.whole(slow, pose)))
+            if found <= 1.0:
+                return slow, factor
+            factor *= found * A_HAIR_MORE
+            yield
+        raise RefusedError("too_fast", f"the path does not fit its limits even {factor:.3g} times slower")
+
+    def _jog(self, start: MotionState, velocity: Sequence[float], hold: float) -> tuple[float, float, Path]:
+        """Return how long it takes to reach a velocity, and to brake from it, and the whole path."""
+        ramp = self._to_velocity(start, velocity, self._platform)
+        if not any(velocity):
+            return ramp.duration, 0.0, ramp
+        pose = _end(ramp)
+        held = np.zeros((1, 3, 6))
+        held[0, :, 0], held[0, :, 1] = pose, velocity
+        hold = max(hold, self._period)
+        end = [value + hold * rate for value, rate in zip(pose, velocity, strict=True)]
+        brake = self._to_velocity(MotionState(end, velocity, STILL), STILL, self._platform)
+        return ramp.duration, brake.duration, joined([ramp, Path(np.array([0.0, hold]), held), brake])
+
+    def _to_velocity(self, start: MotionState, velocity: Sequence[float], limits: Kinodynamic) -> Path:
+        return self._solve(start, limits, velocity=velocity)
+
+    def _solve(
+        self,
+        start: MotionState,
+        limits: Kinodynamic,
+        in_sliders: bool = False,
+        *,
+        target: Sequence[float] | None = None,
+        velocity: Sequence[float] | None = None,
+    ) -> Path:
+        """Ask Ruckig for the way to rest at a target, or to a velocity."""
+        request, trajectory = InputParameter(3), Trajectory(3)
+        request.current_position = list(start.pose)
+        request.current_velocity = list(start.velocity)
+        request.current_acceleration = list(start.acceleration)
+        request.max_velocity = list(limits.velocity)
+        request.max_acceleration = list(limits.acceleration)
+        request.synchronization = Synchronization.Phase
+        if target is not None:
+            request.target_position = list(target)
+        if velocity is not None:
+            request.control_interface = ControlInterface.Velocity
+            request.target_velocity = list(velocity)
+        for share in JERK_SHARES:
+            request.max_jerk = [share * limit for limit in limits.jerk]
+            if solved(self._ruckig, request, trajectory):
+                return from_ruckig(trajectory, in_sliders)
+        raise RefusedError("no_plan", "no motion leads there from the present one: send the goal again when it holds")
+
+
+def _check_ends(points: Sequence[Point], start: MotionState) -> None:
+    """Raise RefusedError where points do not begin as the robot stands, or do not end at rest.
+
+    What they begin or end with of an acceleration counts as the jerk over one cycle that it is (Checker.look).
+    """
+    if not start.at_rest:
+        raise RefusedError("wrong_start", "the robot moves: send the trajectory when it stands")
+    for name, given, stands in zip(COORDINATES, points[0].pose, start.pose, strict=True):
+        if abs(given - stands) > START:
+            text = "the trajectory begins at {} = {}, the robot is at {}: go there first".format(
+                name, *told_apart(given, stands)
+            )
+            raise RefusedError("wrong_start", text, value=given, limit=stands)
+    ends = (
+        ("wrong_start", "begins", "let it begin at rest, as the robot stands", points[0]),
+        ("wrong_end", "ends", "let it end at rest", points[-1]),
+    )
+    for code, does, remedy, point in ends:
+        for name, unit, value in zip(COORDINATES, ("m/s", "m/s", "rad/s"), point.velocity or STILL, strict=True):
+            if abs(value) > STANDS:
+                text = f"the trajectory {does} with {value:.6g} {unit} in {name}: {remedy}"
+                raise RefusedError(code, text, value=value, limit=0.0)
+
+
+def _end(path: Path) -> Array:
+    """Return where a path ends."""
+    last: Array = path.pieces[-1] @ (path.knots[-1] - path.knots[-2]) ** np.arange(6.0)
+    return last

@@ -1,0 +1,54 @@
+"""Timed points joined by quintics: a path that meets position, velocity and acceleration at each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from trirail.kinematics.algebra import Array
+from trirail.motion.paths import Path
+
+
+class Point(NamedTuple):
+    """A point of a timed trajectory: when [s], and where, how fast and how accelerated the platform is."""
+
+    t: float
+    pose: Sequence[float]
+    velocity: Sequence[float] | None = None
+    acceleration: Sequence[float] | None = None
+
+
+def quintic(points: Sequence[Point], start: Sequence[float]) -> Path:
+    """Join points into a path from standstill at the pose `start` to standstill.
+
+    Velocities that are not given are those between the neighbours, accelerations likewise; these are zero at the ends.
+    """
+    t = np.array([point.t for point in points])
+    p = np.array([point.pose for point in points])
+    p[0] = start
+    v = _filled([point.velocity for point in points], t, p)
+    v[0] = v[-1] = 0.0
+    a = _filled([point.acceleration for point in points], t, v)
+    h = np.diff(t)[:, None]
+    gap = p[1:] - p[:-1] - h * v[:-1] - h**2 / 2.0 * a[:-1]
+    speed = v[1:] - v[:-1] - h * a[:-1]
+    pull = a[1:] - a[:-1]
+    pieces = np.zeros((len(points) - 1, 3, 6))
+    pieces[:, :, 0], pieces[:, :, 1], pieces[:, :, 2] = p[:-1], v[:-1], a[:-1] / 2.0
+    pieces[:, :, 3] = 10.0 * gap / h**3 - 4.0 * speed / h**2 + pull / (2.0 * h)
+    pieces[:, :, 4] = -15.0 * gap / h**4 + 7.0 * speed / h**3 - pull / h**2
+    pieces[:, :, 5] = 6.0 * gap / h**5 - 3.0 * speed / h**4 + pull / (2.0 * h**3)
+    return Path(t - t[0], pieces)
+
+
+def _filled(given: Sequence[Sequence[float] | None], t: Array, values: Array) -> Array:
+    """Return the derivatives at points, those between their neighbours where none are given, none at the ends."""
+    rates = np.zeros_like(values)
+    if len(t) > 2:
+        rates[1:-1] = (values[2:] - values[:-2]) / (t[2:] - t[:-2])[:, None]
+    for row, rate in enumerate(given):
+        if rate is not None:
+            rates[row] = rate
+    return rates

@@ -1,0 +1,356 @@
+"""The gateway's process: Zenoh on one side, the loop on the other. It checks and translates; it decides nothing."""
+
+from __future__ import annotations
+
+import math
+import select
+import signal
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import zenoh
+from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_advanced_publisher
+
+from trirail import __version__
+from trirail.config import Config, geometry
+from trirail.errors import RefusedError
+from trirail.processes.heartbeats import BEAT_EVERY
+from trirail.processes.inbox import Inbox, Incoming
+from trirail.processes.lastwords import LastWords
+from trirail.processes.replies import Replies
+from trirail.processes.state import StateMaker
+from trirail.telemetry.provenance import versions
+from trirail.wire import boundary, session
+from trirail.wire.links import Closed, Link
+from trirail.wire.messages import CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
+from trirail.wire.packets import (
+    Accepted,
+    Answer,
+    CommandRequest,
+    Confirmed,
+    GoalRequest,
+    Happened,
+    Kind,
+    Refused,
+    RefusedRequest,
+    Situation,
+    Welcome,
+    decode_answer,
+    message,
+)
+from trirail.wire.records import unpack
+from trirail.wire.sizes import MAX_UNREAD
+from trirail.wire.text import is_name, quoted
+from trirail.wire.vocabulary import Mode
+
+COMMANDS = ("enable", "disable", "stop", "quick_stop", "reset", "home", "pause", "resume", "override")
+CONTENT: dict[str, tuple[Any, str]] = {
+    "override": (Override, 'override takes {"percent": 0, or 1 to 200}'),
+    "stop": (Stop | None, 'stop takes nothing, or {"goal": id}'),
+}
+"""What commands may carry; the others carry nothing."""
+STOPPING = ("stop", "disable", "quick_stop", "pause")
+AT_ONCE = 256
+"""Messages from Zenoh that are read before the loop is listened to again."""
+BACKLOG = 5_000
+"""Goals that may wait for those before them; beyond that they are refused."""
+PATIENCE = 8.0
+"""A goal that has waited longer for those before it does not begin any more: its sender gives up soon [s]."""
+AHEAD = 2
+"""Goals that the loop has at once, so that it has the next one when it is done with the last. The others wait here:
+a command overtakes them, and what waits when the robot is told to stop does not begin any more."""
+UNDER_WAY = 32
+"""Commands that the loop has at once; beyond that they are refused, but for those that stop the robot."""
+EVENTS_KEPT = 1000
+REPLY_WITHIN = 15.0
+"""A command that the loop has not carried out by then is answered with an error [s]."""
+_PAST = RepliesConfig(
+    priority=zenoh.Priority.BACKGROUND, congestion_control=zenoh.CongestionControl.BLOCK, express=False
+)
+REFUSALS_PER_SECOND = 10
+"""Unreadable goals that are told to everyone; the others only get their error reply."""
+
+
+class _Waiting(NamedTuple):
+    incoming: Incoming
+    deadline: float
+
+
+class Gateway:
+    """Takes requests from Zenoh, passes them to the loop, and answers and publishes what the loop says."""
+
+    def __init__(self, config: Config, link: Link, beat: Callable[[], None], opened: zenoh.Session) -> None:
+        self._robot = config.robot.name
+        homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
+        self._home_within = REPLY_WITHIN + sum(homing)
+        self._link = link
+        self._beat = beat
+        self._last_words = LastWords(config.period)
+        self._session = opened
+        self._info = _info(config)
+        self._states = StateMaker(config)
+        self._state_every = 1.0 / config.telemetry.state_hz
+        self._state_due = 0.0
+        self._replies = Replies(self._robot)
+        self._inbox = Inbox(opened, self._robot, self._too_much)
+        self._backlog: deque[tuple[Incoming, GoalRequest]] = deque()
+        self._backlog_bytes = 0
+        self._ahead: set[int] = set()
+        self._commands: set[int] = set()
+        self._waiting: dict[int, _Waiting] = {}
+        self._tickets = 0
+        self._refusals = 0
+        self._refusals_since = 0.0
+        self._ending = False
+        self._state = opened.declare_publisher(
+            self._key("state"),
+            encoding=boundary.JSON,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_HIGH,
+        )
+        self._records = opened.declare_publisher(
+            self._key("records"),
+            encoding=boundary.BINARY,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_LOW,
+        )
+        self._event = declare_advanced_publisher(
+            opened,
+            self._key("event"),
+            encoding=boundary.JSON,
+            # The past goes out in one burst, whole, in a queue of its own: who is slow to take it delays nothing else.
+            cache=CacheConfig(max_samples=EVENTS_KEPT, replies_config=_PAST),
+            sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+            publisher_detection=True,
+        )
+
+    def serve(self, ready: Callable[[], None]) -> None:
+        """Serve until told to end or the loop has gone; `ready` is called once the loop has said welcome."""
+        poll = select.poll()
+        poll.register(self._link.fileno(), select.POLLIN)
+        poll.register(self._inbox.fileno(), select.POLLIN)
+        try:
+            while not self._ending:
+                self._beat()
+                poll.poll(BEAT_EVERY * 1e3)
+                for incoming in self._inbox.take(AT_ONCE):
+                    self._beat()
+                    self._handle(incoming)
+                while (packet := self._link.receive()) is not None:
+                    self._beat()
+                    self._last_words.heard()
+                    self._hear(packet, ready)
+                self._give_up_late()
+        except Closed:
+            self._tell_of_its_end()
+        finally:
+            for incoming in [
+                *(waiting.incoming for waiting in self._waiting.values()),
+                *(goal[0] for goal in self._backlog),
+            ]:
+                self._replies.send(incoming, ErrorReply("ended", "the service has ended"))
+            self._replies.close()
+
+    def end(self) -> None:
+        """End soon; safe from a signal handler."""
+        self._ending = True
+        self._inbox.wake()
+
+    # ------------------------------------------------------------------ Zenoh to loop
+
+    def _handle(self, incoming: Incoming) -> None:
+        """Take a message; whatever is wrong with it is answered, and told to everyone, since a put has no answer."""
+        try:
+            boundary.check_size(incoming.size)
+            if incoming.kind == "info":
+                self._replies.send(incoming, self._info)
+            elif incoming.kind == "goal":
+                self._goal(incoming)
+            else:
+                self._command(incoming)
+        except RefusedError as refusal:
+            self._refuse(incoming, refusal)
+        except Closed:
+            raise
+        except Exception as error:  # noqa: BLE001 - a message that is read wrongly must not end the gateway
+            self._refuse(incoming, RefusedError("internal", f"internal error, please report it: {error!r}"))
+
+    def _goal(self, incoming: Incoming) -> None:
+        (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
+        goal: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
+        if len(self._backlog) >= BACKLOG or self._backlog_bytes + incoming.size > MAX_UNREAD:
+            raise RefusedError("busy", f"{len(self._backlog)} goals are waiting already: send fewer")
+        self._tickets += 1
+        goal_id = goal.id or uuid.uuid4().hex[:12]
+        request = GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns())
+        self._backlog.append((incoming._replace(payload=b""), request))
+        self._backlog_bytes += incoming.size
+        self._send_goals()
+
+    def _send_goals(self) -> None:
+        """Pass on as many goals as the loop is to have."""
+        while self._backlog and len(self._ahead) < AHEAD:
+            incoming, request = self._backlog[0]
+            if time.monotonic_ns() - request.received_ns > PATIENCE * 1e9 and request.withdrawn is None:
+                reason = f"too many goals before it: it has waited longer than {PATIENCE:g} s"
+                request = msgspec.structs.replace(request, withdrawn=reason)
+            if not self._link.send(message(request)):
+                return
+            self._backlog.popleft()
+            self._backlog_bytes -= incoming.size
+            self._ahead.add(request.ticket)
+            self._last_words.take(request)
+            self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
+
+    def _command(self, incoming: Incoming) -> None:
+        user, name = boundary.names(incoming.key, self._key("cmd"), ("user", "command"))
+        if name not in COMMANDS:
+            raise RefusedError("unknown_command", f"{quoted(name)}: no such command; there are {', '.join(COMMANDS)}")
+        kind, takes = CONTENT.get(name, (NoContent | None, f"{name} takes no content"))
+        content = boundary.decode(incoming.payload, kind, takes, incoming.encoding)
+        share = content.percent / 100.0 if isinstance(content, Override) else None
+        goal = content.goal if isinstance(content, Stop) else None
+        reason = f"{name} by {user}"
+        if goal is not None and self._withdraw(incoming, goal, reason):
+            return
+        if len(self._commands) >= UNDER_WAY and name not in STOPPING:
+            raise RefusedError("busy", f"{len(self._commands)} commands are under way already: send fewer")
+        self._tickets += 1
+        if not self._link.send(message(CommandRequest(self._tickets, user, name, share, goal))):
+            raise RefusedError("busy", "too many requests at once: send it again")
+        self._commands.add(self._tickets)
+        within = self._home_within if name == "home" else REPLY_WITHIN
+        self._waiting[self._tickets] = _Waiting(incoming, time.monotonic() + within)
+        if name in STOPPING and goal is None:
+            replace = msgspec.structs.replace
+            self._backlog = deque((waiting, replace(request, withdrawn=reason)) for waiting, request in self._backlog)
+
+    def _withdraw(self, incoming: Incoming, goal_id: str, reason: str) -> bool:
+        """Stop a goal that waits here, before the loop has it; whether there is one."""
+        for number, (waiting, request) in enumerate(self._backlog):
+            if request.id == goal_id:
+                self._backlog[number] = waiting, msgspec.structs.replace(request, withdrawn=reason)
+                self._replies.send(incoming, CommandReply("stop", self._states.newest().mode))
+                return True
+        return False
+
+    def _too_much(self, incoming: Incoming) -> None:
+        """Answer what there is no room for; called by Zenoh's threads."""
+        self._replies.send(incoming, ErrorReply("busy", "too many messages at once: send fewer"))
+
+    def _refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
+        """Answer what cannot be taken; tell everyone too, since a put has no answer."""
+        text = quoted(str(refusal))
+        self._replies.send(incoming, ErrorReply(refusal.code, text))
+        user, *_ = [*incoming.key.split("/")[3:], ""]
+        self._tell(text, user if is_name(user) else "")
+
+    def _tell(self, text: str, user: str = "") -> None:
+        """Have the loop tell everyone, but not too often."""
+        now = time.monotonic()
+        if now - self._refusals_since >= 1.0:
+            self._refusals, self._refusals_since = 0, now
+        self._refusals += 1
+        if self._refusals <= REFUSALS_PER_SECOND:
+            self._link.send(message(RefusedRequest(user, text)))
+
+    # ------------------------------------------------------------------ loop to Zenoh
+
+    def _hear(self, packet: bytes, ready: Callable[[], None]) -> None:
+        """Take a packet of the loop's."""
+        content = memoryview(packet)[1:]
+        try:
+            if packet[0] == Kind.RECORDS:
+                self._publish(content)
+                return
+            answer = decode_answer(content)
+            self._take(answer)
+        except Closed:
+            raise
+        except Exception as error:  # noqa: BLE001 - it would come again after every restart
+            self._tell(quoted(f"the gateway could not read what the loop said, please report it: {error!r}"))
+            return
+        if isinstance(answer, Welcome):
+            self._inbox.declare()
+            ready()
+
+    def _take(self, answer: Answer) -> None:
+        self._last_words.take(answer)
+        match answer:
+            case Happened(event):
+                self._event.put(msgspec.json.encode(event))
+            case Situation() | Welcome():
+                self._states.update(answer)
+            case Accepted(ticket, goal_id, duration, slowed, stops_first, queued):
+                expected = duration if math.isfinite(duration) else None
+                self._answer(ticket, GoalReply(goal_id, expected, slowed, stops_first, queued))
+            case Confirmed(ticket, name, mode):
+                self._answer(ticket, CommandReply(name, mode))
+            case Refused(ticket, code, text, slider, value, limit):
+                self._answer(ticket, ErrorReply(code, text, slider, value, limit))
+
+    def _publish(self, batch: memoryview) -> None:
+        """Take in a batch of records and pass it on; publish the newest state when it is time."""
+        self._records.put(bytes(batch))
+        self._states.records(unpack(batch))
+        now = time.monotonic()
+        if now >= self._state_due:
+            self._state_due = max(self._state_due + self._state_every, now)
+            self._state.put(msgspec.json.encode(self._states.newest()))
+
+    def _tell_of_its_end(self) -> None:
+        """The loop has gone: where it has died, tell everyone in its place."""
+        for event in self._last_words.events(self._states.cycle):
+            self._event.put(msgspec.json.encode(event))
+        if (reason := self._last_words.reason) and self._states.cycle:
+            state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason,))
+            self._state.put(msgspec.json.encode(state))
+
+    def _answer(self, ticket: int, content: msgspec.Struct) -> None:
+        waiting = self._waiting.pop(ticket, None)
+        self._commands.discard(ticket)
+        if waiting is not None:
+            self._replies.send(waiting.incoming, content)
+        if ticket in self._ahead:
+            self._ahead.discard(ticket)
+            self._send_goals()
+
+    def _give_up_late(self) -> None:
+        now = time.monotonic()
+        for ticket in [ticket for ticket, waiting in self._waiting.items() if waiting.deadline < now]:
+            self._answer(ticket, ErrorReply("timeout", "not carried out in time"))
+
+    def _key(self, *parts: str) -> str:
+        return session.key(self._robot, *parts)
+
+
+def _info(config: Config) -> Info:
+    live = config.telemetry.live_port
+    legs: list[dict[str, Any]] = []
+    for name, leg in zip("ABC", geometry(config.geometry).legs, strict=True):
+        legs.append({"name": name} | {field: getattr(leg, field) for field in leg.__slots__})
+    return Info(
+        robot=config.robot.name,
+        version=__version__,
+        geometry=tuple(legs),
+        limits=msgspec.to_builtins(config.limits),
+        rate_hz=config.loop.rate_hz,
+        state_hz=config.telemetry.state_hz,
+        recordings=str(Path(config.telemetry.directory).resolve()),
+        live=f"rerun+http://127.0.0.1:{live}/proxy" if live else "",
+        versions=versions(),
+    )
+
+
+def main(config: Config, link: Link, beat: Callable[[], None], ready: Callable[[object], None]) -> int:
+    """Run the gateway's process; `ready` is called once it can be reached."""
+    with session.open_service(config.zenoh.listen) as opened:
+        gateway = Gateway(config, link, beat, opened)
+        signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
+        gateway.serve(lambda: ready({}))
+    return 0

@@ -1,0 +1,75 @@
+"""What each child process of the service begins with: `trirail.processes.process NAME RUNTIME READY BEATS [SOCKETS…]`.
+
+Its order comes on standard input; READY is a descriptor on which the process says, once, that it is up;
+BEATS that of the heartbeats.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from trirail.config import Config
+from trirail.errors import TrirailError
+from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.realtime import die_with_parent
+from trirail.wire import links
+
+
+class Order(msgspec.Struct, frozen=True):
+    """What a child process is told to do."""
+
+    config: Config
+    record: str | None
+    """Recording file to write, None for one named by the time."""
+
+
+def _main(name: str, runtime: Path, heartbeats: Heartbeats, ready: Callable[[object], None], sockets: list[int]) -> int:
+    order = msgspec.json.decode(sys.stdin.buffer.read(), type=Order)
+    config = order.config
+    # Each process imports what it needs and no more: the loop must not load Zenoh or Rerun.
+    if name == "loop":
+        from trirail.processes import loop
+
+        gateway, recorder = (links.Port(socket.socket(fileno=number)) for number in sockets)
+        return loop.main(config, gateway, recorder, heartbeats, ready)
+    link = links.connect(runtime / name)
+    if name == "gateway":
+        from trirail.processes import gateway as gate
+
+        return gate.main(config, link, heartbeats.of("gateway").beat, ready)
+    from trirail.processes import recording
+
+    return recording.main(config, order.record, link, ready)
+
+
+def main() -> int:
+    """Run one child process; return its exit code."""
+    name, runtime, descriptor, beats, *sockets = sys.argv[1:]
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends it to all; the supervisor alone acts on it
+    if name == "loop":
+        # The others end by themselves once it has gone, so that what it says of its end is published and on disk.
+        die_with_parent(signal.SIGTERM)
+
+    def ready(content: object) -> None:
+        # The descriptor stays open: its end is how the supervisor learns of this process's end.
+        os.write(int(descriptor), msgspec.json.encode(content))
+
+    try:
+        return _main(name, Path(runtime), Heartbeats(int(beats)), ready, [int(number) for number in sockets])
+    except TrirailError as error:
+        print(f"trirail: {error}", file=sys.stderr, flush=True)  # noqa: T201 - a process says why it ends
+        return os.EX_CONFIG
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stderr.flush()
+    # Everything is closed by now. Rerun's file sink, when a disk has failed it, would keep the interpreter from ending.
+    os._exit(code)

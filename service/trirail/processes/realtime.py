@@ -1,0 +1,81 @@
+"""The loop's rights: real-time scheduling, locked memory, its own processor, no garbage collector in its way."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import struct
+from collections.abc import Callable
+
+from trirail.config import Loop
+from trirail.errors import ServiceError
+
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def _call(name: str, *arguments: int) -> None:
+    if getattr(_libc, name)(*arguments) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+def die_with_parent(signal_number: int) -> None:
+    """Have the kernel send this process `signal_number` when its parent ends, however that ends."""
+    _call("prctl", _PR_SET_PDEATHSIG, signal_number)
+
+
+def _fifo(loop: Loop) -> None:
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(loop.priority))
+
+
+def _lock_memory(_: Loop) -> None:
+    _call("mlockall", _MCL_CURRENT | _MCL_FUTURE)
+
+
+def _pin(loop: Loop) -> None:
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0)) if loop.cpu is None else loop.cpu})
+
+
+def _stay_awake(_: Loop) -> None:
+    # Documentation/power/pm_qos_interface: the request holds for as long as the file stays open.
+    handle = os.open("/dev/cpu_dma_latency", os.O_WRONLY | os.O_CLOEXEC)
+    os.write(handle, struct.pack("i", 0))
+
+
+_MEASURES: tuple[tuple[str, Callable[[Loop], None], str], ...] = (
+    ("SCHED_FIFO", _fifo, "run as root, or allow it: systemd LimitRTPRIO=99, or rtprio in limits.conf"),
+    (
+        "locked memory",
+        _lock_memory,
+        "run as root, or allow it: systemd LimitMEMLOCK=infinity, or memlock in limits.conf",
+    ),
+    ("pinned processor", _pin, "name a processor that this process may use in loop.cpu"),
+)
+
+
+def acquire(loop: Loop) -> tuple[str, ...]:
+    """Take every measure that the configuration asks for; return those that failed, each with its remedy.
+
+    Raises ServiceError with `realtime = "enforce"` where one of them is missing.
+    """
+    _call("prctl", _PR_SET_TIMERSLACK, 1)  # 50 µs by default for tasks that are not real-time
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    if loop.realtime == "off":
+        return ('real-time scheduling: switched off by loop.realtime = "off"',)
+    lacking = []
+    for name, measure, remedy in _MEASURES:
+        try:
+            measure(loop)
+        except OSError as error:
+            lacking.append(f"{name}: {error.strerror}; {remedy}")
+    if lacking and loop.realtime == "enforce":
+        raise ServiceError('loop.realtime = "enforce", but this process lacks ' + "; ".join(lacking))
+    if os.path.exists("/dev/cpu_dma_latency") and os.access("/dev/cpu_dma_latency", os.W_OK):
+        _stay_awake(loop)
+    return tuple(lacking)

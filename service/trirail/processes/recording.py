@@ -1,0 +1,120 @@
+"""The recorder's process: takes what the loop sends and gives it to the recorder and to the black box."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from trirail.config import Config
+from trirail.processes.lastwords import LastWords
+from trirail.telemetry.blackbox import BlackBox
+from trirail.telemetry.recorder import Recorder
+from trirail.wire.links import Closed, Link
+from trirail.wire.messages import Level
+from trirail.wire.packets import Answer, Happened, Input, Kind, Remark, Situation, Welcome, decode_answer, message
+from trirail.wire.records import last_cycle
+
+GATHER = 0.14
+"""How long to let packets gather before they are taken: to wake for each costs more than what is in it [s].
+
+A killed recorder loses what it has not written: that much, and the batch that the loop holds. It is less than 0.2 s.
+"""
+
+
+class Intake:
+    """Takes the loop's packets to the recorder and the black box, and tells the loop what it should know."""
+
+    def __init__(self, config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> None:
+        self._link = link
+        self._ready = ready
+        self._cycle = 0
+        self._last_words = LastWords(config.period)
+        path = Path(record) if record else None
+        self.recorder = recorder = Recorder(config, Path(config.telemetry.directory), path=path, warn=self._warn)
+        folder = recorder.path.parent
+        self._box = BlackBox(
+            config.loop.rate_hz, lambda name: Recorder(config, folder, name=name, live=False), self._warn
+        )
+
+    def take(self, packet: bytes) -> None:
+        """Take a packet."""
+        self._last_words.heard()
+        content = packet[1:]
+        if packet[0] == Kind.RECORDS:
+            self._cycle = last_cycle(content)
+            self.recorder.records(content)
+            self._box.records(content)
+        elif packet[0] == Kind.FRAMES:
+            self.recorder.frames(content)
+        else:
+            self._hear(decode_answer(content))
+
+    def loop_gone(self) -> None:
+        """The loop has gone: where it has died, keep what it can no longer say."""
+        for event in self._last_words.events(self._cycle):
+            self._hear(Happened(event))
+
+    def close(self) -> None:
+        """Complete all files."""
+        self.recorder.close()
+        self._box.close()
+
+    def _hear(self, said: Answer) -> None:
+        recorder, box = self.recorder, self._box
+        self._last_words.take(said)
+        match said:
+            case Happened(event):
+                recorder.event(event)
+                box.event(event)
+            case Input():
+                recorder.given(said)
+                box.given(said)
+            case Situation():
+                recorder.target(said.target)
+                box.stands("target", said.target)
+            case Welcome():
+                recorder.bus_load(said.bus_load)
+                box.stands("bus_load", said.bus_load)
+                self._tell("info", f"recording to {recorder.path}")
+                self._ready({"recording": str(recorder.path), "live": recorder.live_url})
+
+    def _warn(self, words: str) -> None:
+        """Say it in the service's log, and to everyone."""
+        print(f"trirail: recorder: {words}", file=sys.stderr, flush=True)  # noqa: T201 - the log
+        self._tell("warning", words)
+
+    def _tell(self, level: Level, words: str) -> None:
+        """Have the loop tell everyone."""
+        with contextlib.suppress(Closed):  # then nobody is left to be told
+            self._link.send(message(Remark(level, words)))
+
+
+def main(config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> int:
+    """Record until the loop has gone or the process is told to end."""
+    intake = Intake(config, record, link, ready)
+    ending = False
+
+    def end(_signal: int, _frame: object) -> None:
+        nonlocal ending
+        ending = True
+
+    signal.signal(signal.SIGTERM, end)
+    poll = select.poll()
+    poll.register(link.fileno(), select.POLLIN)
+    try:
+        while not ending:
+            poll.poll(500)
+            time.sleep(GATHER)
+            while (packet := link.receive()) is not None:
+                intake.take(packet)
+            intake.recorder.save()
+    except Closed:
+        intake.loop_gone()
+    finally:
+        intake.close()
+    return 0

@@ -1,0 +1,142 @@
+"""The published state, made from the loop's records."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from trirail_drivers.interface import PowerState
+
+from trirail.config import Config
+from trirail.wire.messages import Commanded, GoalState, LoopState, Percentiles, Sliders, State, Traffic, Triple
+from trirail.wire.packets import Situation, Welcome
+from trirail.wire.vocabulary import MODES, Mode
+
+WINDOW = 60.0
+"""Span of the timing statistics [s]."""
+
+_ENABLED = [MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING)]
+_NONE = Percentiles(0.0, 0.0, 0.0, 0.0)
+
+
+class StateMaker:
+    """Keeps the newest record and the timing of the last minute."""
+
+    def __init__(self, config: Config) -> None:
+        self._period = config.period
+        self._rate_hz = config.loop.rate_hz
+        self._lateness = _Recent(round(WINDOW / config.period))
+        self._cycle = _Recent(round(WINDOW / config.period))
+        self._statistics = _NONE, _NONE
+        self._statistics_due = 0
+        self._newest: Any = None
+        self._velocity = self._acceleration = np.zeros(3)
+        self._error_max = np.zeros(3)
+        self._welcome = Welcome((), 0.0, 0.0)
+        self._situation = Situation(None, 1.0, None)
+
+    def update(self, news: Situation | Welcome) -> None:
+        """Take in what the loop says beside its records."""
+        if isinstance(news, Welcome):
+            self._welcome = news
+        else:
+            self._situation = news
+
+    def records(self, rows: NDArray[np.void]) -> None:
+        """Take in a batch of records."""
+        newest, before = rows[-1], self._newest
+        if before is not None:
+            # Over a batch and not over a cycle: at 1 kHz a count of the encoder is a large step of velocity.
+            span = (int(newest["cycle"]) - int(before["cycle"])) * self._period
+            velocity = (newest["pose"] - before["pose"]) / span
+            self._acceleration = (velocity - self._velocity) / span
+            self._velocity = velocity
+        self._newest = newest.copy()
+        enabled = rows["following_error"][np.isin(rows["mode"], _ENABLED)]
+        if len(enabled):
+            self._error_max = np.maximum(self._error_max, np.abs(enabled).max(axis=0))
+        self._lateness.extend(rows["lateness_ns"])
+        self._cycle.extend(rows["parts_ns"].sum(axis=1))
+        if newest["cycle"] >= self._statistics_due:
+            self._statistics_due = int(newest["cycle"]) + self._rate_hz
+            self._statistics = self._lateness.percentiles(), self._cycle.percentiles()
+
+    @property
+    def cycle(self) -> int:
+        """Cycle of the newest record; 0 for none."""
+        return 0 if self._newest is None else int(self._newest["cycle"])
+
+    def newest(self) -> State:
+        """Make the state of the newest record."""
+        row = self._newest
+        lateness, cycle = self._statistics
+        goal = self._situation.goal
+        a, b, c = self._situation.counts
+        return State(
+            seq=int(row["cycle"]),
+            t=round(int(row["cycle"]) * self._period, 9),
+            mode=MODES[row["mode"]],
+            pose=_triple(row["pose"]),
+            velocity=_triple(self._velocity),
+            acceleration=_triple(self._acceleration),
+            commanded=Commanded(
+                pose=_triple(row["commanded_pose"]),
+                pose_velocity=_triple(row["commanded_pose_velocity"]),
+                pose_acceleration=_triple(row["commanded_pose_acceleration"]),
+                position=_triple(row["commanded_position"]),
+                velocity=_triple(row["commanded_velocity"]),
+                acceleration=_triple(row["commanded_acceleration"]),
+            ),
+            sliders=Sliders(
+                position=_triple(row["position"]),
+                velocity=_triple(row["velocity"]),
+                following_error=_triple(row["following_error"]),
+                following_error_max=_triple(self._error_max),
+                status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
+                traffic=(Traffic(*a), Traffic(*b), Traffic(*c)),
+            ),
+            goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._situation.target)
+            if goal
+            else None,
+            override=self._situation.override,
+            lease=None,
+            faults=(self._situation.fault,) if self._situation.fault else (),
+            loop=LoopState(
+                rate_hz=self._rate_hz,
+                cycles=int(row["cycle"]),
+                overruns=int(row["overruns"]),
+                lateness_us=lateness,
+                cycle_us=cycle,
+                bus_load=self._welcome.bus_load,
+                bus_load_measured=self._situation.bus_load,
+                lacking=self._welcome.lacking,
+            ),
+        )
+
+
+class _Recent:
+    """The last so many values [ns]."""
+
+    def __init__(self, size: int) -> None:
+        self._values = np.zeros(size, dtype=np.int64)
+        self._next = 0
+        self._full = False
+
+    def extend(self, values: NDArray[np.int64]) -> None:
+        places = (self._next + np.arange(len(values))) % len(self._values)
+        self._values[places] = values
+        self._full = self._full or self._next + len(values) >= len(self._values)
+        self._next = (self._next + len(values)) % len(self._values)
+
+    def percentiles(self) -> Percentiles:
+        values = self._values if self._full else self._values[: self._next]
+        if not len(values):
+            return _NONE
+        p50, p99, p999, most = (np.percentile(values, (50.0, 99.0, 99.9, 100.0)) / 1000.0).tolist()
+        return Percentiles(round(p50, 1), round(p99, 1), round(p999, 1), round(most, 1))
+
+
+def _triple(values: NDArray[np.float64]) -> Triple:
+    x, y, z = values.tolist()
+    return x, y, z

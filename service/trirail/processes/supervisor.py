@@ -1,0 +1,288 @@
+"""`trirail run`: starts the three processes, watches them, restarts those that may be, and ends them in order."""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import structs
+
+from trirail.config import Config
+from trirail.errors import ServiceError
+from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
+from trirail.processes.interpreter import CHILD, python
+from trirail.processes.process import Order
+from trirail.processes.systemd import Watchdog, notify
+from trirail.wire import links
+
+CHILDREN = ("loop", "gateway", "recorder")
+PORTS = ("gateway", "recorder")
+START_WITHIN = 120.0
+"""How long the processes may take to come up; the very first start compiles the kinematics [s]."""
+END_WITHIN = 6.0
+"""How long they may take to end before they are killed [s]."""
+RESTARTS = 5
+"""So many restarts of one process within a minute come at once."""
+TURN = 0.1
+"""How often the supervisor looks whether the others are alive [s]."""
+SILENT = 0.7
+"""A process that should give signs of life and gives none for so long is hung, and is killed [s]."""
+LEAST_CYCLES = 3
+"""So many cycles the loop may take for a sign of life, however long they are."""
+RETRY = 10.0
+"""How long it is waited before any more, for a recorder; the gateway's are the service's end [s]."""
+
+
+class _Child:
+    """A child process, and a pipe on which it says that it is ready and whose end is its end."""
+
+    def __init__(self, name: str, order: bytes, runtime: Path, beats: int, sockets: list[int]) -> None:
+        self.name = name
+        self.began = time.monotonic()
+        self.ready_with: dict[str, Any] | None = None
+        self._hung_for = 0.0
+        self.pipe, write = os.pipe()
+        arguments = [name, str(runtime), str(write), str(beats), *map(str, sockets)]
+        self.process = subprocess.Popen(
+            python("-m", CHILD, *arguments), stdin=subprocess.PIPE, pass_fds=[write, beats, *sockets]
+        )
+        os.close(write)
+        if self.process.stdin is not None:
+            self.process.stdin.write(order)
+            self.process.stdin.close()
+
+    def listen(self) -> bool:
+        """Read what the child says; False once it has ended."""
+        content = os.read(self.pipe, 65_536)
+        if content:
+            self.ready_with = msgspec.json.decode(content)
+        return bool(content)
+
+    def wait(self, deadline: float) -> bool:
+        """Wait for its end until a time of the monotonic clock."""
+        try:
+            self.process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def kill_hung(self, silent: float) -> None:
+        """Kill it for having given no sign of life for so long [s]; SIGTERM would wait, if it is stopped."""
+        self._hung_for = silent
+        self.process.kill()
+
+    @property
+    def how(self) -> str:
+        """How it ended, for people."""
+        code = self.process.returncode
+        if self._hung_for and code == -signal.SIGKILL:
+            return f"no sign of life for {self._hung_for:g} s, so it was killed"
+        if code == 0:
+            return "another process sent it SIGTERM"
+        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+class Supervisor:
+    """Runs the service in the foreground."""
+
+    def __init__(self, config: Config, record: Path | None, say: Callable[[str], None]) -> None:
+        self._orders = dict.fromkeys(CHILDREN, Order(config, None))
+        self._orders["recorder"] = Order(config, str(record) if record else None)
+        self._say = say
+        self._children: dict[str, _Child] = {}
+        self._selector = selectors.DefaultSelector()
+        self._restarts: dict[str, list[float]] = {name: [] for name in CHILDREN}
+        self._due: dict[str, float] = {}
+        self._heartbeats = Heartbeats.create()
+        loop_silent = max(SILENT, LEAST_CYCLES * config.period)
+        self._patience = {"loop": loop_silent, "gateway": max(SILENT, config.watchdogs.gateway_timeout)}
+        self._watches = {
+            name: Watch(self._heartbeats.of(name), round(seconds / TURN)) for name, seconds in self._patience.items()
+        }
+        self._watchdog = Watchdog([self._heartbeats.of(name) for name in PROCESSES])
+        self._next_turn = 0.0
+        self._ending = False
+        self._failed = False
+        self._turned = False
+
+    def run(self, up: Callable[[dict[str, dict[str, Any]]], None]) -> int:
+        """Run until a signal or a process that must not be missing ends it; return the exit code.
+
+        `up` is called once with what each process said when it was ready.
+        """
+        parent = os.environ.get("XDG_RUNTIME_DIR")
+        with tempfile.TemporaryDirectory(prefix="trirail-", dir=parent) as folder, _Signals() as signals:
+            self._runtime = Path(folder)
+            self._listening = [links.listen(self._runtime / name) for name in PORTS]
+            self._selector.register(signals.reader, selectors.EVENT_READ, None)
+            try:
+                for name in CHILDREN:
+                    self._start(name)
+                self._watch(up, signals)
+            finally:
+                self._end()
+                for listening in self._listening:
+                    listening.close()
+        return 1 if self._failed else 0
+
+    def _start(self, name: str) -> None:
+        sockets = [listening.fileno() for listening in self._listening] if name == "loop" else []
+        if name in PROCESSES:
+            self._heartbeats.of(name).rest()
+        beats = self._heartbeats.descriptor
+        child = _Child(name, msgspec.json.encode(self._orders[name]), self._runtime, beats, sockets)
+        self._children[name] = child
+        self._selector.register(child.pipe, selectors.EVENT_READ, child)
+
+    def _watch(self, up: Callable[[dict[str, dict[str, Any]]], None], signals: _Signals) -> None:
+        deadline = time.monotonic() + START_WITHIN
+        is_up = False
+        while not self._ending:
+            heard: list[_Child | None] = [key.data for key, _ in self._selector.select(TURN)]
+            # The loop first: the others end because it has ended, and not by themselves.
+            for child in sorted(heard, key=lambda child: child is not self._children.get("loop")):
+                if child is None:
+                    self._say(f"{signals.take().name}: stopping the robot and disabling the drives")
+                    self._ending = True
+                elif not child.listen() and not self._ending:
+                    self._on_end(child)
+            if self._ending:
+                continue
+            self._start_due()
+            self._look_after()
+            if is_up:
+                self._watchdog.feed()
+                continue
+            ready = {name: child.ready_with for name, child in self._children.items() if child.ready_with is not None}
+            if len(ready) == len(CHILDREN):
+                is_up = True
+                up(ready)
+                notify("READY=1")
+            elif time.monotonic() > deadline:
+                missing = ", ".join(name for name in CHILDREN if name not in ready)
+                raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")
+
+    def _look_after(self) -> None:
+        """Once a turn, kill who should give signs of life and gives none: its end is then dealt with as any other."""
+        now = time.monotonic()
+        if now < self._next_turn:
+            return
+        self._next_turn = now + TURN
+        for child in self._children.values():
+            if child.ready_with is None and now - child.began > START_WITHIN:
+                child.kill_hung(START_WITHIN)
+        for name, watch in self._watches.items():
+            if watch.silent() and name in self._children:
+                self._children[name].kill_hung(self._patience[name])
+
+    def _on_end(self, child: _Child) -> None:
+        """Decide what the end of a process means."""
+        self._forget(child)
+        child.process.wait()
+        if child.name != "loop" and self._loop_is_ending():
+            return  # so it has ended as well, as it should
+        said_why = child.process.returncode == os.EX_CONFIG
+        name, restarts = child.name, self._restarts[child.name]
+        if name == "loop":
+            self._turned = child.ready_with is not None
+            if child.process.returncode == 0:
+                consequence = "it has stopped the robot and disabled the drives"
+            elif self._turned:
+                consequence = "the drives stop by their own watchdogs"
+            else:
+                consequence = "it had not begun"
+            self._fail("" if said_why else f"the loop is dead ({child.how}): {consequence}; ending")
+            return
+        if child.ready_with is None and not restarts:
+            self._fail("" if said_why else f"the {name} could not start ({child.how})")
+            return
+        now = time.monotonic()
+        restarts[:] = [moment for moment in restarts if now - moment < 60.0] + [now]
+        wait = 0.0 if len(restarts) <= RESTARTS else RETRY
+        if wait and name == "gateway":
+            self._fail(f"the gateway keeps dying ({child.how}): ending the service")
+            return
+        consequence = "the loop stops the robot and holds" if name == "gateway" else "the robot is not affected"
+        when = f" in {wait:g} s" if wait else ""
+        self._say(f"the {name} has died ({child.how}): {consequence}; starting it again{when}")
+        self._orders[name] = structs.replace(self._orders[name], record=None)  # never over the first recording
+        self._due[name] = now + wait
+
+    def _loop_is_ending(self) -> bool:
+        """Whether the loop has turned and does not any more: its end is what is told, and not that of the others."""
+        loop = self._children.get("loop")
+        return loop is None or (loop.ready_with is not None and not self._heartbeats.of("loop").count)
+
+    def _start_due(self) -> None:
+        """Start again what is due."""
+        for name in [name for name, due in self._due.items() if due <= time.monotonic()]:
+            del self._due[name]
+            self._start(name)
+
+    def _fail(self, reason: str) -> None:
+        self._failed = self._ending = True
+        if reason:
+            self._say(reason)
+
+    def _forget(self, child: _Child) -> None:
+        self._selector.unregister(child.pipe)
+        os.close(child.pipe)
+        del self._children[child.name]
+
+    def _end(self) -> None:
+        """End the loop first, so that the others can tell of it; then those."""
+        notify("STOPPING=1")
+        if loop := self._children.get("loop"):
+            loop.process.send_signal(signal.SIGTERM)
+            if not loop.wait(time.monotonic() + END_WITHIN):
+                self._kill(loop)
+            self._turned = self._turned or loop.ready_with is not None
+        # The others end by themselves once the loop has gone and what it said is published and on disk; one that has
+        # never turned has said nothing.
+        by_itself = time.monotonic() + (END_WITHIN if self._turned else 0.0)
+        asked = by_itself + END_WITHIN
+        for child in list(self._children.values()):
+            if not child.wait(by_itself):
+                child.process.send_signal(signal.SIGTERM)
+        for child in list(self._children.values()):
+            if not child.wait(asked):
+                self._kill(child)
+            self._failed = self._failed or child.process.returncode != 0
+            self._forget(child)
+
+    def _kill(self, child: _Child) -> None:
+        self._say(f"the {child.name} does not end: killing it")
+        child.process.kill()
+        child.process.wait()
+
+
+class _Signals:
+    """SIGTERM and SIGINT as something to select on."""
+
+    def __enter__(self) -> _Signals:
+        self.reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        self._before = {
+            number: signal.signal(number, lambda _signal, _frame: None) for number in (signal.SIGTERM, signal.SIGINT)
+        }
+        self._wakeup = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        return self
+
+    def take(self) -> signal.Signals:
+        return signal.Signals(self.reader.recv(1)[0])
+
+    def __exit__(self, *_: object) -> None:
+        signal.set_wakeup_fd(self._wakeup)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self.reader.close()
+        self._writer.close()

@@ -1,0 +1,122 @@
+"""The curves that people see, in millimetres, degrees and microseconds, and the limits drawn beside them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trirail.config import Range
+from trirail.kinematics.geometry import LEGS
+from trirail.telemetry import palette
+from trirail.telemetry.palette import Colour
+from trirail.telemetry.subject import Subject
+
+POSITION, VELOCITY, ACCELERATION = "/sliders/position", "/sliders/velocity", "/sliders/acceleration"
+ERROR = "/sliders/following_error"
+CENTRE, PHI, SINGULARITY = "/pose/centre", "/pose/phi", "/pose/singularity"
+TIMING = "/loop/timing"
+
+NEAR = 0.1
+"""The limits of the following error are drawn where it reaches this share of them: else they would flatten it."""
+
+
+class Line(NamedTuple):
+    """A line that moves."""
+
+    name: str
+    colour: Colour
+
+
+class Limit(NamedTuple):
+    """A line that stands still."""
+
+    name: str
+    value: float
+    colour: Colour = palette.LIMIT
+
+
+class Lines(NamedTuple):
+    """The lines of one plot."""
+
+    moving: tuple[Line, ...]
+    still: tuple[Limit, ...] = ()
+    near: float = 0.0
+    """Limits are drawn only where a value reaches this share of one."""
+
+
+def plots(subject: Subject) -> dict[str, Lines]:
+    """Return what is plotted, by entity, in the units of the curves."""
+    slider, platform = subject.limits.slider, subject.limits.platform
+    error = slider.following_error * 1e6
+    margin = float(np.degrees(subject.limits.singularity_margin))
+    return {
+        POSITION: _sliders(*(limit * 1e3 for limit in slider.position)),
+        VELOCITY: _sliders(-slider.velocity * 1e3, slider.velocity * 1e3),
+        ACCELERATION: _sliders(-slider.acceleration, slider.acceleration),
+        ERROR: _sliders(-error, error)._replace(near=NEAR),
+        CENTRE: Lines((Line("x", palette.X), Line("y", palette.Y)), _window(platform.x, platform.y)),
+        PHI: Lines((Line("φ", palette.PHI),)),
+        SINGULARITY: Lines((Line("distance", palette.SINGULARITY),), (Limit("margin", margin),)),
+        TIMING: timing(subject.rate_hz, float("nan")),
+    }
+
+
+def timing(rate_hz: int, bus_load: float) -> Lines:
+    """Return the lines of the loop's timing; the bus is shown as the time that its frames take, as a share of 1."""
+    period = 1e6 / rate_hz
+    return Lines(
+        (Line("cycle", palette.CYCLE), Line("lateness", palette.LATENESS)),
+        (Limit(f"bus {bus_load:.0%}", bus_load * period, palette.BUS), Limit("period", period, palette.BUDGET)),
+    )
+
+
+def values(
+    records: NDArray[np.void],
+    newest: NDArray[np.void],
+    starts: NDArray[np.intp],
+    distance: NDArray[np.float64],
+) -> dict[str, NDArray[np.float64]]:
+    """Return the values of the moving lines, (N, lines), for N groups of records that begin at `starts`.
+
+    `newest` are the last records of the groups, `distance` theirs to a singularity [rad].
+    """
+    error = records["following_error"]
+    highest, lowest = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
+    times = np.stack([records["parts_ns"].sum(axis=1), records["lateness_ns"]], axis=1)
+    return {
+        POSITION: newest["position"] * 1e3,  # [mm]
+        VELOCITY: newest["velocity"] * 1e3,  # [mm/s]
+        ACCELERATION: newest["commanded_acceleration"],  # [m/s²]
+        ERROR: np.where(highest > -lowest, highest, lowest) * 1e6,  # [µm]
+        CENTRE: newest["pose"][:, :2] * 1e3,  # [mm]
+        PHI: np.degrees(newest["pose"][:, 2:]),  # [°]
+        SINGULARITY: np.degrees(distance)[:, np.newaxis],  # [°]
+        TIMING: np.maximum.reduceat(times, starts) * 1e-3,  # [µs]
+    }
+
+
+def with_limits(moving: NDArray[np.float64], lines: Lines) -> NDArray[np.float64]:
+    """Return the values of a plot, (N, k), with columns of its limits to their right."""
+    rows, count = moving.shape
+    limits = [limit.value for limit in lines.still]
+    table = np.empty((rows, count + len(limits)))
+    table[:, :count] = moving
+    table[:, count:] = limits
+    if lines.near and np.abs(moving).max() < lines.near * min(map(abs, limits)):
+        table[:, count:] = np.nan
+    return table
+
+
+def _window(x: Range, y: Range) -> tuple[Limit, ...]:
+    """Return the limits of the platform's centre, once where those of x and y are the same."""
+    if x == y:
+        return Limit("min", x[0] * 1e3), Limit("max", x[1] * 1e3)
+    ends = zip(("x min", "x max", "y min", "y max"), (*x, *y), strict=True)
+    return tuple(Limit(name, end * 1e3) for name, end in ends)
+
+
+def _sliders(low: float, high: float) -> Lines:
+    lines = tuple(Line(leg, colour) for leg, colour in zip(LEGS, palette.SLIDERS, strict=True))
+    return Lines(lines, (Limit("min", low), Limit("max", high)))

@@ -1,0 +1,127 @@
+"""The robot drawn in 2D under /robot: fixed parts and shapes once, then where the moving ones are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from trirail.kinematics.geometry import LEGS, Geometry
+from trirail.telemetry import columns, palette
+from trirail.telemetry.columns import Column
+from trirail.telemetry.palette import Colour
+from trirail.workspace import mechanism
+from trirail.workspace.mechanism import Mechanism, Points
+
+ORIGIN = 0.02
+"""Arms of the cross at the base frame's origin, as a share of the robot's size."""
+POSITIONS = rr.Points2D.descriptor_positions()
+STRIPS = rr.LineStrips2D.descriptor_strips()
+TRANSLATION = rr.Transform3D.descriptor_translation()
+QUATERNION = rr.Transform3D.descriptor_quaternion()
+_CROSS = (np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]]))
+
+
+def still(parts: Mechanism) -> Iterator[tuple[str, rr.AsComponents]]:
+    """Yield what is logged once, as static: entity path and archetype."""
+    yield "/robot", rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # 2D views have y downwards
+    yield "/robot/rails", _lines(parts.rails, [palette.FRAME], 4.5, order=10)
+    yield "/robot/travel", _lines(parts.travel, [palette.dark(c) for c in palette.SLIDERS], 3.0, order=11)
+    yield "/robot/stops", _lines(parts.stops, [palette.LIMIT], 1.2, order=12)
+    yield (
+        "/robot/anchors",
+        rr.Points2D(
+            parts.anchors,
+            radii=rr.Radius.ui_points(6.0),
+            colors=[palette.ANCHORS],
+            labels=[f"{leg}₀" for leg in LEGS],
+            show_labels=True,
+            draw_order=13,
+        ),
+    )
+    yield (
+        "/robot/names",
+        rr.Points2D(
+            parts.names,
+            radii=rr.Radius.ui_points(0.0),
+            colors=palette.SLIDERS,
+            labels=list(LEGS),
+            show_labels=True,
+            draw_order=13,
+        ),
+    )
+    cross = ORIGIN * np.ptp(parts.bounds)
+    yield "/robot/origin", _lines([axis * cross for axis in _CROSS], [palette.ARMS], 0.8, order=14)
+    yield "/robot/commanded/outline", _lines(parts.outline, [palette.COMMANDED], 4.5, order=20)
+    yield "/robot/platform/arms", _lines(parts.arms, [palette.ARMS], 0.8, order=21)
+    yield "/robot/platform/outline", _lines(parts.outline, [palette.PLATFORM], 2.2, order=22)
+    yield "/robot/platform/stops", _lines(parts.edge_stops, [palette.LIMIT], 1.2, order=23)
+    yield (
+        "/robot/workspace",
+        rr.LineStrips2D.from_fields(colors=[palette.WORKSPACE], radii=rr.Radius.ui_points(0.8), draw_order=15),
+    )
+    yield (
+        "/robot/goal",
+        rr.LineStrips2D.from_fields(colors=[palette.GOAL], radii=rr.Radius.ui_points(1.0), draw_order=24),
+    )
+    yield (  # in which the platform's edges slide
+        "/robot/passive",
+        rr.LineStrips2D.from_fields(
+            colors=[palette.dark(c) for c in palette.SLIDERS], radii=rr.Radius.ui_points(5.5), draw_order=25
+        ),
+    )
+    yield (
+        "/robot/trace",
+        rr.LineStrips2D.from_fields(colors=[palette.CENTRE], radii=rr.Radius.ui_points(1.2), draw_order=30),
+    )
+    yield (
+        "/robot/platform/centre",
+        rr.Points2D([[0.0, 0.0]], radii=rr.Radius.ui_points(4.0), colors=[palette.CENTRE], draw_order=31),
+    )
+    yield (  # each slider, and in it the pin that the platform turns on
+        "/robot/sliders",
+        rr.Points2D.from_fields(
+            radii=[-8.5] * 3 + [-3.0] * 3,  # negative: points of the screen, not metres
+            colors=[*palette.SLIDERS, *[palette.PIN] * 3],
+            draw_order=32,
+        ),
+    )
+
+
+def moving(geometry: Geometry, parts: Mechanism, before: NDArray[np.void], records: NDArray[np.void]) -> list[Column]:
+    """Return where the moving parts are in `records`, (N,), and the trace of the centre there from `before`."""
+    sliders = mechanism.sliders(geometry, records["position"])
+    sleeves = mechanism.sleeves(geometry, sliders, records["pose"][:, 2], parts.sleeve)
+    steps = np.stack([before["pose"][:, :2], records["pose"][:, :2]], axis=1)[:, None]
+    return [
+        *_placed("/robot/platform", records["pose"]),
+        *_placed("/robot/commanded", records["commanded_pose"]),
+        Column("/robot/sliders", POSITIONS, columns.vectors(np.concatenate([sliders, sliders], axis=1))),
+        Column("/robot/passive", STRIPS, columns.strips(sleeves)),
+        Column("/robot/trace", STRIPS, columns.strips(steps)),
+    ]
+
+
+def goal(parts: Mechanism, pose: Sequence[float] | None) -> Column:
+    """Return the platform where the goal leads it, with a cross at its centre; nothing without a goal."""
+    if pose is None:
+        return Column("/robot/goal", STRIPS, columns.ragged([[]]))
+    cross = [axis * ORIGIN * np.ptp(parts.bounds) for axis in _CROSS]
+    return Column("/robot/goal", STRIPS, columns.ragged([mechanism.placed([*parts.outline, *cross], pose)]))
+
+
+def _lines(lines: list[Points], colours: Sequence[Colour], radius: float, *, order: float) -> rr.LineStrips2D:
+    return rr.LineStrips2D(lines, colors=colours, radii=rr.Radius.ui_points(radius), draw_order=order)
+
+
+def _placed(path: str, pose: Points) -> list[Column]:
+    """Return the transforms from the platform's frame to the base frame for poses (N, 3)."""
+    translation, quaternion = np.zeros((len(pose), 1, 3)), np.zeros((len(pose), 1, 4))
+    translation[:, 0, :2] = pose[:, :2]
+    quaternion[:, 0, 2], quaternion[:, 0, 3] = np.sin(pose[:, 2] / 2.0), np.cos(pose[:, 2] / 2.0)
+    return [
+        Column(path, TRANSLATION, columns.vectors(translation)),
+        Column(path, QUATERNION, columns.vectors(quaternion)),
+    ]

@@ -1,0 +1,87 @@
+"""What stands in a recording beside the records: what the control was given, and what it said of it.
+
+Both are lines of a log, for people, that carry the message itself as JSON, for programs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from rerun.chunk import Chunk
+
+from trirail.telemetry import columns
+from trirail.telemetry.columns import SECOND, Column
+from trirail.wire.messages import Event, Level
+from trirail.wire.packets import CommandRequest, DrivesFault, GoalRequest, Input, Mishap
+
+EVENTS, REQUESTS = "/events", "/requests"
+TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
+JSON = rr.ComponentDescriptor("json")
+LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
+
+
+class Entry(NamedTuple):
+    """A line of a log."""
+
+    log: str
+    """EVENTS or REQUESTS."""
+    t: float
+    """Nominal time since the loop's start [s]."""
+    wall: float
+    """Wall clock [s since 1970]."""
+    text: str
+    level: Level = "info"
+    message: Event | Input | None = None
+    """The message itself; None for what the recorder has to say."""
+
+
+def said(event: Event) -> Entry:
+    """Return an event of the service."""
+    return Entry(EVENTS, event.t, event.time, event.message, event.level, event)
+
+
+def given(what: Input, rate_hz: int, wall_offset_ns: int) -> Entry:
+    """Return what the control was given, at the nominal time of its cycle."""
+    wall = (what.now_ns + wall_offset_ns) / SECOND
+    return Entry(REQUESTS, what.cycle / rate_hz, wall, _words(what), message=what)
+
+
+def chunks(entries: Sequence[Entry]) -> list[Chunk]:
+    """Return lines as Rerun takes them: all of one log together."""
+    logs = dict.fromkeys(entry.log for entry in entries)
+    return [_chunk(log, [entry for entry in entries if entry.log == log]) for log in logs]
+
+
+def _chunk(log: str, entries: Sequence[Entry]) -> Chunk:
+    messages = [[msgspec.json.encode(entry.message).decode()] if entry.message else [] for entry in entries]
+    parts = [
+        Column(log, TEXT, pa.array([[entry.text] for entry in entries])),
+        Column(log, LEVEL, pa.array([[LEVELS[entry.level]] for entry in entries])),
+        Column(log, JSON, pa.array(messages, pa.list_(pa.string()))),
+    ]
+    times = columns.times(_nanoseconds(entry.t for entry in entries), _nanoseconds(entry.wall for entry in entries))
+    (chunk,) = columns.chunks(times, parts)
+    return chunk
+
+
+def _nanoseconds(seconds: Iterable[float]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    return np.array([round(value * SECOND) for value in seconds])
+
+
+def _words(what: Input) -> str:
+    match what.given:
+        case GoalRequest(id=name, user=user, goal=goal):
+            return f"goal {name} of {user}: {type(goal).__name__.removesuffix('Goal').lower()}"
+        case CommandRequest(name=name, user=user):
+            return f"{name} by {user}"
+        case Mishap(event=event, reason=reason):
+            return f"{event.lower().replace('_', ' ')}: {reason}"
+        case DrivesFault(message=message):
+            return message or "the drives' fault is over"
+        case refused:
+            return refused.message

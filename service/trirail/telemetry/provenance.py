@@ -1,0 +1,97 @@
+"""Where a recording comes from: the configuration, as a file that can be run again, and the software."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+import msgspec
+
+from trirail import __version__
+from trirail.config import Config, parse
+
+CONFIGURATION, SOFTWARE = "/configuration", "/software"
+LIBRARIES = ("eclipse-zenoh", "ruckig", "rerun-sdk", "python-can", "canopen", "numpy", "numba")
+_HERE = Path(__file__).parents[1]
+
+
+class Software(msgspec.Struct, frozen=True):
+    """What ran."""
+
+    trirail: str
+    source: str
+    """Fingerprint of the packages' source files: it tells versions apart that have not been given a number."""
+    machine: str
+    versions: dict[str, str]
+
+    def __str__(self) -> str:
+        return f"trirail {self.trirail}, source {self.source}, on {self.machine}"
+
+
+@cache
+def software() -> Software:
+    """Return what runs here."""
+    return Software(__version__, _fingerprint(), f"{platform.system()} {platform.machine()}", versions())
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the libraries that matter, by name."""
+    return {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
+
+
+def texts(config: Config) -> dict[str, str]:
+    """Return what a recording says of itself, by entity path."""
+    described = msgspec.json.format(msgspec.json.encode(software()), indent=2)
+    return {CONFIGURATION: toml(config), SOFTWARE: described.decode()}
+
+
+def configuration(found: Mapping[str, str]) -> Config | None:
+    """Return the configuration among a recording's texts, None where there is none. Raises ConfigError."""
+    text = found.get(CONFIGURATION)
+    return parse(text) if text is not None else None
+
+
+def recorded_by(found: Mapping[str, str]) -> Software | None:
+    """Return the software among a recording's texts, None where there is none."""
+    text = found.get(SOFTWARE)
+    return msgspec.json.decode(text, type=Software) if text is not None else None
+
+
+def toml(config: Config) -> str:
+    """Write a configuration as TOML: all of it, defaults included; parse(toml(config)) == config."""
+    return "\n".join(_table("", msgspec.to_builtins(config))).lstrip() + "\n"
+
+
+def _table(path: str, table: dict[str, object]) -> Iterator[str]:
+    """Yield the lines of a table: first its values, then the tables in it."""
+    values = {name: value for name, value in table.items() if value is not None and not isinstance(value, dict)}
+    if values and path:
+        yield from ("", f"[{path}]")
+    for name, value in values.items():
+        yield f"{name} = {_value(value)}"
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from _table(f"{path}.{name}" if path else name, value)
+
+
+def _value(value: object) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{name} = {_value(inner)}" for name, inner in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    # Strings, numbers and truth values are written in TOML as in JSON; repr of a number is exact in both.
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _fingerprint() -> str:
+    """Return a digest of the source of both packages, in its order."""
+    digest = hashlib.sha256()
+    for package in (_HERE, _HERE.parent / "drivers"):
+        for path in sorted(package.rglob("*.py")):
+            digest.update(path.relative_to(package.parent).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]

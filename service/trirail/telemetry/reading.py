@@ -1,0 +1,221 @@
+"""Recordings read into numpy: every cycle's record bit for bit, the log of events, and the texts beside them.
+
+from trirail.telemetry.reading import read
+recording = read(Path("recordings/demo-20260101-120000.rrd"))
+error = recording.records["following_error"]      # (N, 3) [m]; the fields are those of trirail.wire.records
+session = join([read(path) for path in parts])    # of a session whose recording was rotated, in any order
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.chunk import Chunk, RrdReader
+from rerun.error_utils import RerunWarning
+from trirail_drivers import files
+from trirail_drivers.errors import FileError
+
+from trirail.errors import ServiceError
+from trirail.telemetry.columns import SECOND, structs
+from trirail.telemetry.journal import EVENTS, JSON, REQUESTS
+from trirail.telemetry.scene import FIELDS
+from trirail.wire.messages import Event
+from trirail.wire.packets import Input
+from trirail.wire.records import DTYPE
+
+# What an RRD file is made of: Rerun's crate re_log_encoding, src/rrd/frames.rs.
+_MAGIC = b"RRF2"
+_FILE_HEADER = 12
+"""Magic number, version and options [bytes]."""
+_MESSAGE_HEADER = struct.Struct("<QQ")
+"""A message's kind, and how many bytes follow."""
+_END = 0
+"""The kind of the last message of a file that was closed; only a table of contents follows."""
+
+_TEXT, _LEVEL = rr.TextLog.descriptor_text().component, rr.TextLog.descriptor_level().component
+_DOCUMENT = rr.TextDocument.descriptor_text().component
+_KEPT = ("/record", EVENTS, REQUESTS)
+_LAYOUT = structs(np.zeros(1, DTYPE)).type.value_type
+"""The records' fields, as they are in a file."""
+
+
+class Line(NamedTuple):
+    """A line of the log: an event of the service, or what the recorder had to say."""
+
+    t: float
+    """Nominal time since the loop's start [s]."""
+    wall: np.datetime64
+    level: str
+    """INFO, WARN or ERROR."""
+    text: str
+    event: Event | None = None
+    """The event itself; None for what the recorder had to say."""
+
+
+class Recording(NamedTuple):
+    """What a recording holds."""
+
+    name: str
+    """The robot's name and when it began; empty if the file does not say."""
+    records: NDArray[np.void]
+    """Of every cycle, (N,), of wire.records.DTYPE, by rising `cycle`. Cycles that did not reach the file lack."""
+    t: NDArray[np.float64]
+    """Nominal times of the records since the loop's start, (N,) [s]."""
+    wall: NDArray[np.datetime64]
+    """Wall-clock times of the records, (N,), UTC [ns]."""
+    events: list[Line]
+    """The log, in order."""
+    texts: dict[str, str]
+    """Text documents that hold for the whole session, by entity path: /configuration, /software."""
+    requests: tuple[Input, ...] = ()
+    """What the control was given, in order: goals and commands, each with the cycle that took it, and mishaps."""
+
+
+def read(path: Path) -> Recording:
+    """Read a recording; of one that was cut off, all that is whole.
+
+    Raises ServiceError if the file cannot be read, is not a recording, or holds no records.
+    """
+    with _whole(path) as whole:
+        chunks = _chunks(whole, path)
+    records, t, wall = _records([chunk for chunk in chunks if chunk.entity_path == "/record"], path)
+    return Recording(
+        name=next(iter(_static(chunks, "RecordingInfo:name").values()), ""),
+        records=records,
+        t=t,
+        wall=wall,
+        events=_events([chunk for chunk in chunks if chunk.entity_path == EVENTS]),
+        texts=_static(chunks, _DOCUMENT),
+        requests=_requests([chunk for chunk in chunks if chunk.entity_path == REQUESTS], path),
+    )
+
+
+def join(parts: Sequence[Recording]) -> Recording:
+    """Put the parts of a session together, in any order. Raises ServiceError if they are of different sessions."""
+    first, *others = sorted(parts, key=lambda part: int(part.records["cycle"][0]))
+    for other in others:
+        if (other.name, other.texts) != (first.name, first.texts):
+            raise ServiceError(f"{other.name!r} is not of the same session as {first.name!r}: give the parts of one")
+    _, rows = np.unique(np.concatenate([part.records["cycle"] for part in parts]), return_index=True)
+    return Recording(
+        name=first.name,
+        records=np.concatenate([part.records for part in parts])[rows],
+        t=np.concatenate([part.t for part in parts])[rows],
+        wall=np.concatenate([part.wall for part in parts])[rows],
+        events=sorted((line for part in parts for line in part.events), key=lambda line: line.t),
+        texts=first.texts,
+        requests=tuple(sorted((given for part in parts for given in part.requests), key=lambda given: given.seq)),
+    )
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Give the file itself or, if its last message was cut off, a copy without that: Rerun would read none of it."""
+    try:
+        size, length = path.stat().st_size, _whole_length(path)
+    except FileError as error:
+        raise ServiceError(str(error)) from error
+    except OSError as error:
+        raise ServiceError(f"{path}: {error.strerror}") from error
+    if length == size:
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+        try:
+            copy = Path(shutil.copyfile(path, f"{folder}/{path.name}"))
+            os.truncate(copy, length)
+        except OSError as error:
+            raise ServiceError(f"{path} was cut off, and cannot be copied to {folder}: {error.strerror}") from error
+        yield copy
+
+
+def _whole_length(path: Path) -> int:
+    """Return how many bytes of a file end with a whole message; all of a file that was closed."""
+    with files.opened(path) as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise ServiceError(f"{path}: not a recording: an RRD file begins with {_MAGIC.decode()}")
+        size, end = os.fstat(file.fileno()).st_size, _FILE_HEADER
+        while end + _MESSAGE_HEADER.size <= size:
+            file.seek(end)
+            kind, length = _MESSAGE_HEADER.unpack(file.read(_MESSAGE_HEADER.size))
+            if end + _MESSAGE_HEADER.size + length > size:
+                break
+            if kind == _END:
+                return size
+            end += _MESSAGE_HEADER.size + length
+    return end
+
+
+def _chunks(whole: Path, path: Path) -> list[Chunk]:
+    """Return what there is of the records, the log and what holds for the whole session."""
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)  # it was cut off
+            reader = RrdReader(whole)
+        if not reader.recordings():
+            raise ServiceError(f"{path}: holds no recording")
+        return [chunk for chunk in reader.stream() if chunk.is_static or chunk.entity_path in _KEPT]
+    except (RuntimeError, ValueError) as error:
+        raise ServiceError(f"{path}: cannot be read as a recording: {error}") from error
+
+
+def _records(chunks: list[Chunk], path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], NDArray[np.datetime64]]:
+    batches = [chunk.to_record_batch() for chunk in chunks]
+    if not any(batch.num_rows for batch in batches):
+        raise ServiceError(f"{path}: holds no records of cycles (entity /record): was it made by trirail?")
+    rows = pa.concat_arrays([batch.column(FIELDS.component).flatten() for batch in batches])
+    if odd := set(rows.type) ^ set(_LAYOUT):
+        names = ", ".join(sorted({field.name for field in odd}))
+        raise ServiceError(f"{path}: written by another version: its records differ in {names}")
+    records = np.zeros(len(rows), DTYPE)
+    for name in DTYPE.names or ():
+        values = rows.field(name)
+        flat = values.flatten() if records[name].ndim > 1 else values
+        records[name] = flat.to_numpy().reshape(records[name].shape)
+    t = np.concatenate([batch.column("t").to_numpy() for batch in batches]).astype(np.int64) / SECOND
+    wall = np.concatenate([batch.column("wall").to_numpy() for batch in batches])
+    order = np.argsort(records["cycle"], kind="stable")
+    return records[order], t[order], wall[order]
+
+
+def _events(chunks: list[Chunk]) -> list[Line]:
+    lines: list[Line] = []
+    for batch in (chunk.to_record_batch() for chunk in chunks):
+        t = batch.column("t").to_numpy().astype(np.int64) / SECOND
+        wall = batch.column("wall").to_numpy()
+        levels, texts = (batch.column(name).flatten().to_pylist() for name in (_LEVEL, _TEXT))
+        spoken = batch.column(JSON.component).to_pylist() if JSON.component in batch.schema.names else [None] * len(t)
+        events = [msgspec.json.decode(content[0], type=Event) if content else None for content in spoken]
+        lines += map(Line, t.tolist(), wall, levels, texts, events)
+    return sorted(lines, key=lambda line: line.t)
+
+
+def _requests(chunks: list[Chunk], path: Path) -> tuple[Input, ...]:
+    rows = [text for chunk in chunks for text in chunk.to_record_batch().column(JSON.component).flatten().to_pylist()]
+    try:
+        found = [msgspec.json.decode(row, type=Input) for row in rows]
+    except msgspec.DecodeError as error:
+        raise ServiceError(f"{path}: written by another version: its requests cannot be read: {error}") from error
+    return tuple(sorted(found, key=lambda given: given.seq))
+
+
+def _static(chunks: list[Chunk], component: str) -> dict[str, str]:
+    """Return the texts of a component that hold for the whole session, by entity path."""
+    return {
+        chunk.entity_path: batch.column(component).flatten()[0].as_py()
+        for chunk in chunks
+        if chunk.is_static and component in (batch := chunk.to_record_batch()).schema.names
+    }

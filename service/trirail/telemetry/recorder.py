@@ -1,0 +1,232 @@
+"""The recorder: takes records, events and frames, and gives them to the file and to the live view."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from trirail.config import Config
+from trirail.errors import ServiceError
+from trirail.telemetry import provenance, shelf
+from trirail.telemetry.candump import CandumpLog
+from trirail.telemetry.show import LIVE_HZ, REPORT_EVERY, Batches, Show
+from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
+from trirail.telemetry.subject import Subject
+from trirail.telemetry.volumes import Volumes, claim
+from trirail.wire.messages import Event
+from trirail.wire.packets import Input
+from trirail.wire.records import LAYOUT, last_cycle
+
+RECORDS_HZ = 5
+"""Batches of whole records a second to the file, at least."""
+DRAWING_HZ = 1
+"""Batches of what is drawn a second to the file: fewer are smaller, and records are enough to draw it again."""
+LOOKS_HZ = 1
+"""How often a second it is looked whether files, folder, log or live view want something."""
+TIDY_EVERY = 10.0
+"""How often the folder is looked at [s]."""
+MB = 1e6
+
+
+class Recorder:
+    """One recording, from start to close.
+
+    Its files are `path` or `<robot>-<date>-<time>.rrd` in `directory`, and where it is rotated the same with
+    `-part2` and so on; with telemetry.capture_can, every CAN frame goes to a .log file beside the first. A black
+    box, given its `name` and not a path, is one file, which takes what room there is.
+
+    `warn` is told what is missing; else that stands in the log alone. Raises ServiceError if the file cannot be
+    written or the live port is taken.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        directory: Path,
+        *,
+        path: Path | None = None,
+        name: str | None = None,
+        live: bool = True,
+        warn: Callable[[str], None] | None = None,
+        wall_ns: Callable[[], int] = time.time_ns,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        started_ns = wall_ns()
+        self._config = config
+        self._is_black_box = name is not None
+        self._own_folder = directory if path is None and name is None else None
+        session = name or f"{config.robot.name}-{datetime.fromtimestamp(started_ns * 1e-9).astimezone():%Y%m%d-%H%M%S}"
+        telemetry = config.telemetry
+        server = live_server(telemetry.live_port, telemetry.live_mb) if live and telemetry.live_port else None
+        try:
+            first = claim(directory, session) if path is None else _overwrite(path)
+            channel = config.can.channel or config.can.interface
+            captured = config.telemetry.capture_can and not self._is_black_box
+            self._frames = CandumpLog(first.with_suffix(".log"), channel) if captured else None
+        except OSError as error:
+            raise ServiceError(
+                f"cannot write a recording to {path or directory}: {error.strerror}; "
+                "telemetry.directory must be a folder that can be written"
+            ) from error
+        self._show = show = Show(Subject.configured(config), session, started_ns - monotonic_ns())
+        self._warn = warn or (lambda words: show.say("warning", words))
+        reserve = 0 if self._is_black_box else RESERVE
+        self._volumes = Volumes(first, self._open, show.drop, reserve, lambda: monotonic_ns() * 1e-9)
+        self._records = Batches(config.loop.rate_hz // RECORDS_HZ, self._record)
+        show.attach(self._volumes, DRAWING_HZ)
+        self._live: Relay | None = None
+        self.live_url = ""
+        """Where viewers connect; empty without a live view."""
+        if server:
+            self._live = live_relay(show.open(server))
+            show.attach(self._live, LIVE_HZ)
+            self.live_url = server.uri
+        self._last: int | None = None
+        self._absent = 0
+        self._reported = (0, 0, 0)
+        self._next_look = 0
+        self._next_report = 0.0
+        self._next_tidy = 0.0
+        self._untidy = ""
+
+    @property
+    def path(self) -> Path:
+        """The newest file of the recording."""
+        return self._volumes.path
+
+    @property
+    def lost(self) -> int:
+        """Batches of records, events or frames that the disk did not take."""
+        return self._volumes.lost + (self._frames.failures if self._frames else 0)
+
+    @property
+    def cause(self) -> str:
+        """Why the disk did not take the newest of them; empty if none is lost."""
+        frames = "the log of CAN frames takes no more" if self._frames and self._frames.failures else ""
+        return self._volumes.cause or frames
+
+    @property
+    def skipped(self) -> int:
+        """Batches that the live view was too slow for."""
+        return self._live.skipped if self._live else 0
+
+    def records(self, batch: bytes) -> None:
+        """Take packed records."""
+        last = last_cycle(batch)
+        if self._last is not None:
+            self._absent += last - self._last - len(batch) // LAYOUT.size
+        self._last = last
+        if last >= self._next_look:
+            self._next_look = last + self._config.loop.rate_hz // LOOKS_HZ
+            self._look_after()
+        self._records.add(batch)
+        self._show.records(batch)
+
+    def save(self) -> None:
+        """Write all records that have been taken, and what was said: they outlive this process."""
+        self._records.flush()
+        self._show.save()
+
+    def event(self, event: Event) -> None:
+        """Take an event."""
+        self._show.event(event)
+
+    def given(self, what: Input) -> None:
+        """Take what the control was given."""
+        self._show.given(what)
+
+    def target(self, pose: Sequence[float] | None) -> None:
+        """Take the pose that the goal leads to; None for no goal."""
+        self._show.target(pose)
+
+    def bus_load(self, share: float) -> None:
+        """Take the load of the bus, 1 for a full one."""
+        self._show.bus_load(share)
+
+    def frames(self, batch: bytes) -> None:
+        """Take captured CAN frames, packed as trirail_drivers.capture.FRAME."""
+        if self._frames:
+            self._frames.write(batch)
+
+    def close(self) -> None:
+        """Write what is left and complete the file; waits a few seconds at most for a stuck disk or viewer."""
+        self._flush()
+        if words := self._missing():
+            self._show.say("warning", words)
+            self._show.save()
+        self._volumes.close()
+        if self._frames:
+            self._frames.close()
+        if self._live:
+            self._live.close()
+
+    def _open(self, path: Path) -> rr.RecordingStream:
+        """Begin a file: with all in it that it takes to be looked at by itself."""
+        stream = self._show.open(rr.FileSink(path))
+        for entity, text in provenance.texts(self._config).items():
+            stream.log(entity, rr.TextDocument(text), static=True)
+        self._show.begin_anew()
+        return stream
+
+    def _record(self, records: NDArray[np.void]) -> None:
+        self._volumes.send(self._show.scene.complete(records))
+
+    def _flush(self) -> None:
+        self._records.flush()
+        self._show.flush()
+
+    def _look_after(self) -> None:
+        """Rotate the file, tidy the folder and say what is missing, where it is time to."""
+        t = self._show.t
+        if not self._is_black_box:
+            self._rotate()
+        if self._live:  # where nobody watches, it shares the file's drawings
+            self._show.attach(self._live, LIVE_HZ if is_watched(self._config.telemetry.live_port) else DRAWING_HZ)
+        if self._own_folder is not None and t >= self._next_tidy:
+            self._next_tidy = t + TIDY_EVERY
+            self._tidy(self._own_folder, self._config.telemetry.keep_mb * MB)
+        if t >= self._next_report and (words := self._missing()):
+            self._next_report = t + REPORT_EVERY
+            self._warn(words)
+
+    def _rotate(self) -> None:
+        """Go on in another file where it is time to; not where the disk is full, for that has no room for it."""
+        telemetry, volumes = self._config.telemetry, self._volumes
+        full = volumes.age >= telemetry.rotate_minutes * 60.0 or volumes.size >= telemetry.rotate_mb * MB
+        if full and not volumes.trouble:
+            self._flush()
+            volumes.turn()
+
+    def _tidy(self, folder: Path, at_most: float) -> None:
+        try:
+            shelf.tidy(folder, at_most)
+        except OSError as error:
+            words = f"cannot delete old recordings: {error}"
+            if words != self._untidy:
+                self._untidy = words
+                self._warn(words)
+
+    def _missing(self) -> str:
+        """Return what is missing, in words, if that is more than was last said."""
+        missing = self.lost, self.skipped, self._absent
+        if missing == self._reported:
+            return ""
+        self._reported = missing
+        because = f" ({self.cause})" if self.cause else ""
+        return (
+            f"missing so far: {self.lost} batches in the file{because}, {self.skipped} in the live view, "
+            f"{self._absent} cycles that the recorder was too slow for"
+        )
+
+
+def _overwrite(path: Path) -> Path:
+    """Create an empty file, or empty it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.open("wb").close()
+    return path

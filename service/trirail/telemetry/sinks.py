@@ -1,0 +1,178 @@
+"""Where a recording goes: a file that gets everything, and a live view that may be slow, frozen or absent.
+
+Rerun's sinks do not report their failures: they stop taking data, and then block for ever whoever sends more.
+Here each is kept from that, and what it does not get is counted.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import stat
+import threading
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import rerun as rr
+from rerun.chunk import Chunk
+
+from trirail.errors import ServiceError
+
+HOST = "127.0.0.1"
+BACKLOG = 20
+"""Batches that may wait for the live view: 2 s."""
+RESERVE = 64 << 20
+"""Free space left on the disk [bytes]: a file sink that once met a full disk never recovers."""
+PATIENCE = 2.0
+"""How long to wait for the disk, or for a thread to end [s]."""
+
+
+class Archive:
+    """A recording file; every batch is handed to the operating system before the next.
+
+    It leaves `reserve` bytes of the disk free.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, path: Path, reserve: int = RESERVE) -> None:
+        self.lost = 0
+        """Batches that are not in the file."""
+        self.trouble = ""
+        """Why the last batch is not in the file; empty if it is."""
+        self._stream = stream
+        self._reserve = reserve
+        self._directory = path.parent
+        self._stuck = False
+
+    def send(self, chunks: list[Chunk]) -> None:
+        """Write a batch, or count it as lost. Waits for the disk, but not for long."""
+        self.trouble = self._write(chunks)
+        self.lost += bool(self.trouble)
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the file takes nothing any more: Rerun's sink does not recover from a disk that has failed it."""
+        return self._stuck
+
+    def close(self) -> None:
+        """Complete the file, unless the disk is stuck."""
+        if self._flushed(PATIENCE):
+            self._stream.disconnect()
+
+    def _write(self, chunks: list[Chunk]) -> str:
+        """Write a batch; return why it could not be, or nothing."""
+        try:
+            free = shutil.disk_usage(self._directory).free
+        except OSError as error:
+            return f"{self._directory}: {error.strerror}"
+        if free <= self._reserve:
+            return (
+                f"{self._directory} is full: {free / 1e6:.0f} MB are free, {self._reserve / 1e6:.0f} MB are to stay so"
+            )
+        if not self._stuck or self._flushed(0.01):
+            self._stream.send_chunks(chunks)
+            self._flushed(PATIENCE)
+        return f"{self._directory} takes no more: disk failing or read-only, or a quota" if self._stuck else ""
+
+    def _flushed(self, within: float) -> bool:
+        try:
+            self._stream.flush(timeout_sec=within)
+        except RuntimeError:  # the only sign of a failing disk: what was sent is not written in time
+            self._stuck = True
+        else:
+            self._stuck = False
+        return not self._stuck
+
+
+class Relay:
+    """Hands batches on in a thread of its own, and skips to the newest when the receiver falls behind."""
+
+    def __init__(self, deliver: Callable[[list[Chunk]], None], finish: Callable[[], None]) -> None:
+        self.skipped = 0
+        """Batches that were not handed on."""
+        self._deliver = deliver
+        self._finish = finish
+        self._waiting: deque[list[Chunk]] = deque()
+        self._changed = threading.Condition()
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="live", daemon=True)
+        self._thread.start()
+
+    def send(self, chunks: list[Chunk]) -> None:
+        """Take a batch; never blocks."""
+        with self._changed:
+            if len(self._waiting) == BACKLOG:
+                self.skipped += BACKLOG
+                self._waiting.clear()
+            self._waiting.append(chunks)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Hand on what waits, unless the receiver is stuck."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join(PATIENCE)
+
+    def _run(self) -> None:
+        while (chunks := self._next()) is not None:
+            self._deliver(chunks)
+        self._finish()
+
+    def _next(self) -> list[Chunk] | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._closing)
+            return self._waiting.popleft() if self._waiting else None
+
+
+def free_port() -> int:
+    """Return a port of the loopback that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def is_watched(port: int) -> bool:
+    """Whether anyone is connected to a port that this process listens on."""
+    return any(_serves(int(name), port) for name in os.listdir("/dev/fd"))
+
+
+def _serves(descriptor: int, port: int) -> bool:
+    """Whether a descriptor is a connection to a port of this process."""
+    try:
+        if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+            return False
+        with socket.socket(fileno=os.dup(descriptor)) as connection:
+            connection.getpeername()  # the one that listens has none
+            return connection.family == socket.AF_INET and connection.getsockname()[1] == port
+    except OSError:  # closed meanwhile
+        return False
+
+
+def live_server(port: int, memory_mb: float) -> rr.GrpcServerSink:
+    """Return a server for viewers on this machine, that keeps so much of the past for those who connect late.
+
+    Raises ServiceError if the port is taken.
+    """
+    with socket.socket() as probe:  # the sink would only log it, and discard all that it is sent
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            raise ServiceError(
+                f"live view: cannot listen on {HOST}:{port}: {error.strerror}; "
+                "set telemetry.live_port to a free port, or to 0 for no live view"
+            ) from error
+    return rr.GrpcServerSink(HOST, port, server_memory_limit=f"{memory_mb:.0f}MB")
+
+
+def live_relay(stream: rr.RecordingStream) -> Relay:
+    """Return a relay to the viewers of a stream."""
+
+    def deliver(chunks: list[Chunk]) -> None:
+        stream.send_chunks(chunks)
+        stream.flush()  # a slow viewer is waited for here, before Rerun's own queues fill the memory
+
+    return Relay(deliver, stream.disconnect)

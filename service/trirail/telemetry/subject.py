@@ -1,0 +1,38 @@
+"""What must be known of a robot to show it: of its configuration, or of what its service tells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+
+from trirail import config
+from trirail.config import Config, Limits
+from trirail.kinematics.geometry import Geometry, Leg
+from trirail.wire.messages import Info
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """The robot that is shown."""
+
+    name: str
+    geometry: Geometry
+    limits: Limits
+    rate_hz: int
+
+    @classmethod
+    def configured(cls, settings: Config) -> Subject:
+        """Take it from a configuration."""
+        return cls(settings.robot.name, config.geometry(settings.geometry), settings.limits, settings.loop.rate_hz)
+
+    @classmethod
+    def told(cls, info: Info) -> Subject:
+        """Take it from a service's answer. msgspec.ValidationError where that is of another version."""
+        first, second, third = (msgspec.convert(_leg(leg), Leg) for leg in info.geometry)
+        limits = msgspec.convert(info.limits, Limits)
+        return cls(info.robot, Geometry(legs=(first, second, third)), limits, info.rate_hz)
+
+
+def _leg(table: dict[str, object]) -> dict[str, object]:
+    return {name: value for name, value in table.items() if name != "name"}

@@ -1,0 +1,106 @@
+"""What comes from outside becomes a value here, or a refusal that says what would be right. Nothing behind it raises.
+
+Both ways: keys, goals and commands that come to the service; replies, states, events and records that come to a client.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import msgspec
+import numpy as np
+from trirail_drivers.interface import PowerState
+
+from trirail.errors import RefusedError
+from trirail.wire.records import LAYOUT, unpack
+from trirail.wire.sizes import MAX_MESSAGE
+from trirail.wire.text import NAME_RULE, is_name, printable, quoted
+from trirail.wire.vocabulary import MODES
+
+JSON, MSGPACK, BINARY = "application/json", "application/msgpack", "application/octet-stream"
+_READ_AS = {
+    "": JSON,
+    "zenoh/bytes": JSON,  # what Zenoh says where nobody said anything
+    "zenoh/string": JSON,
+    "text/plain": JSON,
+    "text/json": JSON,
+    JSON: JSON,
+    MSGPACK: MSGPACK,
+}
+
+_NULL = {JSON: b"null", MSGPACK: b"\xc0"}
+
+
+def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:
+    """Return the parts of a key after its prefix, as many as are wanted; the first is a user.
+
+    Raises RefusedError for wildcards, for too few or too many parts, and for what cannot name a user.
+    """
+    form = "/".join((prefix, *(f"<{name}>" for name in wanted)))
+    if "*" in key:
+        raise RefusedError("wildcard", f"{quoted(key)}: name one robot and one user, as {form}")
+    parts = key.removeprefix(f"{prefix}/").split("/")
+    if not key.startswith(f"{prefix}/") or len(parts) != len(wanted):
+        raise RefusedError("unknown_key", f"{quoted(key)}: no such key; there is {form}")
+    check_name(parts[0], "user")
+    return parts
+
+
+def check_name(name: str, whose: str) -> str:
+    """Return what may name a robot or user. Raises RefusedError."""
+    if not is_name(name):
+        raise RefusedError("bad_name", f"{whose} {quoted(name)!r} cannot be in a key: {NAME_RULE} are taken")
+    return name
+
+
+def check_size(size: int) -> None:
+    """Raise RefusedError for more bytes than are decoded."""
+    if size > MAX_MESSAGE:
+        raise RefusedError("too_large", f"the message has {size} bytes: at most {MAX_MESSAGE} are taken")
+
+
+def encoding(name: str) -> str:
+    """Return how a payload is to be read, JSON or MSGPACK. Raises RefusedError where neither is meant."""
+    read_as = _READ_AS.get(name.split(";", maxsplit=1)[0])
+    if read_as is None:
+        problem = f"encoding {quoted(name)}: JSON ({JSON}, also where none is given) and {MSGPACK} are taken"
+        raise RefusedError("unknown_encoding", problem)
+    return read_as
+
+
+def decode(payload: bytes, kind: Any, what: str, encoded: str = JSON) -> Any:
+    """Read a message of a kind, a type or union; an empty one is null. Raises RefusedError, beginning with `what`."""
+    check_size(len(payload))
+    read_as = encoding(encoded)
+    try:
+        return _decoder(kind, read_as).decode(payload or _NULL[read_as])
+    except RecursionError as error:
+        raise RefusedError("malformed", f"{what}: nested too deep") from error
+    except (msgspec.MsgspecError, ValueError, OverflowError) as error:
+        raise RefusedError("malformed", f"{what}: {quoted(_plain(error))}") from error
+
+
+def encode(content: msgspec.Struct, encoded: str = JSON) -> bytes:
+    """Write a message."""
+    return msgspec.msgpack.encode(content) if encoded == MSGPACK else msgspec.json.encode(content)
+
+
+def batch(payload: bytes) -> bytes:
+    """Return packed records: at least one, all whole, of cycles that follow each other. Raises RefusedError."""
+    if not payload or len(payload) % LAYOUT.size:
+        raise RefusedError("malformed", f"not records: {len(payload)} bytes, and each record has {LAYOUT.size}")
+    rows = unpack(payload)
+    known = np.all(rows["mode"] < len(MODES)) and np.all(rows["drive_state"] < len(PowerState))
+    if not known or rows["cycle"][0] < 0 or np.any(np.diff(rows["cycle"]) != 1):
+        raise RefusedError("malformed", "not records: modes, states or cycles that there are not")
+    return payload
+
+
+@functools.cache
+def _decoder(kind: Any, read_as: str) -> msgspec.json.Decoder[Any] | msgspec.msgpack.Decoder[Any]:
+    return msgspec.msgpack.Decoder(kind) if read_as == MSGPACK else msgspec.json.Decoder(kind)
+
+
+def _plain(error: Exception) -> str:
+    return printable(str(error)).replace("`", "").replace(" - at $.", ": ").replace(" - at $", "")

@@ -1,0 +1,157 @@
+"""Connections between the loop and the processes beside it: bounded by the kernel, never waited for by the loop.
+
+AF_UNIX sockets of type SEQPACKET keep packets whole and in order.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from pathlib import Path
+
+from trirail.wire.sizes import MAX_PACKET
+
+_BUFFER = 1 << 22
+"""Bytes the kernel may hold for a peer that is slow: seconds of records, where the rights allow it."""
+
+
+class Closed(Exception):
+    """The other side has gone."""
+
+
+class TooLarge(Exception):
+    """A packet that the other side would get cut."""
+
+
+class Link:
+    """One side of a connection; neither sending nor receiving ever waits."""
+
+    def __init__(self, connected: socket.socket) -> None:
+        connected.setblocking(False)
+        for option in (socket.SO_SNDBUF, 32):  # 32: SO_SNDBUFFORCE, beyond the system's limit, for root only
+            with contextlib.suppress(PermissionError):
+                connected.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
+        self._socket = connected
+
+    def fileno(self) -> int:
+        """For select and its like."""
+        return self._socket.fileno()
+
+    def send(self, packet: bytes | bytearray | memoryview) -> bool:
+        """Send a packet; False where the peer is so far behind that the kernel takes no more.
+
+        Raises Closed when the peer has gone, TooLarge for what it would get cut.
+        """
+        if len(packet) > MAX_PACKET:
+            raise TooLarge(f"a packet of {len(packet)} bytes: at most {MAX_PACKET} go between the processes")
+        try:
+            self._socket.send(packet)
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            raise Closed from error
+        return True
+
+    def receive(self) -> bytes | None:
+        """Take the next packet, None if there is none. Raises Closed when the peer has gone."""
+        try:
+            packet = self._socket.recv(MAX_PACKET)
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            raise Closed from error
+        if not packet:
+            raise Closed
+        return packet
+
+    def close(self) -> None:
+        """Let the peer see the end."""
+        self._socket.close()
+
+
+def connect(path: Path) -> Link:
+    """Connect to a port of the loop. Raises OSError where nobody listens."""
+    connecting = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        connecting.connect(str(path))
+    except OSError:
+        connecting.close()
+        raise
+    return Link(connecting)
+
+
+def listen(path: Path) -> socket.socket:
+    """Make the socket that a port listens on; a peer may connect from then on, before the loop turns."""
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    listening.bind(str(path))
+    listening.listen(1)
+    return listening
+
+
+class Port:
+    """The loop's side: listens, so that a restarted peer can come back; has one peer at most."""
+
+    def __init__(self, listening: socket.socket) -> None:
+        self._listening = listening
+        self._listening.setblocking(False)
+        self._link: Link | None = None
+        self._lost = False
+        self.dropped = 0
+        """Packets that the peer was too slow for, or that are too large."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a peer."""
+        return self._link is not None
+
+    def accept(self) -> bool:
+        """Take a peer that waits; True if one has just come."""
+        if self._link is not None:
+            return False
+        try:
+            connected, _ = self._listening.accept()
+        except BlockingIOError:
+            return False
+        self._link = Link(connected)
+        return True
+
+    def send(self, packet: bytes | bytearray | memoryview) -> bool:
+        """Send if there is a peer that keeps up; what it is too slow for, or is too large, is dropped and counted."""
+        if self._link is None:
+            return False
+        try:
+            sent = self._link.send(packet)
+        except TooLarge:
+            sent = False
+        except Closed:
+            self._drop_link()
+            return False
+        if not sent:
+            self.dropped += 1
+        return sent
+
+    def receive(self) -> bytes | None:
+        """Take the next packet; None if there is none, or no peer."""
+        if self._link is None:
+            return None
+        try:
+            return self._link.receive()
+        except Closed:
+            self._drop_link()
+            return None
+
+    def take_lost(self) -> bool:
+        """Whether a peer has gone since this was last asked."""
+        lost, self._lost = self._lost, False
+        return lost
+
+    def _drop_link(self) -> None:
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+            self._lost = True
+
+    def close(self) -> None:
+        """Let go of the peer and of the name."""
+        self._drop_link()
+        self._listening.close()

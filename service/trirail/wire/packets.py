@@ -1,0 +1,172 @@
+"""What the loop and the processes beside it say to each other. The first byte of a packet is its kind."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from msgspec import Struct, msgpack, structs
+from trirail_drivers.interface import Counts
+
+from trirail.wire.messages import Event, Goal, Level, Triple
+from trirail.wire.sizes import MAX_PACKET
+
+
+class Kind(IntEnum):
+    """What a packet carries."""
+
+    RECORDS = 1  # packed records, as many as fit
+    MESSAGE = 2  # one msgpack message of the unions below
+    FRAMES = 3  # captured CAN frames
+
+
+class GoalRequest(Struct, frozen=True, tag=True):
+    """Gateway to loop: a goal that was decoded and found well-formed."""
+
+    ticket: int
+    user: str
+    id: str
+    goal: Goal
+    received_ns: int
+    withdrawn: str | None = None
+    """Why it must not begin any more, for a goal that waited when the robot was told to stop."""
+
+
+class CommandRequest(Struct, frozen=True, tag=True):
+    """Gateway to loop: a command."""
+
+    ticket: int
+    user: str
+    name: str
+    value: float | None = None
+    """The rate, for override."""
+    goal: str | None = None
+    """The one goal that is to be stopped, for stop."""
+
+
+class RefusedRequest(Struct, frozen=True, tag=True):
+    """Gateway to loop: something unreadable came and was refused; wants an event."""
+
+    user: str
+    message: str
+
+
+class Accepted(Struct, frozen=True, tag=True):
+    """Loop to gateway: the goal is the loop's now."""
+
+    ticket: int
+    id: str
+    duration: float
+    slowed: float
+    stops_first: bool
+    queued: bool
+
+
+class Confirmed(Struct, frozen=True, tag=True):
+    """Loop to gateway: the command has been carried out."""
+
+    ticket: int
+    name: str
+    mode: str
+
+
+class Refused(Struct, frozen=True, tag=True):
+    """Loop to gateway: neither goal nor command was taken."""
+
+    ticket: int
+    code: str
+    message: str
+    slider: str | None = None
+    value: float | None = None
+    limit: float | None = None
+
+
+class Welcome(Struct, frozen=True, tag=True):
+    """Loop to a peer that has just connected."""
+
+    lacking: tuple[str, ...]
+    bus_load: float
+    epoch: float
+    """Wall clock of nominal time zero [s since 1970]."""
+
+
+class Happened(Struct, frozen=True, tag=True):
+    """Loop to both: an event."""
+
+    event: Event
+
+
+class Farewell(Struct, frozen=True, tag=True):
+    """Loop to both: it has ended as it should, with drives that have no power. Without it, the loop has died."""
+
+
+class Situation(Struct, frozen=True, tag=True):
+    """Loop to both: what records do not say and the state needs; sent when it changes."""
+
+    goal: str | None
+    override: float
+    fault: str | None
+    target: Triple | None = None
+    """The pose that the goal leads to; None for a jog."""
+    bus_load: float = 0.0
+    """Share of the bus that was in use in the last second."""
+    counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
+
+
+class Mishap(Struct, frozen=True, tag=True):
+    """Something that nobody asked for, as Control.happen takes it."""
+
+    event: str
+    """Name of the trirail.control.modes.Event."""
+    reason: str
+
+
+class DrivesFault(Struct, frozen=True, tag=True):
+    """What the drives say is wrong from this cycle on."""
+
+    message: str | None
+    """None when nothing is any more."""
+
+
+class Input(Struct, frozen=True, tag=True):
+    """Loop to recorder: what the control was given in a cycle, beside the feedback that is in its record.
+
+    Together they are all that setpoints depend on.
+    """
+
+    seq: int
+    """Numbered without gaps from 1."""
+    cycle: int
+    now_ns: int
+    """The monotonic clock then: how old a goal was."""
+    given: GoalRequest | CommandRequest | RefusedRequest | Mishap | DrivesFault
+
+
+class Remark(Struct, frozen=True, tag=True):
+    """Recorder to loop: something that everyone is to know."""
+
+    level: Level
+    message: str
+
+
+Request = GoalRequest | CommandRequest | RefusedRequest
+Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Situation | Input
+
+encode = msgpack.Encoder().encode
+decode_request = msgpack.Decoder(Request).decode
+decode_answer = msgpack.Decoder(Answer).decode
+decode_remark = msgpack.Decoder(Remark).decode
+
+
+def message(content: Request | Answer | Remark) -> bytes:
+    """Pack a message."""
+    return bytes((Kind.MESSAGE,)) + encode(content)
+
+
+def told(event: Event) -> bytes:
+    """Pack an event so that it fits: it is kept, and a gateway that could not read it would meet it again."""
+    packet = message(Happened(event))
+    if len(packet) <= MAX_PACKET:
+        return packet
+    words = f"{event.message[:1000]}… ({len(event.message)} characters)"
+    name, user = (text and text[:100] for text in (event.id, event.user))
+    return message(Happened(structs.replace(event, message=words, id=name, user=user)))

@@ -1,0 +1,84 @@
+"""Zenoh sessions as both sides open them: no discovery, bounded queues, nothing beyond the addresses given."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import zenoh
+
+from trirail.errors import ServiceError
+from trirail.wire.sizes import MAX_TRANSPORT
+
+DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
+GIVEN_UP_AFTER = 2.0
+"""Whoever takes nothing that must not be dropped, an answer or past events, is disconnected after so long [s]."""
+
+_ALWAYS = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "scouting/gossip/autoconnect": {"router": [], "peer": [], "client": []},
+    "transport/shared_memory/enabled": False,  # the memory of strangers; and the size below is for what is sent
+    "transport/link/rx/max_message_size": MAX_TRANSPORT,
+}
+
+
+def key(robot: str, *parts: str) -> str:
+    """Return the key expression of a robot's resource."""
+    return "/".join(("trirail", robot, *parts))
+
+
+def open_service(listen: Sequence[str]) -> zenoh.Session:
+    """Open the service's session: a peer that listens on the given locators and nowhere else."""
+    return _open(
+        {
+            "mode": "peer",
+            "listen/endpoints": list(listen),
+            "connect/endpoints": [],
+            # Connections on which nothing comes must not keep others out.
+            "transport/unicast/accept_pending": 1000,
+            "transport/unicast/accept_timeout": 3000,
+            "timestamping/enabled": True,  # advanced publishers order their history by it
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+            "transport/link/tx/queue/congestion_control/block/wait_before_close": round(GIVEN_UP_AFTER * 1e6),
+            "transport/link/tx/queue/size/data_high": 16,
+            "transport/link/tx/queue/size/real_time": 16,  # answers come in bursts
+        },
+        f"cannot listen on {', '.join(listen)}",
+        "another service may hold it: end that, or set zenoh.listen to another address",
+    )
+
+
+def open_client(locator: str) -> zenoh.Session:
+    """Open a client's session to a service or router."""
+    return _open(
+        {
+            "mode": "client",
+            "connect/endpoints": [locator],
+            "connect/timeout_ms": 2000,
+            "connect/exit_on_failure": True,
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+            "listen/endpoints": [],
+        },
+        f"no service at {locator}",
+        "start one with: trirail run configs/sim.toml, or name its address with --connect",
+    )
+
+
+def close(opened: zenoh.Session) -> None:
+    """Close a session; one that is stuck is left to the end of the process."""
+    with contextlib.suppress(zenoh.ZError):
+        opened.close()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
+
+
+def _open(settings: dict[str, Any], failure: str, remedy: str) -> zenoh.Session:
+    zenoh.init_log_from_env_or("off")  # what zenoh would print is in the error below
+    config = zenoh.Config()
+    for name, value in (_ALWAYS | settings).items():
+        config.insert_json5(name, json.dumps(value))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise ServiceError(f"{failure}; {remedy}") from error

@@ -1,0 +1,50 @@
+"""Text from outside: what a name or an id may have in it, and how it is shown."""
+
+from __future__ import annotations
+
+import json
+import re
+import unicodedata
+
+from trirail.wire.sizes import MAX_NAME, MAX_TEXT
+
+_HIDDEN = frozenset({"Cc", "Cf", "Cs", "Co", "Zl", "Zp"})
+"""Unicode's categories of what steers a terminal, reorders or ends a line, or cannot be seen."""
+_NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{MAX_NAME}}}")
+
+NAME_RULE = f"letters, digits, - and _, at most {MAX_NAME}"
+ID_RULE = f"at most {MAX_NAME} characters, none of them for control or formatting"
+
+
+def is_name(text: str) -> bool:
+    """Whether it may name a robot or a user in a key."""
+    return _NAME.fullmatch(text) is not None
+
+
+def is_id(text: str) -> bool:
+    """Whether it may be a goal's id."""
+    return 0 < len(text) <= MAX_NAME and not any(map(_is_hidden, text))
+
+
+def printable(text: str) -> str:
+    """Return text with what a terminal would obey, or nobody would see, as an escape: \\x1b, \\u202e, \\n."""
+    return "".join(_escaped(character) if _is_hidden(character) else character for character in text)
+
+
+def json_printable(text: str) -> str:
+    """Return JSON with the same characters escaped as JSON has them, for JSON that may end on a terminal."""
+    return "".join(json.dumps(character)[1:-1] if _is_hidden(character) else character for character in text)
+
+
+def quoted(text: str) -> str:
+    """Return text from outside as a part of a line: printable, and not longer than a line may be."""
+    said = printable(text[: MAX_TEXT + 1])
+    return said if len(said) <= MAX_TEXT else said[: MAX_TEXT - 1] + "…"
+
+
+def _is_hidden(character: str) -> bool:
+    return unicodedata.category(character) in _HIDDEN
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")

@@ -1,0 +1,1 @@
+"""Where the robot can be: workspace, singularities, the mechanism's outline, and pictures of them."""

@@ -1,0 +1,180 @@
+"""The workspace drawn: slices over phi, coloured by conditioning, and their area along phi. Needs matplotlib."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+
+from trirail.config import Limits
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.geometry import Geometry
+from trirail.workspace.mechanism import Mechanism
+from trirail.workspace.singularity import conditioning, range_of_j1
+from trirail.workspace.workspace import Survey, area, permitted, reachable
+
+__all__ = ["draw"]
+
+INK, GREY, RAIL, PLATFORM, FORBIDDEN = "#1f2933", "#7b8794", "#d3d9e0", "#f0772b", "#c0392b"
+COLOURS, SCALE = colormaps["viridis"], Normalize(0.0, 1.0)
+BEYOND = 0.35  # opacity of what the robot reaches outside the platform's window
+PIXELS = 160  # samples of conditioning across a slice
+COLUMNS, WIDTH, STRIP = 4, 13.0, 3.4  # of the figure, in inches the last two
+DASHES = (0, (4, 3))
+MM = 1e3
+
+
+def draw(
+    file: Path, title: str, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Survey, service: Survey
+) -> None:
+    """Draw slices at `angles` [rad] and the areas of two surveys: of `reachable` and of `permitted`.
+
+    The file's suffix chooses the format. ValueError for one that matplotlib does not write, OSError if the
+    file cannot be written.
+    """
+    columns = min(COLUMNS, len(angles))
+    rows = math.ceil(len(angles) / columns)
+    height = rows * min(0.9 * WIDTH / columns, 5.0)
+    figure = Figure(figsize=(WIDTH, height + STRIP), dpi=150, layout="constrained")
+    figure.suptitle(title, x=0.008, ha="left", color=INK, fontsize=16, fontweight="bold")
+    slices, below = figure.subfigures(2, 1, height_ratios=[height, STRIP])  # type: ignore[misc]
+    panels = slices.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    parts = Mechanism.of(geometry, limits.slider)
+    for panel, phi in zip(panels.flat, angles, strict=False):
+        _slice(panel, geometry, limits, parts, phi)
+    for panel in panels.flat[len(angles) :]:
+        panel.set_axis_off()
+    extent = 1.06 * MM * np.abs([*np.ravel(parts.rails), *reach.x, *reach.y]).max()
+    panels[0, 0].set(xlim=(-extent, extent), ylim=(-extent, extent))
+    for panel in panels[:, 0]:
+        panel.set_ylabel("y [mm]", color=GREY, fontsize=9)
+    for panel in panels.flat[max(len(angles) - columns, 0) : len(angles)]:  # the lowest of each column
+        panel.tick_params(labelbottom=True)
+    for panel in panels[-1]:
+        panel.set_xlabel("x [mm]", color=GREY, fontsize=9)
+    bar = slices.colorbar(ScalarMappable(SCALE, COLOURS), ax=panels, aspect=40, pad=0.01)
+    bar.set_label("conditioning of J₁⁻¹J₂   (0 singular, 1 isotropic)", color=INK, fontsize=9)
+    bar.ax.tick_params(colors=GREY, labelsize=8)
+    _areas(below.subplots(), geometry, limits, angles, reach, service)
+    figure.savefig(file)
+
+
+def _slice(panel: Axes, geometry: Geometry, limits: Limits, parts: Mechanism, phi: float) -> None:
+    """Draw the slice at one angle, with the rails and the platform as it is turned at the origin."""
+    for rail in parts.rails:
+        panel.plot(*(MM * rail.T), color=RAIL, linewidth=4.0, solid_capstyle="round", zorder=1)
+    reach, service = reachable(geometry, limits, phi), permitted(geometry, limits, phi)
+    _shade(panel, geometry, reach, phi, BEYOND)
+    _shade(panel, geometry, service, phi, 1.0)
+    panel.add_patch(Polygon(MM * reach, fill=False, edgecolor=GREY, linewidth=0.8, zorder=4))
+    panel.add_patch(Polygon(MM * service, fill=False, edgecolor=INK, linewidth=1.4, joinstyle="round", zorder=5))
+    (left, right), (bottom, top) = limits.platform.x, limits.platform.y
+    window = MM * np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+    panel.add_patch(Polygon(window, fill=False, edgecolor=INK, linewidth=0.7, linestyle=DASHES, zorder=6))
+    turned = np.array([[math.cos(phi), math.sin(phi)], [-math.sin(phi), math.cos(phi)]])
+    for line in parts.outline:
+        panel.plot(*(MM * line @ turned).T, color=PLATFORM, linewidth=0.9, zorder=7)
+    if len(reach) == 0:
+        panel.text(0.5, 0.5, "out of reach", color=GREY, ha="center", va="center", transform=panel.transAxes, zorder=8)
+    panel.set_aspect("equal")
+    panel.set_title(f"φ = {_degrees(phi)}", loc="left", color=INK, fontsize=11, fontweight="bold", pad=4)
+    panel.set_title(f"{area(service):.4f} m²", loc="right", color=GREY, fontsize=9, pad=4)
+    _quiet(panel)
+
+
+def _shade(panel: Axes, geometry: Geometry, polygon: Array, phi: float, opacity: float) -> None:
+    """Fill a polygon with the conditioning at its points."""
+    if len(polygon) == 0:
+        return
+    (left, bottom), (right, top) = polygon.min(axis=0), polygon.max(axis=0)
+    x, y = np.meshgrid(np.linspace(left, right, PIXELS), np.linspace(bottom, top, PIXELS))
+    poses = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, phi)])
+    image = panel.imshow(
+        conditioning(geometry, poses).reshape(x.shape),
+        cmap=COLOURS,
+        norm=SCALE,
+        alpha=opacity,
+        origin="lower",
+        extent=(MM * left, MM * right, MM * bottom, MM * top),
+        interpolation="bilinear",
+        zorder=2,
+    )
+    image.set_clip_path(Polygon(MM * polygon, transform=panel.transData))
+
+
+def _areas(
+    strip: Axes, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Survey, service: Survey
+) -> None:
+    """Draw the area of the slices along phi, with the angles near which every pose is singular."""
+    low, high = np.degrees(range_of_j1(geometry))
+    margin = math.degrees(limits.singularity_margin)
+    for wall, inward in ((low, margin), (high, -margin)):
+        strip.axvspan(wall, wall + inward, color=FORBIDDEN, alpha=0.10, linewidth=0)
+        strip.axvline(wall, color=FORBIDDEN, linewidth=1.2)
+    strip.fill_between(np.degrees(reach.angles), reach.areas, color=RAIL, alpha=0.45, linewidth=0)
+    strip.plot(np.degrees(reach.angles), reach.areas, color=GREY, linewidth=0.9)
+    shown = np.degrees(service.angles)
+    centre = conditioning(geometry, np.column_stack([np.zeros((len(shown), 2)), service.angles]))
+    filled = strip.fill_between(shown, service.areas, alpha=0.0)
+    image = strip.imshow(
+        centre[np.newaxis],
+        cmap=COLOURS,
+        norm=SCALE,
+        aspect="auto",
+        extent=(shown[0], shown[-1], 0.0, service.best_area),
+        interpolation="bilinear",
+        zorder=2,
+    )
+    image.set_clip_path(filled.get_paths()[0], transform=strip.transData)
+    strip.plot(shown, service.areas, color=INK, linewidth=1.4, zorder=3)
+    strip.plot(
+        np.degrees(angles), [area(permitted(geometry, limits, phi)) for phi in angles], "o", color=INK, markersize=4
+    )
+    strip.set(xlim=(low - 3.0, high + 3.0), ylim=(0.0, 1.12 * reach.best_area))
+    strip.set_title(
+        "Area of the slices along φ, coloured by the conditioning at x = y = 0",
+        loc="left",
+        color=INK,
+        fontsize=10,
+        pad=6,
+    )
+    strip.set_xlabel("φ [°]", color=GREY, fontsize=9)
+    strip.set_ylabel("area [m²]", color=GREY, fontsize=9)
+    _quiet(strip)
+    strip.legend(
+        handles=[
+            Patch(
+                facecolor=COLOURS(0.7), edgecolor=INK, label=f"what the service permits: {service.volume:.4f} m²·rad"
+            ),
+            Patch(facecolor=RAIL, alpha=0.6, edgecolor=GREY, label=f"the robot's own reach: {reach.volume:.4f} m²·rad"),
+            Line2D([], [], color=PLATFORM, linewidth=0.9, label="the platform, turned, with its centre at x = y = 0"),
+            Line2D([], [], color=INK, linewidth=0.7, linestyle=DASHES, label="limits.platform, the window for x and y"),
+            Patch(facecolor=FORBIDDEN, alpha=0.3, label=f"singular, and {margin:.1f}° of margin"),
+        ],
+        loc="upper left",
+        bbox_to_anchor=(low + margin + 1.0, 1.0),
+        bbox_transform=strip.get_xaxis_transform(),
+        frameon=False,
+        fontsize=9,
+        labelcolor=INK,
+    )
+
+
+def _quiet(axes: Axes) -> None:
+    """Leave the word to the data."""
+    axes.tick_params(colors=GREY, labelsize=8, length=2)
+    for spine in axes.spines.values():
+        spine.set_color(RAIL)
+
+
+def _degrees(phi: float) -> str:
+    return f"{round(math.degrees(phi), 2) + 0.0:g}°".replace("-", "−")

@@ -1,0 +1,133 @@
+"""How near a pose is to a singularity, and how evenly the sliders move the platform there.
+
+A pose is (x, y, phi): the platform's centre G [m] and its angle [rad]; arrays hold one, shape (3,), or N of
+them, (N, 3). The singular poses divide all others into aspects, which no motion connects. The robot works in
+the one of the pose (0, 0, 0): there each delta_i of J1 and det J2 have the signs that they have at that pose.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.kinematics import jacobians
+
+__all__ = [
+    "characteristic_length",
+    "conditioning",
+    "det_j2_rows",
+    "distance_to_singularity",
+    "range_of_j1",
+    "sensitivity",
+]
+
+HOME = np.zeros(3)
+SAMPLES = 255  # of det J2 between two angles at which J1 is singular
+COINCIDENT = 1e-4  # two such angles that are nearer than this leave no room for a pose between them [rad]
+
+
+def sensitivity(geometry: Geometry, pose: ArrayLike) -> Array:
+    """Return J1⁻¹ J2, (3, 3) or (N, 3, 3): slider velocity = J1⁻¹ J2 @ platform velocity, (16).
+
+    Rows are the sliders A, B, C; the columns for x and y have no unit, that for phi is in m/rad.
+    KinematicsError as from inverse.
+    """
+    j1, j2 = jacobians(geometry, pose)
+    return j2 / np.diagonal(j1, axis1=-2, axis2=-1)[..., np.newaxis]
+
+
+def characteristic_length(geometry: Geometry) -> float:
+    """Return the length [m] that makes turning comparable with shifting.
+
+    Turning by an angle counts as shifting by this length times the angle. It is chosen so that at the pose
+    (0, 0, 0) both move the sliders alike, in the root mean square over sliders and directions. That makes
+    the symmetric robot isotropic there: the length is l0/√6. It depends on no choice of zeros or of points
+    along rails and edges.
+    """
+    at_home = sensitivity(geometry, HOME)
+    return float(math.sqrt(2.0) * np.linalg.norm(at_home[:, 2]) / np.linalg.norm(at_home[:, :2]))
+
+
+def conditioning(geometry: Geometry, pose: ArrayLike, length: float | None = None) -> NDArray[np.float64]:
+    """Return the ratio of the least to the greatest singular value of J1⁻¹ J2, shape () or (N,), no unit.
+
+    1 is isotropic, 0 singular. `length` [m] makes the column for phi comparable with the others, the
+    characteristic length if not given. KinematicsError as from inverse.
+    """
+    scale = [1.0, 1.0, 1.0 / (characteristic_length(geometry) if length is None else length)]
+    values = np.linalg.svd(sensitivity(geometry, pose) * scale, compute_uv=False)
+    return np.asarray(values[..., -1] / values[..., 0], dtype=np.float64)
+
+
+def range_of_j1(geometry: Geometry) -> tuple[float, float]:
+    """Return the angles phi [rad] on either side of zero at which the edge of some leg is parallel to its rail."""
+    ahead = _parallel(geometry) % math.pi
+    return float(ahead.max()) - math.pi, float(ahead.min())
+
+
+def det_j2_rows(geometry: Geometry, phi: Array) -> Array:
+    """Return rows d, (K, 3), for angles phi, (K,): at these det J2 = d @ (1, x, y), in metres.
+
+    Only the third column of J2, (18), depends on G, and at one phi it does so linearly.
+    """
+    centres = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    poses = np.column_stack([np.tile(centres, (len(phi), 1)), np.repeat(phi, 3)])
+    d = _det_j2(geometry, poses).reshape(-1, 3)
+    d[:, 1:] -= d[:, :1]
+    return d
+
+
+def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.float64]:
+    """Return by what angle [rad] the platform can turn either way before it is singular, shape () or (N,).
+
+    That is the distance in phi to the nearest of singular_angles at the pose's G. It is negative for a pose
+    beyond: of another aspect than (0, 0, 0). Like singular_angles it can miss two zeros of det J2 nearer together
+    than its samples, which are 1.2° apart at most. KinematicsError as from inverse, so also where J1 is singular.
+    """
+    at_home, _ = jacobians(geometry, HOME)
+    j1, j2 = jacobians(geometry, pose)
+    inside = (np.diagonal(j1 * np.sign(at_home), axis1=-2, axis2=-1) > 0.0).all(axis=-1)
+    inside &= np.linalg.det(j2) * _det_j2(geometry, HOME) > 0.0
+
+    poses = np.array(pose, dtype=np.float64).reshape(-1, 3)
+    turn = 2.0 * math.pi
+    poses[:, 2] -= turn * np.round(poses[:, 2] / turn)
+    of_j1 = np.sort(np.concatenate([_parallel(geometry) % math.pi + k * math.pi for k in (-2, -1, 0, 1)]))
+    above = np.searchsorted(of_j1, poses[:, 2])
+    distance = np.minimum(poses[:, 2] - of_j1[above - 1], of_j1[above] - poses[:, 2])
+    for k in np.unique(above):  # beyond the neighbours of J1 there is nothing nearer
+        if of_j1[k] - of_j1[k - 1] > COINCIDENT:
+            rows = np.flatnonzero(above == k)
+            found, zeros = _zeros_of_det_j2(geometry, poses[rows], of_j1[k - 1], of_j1[k])
+            np.minimum.at(distance, rows[found], np.abs(zeros - poses[rows[found], 2]))
+    distance = distance.reshape(inside.shape)
+    return np.asarray(np.where(inside, distance, -distance), dtype=np.float64)
+
+
+def _zeros_of_det_j2(geometry: Geometry, poses: Array, low: float, high: float) -> tuple[NDArray[np.intp], Array]:
+    """Return every phi between two neighbouring angles of J1 at which J2 is singular, after the row it is for."""
+    # zeros crowd where J1 is singular, so the samples do too
+    phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, SAMPLES + 2)[1:-1])
+    ones = np.ones(len(poses))
+    negative = np.column_stack([ones, poses[:, :2]]) @ det_j2_rows(geometry, phi).T < 0.0
+    rows, columns = np.nonzero(negative[:, 1:] != negative[:, :-1])
+    start, end = phi[columns], phi[columns + 1]
+    middle = poses[rows]
+    for _ in range(52):  # halvings, one for each bit of a float64
+        middle[:, 2] = (start + end) / 2.0
+        as_at_start = (_det_j2(geometry, middle) < 0.0) == negative[rows, columns]
+        start, end = np.where(as_at_start, middle[:, 2], start), np.where(as_at_start, end, middle[:, 2])
+    return rows, (start + end) / 2.0
+
+
+def _det_j2(geometry: Geometry, poses: Array) -> Array:
+    return np.asarray(np.linalg.det(jacobians(geometry, poses)[1]), dtype=np.float64)
+
+
+def _parallel(geometry: Geometry) -> Array:
+    """Return for each leg an angle phi [rad] at which its edge is parallel to its rail; others are pi apart."""
+    return np.array([leg.rail_angle - leg.edge_angle for leg in geometry.legs])
