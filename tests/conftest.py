@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
 from trirail.control.control import Control, Given
-from trirail.control.desk import Happening
+from trirail.control.ledger import Happening
 from trirail.wire.messages import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Mode

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from trirail.kinematics.geometry import Geometry
-from trirail.kinematics.kinematics import inverse
+from trirail.kinematics.robot import inverse
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import MODES, Mode
 from trirail_drivers.interface import PowerState

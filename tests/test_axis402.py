@@ -6,7 +6,7 @@ import math
 
 import pytest
 from trirail_drivers import frames
-from trirail_drivers.cia402.axis402 import Axis
+from trirail_drivers.cia402.axis import Axis
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.scaling import Scale
 

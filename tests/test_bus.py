@@ -9,10 +9,10 @@ import can
 import msgspec
 import pytest
 from trirail_drivers import bus
-from trirail_drivers.cia402.cia402 import Cia402
+from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Can, Drive, Drives
 from trirail_drivers.errors import BusError, DriveError
-from trirail_drivers.odrive.odrive import Odrive
+from trirail_drivers.odrive.drives import Odrive
 
 DRIVES = Drives(
     protocol="cia402",

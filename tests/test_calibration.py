@@ -15,7 +15,7 @@ from trirail import config
 from trirail.kinematics import calibration
 from trirail.kinematics.calibration import DOUBT, PARAMETERS, CalibrationError, corrected, identify, pose_derivatives
 from trirail.kinematics.geometry import LEGS, Geometry, Leg
-from trirail.kinematics.kinematics import forward, inverse
+from trirail.kinematics.robot import forward, inverse
 
 Array = NDArray[np.float64]
 

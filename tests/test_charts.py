@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.style import Style
 from trirail.analysis import charts
-from trirail.cli import sessions, terminal
+from trirail.cli import recording_commands, terminal
 from trirail.config import SIM, load
 from trirail.telemetry import palette
 from trirail.telemetry.recorder import Recorder
@@ -35,7 +35,7 @@ def test_a_session_that_was_in_every_mode_is_drawn(
     recorder.records(records[:350].tobytes())
     recorder.records(records[350:].tobytes())
     recorder.close()
-    assert sessions.report(recording, plot=tmp_path / picture) == 0
+    assert recording_commands.report(recording, plot=tmp_path / picture) == 0
     said = capsys.readouterr().out
     assert all(f"{mode} 0.1 s" in said for mode in MODES)
     if picture.endswith(".svg"):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import CONFIG
 from trirail.config import geometry
-from trirail.motion.checks import Checker
+from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
 from trirail.motion.paths import FOR_EVER, Path
 

@@ -12,9 +12,9 @@ import canopen
 import msgspec
 import pytest
 from trirail_drivers import frames
-from trirail_drivers.cia402.cia402 import Cia402
+from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.eds import SERVO
-from trirail_drivers.cia402.settings402 import interpolation_period, settings_of
+from trirail_drivers.cia402.settings import interpolation_period, settings_of
 from trirail_drivers.config import Drive, Drives, Homing
 from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState, Triple

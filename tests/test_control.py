@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from trirail.config import Config, geometry
 from trirail.control.modes import Event
-from trirail.kinematics.kinematics import forward, inverse
-from trirail.motion.motion import MotionState, rest
+from trirail.kinematics.robot import forward, inverse
+from trirail.motion.runs import MotionState, rest
 from trirail.wire.messages import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, Confirmed, GoalRequest, Refused
 from trirail.wire.vocabulary import Mode

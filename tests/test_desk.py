@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.control.desk import REMEMBERED_IDS, Desk
-from trirail.control.pilot import Taken
+from trirail.control.ledger import REMEMBERED_IDS, Desk
+from trirail.control.stepwise_planner import Taken
 from trirail.errors import RefusedError
 from trirail.wire.messages import PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest

@@ -14,7 +14,7 @@ import pytest
 from conftest import CONFIG
 from trirail.processes.gateway import PATIENCE, UNDER_WAY, Gateway
 from trirail.processes.inbox import Incoming
-from trirail.wire import boundary, packets, session
+from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, RefusedRequest, Request
 
 
@@ -35,7 +35,7 @@ Rig = tuple[Gateway, FakeLink]
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
     link = FakeLink()
-    with session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
+    with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
         yield Gateway(CONFIG, link, lambda: None, opened), link  # type: ignore[arg-type]
 
 
@@ -100,12 +100,12 @@ def test_an_error_of_its_own_is_told_and_does_not_end_it(rig: Rig, monkeypatch: 
 
 STUCK = """
 import sys, threading, zenoh
-from trirail.wire.session import open_client
+from trirail.wire.zenoh_session import open_client
 session = open_client(sys.argv[1])
 never = threading.Event()
 stuck = zenoh.handlers.Callback(lambda reply: never.wait(), indirect=False)
 for _ in range(3000):
-    session.get("trirail/demo/info", stuck, timeout=60.0)
+    zenoh_session.get("trirail/demo/info", stuck, timeout=60.0)
 print("asked", flush=True)
 never.wait()
 """
@@ -125,7 +125,7 @@ def test_an_asker_that_takes_no_answer_holds_up_nobody_else(rig: Rig, tmp_path: 
     serving = threading.Thread(target=serve)
     serving.start()
     with (
-        session.open_client(locator) as other,
+        zenoh_session.open_client(locator) as other,
         subprocess.Popen([sys.executable, "-c", STUCK, locator], stdout=subprocess.PIPE) as asker,
     ):
         try:

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import Geometry, Leg, singular_angles
-from trirail.kinematics.kinematics import jacobians
+from trirail.kinematics.robot import jacobians
 
 L0 = 0.3
 SYMMETRIC = Geometry.symmetric(L0)

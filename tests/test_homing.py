@@ -16,7 +16,7 @@ from canopen.profiles.p402 import BaseNode402
 from conftest import CONFIG, Delay, Rig, changed
 from trirail.config import Config, geometry
 from trirail.control.modes import Event
-from trirail.kinematics.kinematics import inverse
+from trirail.kinematics.robot import inverse
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused
 from trirail.wire.vocabulary import Mode
 from trirail_drivers import config, frames

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import zenoh
 from trirail.processes.inbox import UNREAD, Inbox, Incoming
-from trirail.wire import session
+from trirail.wire import zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE, MAX_UNREAD
 
 
@@ -19,7 +19,7 @@ def refused() -> list[Incoming]:
 
 @pytest.fixture
 def inbox(tmp_path: Path, refused: list[Incoming]) -> Iterator[Inbox]:
-    with session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
+    with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
         yield Inbox(opened, "demo", refused.append)
 
 

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import Geometry, Leg, singular_angles
-from trirail.kinematics.kinematics import forward, forward_into, inverse, inverse_into, jacobians, warm_up
+from trirail.kinematics.robot import forward, forward_into, inverse, inverse_into, jacobians, warm_up
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.processes.lastwords import LastWords
+from trirail.processes.last_words import LastWords
 from trirail.wire.messages import Event, PoseGoal
 from trirail.wire.packets import Farewell, GoalRequest, Happened, Input, Situation
 

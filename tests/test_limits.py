@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from test_control import GOAL, PERIOD, ROBOT, assert_within_limits, refusal
-from trirail.control.measured import Measured
-from trirail.kinematics.kinematics import inverse
-from trirail.motion.checks import PLATFORM_LAWS
+from trirail.control.feedback import Measured
+from trirail.kinematics.robot import inverse
+from trirail.motion.feasibility import PLATFORM_LAWS
 from trirail.motion.limits import EDGE, EXCESS, PLATFORM_EXCESS, Bounds, told_apart
-from trirail.motion.motion import MotionState, rest
-from trirail.motion.planning import START
+from trirail.motion.planner import START
+from trirail.motion.runs import MotionState, rest
 from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode

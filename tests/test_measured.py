@@ -7,8 +7,8 @@ from conftest import CONFIG
 from hypothesis import example, given
 from hypothesis import strategies as st
 from trirail.config import geometry
-from trirail.control.measured import Measured
-from trirail.kinematics.kinematics import forward, inverse
+from trirail.control.feedback import Measured
+from trirail.kinematics.robot import forward, inverse
 from trirail_drivers.interface import Feedback, PowerState
 
 PERIOD = CONFIG.period

@@ -16,12 +16,12 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal, slower
 from trirail.config import Config
 from trirail.errors import KinematicsError
-from trirail.kinematics.kinematics import forward, inverse
-from trirail.motion.course import Course
+from trirail.kinematics.robot import forward, inverse
 from trirail.motion.goals import LEAD, Goals, Motion
 from trirail.motion.limits import LEGS
-from trirail.motion.planning import TOO_FAST_IN_MOTION
+from trirail.motion.planner import TOO_FAST_IN_MOTION
 from trirail.motion.quintic import Point, quintic
+from trirail.motion.schedule import Course
 from trirail.motion.steps import Steps
 from trirail.wire.messages import Goal, OwnLimits, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, GoalRequest

@@ -13,7 +13,7 @@ from cantools.database.can import Database
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail_drivers.frames import frame_bits
-from trirail_drivers.odrive import odrive_frames as frames
+from trirail_drivers.odrive import frames
 
 LOADED = cantools.database.load_file(Path(__file__).with_name("data") / "odrive-cansimple.dbc")
 assert isinstance(LOADED, Database)

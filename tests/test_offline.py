@@ -11,17 +11,17 @@ import pytest
 from cyclopts import App, CycloptsError
 from matplotlib.image import imread
 from numpy.testing import assert_allclose
-from trirail.cli import offline
+from trirail.cli import math_commands
 from trirail.config import SIM
 from trirail.errors import KinematicsError, TrirailError
 from trirail.kinematics.geometry import Geometry
-from trirail.kinematics.kinematics import inverse
+from trirail.kinematics.robot import inverse
 from trirail.workspace.singularity import conditioning, sensitivity
 
 PAPER = Geometry.symmetric(0.3)
 
 app = App()
-for command in (offline.ik, offline.fk, offline.workspace):
+for command in (math_commands.ik, math_commands.fk, math_commands.workspace):
     app.command(command)
 
 

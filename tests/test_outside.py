@@ -23,8 +23,8 @@ from trirail.client.client import Robot
 from trirail.errors import RefusedError
 from trirail.wire import boundary
 from trirail.wire.messages import Event, TrajectoryGoal, TrajectoryPoint
-from trirail.wire.session import open_client
 from trirail.wire.sizes import MAX_MESSAGE, MAX_POINTS, MAX_TRANSPORT
+from trirail.wire.zenoh_session import open_client
 
 pytestmark = pytest.mark.slow
 
@@ -250,7 +250,7 @@ def test_an_asker_that_is_frozen_holds_up_nobody(shared: tuple[Service, Robot, z
     service, robot, _ = shared
     script = """
 import sys
-from trirail.wire.session import open_client
+from trirail.wire.zenoh_session import open_client
 session = open_client(sys.argv[1])
 print("ready", flush=True)
 while True:  # asks, and is stopped in the middle of it

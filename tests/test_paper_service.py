@@ -13,7 +13,7 @@ import paper_service
 import pytest
 from paper_motions import DURATION, EXAMPLES, QUANTITIES, Example, computed, greatest_difference, platform
 from paper_service import REACHED, driven, points
-from trirail.client import spawned
+from trirail.client import own_service
 from trirail.config import SIM, load
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry.reading import Line, Recording
@@ -146,7 +146,7 @@ def test_a_motion_whose_time_ran_at_another_rate_is_refused(rate: float) -> None
 
 
 def test_its_configuration_is_the_simulated_robots_out_of_reach_of_others(tmp_path: Path) -> None:
-    path, locator = spawned.private(tmp_path)
+    path, locator = own_service.private(tmp_path)
     config, sim = load(path), load(SIM)
     assert config.zenoh.listen == (locator,)
     assert locator == f"unixsock-stream/{tmp_path}/zenoh"

@@ -20,7 +20,7 @@ from trirail.telemetry.columns import Column, Timelines, chunks, structs
 from trirail.telemetry.reading import read
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.scene import FIELDS, Scene
-from trirail.telemetry.subject import Subject
+from trirail.telemetry.shown_robot import Subject
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
 

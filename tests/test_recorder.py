@@ -19,9 +19,9 @@ from rerun.chunk import Chunk, RrdReader
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.show import Show
+from trirail.telemetry.shown_robot import Subject
 from trirail.telemetry.sinks import BACKLOG, Archive, Relay, free_port
-from trirail.telemetry.subject import Subject
+from trirail.telemetry.streams import Show
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
 from trirail_drivers.capture import FRAME, REMOTE

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from trirail.analysis.replay import again
 from trirail.analysis.summary import summary
-from trirail.client import spawned
+from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.config import Config, load
 from trirail.errors import RefusedError, ServiceError
@@ -55,9 +55,9 @@ def act(robot: Robot, choice: random.Random) -> None:
 def session(folder: Path) -> Path:
     """Run a random session on a service of its own; return its recording."""
     recording = folder / "session.rrd"
-    config, locator = spawned.private(folder)
+    config, locator = own_service.private(folder)
     choice = random.Random(6)
-    with spawned.service(config, recording) as service, Robot("demo", locator, user="ann") as robot:
+    with own_service.service(config, recording) as service, Robot("demo", locator, user="ann") as robot:
         for then in (robot.stop, robot.quick_stop):
             robot.enable()
             for _ in range(STEPS):
@@ -72,7 +72,7 @@ def session(folder: Path) -> Path:
                 break
         robot.enable()
         robot.move_to(x=0.05, y=0.0, phi=0.0)
-        assert spawned.end(service) == 0  # in motion
+        assert own_service.end(service) == 0  # in motion
     return recording
 
 
@@ -210,7 +210,7 @@ def test_the_commands(path: Path, tmp_path: Path) -> None:
 
 
 def test_another_configuration_is_tried_on_simulated_drives(path: Path, tmp_path: Path) -> None:
-    config, _ = spawned.private(tmp_path)
+    config, _ = own_service.private(tmp_path)
     config.write_text(config.read_text().replace("velocity = [0.25, 0.25, 1.5]", "velocity = [0.1, 0.1, 1.0]"))
     assert load(config).limits.platform.velocity == (0.1, 0.1, 1.0)
     replayed = trirail("replay", path, "--config", config, "--json")

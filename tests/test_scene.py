@@ -15,12 +15,12 @@ from trirail.config import SIM, LegTable, load
 from trirail.kinematics.geometry import Geometry, Leg
 from trirail.processes.gateway import _info
 from trirail.telemetry.scene import Scene
-from trirail.telemetry.subject import Subject
+from trirail.telemetry.shown_robot import Subject
 from trirail.wire.messages import Info
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import MODES, Mode
 from trirail.workspace.mechanism import Mechanism, sliders
-from trirail.workspace.outlook import Outlook
+from trirail.workspace.reach import Outlook
 from trirail.workspace.singularity import distance_to_singularity
 
 CONFIG = load(SIM)

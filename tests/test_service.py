@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 import zenoh
 from can import CanutilsLogReader
-from trirail.cli.remote import RemoteView
+from trirail.cli.remote_view import RemoteView
 from trirail.client.client import Robot
 from trirail.config import SIM, load
 from trirail.errors import RefusedError, ServiceError
@@ -33,10 +33,10 @@ from trirail.processes.interpreter import child, python
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import read
 from trirail.wire.messages import Event, GoalReply, OwnLimits, State
-from trirail.wire.session import open_client
 from trirail.wire.vocabulary import MODES, Mode
+from trirail.wire.zenoh_session import open_client
 from trirail_drivers import frames
-from trirail_drivers.odrive import odrive_frames
+from trirail_drivers.odrive import frames as odrive_frames
 
 pytestmark = pytest.mark.slow
 

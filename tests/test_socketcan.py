@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import can
 import pytest
 from trirail_drivers import bus, frames
-from trirail_drivers.cia402.cia402 import Cia402
+from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Can, Drive, Drives, Simulated
 from trirail_drivers.errors import BusError
 from trirail_drivers.interface import Feedback, PowerState

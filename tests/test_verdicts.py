@@ -7,8 +7,8 @@ from itertools import product
 import pytest
 from conftest import CONFIG
 from trirail.config import geometry
-from trirail.control.measured import Measured
-from trirail.control.verdicts import still_powered, verdict
+from trirail.control.completion import still_powered, verdict
+from trirail.control.feedback import Measured
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.interface import DriveFault, Feedback, PowerState
 

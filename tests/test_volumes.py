@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 from trirail.config import SIM, Config, load, parse
 from trirail.processes.loop import BATCHES_PER_SECOND
 from trirail.processes.recording import GATHER
-from trirail.telemetry import provenance, shelf
+from trirail.telemetry import provenance, retention
 from trirail.telemetry.blackbox import AFTER, BEFORE, BlackBox
 from trirail.telemetry.reading import Recording, join, read
 from trirail.telemetry.recorder import Recorder
@@ -151,12 +151,12 @@ def test_the_oldest_recordings_go_and_black_boxes_last(tmp_path: Path) -> None:
     part = kept(tmp_path, "demo-20260101-120000-part2.rrd", 4, 3000)
     mine = kept(tmp_path, "my-best.rrd", 50, 9000)
     live = kept(tmp_path, "other-20260101-130000.rrd", 4, 1)
-    assert shelf.tidy(tmp_path, 18e6, now=1e9) == []
-    assert shelf.tidy(tmp_path, 17e6, now=1e9) == [old]
+    assert retention.tidy(tmp_path, 18e6, now=1e9) == []
+    assert retention.tidy(tmp_path, 17e6, now=1e9) == [old]
     assert not log.exists()
-    assert shelf.tidy(tmp_path, 8e6, now=1e9) == [part]
-    assert shelf.tidy(tmp_path, 7e6, now=1e9) == [box]
-    assert shelf.tidy(tmp_path, 1e6, now=1e9) == []  # what is being written stays
+    assert retention.tidy(tmp_path, 8e6, now=1e9) == [part]
+    assert retention.tidy(tmp_path, 7e6, now=1e9) == [box]
+    assert retention.tidy(tmp_path, 1e6, now=1e9) == []  # what is being written stays
     assert mine.exists()
     assert live.exists()
 
@@ -193,7 +193,7 @@ LIMITED = """
 import os, resource, sys
 from pathlib import Path
 import made, test_volumes as here
-from trirail.telemetry.volumes import RETRY
+from trirail.telemetry.rotation import RETRY
 told, time = [], here.Time()
 config = here.configured()
 recording = here.recorder(Path(sys.argv[1]), time, config, warn=told.append)

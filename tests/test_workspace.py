@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from trirail.config import SIM, Limits, load
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import Geometry, Leg, singular_angles
-from trirail.kinematics.kinematics import inverse, jacobians
+from trirail.kinematics.robot import inverse, jacobians
 from trirail.workspace.singularity import (
     characteristic_length,
     conditioning,

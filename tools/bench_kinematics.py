@@ -11,7 +11,7 @@ import numpy as np
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.closure import inverse_batch
 from trirail.kinematics.geometry import Geometry
-from trirail.kinematics.kinematics import forward_into, inverse, inverse_into, warm_up
+from trirail.kinematics.robot import forward_into, inverse, inverse_into, warm_up
 
 L0 = 0.3
 POSE = np.array([0.02, -0.01, 0.15])

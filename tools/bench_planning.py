@@ -11,9 +11,9 @@ import numpy as np
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from trirail.config import SIM, geometry, load
 from trirail.errors import RefusedError
-from trirail.motion.course import Course
 from trirail.motion.goals import Goals
-from trirail.motion.motion import rest
+from trirail.motion.runs import rest
+from trirail.motion.schedule import Course
 from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, VelocityGoal
 
 GOALS = 1500

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from moving import keep_moving
-from trirail.client import spawned
+from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.config import load
 from trirail.processes.interpreter import child
@@ -32,10 +32,10 @@ def measure(seconds: float) -> dict[str, dict[str, float]]:
     """Run a service for so many seconds, moving; return what its recorder took, unwatched and watched."""
     port = free_port()
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
-        config, locator = spawned.private(Path(folder), port)
+        config, locator = own_service.private(Path(folder), port)
         rate = load(config).loop.rate_hz
         recording = Path(folder) / "bench.rrd"
-        with spawned.service(config, recording) as service, Robot("demo", locator, user="bench") as robot:
+        with own_service.service(config, recording) as service, Robot("demo", locator, user="bench") as robot:
             recorder, loop = (child(service.pid, name) for name in ("recorder", "loop"))
 
             def taken() -> dict[str, float]:

@@ -28,7 +28,7 @@ from typing import NamedTuple
 from chaos_rig import PATIENCE, PROCESSES, Failed, Rig, states, wait_for
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
-from trirail.wire.session import key, open_client
+from trirail.wire.zenoh_session import key, open_client
 
 MODES = ("disabled", "enabling", "holding", "moving", "stopping", "fault")
 HARM: dict[str, tuple[signal.Signals, float | None]] = {

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import can
 import numpy as np
-from trirail.client import spawned
+from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.config import SIM, load
 from trirail.errors import ServiceError, TrirailError
@@ -112,7 +112,7 @@ class Rig:
         runtime = self.folder / "runtime"
         runtime.mkdir(exist_ok=True)
         self._log = (self.folder / "service.log").open("w+b")
-        self.service = spawned.start(self.config, self._log, XDG_RUNTIME_DIR=str(runtime))
+        self.service = own_service.start(self.config, self._log, XDG_RUNTIME_DIR=str(runtime))
 
     @property
     def locator(self) -> str:

@@ -28,11 +28,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import zenoh
-from trirail.client import spawned
+from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.telemetry.sinks import free_port
-from trirail.wire import boundary, session
+from trirail.wire import boundary, zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE
 
 SESSIONS = 200
@@ -72,7 +72,7 @@ def _trajectory(points: int) -> bytes:
 
 
 def _key(*parts: str) -> str:
-    return session.key("demo", *parts)
+    return zenoh_session.key("demo", *parts)
 
 
 JUNK: dict[str, Callable[[random.Random], Message]] = {
@@ -108,7 +108,7 @@ class Flood:
         self._threads: list[threading.Thread] = []
 
     def __enter__(self) -> Flood:
-        sessions = [session.open_client(self._locator) for _ in range(SESSIONS - DEAF)]
+        sessions = [zenoh_session.open_client(self._locator) for _ in range(SESSIONS - DEAF)]
         share = len(sessions) // SENDERS
         for number in range(SENDERS):
             own = sessions[number * share :][:share]
@@ -166,7 +166,7 @@ class Flood:
 def _flood(locator: str, ports: tuple[int, ...], rate: float, seconds: float, deaf: bool, said: Connection) -> None:
     """Flood from a process of its own: readers that never read block Zenoh's threads in the whole process."""
     if deaf:
-        kept = [session.open_client(locator) for _ in range(DEAF)]
+        kept = [zenoh_session.open_client(locator) for _ in range(DEAF)]
         subscribed = [one.declare_subscriber("trirail/**", zenoh.handlers.FifoChannel(1)) for one in kept]
         time.sleep(seconds)
         said.send((Counter({"deaf": len(subscribed)}), 0))
@@ -194,13 +194,13 @@ def memory(pids: dict[str, int]) -> dict[str, float]:
 
 
 @contextlib.contextmanager
-def private_service(folder: Path) -> Iterator[tuple[spawned.Process, str, tuple[int, int]]]:
+def private_service(folder: Path) -> Iterator[tuple[own_service.Process, str, tuple[int, int]]]:
     """Run a service on TCP ports of its own; give its process, its locator and the ports."""
     zenoh_port, live_port = free_port(), free_port()
-    config, private = spawned.private(folder, live_port)
+    config, private = own_service.private(folder, live_port)
     locator = f"tcp/127.0.0.1:{zenoh_port}"
     config.write_text(config.read_text().replace(private, locator))
-    with spawned.service(config, folder / "flood.rrd") as process:
+    with own_service.service(config, folder / "flood.rrd") as process:
         yield process, locator, (zenoh_port, live_port)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from trirail.errors import ServiceError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.geometry import LEGS, Geometry
-from trirail.kinematics.kinematics import inverse
+from trirail.kinematics.robot import inverse
 
 L0 = 0.3
 """Centre to summit of the fixed triangle [m]."""

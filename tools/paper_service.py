@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from paper_motions import DURATION, EXAMPLES, Curves, Example, platform
-from trirail.client import spawned
+from trirail.client import own_service
 from trirail.client.client import Goal, Robot
 from trirail.config import SIM, load
 from trirail.errors import RefusedError, ServiceError
@@ -50,9 +50,9 @@ def drive(recording: Path, say: Callable[[str], None]) -> dict[Example, Driven]:
     """Have a service of its own follow the motions, recorded to a file, and return what it did. Raises TrirailError."""
     period = load(SIM).period
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
-        config, locator = spawned.private(Path(folder))
+        config, locator = own_service.private(Path(folder))
         say("starting a service on simulated drives")
-        with spawned.service(config, recording) as service:
+        with own_service.service(config, recording) as service:
             with Robot(load(config).robot.name, locator, user=USER) as robot:
                 robot.enable()
                 for example in EXAMPLES:
@@ -60,7 +60,7 @@ def drive(recording: Path, say: Callable[[str], None]) -> dict[Example, Driven]:
                     _finish(robot.move_to(x=0.0, y=0.0, phi=0.0), "the way back to the centre")
                     _finish(_send(robot, example), example.name)
                 robot.disable()
-            if code := spawned.end(service):
+            if code := own_service.end(service):
                 raise ServiceError(f"the service ended with exit code {code}")
     made = read(recording)
     return {example: driven(made, _name(example), period) for example in EXAMPLES}

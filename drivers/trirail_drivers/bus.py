@@ -12,10 +12,10 @@ import can
 
 from trirail_drivers import canerrors, config
 from trirail_drivers.capture import Capture, CapturedBus
-from trirail_drivers.cia402.cia402 import Cia402
+from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import Drives
-from trirail_drivers.odrive.odrive import Odrive
+from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.simulated import simulated_bus
 from trirail_drivers.unixbus import UnixBus
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from trirail_drivers.cia402 import settings402
+from trirail_drivers.cia402 import settings
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
-from trirail_drivers.odrive import odrive_setup
-from trirail_drivers.odrive.odrive_frames import MAX_FEED_FORWARD
+from trirail_drivers.odrive import setup
+from trirail_drivers.odrive.frames import MAX_FEED_FORWARD
 from trirail_drivers.scaling import INT32_MAX, Scale, scale_of
 
 FINE_ENOUGH: Final = 10
@@ -40,15 +40,15 @@ def check(drives: Drives, motion: Motion) -> None:
             f"wanted at least its period, {motion.period:g} s"
         )
     if drives.protocol == "cia402":
-        settings402.check_nodes(drives)
+        settings.check_nodes(drives)
     else:
-        odrive_setup.check_nodes(drives)
+        setup.check_nodes(drives)
     for name, drive in zip(NAMES, drives.each, strict=True):
         scale = scale_of(name, drive)
         _check_resolution(name, drive, drives, motion)
         if drives.protocol == "cia402":
             _check_counts(name, drive, scale, motion)
-            settings402.settings_of(name, drive, drives, scale, motion.period)
+            settings.settings_of(name, drive, drives, scale, motion.period)
         else:
             _check_feed_forward(name, drive, motion)
 

@@ -1,5 +1,5 @@
 """`python -m trirail` is `trirail`."""
 
-from trirail.cli.cli import main
+from trirail.cli.commands import main
 
 main()

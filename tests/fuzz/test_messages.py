@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from trirail.errors import RefusedError
 from trirail.processes.gateway import Gateway
 from trirail.processes.inbox import Incoming, Kind
-from trirail.wire import boundary, links, packets, session, text
+from trirail.wire import boundary, links, packets, text, zenoh_session
 from trirail.wire.links import Port, TooLarge
 from trirail.wire.messages import CommandReply, Event, Goal, Info, Override, PoseGoal, State, Stop, TrajectoryGoal
 from trirail.wire.messages import TrajectoryPoint as Point
@@ -169,7 +169,7 @@ class FakeLink:
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gateway, FakeLink]]:
     folder = tmp_path_factory.mktemp("zenoh")
     link = FakeLink()
-    with session.open_service([f"unixsock-stream/{folder}/z"]) as opened:
+    with zenoh_session.open_service([f"unixsock-stream/{folder}/z"]) as opened:
         yield Gateway(CONFIG, link, lambda: None, opened), link  # type: ignore[arg-type]
 
 

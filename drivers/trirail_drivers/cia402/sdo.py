@@ -13,7 +13,7 @@ from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from trirail_drivers import frames
-from trirail_drivers.cia402.settings402 import INVALID, NO_REMOTE_REQUEST
+from trirail_drivers.cia402.settings import INVALID, NO_REMOTE_REQUEST
 from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 
 # What canopen would say of a failed transfer is in the DriveError; standard error is for that one line.

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 from trirail_drivers import frames
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
-from trirail_drivers.odrive import odrive_frames
+from trirail_drivers.odrive import frames as odrive_frames
 
 HELP: Final = """\
 [at SECONDS] [when DRIVE CONDITION] [with CHANCE] [DRIVE] FAULT [VALUE] [FRAMES ...] [for SECONDS | for N frames]

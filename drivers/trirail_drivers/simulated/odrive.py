@@ -9,8 +9,8 @@ from collections.abc import Callable
 from typing import Final
 
 from trirail_drivers.interface import PowerState
-from trirail_drivers.odrive import odrive_frames as frames
-from trirail_drivers.odrive.odrive_frames import AxisState, Error, Result
+from trirail_drivers.odrive import frames
+from trirail_drivers.odrive.frames import AxisState, Error, Result
 from trirail_drivers.simulated.servo import Servo
 
 FIRMWARE: Final = (0, 6, 10)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from trirail.cli.terminal import out, percentiles, plain
-from trirail.client import spawned
+from trirail.client import own_service
 from trirail.client.client import Result, Robot
 from trirail.config import SIM, load
 from trirail.errors import RefusedError
@@ -66,7 +66,7 @@ def run(*, stay: bool, record: Path | None) -> int:
     )
     with contextlib.ExitStack() as stack:
         with out.status("starting the service (the very first time compiles the kinematics, some seconds)"):
-            service = stack.enter_context(spawned.service(SIM, recording))
+            service = stack.enter_context(own_service.service(SIM, recording))
         with Robot(config.robot.name, locator, user="demo") as robot:
             robot.enable()
             rows = list(_tour(robot))
@@ -75,7 +75,7 @@ def run(*, stay: bool, record: Path | None) -> int:
                 _report(rows, state, recording)
                 _stay()
             robot.disable()
-        code = spawned.end(service)
+        code = own_service.end(service)
     if not stay:
         _report(rows, state, recording)
     if code:

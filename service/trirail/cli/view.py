@@ -80,7 +80,7 @@ def _source(file: Path | None, robot: str, connect: str, records: bool) -> Itera
     with Robot(robot, connect) as service:
         info = service.info()
     if records or not is_local(connect):
-        from trirail.cli.remote import RemoteView
+        from trirail.cli.remote_view import RemoteView
 
         with RemoteView(info, connect) as drawn:
             yield drawn.url

@@ -24,7 +24,7 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.listener import Listener
 from trirail.errors import RefusedError, ServiceError, TrirailError
-from trirail.wire import boundary, session
+from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import (
     CommandReply,
     ErrorReply,
@@ -155,13 +155,15 @@ class Robot:
     Raises ServiceError where there is no service, RefusedError where it says no.
     """
 
-    def __init__(self, name: str = "demo", connect: str = session.DEFAULT_LOCATOR, user: str | None = None) -> None:
+    def __init__(
+        self, name: str = "demo", connect: str = zenoh_session.DEFAULT_LOCATOR, user: str | None = None
+    ) -> None:
         self.name = boundary.check_name(name, "robot")
         self.user = boundary.check_name(user or _user(), "user")
         self._connect = connect
-        self._session = session.open_client(connect)
+        self._session = zenoh_session.open_client(connect)
         # Also at the end of a program that does not close it: Zenoh's threads must not outlive the interpreter.
-        self._close = weakref.finalize(self, session.close, self._session)
+        self._close = weakref.finalize(self, zenoh_session.close, self._session)
         self._listener = Listener()
         self._goals: dict[str, Goal] = {}
         self._goals_lock = threading.Lock()
@@ -363,7 +365,7 @@ class Robot:
     # ------------------------------------------------------------------ inside
 
     def _key(self, *parts: str) -> str:
-        return session.key(self.name, *parts)
+        return zenoh_session.key(self.name, *parts)
 
     def _on_event(self, event: Event) -> None:
         if event.id is None or event.outcome is None:

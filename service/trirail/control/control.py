@@ -13,18 +13,18 @@ from collections.abc import Callable, Iterable
 from trirail_drivers.interface import NAMES, Drives, Feedback, PowerState
 
 from trirail.config import Config, geometry
-from trirail.control.desk import Desk
-from trirail.control.dispatch import Dispatch
-from trirail.control.measured import Measured
+from trirail.control.completion import still_powered, verdict
+from trirail.control.feedback import Measured
+from trirail.control.goal_queue import Dispatch
+from trirail.control.ledger import Desk
 from trirail.control.modes import DISABLED, HOLDING, Action, Event, Refusal, State, step
-from trirail.control.pilot import Pilot
 from trirail.control.setpoints import Setpoints
-from trirail.control.verdicts import still_powered, verdict
+from trirail.control.stepwise_planner import Pilot
 from trirail.errors import RefusedError
-from trirail.motion.course import Course
 from trirail.motion.goals import Goals
 from trirail.motion.limits import EDGE, Bounds
-from trirail.motion.motion import STILL, MotionState, Run, rest
+from trirail.motion.runs import STILL, MotionState, Run, rest
+from trirail.motion.schedule import Course
 from trirail.motion.steps import finish
 from trirail.wire.messages import Outcome, PoseGoal, SlidersGoal
 from trirail.wire.packets import CommandRequest, GoalRequest, Mishap, Request
@@ -293,7 +293,7 @@ class Control:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
 
     def _verdict(self, name: str, since: int) -> str | None:
-        """Say what has become of a command that came in a cycle: trirail.control.verdicts.verdict."""
+        """Say what has become of a command that came in a cycle: trirail.control.completion.verdict."""
         settled = self.cycles - since >= self._settle_cycles
         return verdict(name, self.state.mode, self.fault, self.measured, settled=settled)
 

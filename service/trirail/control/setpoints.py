@@ -7,12 +7,12 @@ import math
 import numpy as np
 from trirail_drivers.interface import NAMES, PowerState
 
-from trirail.control.measured import Measured
+from trirail.control.feedback import Measured
 from trirail.errors import RefusedError
 from trirail.kinematics.algebra import Array
-from trirail.kinematics.kinematics import inverse_into
+from trirail.kinematics.robot import inverse_into
 from trirail.motion.limits import Bounds
-from trirail.motion.motion import MotionState, rest
+from trirail.motion.runs import MotionState, rest
 
 
 class Setpoints:

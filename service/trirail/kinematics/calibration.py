@@ -23,7 +23,7 @@ from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from trirail.errors import KinematicsError, TrirailError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.geometry import LEGS, Geometry, Leg
-from trirail.kinematics.kinematics import forward, inverse, jacobians
+from trirail.kinematics.robot import forward, inverse, jacobians
 
 __all__ = ["PARAMETERS", "Calibration", "CalibrationError", "Open", "corrected", "identify", "pose_derivatives"]
 

@@ -11,15 +11,15 @@ import numpy as np
 from trirail.config import Limits
 from trirail.errors import RefusedError
 from trirail.kinematics.geometry import Geometry
-from trirail.motion.checks import Checker
-from trirail.motion.course import Course
-from trirail.motion.laws import Laws
+from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
-from trirail.motion.motion import MotionState, Run, rest, stretched
 from trirail.motion.paths import HALVINGS, Path, constant, value
-from trirail.motion.planning import TOO_FAST_IN_MOTION, Kinodynamic, Plan, Planner
+from trirail.motion.planner import TOO_FAST_IN_MOTION, Kinodynamic, Plan, Planner
 from trirail.motion.quintic import Point
+from trirail.motion.runs import MotionState, Run, rest, stretched
+from trirail.motion.schedule import Course
 from trirail.motion.steps import Steps, T
+from trirail.motion.time_scaling import Laws
 from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 
 SLOWEST = 0.05

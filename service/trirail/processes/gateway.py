@@ -21,11 +21,11 @@ from trirail.config import Config, geometry
 from trirail.errors import RefusedError
 from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox, Incoming
-from trirail.processes.lastwords import LastWords
+from trirail.processes.last_words import LastWords
 from trirail.processes.replies import Replies
 from trirail.processes.state import StateMaker
 from trirail.telemetry.provenance import versions
-from trirail.wire import boundary, session
+from trirail.wire import boundary, zenoh_session
 from trirail.wire.links import Closed, Link
 from trirail.wire.messages import CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
 from trirail.wire.packets import (
@@ -326,7 +326,7 @@ class Gateway:
             self._answer(ticket, ErrorReply("timeout", "not carried out in time"))
 
     def _key(self, *parts: str) -> str:
-        return session.key(self._robot, *parts)
+        return zenoh_session.key(self._robot, *parts)
 
 
 def _info(config: Config) -> Info:
@@ -349,7 +349,7 @@ def _info(config: Config) -> Info:
 
 def main(config: Config, link: Link, beat: Callable[[], None], ready: Callable[[object], None]) -> int:
     """Run the gateway's process; `ready` is called once it can be reached."""
-    with session.open_service(config.zenoh.listen) as opened:
+    with zenoh_session.open_service(config.zenoh.listen) as opened:
         gateway = Gateway(config, link, beat, opened)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
         gateway.serve(lambda: ready({}))

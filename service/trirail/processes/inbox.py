@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 import zenoh
 
-from trirail.wire import session
+from trirail.wire import zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE, MAX_UNREAD
 
 UNREAD = 8192
@@ -64,7 +64,7 @@ class Inbox:
             return zenoh.handlers.Callback(partial(self._on_query, kind), indirect=False)
 
         on_sample = zenoh.handlers.Callback(self._on_sample, indirect=False)
-        key, declare = partial(session.key, self._robot), self._session.declare_queryable
+        key, declare = partial(zenoh_session.key, self._robot), self._session.declare_queryable
         self._declared = [
             declare(key("goal", "*"), queries("goal")),
             declare(key("cmd", "*", "*"), queries("cmd")),

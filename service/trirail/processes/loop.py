@@ -17,7 +17,7 @@ from trirail_drivers.interface import DriveFault, Drives
 from trirail.config import Config
 from trirail.control.control import Control, Given
 from trirail.control.modes import Event as ModeEvent
-from trirail.kinematics.kinematics import warm_up
+from trirail.kinematics.robot import warm_up
 from trirail.processes import realtime
 from trirail.processes.clock import Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, Watch

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from trirail.config import Config
-from trirail.processes.lastwords import LastWords
+from trirail.processes.last_words import LastWords
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.links import Closed, Link

@@ -12,7 +12,7 @@ import zenoh
 
 from trirail.errors import RefusedError
 from trirail.processes.inbox import Incoming
-from trirail.wire import boundary, session
+from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import ErrorReply
 
 LANES = 32
@@ -75,5 +75,5 @@ class Replies:
             if isinstance(content, ErrorReply):
                 query.reply_err(payload, encoding=encoding)
             else:
-                key = session.key(self._robot, "info") if incoming.kind == "info" else incoming.key
+                key = zenoh_session.key(self._robot, "info") if incoming.kind == "info" else incoming.key
                 query.reply(key, payload, encoding=encoding)

@@ -14,7 +14,7 @@ from operator import methodcaller
 
 from trirail.errors import ServiceError
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.shelf import BLACK_BOX
+from trirail.telemetry.retention import BLACK_BOX
 from trirail.wire.messages import Event
 from trirail.wire.packets import Input
 from trirail.wire.records import last_cycle

@@ -7,7 +7,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from trirail.telemetry import curves
-from trirail.telemetry.subject import Subject
+from trirail.telemetry.shown_robot import Subject
 from trirail.workspace.mechanism import Points
 
 WINDOW = 8.0

@@ -11,7 +11,7 @@ from trirail.config import Range
 from trirail.kinematics.geometry import LEGS
 from trirail.telemetry import palette
 from trirail.telemetry.palette import Colour
-from trirail.telemetry.subject import Subject
+from trirail.telemetry.shown_robot import Subject
 
 POSITION, VELOCITY, ACCELERATION = "/sliders/position", "/sliders/velocity", "/sliders/acceleration"
 ERROR = "/sliders/following_error"

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from trirail.config import Config
 from trirail.errors import ServiceError
-from trirail.telemetry import provenance, shelf
+from trirail.telemetry import provenance, retention
 from trirail.telemetry.candump import CandumpLog
-from trirail.telemetry.show import LIVE_HZ, REPORT_EVERY, Batches, Show
+from trirail.telemetry.rotation import Volumes, claim
+from trirail.telemetry.shown_robot import Subject
 from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
-from trirail.telemetry.subject import Subject
-from trirail.telemetry.volumes import Volumes, claim
+from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Show
 from trirail.wire.messages import Event
 from trirail.wire.packets import Input
 from trirail.wire.records import LAYOUT, last_cycle
@@ -205,7 +205,7 @@ class Recorder:
 
     def _tidy(self, folder: Path, at_most: float) -> None:
         try:
-            shelf.tidy(folder, at_most)
+            retention.tidy(folder, at_most)
         except OSError as error:
             words = f"cannot delete old recordings: {error}"
             if words != self._untidy:

@@ -17,10 +17,10 @@ from rerun.chunk import Chunk
 
 from trirail.telemetry import columns, curves, drawing, palette
 from trirail.telemetry.columns import Column
-from trirail.telemetry.subject import Subject
+from trirail.telemetry.shown_robot import Subject
 from trirail.wire.vocabulary import MODES
 from trirail.workspace.mechanism import Mechanism
-from trirail.workspace.outlook import Outlook
+from trirail.workspace.reach import Outlook
 
 DRAWN_HZ = 100
 """Samples a second of what is drawn."""

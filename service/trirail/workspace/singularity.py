@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.geometry import Geometry
-from trirail.kinematics.kinematics import jacobians
+from trirail.kinematics.robot import jacobians
 
 __all__ = [
     "characteristic_length",

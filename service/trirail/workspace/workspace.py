@@ -18,7 +18,7 @@ from trirail.config import Limits, Range
 from trirail.errors import KinematicsError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.geometry import LEGS, Geometry
-from trirail.kinematics.kinematics import inverse
+from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Violation
 from trirail.workspace.singularity import det_j2_rows, distance_to_singularity, range_of_j1
 

@@ -9,10 +9,10 @@ from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
 from trirail.config import PlatformLimits
 from trirail.kinematics.geometry import Geometry
-from trirail.motion.checks import Checker
-from trirail.motion.motion import Run, arrival, law_from_ruckig
+from trirail.motion.feasibility import Checker
 from trirail.motion.paths import Path, constant
-from trirail.motion.solver import solved
+from trirail.motion.ruckig_call import solved
+from trirail.motion.runs import Run, arrival, law_from_ruckig
 from trirail.motion.steps import Steps
 
 SHARES = tuple(0.6**k for k in range(12))

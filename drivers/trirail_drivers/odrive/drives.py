@@ -24,10 +24,9 @@ import can
 from trirail_drivers import config, load
 from trirail_drivers.axis import MISSED_ANSWERS
 from trirail_drivers.interface import NAMES, DriveFault, Feedback, Triple
-from trirail_drivers.odrive import odrive_frames as frames
-from trirail_drivers.odrive import odrive_setup
-from trirail_drivers.odrive.odrive_axis import OdriveAxis
-from trirail_drivers.odrive.odrive_frames import AxisState
+from trirail_drivers.odrive import frames, setup
+from trirail_drivers.odrive.axis import OdriveAxis
+from trirail_drivers.odrive.frames import AxisState
 from trirail_drivers.ramp import braked
 from trirail_drivers.scaling import scale_of
 from trirail_drivers.wire import Wire
@@ -53,7 +52,7 @@ class Odrive:
     """
 
     def __init__(self, bus: can.BusABC, bitrate: int, drives: config.Drives, clock: Clock = time.monotonic) -> None:
-        odrive_setup.check_nodes(drives)
+        setup.check_nodes(drives)
         self.bus_load = 0.0
         self._bitrate = bitrate
         self._drives = drives
@@ -107,7 +106,7 @@ class Odrive:
         rate = 1.0 / period
         self.bus_load = load.checked(rate, self._bitrate, self._drives)
         self._period = period
-        odrive_setup.configure(self._wire, self._axes, self._drives, self._clock)
+        setup.configure(self._wire, self._axes, self._drives, self._clock)
         if warning := load.warning(rate, self.bus_load):
             self._wire.warn(warning)
 

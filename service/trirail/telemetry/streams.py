@@ -16,7 +16,7 @@ from trirail.telemetry import blueprint, journal
 from trirail.telemetry.columns import SECOND
 from trirail.telemetry.journal import EVENTS, Entry
 from trirail.telemetry.scene import Scene
-from trirail.telemetry.subject import Subject
+from trirail.telemetry.shown_robot import Subject
 from trirail.wire.messages import Event, Level
 from trirail.wire.packets import Input
 from trirail.wire.records import DTYPE, unpack

@@ -6,11 +6,11 @@ import math
 from typing import NamedTuple
 
 from trirail.errors import RefusedError
-from trirail.motion.course import Course
 from trirail.motion.goals import Extension, Goals, Motion
-from trirail.motion.laws import SHARES
-from trirail.motion.motion import Run
+from trirail.motion.runs import Run
+from trirail.motion.schedule import Course
 from trirail.motion.steps import Steps
+from trirail.motion.time_scaling import SHARES
 from trirail.wire.messages import Goal, PoseGoal
 
 MOST_STEPS = 500

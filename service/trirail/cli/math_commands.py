@@ -77,7 +77,7 @@ def ik(
     """
     import numpy as np
 
-    from trirail.kinematics.kinematics import inverse
+    from trirail.kinematics.robot import inverse
     from trirail.motion.limits import Bounds
     from trirail.workspace.singularity import conditioning, distance_to_singularity, sensitivity
 
@@ -118,7 +118,7 @@ def fk(a: float, b: float, c: float, /, *, offline: Offline = DEFAULT) -> int:
     c
         Position of slider C [m].
     """
-    from trirail.kinematics.kinematics import forward
+    from trirail.kinematics.robot import forward
     from trirail.motion.limits import Bounds
 
     config, robot = _load(offline)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from trirail.motion.motion import MotionState, Run
+from trirail.motion.runs import MotionState, Run
 
 
 class Course:

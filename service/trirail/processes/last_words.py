@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from trirail.control.desk import REMEMBERED_IDS, Happening
+from trirail.control.ledger import REMEMBERED_IDS, Happening
 from trirail.wire.messages import Event
 from trirail.wire.packets import Answer, Farewell, GoalRequest, Happened, Input, Situation
 from trirail.wire.vocabulary import Mode

@@ -9,9 +9,9 @@ import can
 
 from trirail_drivers import frames
 from trirail_drivers.cia402 import eds
-from trirail_drivers.cia402.homing402 import CYCLIC_SYNCHRONOUS_POSITION, HOMING
+from trirail_drivers.cia402.homing import CYCLIC_SYNCHRONOUS_POSITION, HOMING
 from trirail_drivers.cia402.sdo import Client, Clock, Remote
-from trirail_drivers.cia402.settings402 import Setting, check_nodes, settings_of
+from trirail_drivers.cia402.settings import Setting, check_nodes, settings_of
 from trirail_drivers.config import Drives
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import NAMES, PowerState

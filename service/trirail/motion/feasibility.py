@@ -12,12 +12,12 @@ from trirail.config import Limits
 from trirail.errors import RefusedError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.geometry import Geometry
-from trirail.kinematics.kinematics import inverse_into
+from trirail.kinematics.robot import inverse_into
 from trirail.motion.limits import COORDINATES, LEGS, Bounds, Violation
-from trirail.motion.motion import STILL
+from trirail.motion.path_sampling import survey
 from trirail.motion.paths import ROUNDING, Path, advance, constant
+from trirail.motion.runs import STILL
 from trirail.motion.steps import Steps
-from trirail.motion.survey import survey
 
 PLANNED = (0.98, 0.98, 0.93)
 """Share of the sliders' limits of velocity, acceleration and jerk that plans make use of: the rest is for what lies

@@ -8,8 +8,8 @@ import numpy as np
 from trirail_drivers.interface import Feedback, PowerState
 
 from trirail.kinematics.algebra import Array
-from trirail.kinematics.kinematics import forward_into
-from trirail.motion.motion import STILL
+from trirail.kinematics.robot import forward_into
+from trirail.motion.runs import STILL
 
 Triple = tuple[float, float, float]
 

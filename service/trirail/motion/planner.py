@@ -13,13 +13,13 @@ from trirail.config import PlatformLimits, SliderLimits
 from trirail.errors import RefusedError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.geometry import Geometry
-from trirail.kinematics.kinematics import inverse_into
-from trirail.motion.checks import Checker, excess, fastest
+from trirail.kinematics.robot import inverse_into
+from trirail.motion.feasibility import Checker, excess, fastest
 from trirail.motion.limits import COORDINATES, LEGS, Bounds, beyond, told_apart
-from trirail.motion.motion import STILL, MotionState, from_ruckig, joined, stretched
 from trirail.motion.paths import Path, constant
 from trirail.motion.quintic import Point, quintic
-from trirail.motion.solver import solved
+from trirail.motion.ruckig_call import solved
+from trirail.motion.runs import STILL, MotionState, from_ruckig, joined, stretched
 from trirail.motion.steps import Steps
 
 GENTLEST = 0.1

@@ -20,9 +20,9 @@ import can
 from trirail_drivers.axis import MISSED_HEARTBEATS
 from trirail_drivers.config import Drives
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout
-from trirail_drivers.odrive import odrive_frames as frames
-from trirail_drivers.odrive.odrive_axis import OdriveAxis
-from trirail_drivers.odrive.odrive_frames import AxisState
+from trirail_drivers.odrive import frames
+from trirail_drivers.odrive.axis import OdriveAxis
+from trirail_drivers.odrive.frames import AxisState
 from trirail_drivers.wire import Wire
 
 Clock = Callable[[], float]

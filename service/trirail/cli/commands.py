@@ -12,9 +12,9 @@ import msgspec
 from cyclopts import App, CycloptsError, Parameter
 
 from trirail import __version__
-from trirail.cli import offline, sessions, terminal
+from trirail.cli import math_commands, recording_commands, terminal
 from trirail.errors import TrirailError
-from trirail.wire.session import DEFAULT_LOCATOR
+from trirail.wire.zenoh_session import DEFAULT_LOCATOR
 
 if TYPE_CHECKING:
     from trirail.client.client import Goal, Robot
@@ -25,7 +25,7 @@ app = App(
     version=f"trirail {__version__}",
 )
 
-Flag = offline.Flag
+Flag = math_commands.Flag
 
 
 @Parameter(name="*")
@@ -354,11 +354,11 @@ def view(
     return viewer.run(file, service.robot, service.connect, web=web, records=records, say=say)
 
 
-app.command(offline.ik)
-app.command(offline.fk)
-app.command(offline.workspace)
-app.command(sessions.replay)
-app.command(sessions.report)
+app.command(math_commands.ik)
+app.command(math_commands.fk)
+app.command(math_commands.workspace)
+app.command(recording_commands.replay)
+app.command(recording_commands.report)
 
 
 def _command(name: str, service: Service) -> int:

@@ -15,9 +15,9 @@ from collections.abc import Callable
 import can
 
 from trirail_drivers import config, frames, load
-from trirail_drivers.cia402 import setup402
-from trirail_drivers.cia402.axis402 import Axis
-from trirail_drivers.cia402.homing402 import Homing
+from trirail_drivers.cia402 import setup
+from trirail_drivers.cia402.axis import Axis
+from trirail_drivers.cia402.homing import Homing
 from trirail_drivers.interface import NAMES, DriveFault, Feedback, PowerState, Triple
 from trirail_drivers.scaling import scale_of
 from trirail_drivers.wire import Wire
@@ -92,7 +92,7 @@ class Cia402:
         rate = 1.0 / period
         self.bus_load = load.checked(rate, self._bitrate, self._drives)
         scales = tuple(axis.scale for axis in self._axes)
-        starts = setup402.configure(self._wire.bus, self._drives, scales, period, self._clock)
+        starts = setup.configure(self._wire.bus, self._drives, scales, period, self._clock)
         for axis, start in zip(self._axes, starts, strict=True):
             axis.take_position(start.counts)
             axis.error_code = start.error_code
@@ -325,4 +325,4 @@ class Cia402:
             self._wire.take(message, self._clock())
 
     def _powered(self) -> bool:
-        return any(axis.state in setup402.POWERED for axis in self._axes)
+        return any(axis.state in setup.POWERED for axis in self._axes)

@@ -6,8 +6,8 @@ import math
 
 from trirail_drivers.axis import Axis
 from trirail_drivers.interface import DriveFault, PowerState
-from trirail_drivers.odrive import odrive_frames as frames
-from trirail_drivers.odrive.odrive_frames import AxisState, Result
+from trirail_drivers.odrive import frames
+from trirail_drivers.odrive.frames import AxisState, Result
 from trirail_drivers.scaling import Scale
 
 RESET_TIME = 3 * 3 * frames.ERROR_PERIOD

@@ -18,7 +18,7 @@ from typing import Final
 import can
 
 from trirail_drivers import config, frames
-from trirail_drivers.cia402.axis402 import Axis
+from trirail_drivers.cia402.axis import Axis
 from trirail_drivers.interface import DriveFault
 
 HOMING = 6

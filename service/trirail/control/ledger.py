@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from trirail.control.pilot import Taken
+from trirail.control.stepwise_planner import Taken
 from trirail.errors import RefusedError
 from trirail.wire.messages import Level, Outcome, PoseGoal, VelocityGoal
 from trirail.wire.packets import (

@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from trirail.control.desk import Desk
-from trirail.control.pilot import Pilot
+from trirail.control.ledger import Desk
+from trirail.control.stepwise_planner import Pilot
 from trirail.errors import RefusedError
-from trirail.motion.course import Course
+from trirail.motion.schedule import Course
 from trirail.wire.messages import Outcome, PoseGoal, VelocityGoal
 from trirail.wire.packets import GoalRequest
 

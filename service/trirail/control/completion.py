@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from trirail_drivers.interface import NAMES, PowerState
 
-from trirail.control.measured import POWERED, Measured
+from trirail.control.feedback import POWERED, Measured
 from trirail.wire.vocabulary import Mode
 
 _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)

@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from trirail_drivers import frames
-from trirail_drivers.cia402.homing402 import CYCLIC_SYNCHRONOUS_POSITION
+from trirail_drivers.cia402.homing import CYCLIC_SYNCHRONOUS_POSITION
 from trirail_drivers.config import Drive, Drives, Homing
 from trirail_drivers.errors import DriveError
 from trirail_drivers.scaling import Scale, unsigned

@@ -11,10 +11,10 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.listener import Listener
 from trirail.errors import ServiceError
-from trirail.telemetry.show import LIVE_HZ, Shortfall, Show
+from trirail.telemetry.shown_robot import Subject
 from trirail.telemetry.sinks import free_port, live_relay, live_server
-from trirail.telemetry.subject import Subject
-from trirail.wire import session
+from trirail.telemetry.streams import LIVE_HZ, Shortfall, Show
+from trirail.wire import zenoh_session
 from trirail.wire.messages import Event, Info, State
 from trirail.wire.records import unpack
 
@@ -36,7 +36,7 @@ class RemoteView:
         self._lost = 0
         self._cycle: int | None = None
         self._bus_load: float | None = None
-        self._session = session.open_client(connect)
+        self._session = zenoh_session.open_client(connect)
         self._listener = Listener()
         try:
             self._subscribe(info.robot)
@@ -71,11 +71,11 @@ class RemoteView:
     def _subscribe(self, robot: str) -> None:
         heard, declare = self._listener, self._session.declare_subscriber
         self._declared = [
-            declare(session.key(robot, "records"), heard.batches(self._queue.put)),
-            declare(session.key(robot, "state"), heard.messages(State, self._queue.put)),
+            declare(zenoh_session.key(robot, "records"), heard.batches(self._queue.put)),
+            declare(zenoh_session.key(robot, "state"), heard.messages(State, self._queue.put)),
             declare_advanced_subscriber(
                 self._session,
-                session.key(robot, "event"),
+                zenoh_session.key(robot, "event"),
                 heard.messages(Event, self._queue.put),
                 history=HistoryConfig(detect_late_publishers=True),
                 recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
