@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
 from trirail.control.control import Control, Given
-from trirail.control.ledger import Happening
+from trirail.control.ledger import Notice
 from trirail.wire.messages import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Mode
@@ -85,7 +85,7 @@ class Rig:
         self.driver.sync()
         self.control.start(self.driver.read())
         self.answers: list[Answer] = []
-        self.happenings: list[Happening] = []
+        self.notices: list[Notice] = []
         self.rows: list[list[list[float]]] = []
         self.seen: list[list[tuple[int, int]]] = []
         self._tickets = itertools.count(1)
@@ -116,11 +116,11 @@ class Rig:
         control.cycle(self.driver.read(), given)
         self.rows.append(control.setpoints.rows)
         self.seen.append([frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6])
-        desk = control.desk
-        self.answers += desk.answers
-        self.happenings += desk.happenings
-        desk.answers.clear()
-        desk.happenings.clear()
+        ledger = control.ledger
+        self.answers += ledger.answers
+        self.notices += ledger.notices
+        ledger.answers.clear()
+        ledger.notices.clear()
 
     def cycles(self, number: int) -> None:
         for _ in range(number):
@@ -168,7 +168,7 @@ class Rig:
         assert self.mode is Mode.HOLDING
 
     def outcomes(self) -> list[tuple[str | None, str | None]]:
-        return [(said.id, said.outcome) for said in self.happenings if said.kind == "goal"]
+        return [(said.id, said.outcome) for said in self.notices if said.kind == "goal"]
 
     def setpoints(self) -> NDArray[np.float64]:
         """Rows of all cycles so far: (cycles, 6, 3), lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32."""

@@ -40,9 +40,9 @@ def slower(by: float, within: float, edge: float) -> Path:
     return Path(knots, pieces)
 
 
-@pytest.mark.parametrize(("share", "bearable"), [(0.9, True), (1.5, False)])
-def test_a_change_of_rate_counts_with_what_the_velocities_tell(share: float, bearable: bool) -> None:
+@pytest.mark.parametrize(("share", "within_limits"), [(0.9, True), (1.5, False)])
+def test_a_change_of_rate_counts_with_what_the_velocities_tell(share: float, within_limits: bool) -> None:
     """Within one cycle the accelerations before and after are zero; a slider's velocity takes a step all the same."""
     by = share * LIMITS.slider.jerk * PERIOD**2 / 2.0 / SPEED
     law = slower(by, PERIOD, PERIOD / 20.0)
-    assert CHECKER.look(straight(), law, 0.0, 0.9, (-SPEED / 2.0, 0.0, 0.0)).bearable is bearable
+    assert CHECKER.look(straight(), law, 0.0, 0.9, (-SPEED / 2.0, 0.0, 0.0)).within_limits is within_limits

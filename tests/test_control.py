@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from trirail.config import Config, geometry
-from trirail.control.modes import Event
+from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState, rest
 from trirail.wire.messages import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
@@ -110,7 +110,7 @@ def test_a_drive_that_keeps_its_power_is_named_with_its_state(rig: Rig, name: st
     assert rig.mode is Mode.FAULT
     said = f"drive B: is operation enabled 1 s after {name.replace('_', ' ')}; switch on disabled was expected"
     assert said in answer.message
-    assert any(said in happening.message for happening in rig.happenings if happening.kind == "fault")
+    assert any(said in notice.message for notice in rig.notices if notice.kind == "fault")
 
 
 # ---------------------------------------------------------------------- goals
@@ -207,7 +207,7 @@ def test_a_goal_too_late_has_expired(rig: Rig) -> None:
     rig.cycle(GoalRequest(99, "ann", "g1", goal, round((rig.now - 0.6) * 1e9)))
     assert refusal(rig.answers[-1]).code == "expired"
     assert rig.outcomes() == [("g1", "expired")]
-    assert rig.control.desk.goal is None
+    assert rig.control.ledger.goal is None
 
 
 def test_an_id_is_used_once(rig: Rig) -> None:
@@ -253,9 +253,9 @@ def test_disable_in_motion_stops_first(rig: Rig) -> None:
 
 @pytest.mark.parametrize(
     ("event", "end"),
-    [(Event.GATEWAY_LOST, Mode.HOLDING), (Event.LATE, Mode.HOLDING), (Event.SHUTDOWN, Mode.DISABLED)],
+    [(ModeEvent.GATEWAY_LOST, Mode.HOLDING), (ModeEvent.LATE, Mode.HOLDING), (ModeEvent.SHUTDOWN, Mode.DISABLED)],
 )
-def test_mishaps_stop_within_the_limits(rig: Rig, event: Event, end: Mode) -> None:
+def test_mishaps_stop_within_the_limits(rig: Rig, event: ModeEvent, end: Mode) -> None:
     rig.enable()
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(200)
@@ -288,7 +288,7 @@ def test_goals_in_the_wrong_mode(rig: Rig) -> None:
     rig.enable()
     rig.goal("g2", 0.1, 0.0, 0.0)
     rig.cycles(100)
-    rig.control.happen(Event.GATEWAY_LOST, "gone")
+    rig.control.happen(ModeEvent.GATEWAY_LOST, "gone")
     assert refusal(rig.goal("g3", 0.0, 0.0, 0.1)).code == "stopping"
     assert rig.outcomes() == [("g1", "rejected"), ("g2", "stopped"), ("g3", "rejected")]
 
@@ -433,7 +433,7 @@ def test_a_following_error(rig: Rig) -> None:
 def test_the_last_gate(rig: Rig, monkeypatch: pytest.MonkeyPatch, commanded: MotionState, said: str) -> None:
     moving(rig)
     sent = rig.setpoints()[-1, 0]
-    monkeypatch.setattr(rig.control._course.runs[0], "state", lambda *_: commanded)
+    monkeypatch.setattr(rig.control._schedule.runs[0], "state", lambda *_: commanded)
     rig.cycle()
     assert rig.mode is Mode.FAULT
     assert quick_stops(rig) == {1, 2, 3}
@@ -448,7 +448,7 @@ def test_the_last_gate_knows_the_platforms_limits(rig: Rig, monkeypatch: pytest.
     rig.until(lambda: rig.mode is Mode.HOLDING)
     rig.goal("g1", 0.1499, 0.0, 0.0)
     rig.cycle()
-    monkeypatch.setattr(rig.control._course.runs[0], "state", lambda *_: rest((0.1502, 0.0, 0.0)))
+    monkeypatch.setattr(rig.control._schedule.runs[0], "state", lambda *_: rest((0.1502, 0.0, 0.0)))
     rig.cycle()
     assert "setpoint refused: platform x: position 0.1502 m is beyond its limit 0.15 m" in (rig.control.fault or "")
     assert quick_stops(rig) == {1, 2, 3}
@@ -585,7 +585,7 @@ def test_pause_and_resume_stay_on_the_path(rig: Rig) -> None:
     assert isinstance(rig.command("pause"), Confirmed)
     assert rig.mode is Mode.HOLDING
     assert rig.control.commanded.at_rest
-    assert rig.control.desk.goal is not None
+    assert rig.control.ledger.goal is not None
     rig.cycles(100)
     assert rig.outcomes() == []
     rig.command("resume")
@@ -675,7 +675,7 @@ def test_any_sequence_is_smooth_and_ends_every_goal_once(config: Config, steps: 
     ids = []
     for number, (what, wait) in enumerate(steps):
         if what == "lost":
-            rig.control.happen(Event.GATEWAY_LOST, "gone")
+            rig.control.happen(ModeEvent.GATEWAY_LOST, "gone")
         elif isinstance(what, str):
             rig.command(what)
         elif isinstance(what, float):
@@ -688,7 +688,7 @@ def test_any_sequence_is_smooth_and_ends_every_goal_once(config: Config, steps: 
     rig.command("stop")
     rig.until(lambda: rig.mode is Mode.HOLDING)
     rig.bus.shutdown()
-    assert [said.message for said in rig.happenings if said.kind == "fault"] == []
+    assert [said.message for said in rig.notices if said.kind == "fault"] == []
     assert sorted(goal_id or "" for goal_id, _ in rig.outcomes()) == sorted(ids)
     assert_within_limits(rig)
 

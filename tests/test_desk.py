@@ -1,4 +1,4 @@
-"""The desk's books: every goal ends once, every command is answered once, in order, to whom it belongs."""
+"""The ledger's books: every goal ends once, every command is answered once, in order, to whom it belongs."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.control.ledger import REMEMBERED_IDS, Desk
-from trirail.control.stepwise_planner import Taken
+from trirail.control.ledger import REMEMBERED_IDS, Ledger
+from trirail.control.stepwise_planner import AcceptedPlan
 from trirail.errors import RefusedError
 from trirail.wire.messages import PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest
 
 POSE = PoseGoal(x=0.0, y=0.0, phi=0.0, blend=0.01)
 JOG = VelocityGoal(x=0.01, y=0.0, phi=0.0)
-AT_ONCE = Taken(duration=1.5, slowed=1.2, stops_first=True, queued=False)
-QUEUED = Taken(duration=2.5, slowed=1.0, stops_first=False, queued=True)
+AT_ONCE = AcceptedPlan(duration=1.5, slowed=1.2, stops_first=True, queued=False)
+QUEUED = AcceptedPlan(duration=2.5, slowed=1.0, stops_first=False, queued=True)
 
 
 def asked(name: str, goal: Any = POSE, ticket: int = 1, user: str = "ann") -> GoalRequest:
     return GoalRequest(ticket, user, name, goal, 0)
 
 
-def ended(desk: Desk) -> list[tuple[str | None, str | None, str | None]]:
-    return [(said.id, said.outcome, said.user) for said in desk.happenings if said.kind == "goal"]
+def ended(ledger: Ledger) -> list[tuple[str | None, str | None, str | None]]:
+    return [(said.id, said.outcome, said.user) for said in ledger.notices if said.kind == "goal"]
 
 
 @pytest.fixture
-def desk() -> Desk:
+def ledger() -> Ledger:
     """With three goals: one under way, and two that wait."""
-    made = Desk()
+    made = Ledger()
     for number, user in enumerate(("ann", "bob", "eve")):
         made.begin(asked(f"g{number}", user=user), AT_ONCE if number == 0 else QUEUED, 100.0, math.inf)
     made.answers.clear()
@@ -39,117 +39,117 @@ def desk() -> Desk:
 
 
 def test_an_accepted_goal_is_answered_with_what_was_planned() -> None:
-    desk = Desk()
-    desk.begin(asked("g", ticket=7), AT_ONCE, 100.0, math.inf)
-    assert desk.answers == [Accepted(7, "g", 1.5, 1.2, True, False)]
-    assert desk.goal is not None
-    assert desk.goal[:5] == ("g", "ann", False, 0.01, 100.0)
-    assert ended(desk) == []
+    ledger = Ledger()
+    ledger.begin(asked("g", ticket=7), AT_ONCE, 100.0, math.inf)
+    assert ledger.answers == [Accepted(7, "g", 1.5, 1.2, True, False)]
+    assert ledger.goal is not None
+    assert ledger.goal[:5] == ("g", "ann", False, 0.01, 100.0)
+    assert ended(ledger) == []
 
 
-def test_a_goal_that_does_not_wait_preempts_all_before_it(desk: Desk) -> None:
-    desk.begin(asked("now"), AT_ONCE, 100.0, math.inf)
-    assert ended(desk) == [("g0", "preempted", "ann"), ("g1", "preempted", "bob"), ("g2", "preempted", "eve")]
-    assert [goal.id for goal in desk.goals] == ["now"]
-    assert {said.message for said in desk.happenings} == {
+def test_a_goal_that_does_not_wait_preempts_all_before_it(ledger: Ledger) -> None:
+    ledger.begin(asked("now"), AT_ONCE, 100.0, math.inf)
+    assert ended(ledger) == [("g0", "preempted", "ann"), ("g1", "preempted", "bob"), ("g2", "preempted", "eve")]
+    assert [goal.id for goal in ledger.goals] == ["now"]
+    assert {said.message for said in ledger.notices} == {
         f"goal g{n} preempted: preempted by goal now" for n in range(3)
     }
 
 
-def test_what_is_reached_on_the_way_is_done(desk: Desk) -> None:
-    desk.pass_on()
-    assert ended(desk) == [("g0", "done", "ann")]
-    assert desk.happenings[0].message == "goal g0 done: passed on the way to goal g1"
-    assert [goal.id for goal in desk.goals] == ["g1", "g2"]
+def test_what_is_reached_on_the_way_is_done(ledger: Ledger) -> None:
+    ledger.pass_on()
+    assert ended(ledger) == [("g0", "done", "ann")]
+    assert ledger.notices[0].message == "goal g0 done: passed on the way to goal g1"
+    assert [goal.id for goal in ledger.goals] == ["g1", "g2"]
 
 
 @pytest.mark.parametrize("but", range(5))
-def test_goals_end_but_for_the_first_ones(desk: Desk, but: int) -> None:
-    desk.end("stopped", "stop by ann", but)
-    assert [goal.id for goal in desk.goals] == ["g0", "g1", "g2"][:but]
-    assert ended(desk) == [("g0", "stopped", "ann"), ("g1", "stopped", "bob"), ("g2", "stopped", "eve")][but:]
+def test_goals_end_but_for_the_first_ones(ledger: Ledger, but: int) -> None:
+    ledger.end("stopped", "stop by ann", but)
+    assert [goal.id for goal in ledger.goals] == ["g0", "g1", "g2"][:but]
+    assert ended(ledger) == [("g0", "stopped", "ann"), ("g1", "stopped", "bob"), ("g2", "stopped", "eve")][but:]
 
 
 @pytest.mark.parametrize(
     ("outcome", "level"), [("done", "info"), ("stopped", "info"), ("faulted", "error"), ("rejected", "warning")]
 )
-def test_how_a_goal_ended_is_told_by_its_weight(desk: Desk, outcome: Any, level: str) -> None:
-    desk.end(outcome, "so it is")
-    assert {said.level for said in desk.happenings} == {level}
+def test_how_a_goal_ended_is_told_by_its_weight(ledger: Ledger, outcome: Any, level: str) -> None:
+    ledger.end(outcome, "so it is")
+    assert {said.level for said in ledger.notices} == {level}
 
 
-def test_an_id_is_good_for_one_goal(desk: Desk) -> None:
+def test_an_id_is_good_for_one_goal(ledger: Ledger) -> None:
     for name in ("g0", "g2"):
         with pytest.raises(RefusedError, match=f"goal id '{name}' has been used"):
-            desk.check_id(asked(name))
-    desk.end("done", "arrived")
+            ledger.check_id(asked(name))
+    ledger.end("done", "arrived")
     with pytest.raises(RefusedError, match="goal id 'g1' has been used") as refused:
-        desk.check_id(asked("g1"))
-    desk.refuse(asked("g1", ticket=9, user="bob"), refused.value)
-    assert desk.answers == [Refused(9, "duplicate_id", "goal id 'g1' has been used: every goal needs its own")]
-    assert len(ended(desk)) == 3  # the one that had the id ended once
-    assert desk.happenings[-1][:3] == ("refused", "warning", "goal id 'g1' has been used: every goal needs its own")
-    desk.check_id(asked("g9"))
+        ledger.check_id(asked("g1"))
+    ledger.refuse(asked("g1", ticket=9, user="bob"), refused.value)
+    assert ledger.answers == [Refused(9, "duplicate_id", "goal id 'g1' has been used: every goal needs its own")]
+    assert len(ended(ledger)) == 3  # the one that had the id ended once
+    assert ledger.notices[-1][:3] == ("refused", "warning", "goal id 'g1' has been used: every goal needs its own")
+    ledger.check_id(asked("g9"))
 
 
 def test_ids_of_the_newest_goals_are_remembered() -> None:
-    desk = Desk()
+    ledger = Ledger()
     for number in range(REMEMBERED_IDS + 1):
-        desk.withdraw(asked(f"g{number}"), "stopped", "stop by ann")
-    desk.check_id(asked("g0"))
+        ledger.withdraw(asked(f"g{number}"), "stopped", "stop by ann")
+    ledger.check_id(asked("g0"))
     for number in (1, REMEMBERED_IDS):
         with pytest.raises(RefusedError):
-            desk.check_id(asked(f"g{number}"))
+            ledger.check_id(asked(f"g{number}"))
 
 
 def test_a_jog_is_renewed_by_velocities_of_its_id_alone() -> None:
-    desk = Desk()
-    desk.begin(asked("j", JOG), AT_ONCE, 100.0, math.inf)
-    desk.check_id(asked("j", JOG))
+    ledger = Ledger()
+    ledger.begin(asked("j", JOG), AT_ONCE, 100.0, math.inf)
+    ledger.check_id(asked("j", JOG))
     with pytest.raises(RefusedError):
-        desk.check_id(asked("j"))
-    desk.begin(asked("j", JOG, ticket=2), AT_ONCE, 100.0, math.inf)
-    assert [answer.ticket for answer in desk.answers if isinstance(answer, Accepted)] == [1, 2]
-    assert len(desk.goals) == 1
-    desk.refuse(asked("j", JOG, ticket=3), RefusedError("limit", "too fast", slider="A", value=2.0, limit=1.0))
-    desk.withdraw(asked("j", JOG, ticket=4), "stopped", "stop by ann")
-    assert ended(desk) == []  # the jog itself goes on
-    assert desk.answers[-2:] == [
+        ledger.check_id(asked("j"))
+    ledger.begin(asked("j", JOG, ticket=2), AT_ONCE, 100.0, math.inf)
+    assert [answer.ticket for answer in ledger.answers if isinstance(answer, Accepted)] == [1, 2]
+    assert len(ledger.goals) == 1
+    ledger.refuse(asked("j", JOG, ticket=3), RefusedError("limit", "too fast", slider="A", value=2.0, limit=1.0))
+    ledger.withdraw(asked("j", JOG, ticket=4), "stopped", "stop by ann")
+    assert ended(ledger) == []  # the jog itself goes on
+    assert ledger.answers[-2:] == [
         Refused(3, "limit", "too fast", "A", 2.0, 1.0),
         Refused(4, "stopped", "goal j stopped before it began: stop by ann"),
     ]
-    desk.end("stopped", "stop by ann")
-    assert ended(desk) == [("j", "stopped", "ann")]
+    ledger.end("stopped", "stop by ann")
+    assert ended(ledger) == [("j", "stopped", "ann")]
 
 
 @pytest.mark.parametrize(("code", "outcome"), [("expired", "expired"), ("out_of_reach", "rejected")])
 def test_a_refused_goal_has_ended(code: str, outcome: str) -> None:
-    desk = Desk()
-    desk.refuse(asked("g", ticket=5, user="bob"), RefusedError(code, "it cannot be"))
-    assert desk.answers == [Refused(5, code, "it cannot be")]
-    assert ended(desk) == [("g", outcome, "bob")]
+    ledger = Ledger()
+    ledger.refuse(asked("g", ticket=5, user="bob"), RefusedError(code, "it cannot be"))
+    assert ledger.answers == [Refused(5, code, "it cannot be")]
+    assert ended(ledger) == [("g", outcome, "bob")]
     with pytest.raises(RefusedError):
-        desk.check_id(asked("g"))
+        ledger.check_id(asked("g"))
 
 
 def test_a_refused_command_is_answered_and_told() -> None:
-    desk = Desk()
-    desk.refuse(CommandRequest(6, "bob", "resume"), RefusedError("not_paused", "nothing is paused"))
-    assert desk.answers == [Refused(6, "not_paused", "nothing is paused")]
-    (said,) = desk.happenings
+    ledger = Ledger()
+    ledger.refuse(CommandRequest(6, "bob", "resume"), RefusedError("not_paused", "nothing is paused"))
+    assert ledger.answers == [Refused(6, "not_paused", "nothing is paused")]
+    (said,) = ledger.notices
     assert (said.kind, said.level, said.message, said.user) == (
         "refused", "warning", "resume refused: nothing is paused", "bob",
     )  # fmt: skip
-    desk.refuse(RefusedRequest("bob", "unreadable"), RefusedError("syntax", "unreadable"))
-    assert len(desk.answers) == len(desk.happenings) == 1  # the gateway has answered it
+    ledger.refuse(RefusedRequest("bob", "unreadable"), RefusedError("syntax", "unreadable"))
+    assert len(ledger.answers) == len(ledger.notices) == 1  # the gateway has answered it
 
 
 @given(st.lists(st.sampled_from(["", None, "a drive is silent"]), min_size=1, max_size=8), st.integers(1, 5))
 def test_each_command_is_answered_once_when_its_verdict_is_there(verdicts: list[str | None], rounds: int) -> None:
     """Those without a verdict wait for one, however long; those with one are not asked about again."""
-    desk = Desk()
+    ledger = Ledger()
     for ticket, _ in enumerate(verdicts):
-        desk.undertake(CommandRequest(ticket, "ann", f"c{ticket}"), 100 + ticket)
+        ledger.undertake(CommandRequest(ticket, "ann", f"c{ticket}"), 100 + ticket)
     asked_about: list[tuple[str, int]] = []
 
     def verdict(name: str, since: int) -> str | None:
@@ -157,8 +157,8 @@ def test_each_command_is_answered_once_when_its_verdict_is_there(verdicts: list[
         return verdicts[int(name[1:])]
 
     for _ in range(rounds):
-        desk.settle(verdict, "holding")
-    assert desk.answers == [
+        ledger.settle(verdict, "holding")
+    assert ledger.answers == [
         Refused(n, "failed", f"c{n} failed: {said}") if said else Confirmed(n, f"c{n}", "holding")
         for n, said in enumerate(verdicts)
         if said is not None

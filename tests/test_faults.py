@@ -312,7 +312,7 @@ def assert_goes_on(rig: FaultRig, begun: Begin, cycles: int = 800) -> None:
     """What is under way ends as if nothing had happened, and nothing happens in so many cycles."""
     rig.cycles(cycles)
     rig.until(rig.holds)
-    assert [said.message for said in rig.happenings if said.kind == "fault"] == []
+    assert [said.message for said in rig.notices if said.kind == "fault"] == []
     assert rig.control.measured.homed
     assert tuple(rig.outcomes()) == begun.otherwise
     rig.assert_no_jump()
@@ -374,6 +374,6 @@ def test_a_drive_that_does_not_leave_its_fault_is_not_reset(rig: Cia402Rig) -> N
 def test_a_warning_of_the_bus_is_an_event(rig: Cia402Rig) -> None:
     rig.inject("error-passive")
     rig.cycles(10)
-    told = [said.message for said in rig.happenings if said.level == "warning"]
+    told = [said.message for said in rig.notices if said.level == "warning"]
     assert len(told) == 1
     assert "error-passive: 128 transmit errors; check cable" in told[0]

@@ -15,7 +15,7 @@ import pytest
 from canopen.profiles.p402 import BaseNode402
 from conftest import CONFIG, Delay, Rig, changed
 from trirail.config import Config, geometry
-from trirail.control.modes import Event
+from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import inverse
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused
 from trirail.wire.vocabulary import Mode
@@ -263,16 +263,16 @@ WHEN = [0, 1, 3, 8, 21, 150, 301, 460]
     [
         ("stop", Mode.HOLDING),
         ("disable", Mode.DISABLED),
-        (Event.GATEWAY_LOST, Mode.HOLDING),
-        (Event.LATE, Mode.HOLDING),
-        (Event.SHUTDOWN, Mode.DISABLED),
+        (ModeEvent.GATEWAY_LOST, Mode.HOLDING),
+        (ModeEvent.LATE, Mode.HOLDING),
+        (ModeEvent.SHUTDOWN, Mode.DISABLED),
     ],
 )
-def test_a_stop_halts_it_and_it_can_begin_again(event: str | Event, end: Mode, when: int) -> None:
+def test_a_stop_halts_it_and_it_can_begin_again(event: str | ModeEvent, end: Mode, when: int) -> None:
     rig = Rig(incremental(), part_of_a_cycle if when % 2 else None)
     rig.enable()
     begin(rig, when)
-    if isinstance(event, Event):
+    if isinstance(event, ModeEvent):
         rig.control.happen(event, "it happened")
         rig.until(lambda: rig.mode is end, 400)
     else:

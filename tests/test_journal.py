@@ -7,12 +7,12 @@ import pytest
 from trirail.telemetry import journal
 from trirail.telemetry.journal import EVENTS, REQUESTS, Entry
 from trirail.wire.messages import Event, Level, PoseGoal
-from trirail.wire.packets import CommandRequest, GoalRequest, Input
+from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
 
 SAID = 1_700_000_000_500_000_000
 EVENT = Event(7, 1.25, 1250, 1_700_000_000.5, "goal", "warning", "goal g expired", id="g")
-GOAL = Input(3, 1250, 5_000_000_000, GoalRequest(1, "ann", "g", PoseGoal(0.01, 0.0, 0.0), 4_999_000_000))
-STOP = Input(4, 1300, 5_050_000_000, CommandRequest(2, "ann", "stop"))
+GOAL = ControlInput(3, 1250, 5_000_000_000, GoalRequest(1, "ann", "g", PoseGoal(0.01, 0.0, 0.0), 4_999_000_000))
+STOP = ControlInput(4, 1300, 5_050_000_000, CommandRequest(2, "ann", "stop"))
 
 
 def test_lines_of_one_log_are_one_chunk_with_their_own_times() -> None:
@@ -31,7 +31,10 @@ def test_lines_of_one_log_are_one_chunk_with_their_own_times() -> None:
     assert not none
     batch = requests.to_record_batch()
     assert batch.column("TextLog:text").to_pylist() == [["goal g of ann: pose"], ["stop by ann"]]
-    assert [msgspec.json.decode(text, type=Input) for (text,) in batch.column("json").to_pylist()] == [GOAL, STOP]
+    assert [msgspec.json.decode(text, type=ControlInput) for (text,) in batch.column("json").to_pylist()] == [
+        GOAL,
+        STOP,
+    ]
     assert batch.column("t").to_numpy().astype(int).tolist() == [1_250_000_000, 1_300_000_000]
     assert batch.column("wall").to_numpy().astype(int).tolist() == [6_000_000_000, 6_050_000_000]
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.processes.last_words import LastWords
 from trirail.wire.messages import Event, PoseGoal
-from trirail.wire.packets import Farewell, GoalRequest, Happened, Input, Situation
+from trirail.wire.packets import ControlInput, Farewell, GoalRequest, Happened, Status
 
 
 class Clock:
@@ -34,7 +34,7 @@ def test_the_goal_under_way_is_faulted(silent: float, said: str) -> None:
     words = LastWords(0.001, clock)
     words.heard()
     words.take(ended(7, "before"))
-    words.take(Input(1, 3, 0, request("g-1")))
+    words.take(ControlInput(1, 3, 0, request("g-1")))
     clock.now += silent
     reason = f"{said}: the drives stop by their own watchdogs"
     assert words.reason == reason
@@ -89,7 +89,7 @@ def test_every_goal_ends_once(history: list[tuple[str, str]]) -> None:
             words.take(ended(1, name))
             over.add(name)
         else:
-            words.take(request(name) if what == "asked" else Situation(name, 1.0, None))
+            words.take(request(name) if what == "asked" else Status(name, 1.0, None))
             begun.add(name)
     said = [event.id for event in words.events(1) if event.outcome]
     assert sorted(filter(None, said)) == sorted(begun - over)

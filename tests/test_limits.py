@@ -271,7 +271,7 @@ def test_a_step_in_any_row_is_a_fault_before_it_is_sent(
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(20)
     stepped = later(rig.control.commanded)  # type: ignore[operator]
-    monkeypatch.setattr(rig.control._course.runs[0], "state", lambda *_: stepped)
+    monkeypatch.setattr(rig.control._schedule.runs[0], "state", lambda *_: stepped)
     rig.cycle()
     assert rig.mode is Mode.FAULT
     assert "setpoint refused: " in (rig.control.fault or "")
@@ -283,7 +283,7 @@ def test_a_motion_that_ends_at_once_is_a_fault(rig: Rig, monkeypatch: pytest.Mon
     rig.enable()
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(100)
-    monkeypatch.setattr(rig.control._course.runs[0], "state", lambda *_: rest(rig.control.commanded.pose))
+    monkeypatch.setattr(rig.control._schedule.runs[0], "state", lambda *_: rest(rig.control.commanded.pose))
     rig.cycle()
     assert "jerk" in (rig.control.fault or "")
 
@@ -321,7 +321,7 @@ def test_a_jog_into_a_limit_ends_there_and_says_so(rig: Rig, velocity: tuple[flo
             break
     assert isinstance(answer, Accepted) or refusal(answer).code == "at_limit"  # it ended as this one was planned
     assert rig.outcomes() == [("j1", "done")]
-    assert f"goal j1 done: at the limit of {bound}" in [said.message for said in rig.happenings]
+    assert f"goal j1 done: at the limit of {bound}" in [said.message for said in rig.notices]
     again = refusal(rig.send("j1", jog))
     assert again.code == "at_limit"
     assert f"has ended at the limit of {bound}" in again.message
@@ -332,7 +332,7 @@ def test_a_jog_that_is_let_go_before_a_limit_is_not_at_it(rig: Rig) -> None:
     rig.enable()
     rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.4))
     rig.until(rig.holds)
-    assert [said.message for said in rig.happenings if said.outcome] == ["goal j1 done: released"]
+    assert [said.message for said in rig.notices if said.outcome] == ["goal j1 done: released"]
 
 
 def test_a_jog_of_no_velocity_brakes_one_and_begins_none(rig: Rig) -> None:

@@ -16,14 +16,14 @@ from trirail.wire.messages import PoseGoal
 from trirail.wire.packets import (
     CommandRequest,
     Confirmed,
+    ControlInput,
+    Disturbance,
     DrivesFault,
     GoalRequest,
     Happened,
-    Input,
     Kind,
-    Mishap,
     Remark,
-    Situation,
+    Status,
     Welcome,
     decode_answer,
     message,
@@ -105,7 +105,7 @@ def test_the_bus_load_is_measured(shell: Shell) -> None:
     shell.enabled()
     shell.cycles(2100)
     said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
-    measured = [answer.bus_load for answer in said if isinstance(answer, Situation)][-1]
+    measured = [answer.bus_load for answer in said if isinstance(answer, Status)][-1]
     assert measured == pytest.approx(shell.rig.driver.bus_load, rel=0.05)
 
 
@@ -231,10 +231,10 @@ def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) 
     shell.loop.ending = True
     shell.cycles(2)
     said = [decode_answer(packet[1:]) for packet in shell.received(shell.recorder) if packet[0] == Kind.MESSAGE]
-    given = [answer for answer in said if isinstance(answer, Input)]
-    assert [type(what.given) for what in given] == [CommandRequest, DrivesFault, Mishap, Mishap]
+    given = [answer for answer in said if isinstance(answer, ControlInput)]
+    assert [type(what.given) for what in given] == [CommandRequest, DrivesFault, Disturbance, Disturbance]
     assert [what.seq for what in given] == [1, 2, 3, 4]
-    assert [what.given.event for what in given if isinstance(what.given, Mishap)] == ["GATEWAY_LOST", "SHUTDOWN"]
+    assert [what.given.event for what in given if isinstance(what.given, Disturbance)] == ["GATEWAY_LOST", "SHUTDOWN"]
     events = {answer.event.kind: answer.event for answer in said if isinstance(answer, Happened)}
     assert isinstance(given[1].given, DrivesFault)
     assert given[1].given.message == events["fault"].message
@@ -264,7 +264,7 @@ def test_whatever_the_fault_says_the_gateway_and_the_recorder_can_read_it(shell:
         said = [decode_answer(packet[1:]) for packet in shell.received(link) if packet[0] == Kind.MESSAGE]
         (told,) = [answer.event for answer in said if isinstance(answer, Happened) and answer.event.kind == "fault"]
         assert told.message.startswith("xxx")
-        faults = [answer.fault for answer in said if isinstance(answer, Situation) and answer.fault]
+        faults = [answer.fault for answer in said if isinstance(answer, Status) and answer.fault]
         assert all(fault.startswith("xxx") and fault.isprintable() for fault in faults)
         assert faults
 

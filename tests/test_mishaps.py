@@ -10,7 +10,7 @@ from test_loop import Shell, shell
 from trirail.analysis.replay import again
 from trirail.telemetry.reading import Recording
 from trirail.wire.messages import PoseGoal
-from trirail.wire.packets import CommandRequest, GoalRequest, Input, Kind, decode_answer, message
+from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Kind, decode_answer, message
 from trirail.wire.records import unpack
 from trirail.wire.vocabulary import MODES, Mode
 
@@ -22,7 +22,7 @@ def recorded(shell: Shell) -> Recording:
     packets = shell.received(shell.recorder)
     records = np.concatenate([unpack(packet[1:]) for packet in packets if packet[0] == Kind.RECORDS])
     said = [decode_answer(packet[1:]) for packet in packets if packet[0] == Kind.MESSAGE]
-    given = tuple(answer for answer in said if isinstance(answer, Input))
+    given = tuple(answer for answer in said if isinstance(answer, ControlInput))
     t, wall = records["cycle"] * shell.rig.config.period, np.zeros(len(records), "datetime64[ns]")
     return Recording("demo", records, t, wall, [], {}, given)
 

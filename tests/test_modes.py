@@ -18,9 +18,9 @@ from trirail.control.modes import (
     STOPPING,
     STOPPING_TO_DISABLE,
     Action,
-    Event,
+    ModeEvent,
+    ModeState,
     Refusal,
-    State,
     Step,
     step,
 )
@@ -30,8 +30,8 @@ from trirail.wire.vocabulary import Mode
 REFUSED = None
 
 # One row a state, one column an event: the next state (None: refused) and the action where there is one.
-E = Event
-TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
+E = ModeEvent
+TABLE: dict[ModeState, dict[ModeEvent, tuple[ModeState, Action] | None]] = {
     DISABLED: {
         E.ENABLE: (ENABLING, Action.POWER_UP),
         E.DISABLE: (DISABLED, Action.NOTHING),
@@ -257,12 +257,12 @@ TABLE: dict[State, dict[Event, tuple[State, Action] | None]] = {
 
 def test_the_table_names_every_state_and_event() -> None:
     assert set(TABLE) == set(STATES)
-    assert all(set(row) == set(Event) for row in TABLE.values())
+    assert all(set(row) == set(ModeEvent) for row in TABLE.values())
 
 
-@pytest.mark.parametrize("event", Event)
+@pytest.mark.parametrize("event", ModeEvent)
 @pytest.mark.parametrize("state", STATES)
-def test_step(state: State, event: Event) -> None:
+def test_step(state: ModeState, event: ModeEvent) -> None:
     decided = step(state, event)
     wanted = TABLE[state][event]
     if wanted is None:
@@ -279,20 +279,22 @@ def test_every_mode_has_its_colours() -> None:
 
 
 @pytest.mark.parametrize("state", STATES)
-def test_a_fault_stops_from_everywhere_and_only_reset_leads_out(state: State) -> None:
-    assert step(state, Event.FAULT) in (Step(FAULT, Action.QUICK_STOP), Step(FAULT))
-    leaving = {event for event in Event if not isinstance(out := step(FAULT, event), Refusal) and out.state != FAULT}
-    assert leaving == {Event.RESET}
+def test_a_fault_stops_from_everywhere_and_only_reset_leads_out(state: ModeState) -> None:
+    assert step(state, ModeEvent.FAULT) in (Step(FAULT, Action.QUICK_STOP), Step(FAULT))
+    leaving = {
+        event for event in ModeEvent if not isinstance(out := step(FAULT, event), Refusal) and out.state != FAULT
+    }
+    assert leaving == {ModeEvent.RESET}
 
 
 def test_only_enable_powers_up() -> None:
     for state in STATES:
-        for event in Event:
+        for event in ModeEvent:
             decided = step(state, event)
             if isinstance(decided, Step) and decided.action is Action.POWER_UP:
-                assert (state.mode, event) == (Mode.DISABLED, Event.ENABLE)
+                assert (state.mode, event) == (Mode.DISABLED, ModeEvent.ENABLE)
 
 
 @pytest.mark.parametrize("state", STATES)
-def test_a_goal_is_under_way_in_motion_and_while_it_is_paused(state: State) -> None:
+def test_a_goal_is_under_way_in_motion_and_while_it_is_paused(state: ModeState) -> None:
     assert state.has_goal == (state in (MOVING, PAUSING, PAUSED, RELEASING))

@@ -16,12 +16,12 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal, slower
 from trirail.config import Config
 from trirail.errors import KinematicsError
+from trirail.kinematics.geometry import LEGS
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.goals import LEAD, Goals, Motion
-from trirail.motion.limits import LEGS
 from trirail.motion.planner import TOO_FAST_IN_MOTION
 from trirail.motion.quintic import Point, quintic
-from trirail.motion.schedule import Course
+from trirail.motion.schedule import Schedule
 from trirail.motion.steps import Steps
 from trirail.wire.messages import Goal, OwnLimits, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, GoalRequest
@@ -64,7 +64,7 @@ def accepted(answer: Answer) -> Accepted:
 
 
 def stands(rig: Rig) -> bool:
-    return rig.mode is Mode.HOLDING and rig.control.dispatch.idle
+    return rig.mode is Mode.HOLDING and rig.control.goal_queue.idle
 
 
 def bare(start: tuple[float, float, float], end: tuple[float, float, float]) -> float:
@@ -346,7 +346,7 @@ def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig) -> None:
         if k % 100 == 0:
             rig.rows.clear()
             rig.seen.clear()
-    rig.until(lambda: rig.control.dispatch.idle, 50_000)
+    rig.until(lambda: rig.control.goal_queue.idle, 50_000)
     rig.order("override", 1.0)
     rig.order("stop")
     rig.until(lambda: rig.mode in (Mode.HOLDING, Mode.DISABLED, Mode.FAULT))
@@ -363,7 +363,7 @@ def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig) -> None:
     }
     answered = Counter(getattr(answer, "ticket", None) for answer in rig.answers)
     assert set(answered.values()) == {1}
-    said = [happening.message for happening in rig.happenings if happening.kind == "fault"]
+    said = [notice.message for notice in rig.notices if notice.kind == "fault"]
     assert all("emergency 4310" in message or message == "quick_stop by ann" for message in said), set(said)
 
 
@@ -377,7 +377,7 @@ def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
     rig.goal("g1", 0.08, 0.0, 0.0)
     rig.cycles(300)
     rig.post("g2", PoseGoal(-0.05, 0.05, 0.4))
-    assert rig.control._pilot.busy  # from this motion it takes more than a step
+    assert rig.control._planner.busy  # from this motion it takes more than a step
     rig.order(name)
     rig.until(lambda: rig.mode in (Mode.HOLDING, Mode.DISABLED, Mode.FAULT))
     end = "faulted" if name == "quick_stop" else "stopped"
@@ -392,11 +392,11 @@ def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
 PLAIN_SET_OUT = Goals._set_out
 
 
-def only_from_rest(goals: Goals, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
+def only_from_rest(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> Steps[Motion]:
     """Plan from no motion, so that the robot stops first."""
-    if not course.commanded.at_rest:
+    if not schedule.commanded.at_rest:
         raise TOO_FAST_IN_MOTION
-    return (yield from PLAIN_SET_OUT(goals, goal, course, rate))
+    return (yield from PLAIN_SET_OUT(goals, goal, schedule, rate))
 
 
 @pytest.mark.parametrize(
@@ -413,7 +413,7 @@ def test_of_two_ways_the_sooner_is_taken(
     """From the same motion, with lower limits or after a stop: each where the other is not to be had, and then both."""
     plain_stop_first = Goals._stop_first
 
-    def no_stop(goals: Goals, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
+    def no_stop(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> Steps[Motion]:
         raise TOO_FAST_IN_MOTION
         yield
 
@@ -463,11 +463,11 @@ def test_a_stop_is_kept_though_the_rate_of_the_goal_to_come_is_thought_about(
     rig.cycles(100)
     assert accepted(rig.goal("g2", -0.05, 0.05, -0.3)).stops_first
     rig.command("override", 0.9)
-    course = rig.control._course
-    rig.until(lambda: not course.turning)
+    schedule = rig.control._schedule
+    rig.until(lambda: not schedule.turning)
     rig.cycles(later)
-    assert len(course.runs) == 2
-    assert rig.control._pilot._change is not None or later
+    assert len(schedule.runs) == 2
+    assert rig.control._planner._change is not None or later
     rig.command("stop")
     rig.until(lambda: rig.mode is Mode.HOLDING, 2000)
     assert rig.outcomes() == [("g1", "preempted"), ("g2", "stopped")]
@@ -510,7 +510,7 @@ def test_a_goal_that_waits_for_its_turn_is_not_done_where_another_would_have_beg
         rig.enable()
         rig.send("q0", PoseGoal(0.05, 0.02, 0.3, blend=0.01))
         rig.send("q1", PoseGoal(-0.05, 0.05, -0.3))
-        run = rig.control._course.runs[0]
+        run = rig.control._schedule.runs[0]
         while run.at.s <= run.seams[0].s - before * PERIOD:
             rig.cycle()
         answer = accepted(rig.goal("g2", 0.0, -0.05, 0.4))

@@ -372,7 +372,7 @@ def test_a_drive_that_keeps_its_power_stays_at_the_end_of_the_ramp_and_is_named(
     assert rig.odrives[0].servo.position / TURNS == pytest.approx(ends[0].position, abs=1e-6)
     assert rig.control.fault == "quick_stop by ann"
     assert "drive A: is in closed loop control 1 s after quick stop; idle was expected" in [
-        said.message for said in rig.happenings if said.kind == "fault"
+        said.message for said in rig.notices if said.kind == "fault"
     ]
     assert isinstance(rig.command("reset"), Refused)
     rig.mend()

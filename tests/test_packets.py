@@ -16,7 +16,7 @@ from trirail.wire.packets import (
     Refused,
     RefusedRequest,
     Request,
-    Situation,
+    Status,
     Welcome,
 )
 from trirail.wire.records import FIELDS, LAYOUT, Record, pack_into, unpack
@@ -43,7 +43,7 @@ def test_requests(request_: Request) -> None:
         Confirmed(2, "stop", "holding"),
         Refused(3, "out_of_workspace", "no", "A", 0.4, 0.3),
         Happened(Event(1, 0.5, 500, 1.0, "goal", "info", "goal g done", id="g", outcome="done")),
-        Situation("g", 1.0, None),
+        Status("g", 1.0, None),
         Welcome(("SCHED_FIFO: no",), 0.75, 1.0),
     ],
 )

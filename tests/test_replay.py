@@ -21,7 +21,7 @@ from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import Recording, join, read
 from trirail.wire.messages import VelocityGoal
-from trirail.wire.packets import CommandRequest, GoalRequest, Mishap
+from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest
 
 pytestmark = pytest.mark.slow
 
@@ -97,7 +97,7 @@ def test_the_recording_is_whole(recording: Recording) -> None:
     assert np.array_equal(recording.records["cycle"], np.arange(1, len(recording.records) + 1))
     assert [what.seq for what in recording.requests] == list(range(1, len(recording.requests) + 1))
     kinds = {type(what.given) for what in recording.requests}
-    assert {GoalRequest, CommandRequest, Mishap} <= kinds
+    assert {GoalRequest, CommandRequest, Disturbance} <= kinds
 
 
 def test_it_comes_out_the_same_to_the_last_bit(recording: Recording, config: Config) -> None:

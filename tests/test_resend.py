@@ -10,7 +10,7 @@ from trirail.analysis.resend import _send
 from trirail.client.client import Goal, Result, Robot
 from trirail.telemetry.reading import Line, Recording
 from trirail.wire.messages import Event, PoseGoal
-from trirail.wire.packets import CommandRequest, GoalRequest, Input, Request
+from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Request
 
 
 class Heard:
@@ -36,8 +36,8 @@ class Ending(Goal):
         return Result(self.id, "done", "")
 
 
-def goal(seq: int, cycle: int, name: str) -> Input:
-    return Input(seq, cycle, 0, GoalRequest(seq, "ann", name, PoseGoal(0.01, 0.0, 0.0), 0))
+def goal(seq: int, cycle: int, name: str) -> ControlInput:
+    return ControlInput(seq, cycle, 0, GoalRequest(seq, "ann", name, PoseGoal(0.01, 0.0, 0.0), 0))
 
 
 def ended(cycle: int, name: str, outcome: Any) -> Line:
@@ -55,7 +55,7 @@ def test_none_goes_before_the_goals_that_had_ended() -> None:
         wall=np.zeros(len(rows), "datetime64[ns]"),
         events=[ended(50, "first", "done"), ended(90, "second", "stopped")],
         texts={},
-        requests=(goal(1, 10, "first"), goal(2, 60, "second"), Input(3, 70, 0, stop), goal(4, 100, "third")),
+        requests=(goal(1, 10, "first"), goal(2, 60, "second"), ControlInput(3, 70, 0, stop), goal(4, 100, "third")),
     )
     robot = Heard()
     renamed, goals = _send(recording, cast("Robot", robot), lambda _: None)

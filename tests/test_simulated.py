@@ -860,7 +860,7 @@ def test_following_error_beyond_its_window_for_its_time_is_a_fault(rig: Rig) -> 
         rig.now += PERIOD
         found.append(emergencies(rig.send(0x080)))
         rig.send(0x205, pack("<Hi", 0x0F, START + 300_000))
-    # Taken up at SYNC 1 and beyond the window from SYNC 2 on: SYNC 12 is 10 ms later.
+    # AcceptedPlan up at SYNC 1 and beyond the window from SYNC 2 on: SYNC 12 is 10 ms later.
     assert [n for n, emergency in enumerate(found) if emergency] == [12]
     assert found[12] == [(0x8611, 0x21)]
     assert rig.read(0x603F) == 0x8611

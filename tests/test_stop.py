@@ -10,7 +10,7 @@ from conftest import CONFIG, Rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.config import Config
-from trirail.control.modes import Event
+from trirail.control.modes import ModeEvent
 from trirail.motion.goals import Motion
 from trirail.motion.steps import Steps
 from trirail.wire.messages import PoseGoal, SlidersGoal, VelocityGoal
@@ -113,11 +113,11 @@ def planned(rig: Rig, goal: PoseGoal, name: str) -> None:
     rig.goal("running", -0.12, 0.0, 0.0)
     rig.cycles(150)
     rig.post(name, goal)
-    assert not rig.control.dispatch.idle
+    assert not rig.control.goal_queue.idle
 
 
-@pytest.mark.parametrize("event", [Event.GATEWAY_LOST, Event.LATE, Event.SHUTDOWN])
-def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: Rig, event: Event) -> None:
+@pytest.mark.parametrize("event", [ModeEvent.GATEWAY_LOST, ModeEvent.LATE, ModeEvent.SHUTDOWN])
+def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: Rig, event: ModeEvent) -> None:
     planned(slow, FAR, "g1")
     slow.control.happen(event, "gone")
     slow.until(lambda: slow.mode in (Mode.HOLDING, Mode.DISABLED))
@@ -129,7 +129,7 @@ def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: R
 
 def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow: Rig) -> None:
     slow.post("g1", FAR)
-    slow.control.happen(Event.GATEWAY_LOST, "gone")
+    slow.control.happen(ModeEvent.GATEWAY_LOST, "gone")
     slow.cycles(100)
     assert slow.mode is Mode.HOLDING
     assert slow.outcomes() == [("g1", "stopped")]
@@ -150,7 +150,7 @@ def test_stop_of_a_goal_that_has_not_begun_leaves_the_others(slow: Rig, waiting:
     assert (
         isinstance(answer_to(slow, 99), Confirmed) or slow.until(lambda: isinstance(answer_to(slow, 99), Confirmed)) < 3
     )
-    slow.until(lambda: slow.holds() and slow.control.dispatch.idle)
+    slow.until(lambda: slow.holds() and slow.control.goal_queue.idle)
     assert sorted(slow.outcomes()) == [
         ("g1", "stopped" if waiting == "planned" else "done"),
         ("g2", "done" if waiting == "planned" else "stopped"),
@@ -192,7 +192,7 @@ def test_a_goal_that_is_sent_to_a_paused_robot_begins(slow: Rig) -> None:
     slow.cycles(60)
     slow.command("pause")
     slow.send("g2", PoseGoal(0.0, 0.03, 0.0))
-    slow.until(lambda: slow.holds() and slow.control.dispatch.idle)
+    slow.until(lambda: slow.holds() and slow.control.goal_queue.idle)
     assert dict(slow.outcomes()) == {"running": "preempted", "g2": "done"}
 
 

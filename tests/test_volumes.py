@@ -23,7 +23,7 @@ from trirail.telemetry.blackbox import AFTER, BEFORE, BlackBox
 from trirail.telemetry.reading import Recording, join, read
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.messages import Event, PoseGoal
-from trirail.wire.packets import GoalRequest, Input
+from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.vocabulary import Mode
 
 WALL_NS = 1_795_245_300_000_000_000
@@ -60,9 +60,9 @@ def feed(to: Recorder | BlackBox, records: NDArray[np.void], time: Time) -> None
         to.records(batch.tobytes())
 
 
-def goal(cycle: int) -> Input:
+def goal(cycle: int) -> ControlInput:
     request = GoalRequest(7, "ann", "g-1", PoseGoal(0.01, 0.0, 0.1), made.MONOTONIC_NS)
-    return Input(1, cycle, made.MONOTONIC_NS + cycle * 1_000_000, request)
+    return ControlInput(1, cycle, made.MONOTONIC_NS + cycle * 1_000_000, request)
 
 
 def parts(folder: Path) -> list[Path]:

@@ -13,7 +13,7 @@ from trirail.config import SIM, geometry, load
 from trirail.errors import RefusedError
 from trirail.motion.goals import Goals
 from trirail.motion.runs import rest
-from trirail.motion.schedule import Course
+from trirail.motion.schedule import Schedule
 from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, VelocityGoal
 
 GOALS = 1500
@@ -35,13 +35,13 @@ def main(json: bool) -> None:
     }
     results = {}
     for kind, make in kinds.items():
-        course, rnd = Course(rest((0.0, 0.0, 0.0)), config.period), random.Random(SEED)
+        schedule, rnd = Schedule(rest((0.0, 0.0, 0.0)), config.period), random.Random(SEED)
         steps: list[float] = []
         counts: list[int] = []
         for _ in range(GOALS):
-            counts.append(_plan(goals, course, make(rnd), steps))
+            counts.append(_plan(goals, schedule, make(rnd), steps))
             for _ in range(rnd.randrange(1, 300)):
-                course.advance()
+                schedule.advance()
         results[kind] = {
             "steps_us": dict(
                 zip(("p50", "p99", "max"), np.percentile(np.array(steps) * 1e6, (50, 99, 100)).tolist(), strict=True)
@@ -67,9 +67,9 @@ def _pose(rnd: random.Random) -> tuple[float, float, float]:
     return rnd.uniform(-0.06, 0.06), rnd.uniform(-0.06, 0.06), rnd.uniform(-0.5, 0.4)
 
 
-def _plan(goals: Goals, course: Course, goal: Goal, steps: list[float]) -> int:
-    """Plan a goal step by step, the course going on meanwhile; return how many steps it took."""
-    planning, count = goals.plan(goal, course, 1.0), 0
+def _plan(goals: Goals, schedule: Schedule, goal: Goal, steps: list[float]) -> int:
+    """Plan a goal step by step, the schedule going on meanwhile; return how many steps it took."""
+    planning, count = goals.plan(goal, schedule, 1.0), 0
     while True:
         count += 1
         began = time.thread_time()
@@ -77,13 +77,13 @@ def _plan(goals: Goals, course: Course, goal: Goal, steps: list[float]) -> int:
             next(planning)
         except StopIteration as decided:
             steps.append(time.thread_time() - began)
-            course.take(decided.value.runs, decided.value.turn)
+            schedule.take(decided.value.runs, decided.value.turn)
             return count
         except RefusedError:
             steps.append(time.thread_time() - began)
             return count
         steps.append(time.thread_time() - began)
-        course.advance()
+        schedule.advance()
 
 
 def _bare(period: float) -> float:

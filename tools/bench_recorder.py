@@ -89,10 +89,10 @@ def main(seconds: float, json: bool = False) -> None:
     if json:
         print(json_format.dumps(measured))
         return
-    for situation, found in measured.items():
+    for status, found in measured.items():
         of = found.__getitem__
         print(
-            f"{situation}: the loop turned at {of('rate'):.0f} Hz for {of('seconds'):.0f} s, "
+            f"{status}: the loop turned at {of('rate'):.0f} Hz for {of('seconds'):.0f} s, "
             f"{of('rate_to_wanted'):.0%} of its rate"
         )
         print(

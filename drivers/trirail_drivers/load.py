@@ -6,6 +6,7 @@ from typing import Final
 
 from trirail_drivers import config, frames
 from trirail_drivers.errors import BusError
+from trirail_drivers.odrive import frames as odrive_frames
 
 HIGH: Final = 0.8
 """Worst-case share of the bus from which on people are warned: what is not cyclic has to wait."""

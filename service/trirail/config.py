@@ -92,7 +92,7 @@ class Limits(Struct, frozen=True, forbid_unknown_fields=True):
     """How near phi may come to a singular angle [rad]."""
 
 
-class Motion(Struct, frozen=True, forbid_unknown_fields=True):
+class MotionTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [motion]."""
 
     queue: Annotated[int, Meta(ge=0, le=100)] = 8
@@ -159,7 +159,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     zenoh: Zenoh
     telemetry: Telemetry
     watchdogs: Watchdogs
-    motion: Motion = Motion()
+    motion: MotionTable = MotionTable()
 
     @property
     def period(self) -> float:

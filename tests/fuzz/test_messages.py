@@ -204,7 +204,7 @@ def test_the_largest_goal_fits_into_a_packet() -> None:
     goal = TrajectoryGoal(points, id="\U0001f916" * MAX_NAME, stretch=True, valid_for=1234.5678)
     request = GoalRequest(2**63, "u" * MAX_NAME, "\U0001f916" * MAX_NAME, goal, 2**63, withdrawn="w" * 512)
     assert len(packets.message(request)) <= MAX_PACKET
-    assert len(packets.message(packets.Input(2**63, 2**63, 2**63, request))) <= MAX_PACKET
+    assert len(packets.message(packets.ControlInput(2**63, 2**63, 2**63, request))) <= MAX_PACKET
     assert len(json.dumps(msgspec.to_builtins(goal), indent=2)) <= MAX_MESSAGE
 
 

@@ -325,4 +325,4 @@ class Cia402:
             self._wire.take(message, self._clock())
 
     def _powered(self) -> bool:
-        return any(axis.state in setup.POWERED for axis in self._axes)
+        return any(axis.state in setup.HAS_POWER for axis in self._axes)

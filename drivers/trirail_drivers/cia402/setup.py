@@ -17,7 +17,7 @@ from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import NAMES, PowerState
 from trirail_drivers.scaling import Scale
 
-POWERED = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
+HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 """States in which a drive may have current in its motor."""
 
 _USED = ((0x1000, 0), (0x603F, 0), (0x6040, 0), (0x6041, 0), (0x6061, 0), (0x6064, 0), (0x607A, 0), (0x60B1, 0))
@@ -83,7 +83,7 @@ def _check_is_idle_servo(remote: Remote) -> None:
         )
     remote.write(0x6040, 0, frames.DISABLE_VOLTAGE)
     statusword = remote.read(0x6041)
-    if frames.power_state(statusword) in POWERED:
+    if frames.power_state(statusword) in HAS_POWER:
         raise DriveError(f"drive {remote.name}: keeps its power on when told off (statusword {statusword:04X})")
 
 

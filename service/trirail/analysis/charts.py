@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from trirail.analysis.summary import POWERED, GoalSummary, Summary
+from trirail.analysis.summary import ENABLED_MODES, GoalSummary, Summary
 from trirail.telemetry import palette
 from trirail.telemetry.reading import Recording
 from trirail.wire.vocabulary import MODES, Mode
@@ -44,7 +44,7 @@ def draw(file: Path, recording: Recording, summed: Summary) -> None:
     _modes(modes, records, t, summed)
     _bands(position, t, records["position"] * 1e3, "position [mm]")
     _bands(velocity, t, records["commanded_velocity"] * 1e3, "velocity [mm/s]")
-    enabled = np.isin(records["mode"], POWERED)[:, np.newaxis]
+    enabled = np.isin(records["mode"], ENABLED_MODES)[:, np.newaxis]
     _bands(error, t, np.where(enabled, records["following_error"], np.nan) * 1e6, "following error [µm]")
     _timing(timing, records, t, 1e6 / summed.rate_hz)
     worst = [f"{each.slider}  max {each.max * 1e6:.0f}, rms {each.rms * 1e6:.1f} µm" for each in summed.tracking]

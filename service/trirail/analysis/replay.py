@@ -23,7 +23,7 @@ from trirail.config import Config
 from trirail.control.control import Control
 from trirail.errors import ServiceError
 from trirail.telemetry.reading import Recording
-from trirail.wire.packets import DrivesFault, Input
+from trirail.wire.packets import ControlInput, DrivesFault
 from trirail.wire.vocabulary import MODES, Mode
 
 SETPOINTS = ("commanded_position", "commanded_velocity")
@@ -80,7 +80,7 @@ def again(recording: Recording, config: Config, *, simulated: bool) -> Compariso
 
 
 def _run(
-    control: Control, drives: Drives, clock: _Clock, records: NDArray[np.void], given: Sequence[Input]
+    control: Control, drives: Drives, clock: _Clock, records: NDArray[np.void], given: Sequence[ControlInput]
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return what is sent to the drives in each cycle, (N, 2, 3), and the modes, (N,)."""
     clock.step()
@@ -99,7 +99,7 @@ def _run(
     return made, modes
 
 
-def _cycle(control: Control, drives: Drives, given: Sequence[Input]) -> None:
+def _cycle(control: Control, drives: Drives, given: Sequence[ControlInput]) -> None:
     """Do what the loop does in a cycle after its SYNC."""
     if isinstance(drives, _Recorded):
         for what in given:
@@ -108,16 +108,16 @@ def _cycle(control: Control, drives: Drives, given: Sequence[Input]) -> None:
     control.cycle(
         drives.read(), [(what.given, what.now_ns) for what in given if not isinstance(what.given, DrivesFault)]
     )
-    control.desk.answers.clear()
-    control.desk.happenings.clear()
+    control.ledger.answers.clear()
+    control.ledger.notices.clear()
 
 
-def _due(waiting: deque[Input], cycle: int) -> Iterator[Input]:
+def _due(waiting: deque[ControlInput], cycle: int) -> Iterator[ControlInput]:
     while waiting and waiting[0].cycle <= cycle:
         yield waiting.popleft()
 
 
-def _whole(recording: Recording) -> tuple[NDArray[np.void], list[Input]]:
+def _whole(recording: Recording) -> tuple[NDArray[np.void], list[ControlInput]]:
     """Return the records up to the first gap, in them or in what the control was given, and what it was given."""
     records, given = recording.records, recording.requests
     steps = np.diff(records["cycle"]) != 1

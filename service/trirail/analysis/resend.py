@@ -18,6 +18,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from trirail_drivers.interface import Triple
 
 from trirail.client.client import Goal, Robot
 from trirail.errors import RefusedError, ServiceError
@@ -36,8 +37,6 @@ HEARD_WITHIN = 2.0
 """How much later than a goal's end its last records may come [s]."""
 _BEGAN = re.compile(rf"{Mode.MOVING}: goal (?P<id>\S+) of ")
 _MOVING = MODES.index(Mode.MOVING)
-
-Triple = tuple[float, float, float]
 
 
 class Motion(NamedTuple):

@@ -14,7 +14,7 @@ from trirail.wire.messages import Event, Percentiles
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.vocabulary import MODES, Mode
 
-POWERED = tuple(MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING))
+ENABLED_MODES = tuple(MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING))
 """Modes in which the sliders are to be where they are commanded."""
 UNKNOWN = "unknown"
 """The outcome of a goal whose end is not in the recording."""
@@ -118,7 +118,7 @@ def _period(recording: Recording) -> float:
 
 
 def _tracking(records: NDArray[np.void]) -> Iterator[Tracking]:
-    enabled = np.isin(records["mode"], POWERED)
+    enabled = np.isin(records["mode"], ENABLED_MODES)
     error = np.abs(records["following_error"])
     moving = enabled & (records["commanded_velocity"] != 0.0).any(axis=1)
     for number, slider in enumerate("ABC"):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from rich.table import Table
+from trirail_drivers.interface import Triple
 
 from trirail.cli import terminal
 from trirail.errors import KinematicsError, TrirailError
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from trirail.workspace.workspace import Survey
 
 Flag = Parameter(negative="")
-Triple = tuple[float, float, float]
 
 AT_REST: Triple = (0.0, 0.0, 0.0)
 STEPS = (1, 2, 5, 10, 15, 20, 30, 45)

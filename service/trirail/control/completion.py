@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from trirail_drivers.interface import NAMES, PowerState
 
-from trirail.control.feedback import POWERED, Measured
+from trirail.control.feedback import CAN_MOVE, Measured
 from trirail.wire.vocabulary import Mode
 
 _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
@@ -45,5 +45,5 @@ def verdict(name: str, mode: Mode, latched: str | None, measured: Measured, *, s
 def still_powered(measured: Measured, latched: str | None) -> str:
     """Tell which drives, by what they said last, can still move."""
     states = zip(NAMES, measured.feedback.state, strict=True)
-    said = ", ".join(f"drive {name} is {state}" for name, state in states if state in POWERED)
+    said = ", ".join(f"drive {name} is {state}" for name, state in states if state in CAN_MOVE)
     return f"{said} by what it said last: send reset again when the drives stand (fault: {latched})"

@@ -1,7 +1,7 @@
 """The robot's control, one cycle at a time, without a clock, a socket or a file.
 
 Each `cycle`: `observe` what the drives said, `handle` what is asked for, `advance` the motion and solve the sliders,
-and `write` the setpoints behind the last gate. What is to be said of it waits at the `desk`.
+and `write` the setpoints behind the last gate. What is to be said of it waits at the `ledger`.
 """
 
 from __future__ import annotations
@@ -10,48 +10,58 @@ import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from trirail_drivers.interface import NAMES, Drives, Feedback, PowerState
+from trirail_drivers.interface import NAMES, Drives, Feedback, PowerState, Triple
 
 from trirail.config import Config, geometry
 from trirail.control.completion import still_powered, verdict
 from trirail.control.feedback import Measured
-from trirail.control.goal_queue import Dispatch
-from trirail.control.ledger import Desk
-from trirail.control.modes import DISABLED, HOLDING, Action, Event, Refusal, State, step
+from trirail.control.goal_queue import GoalQueue
+from trirail.control.ledger import Ledger
+from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeState, Refusal, step
 from trirail.control.setpoints import Setpoints
-from trirail.control.stepwise_planner import Pilot
+from trirail.control.stepwise_planner import StepwisePlanner
 from trirail.errors import RefusedError
 from trirail.motion.goals import Goals
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
-from trirail.motion.schedule import Course
+from trirail.motion.schedule import Schedule
 from trirail.motion.steps import finish
 from trirail.wire.messages import Outcome, PoseGoal, SlidersGoal
-from trirail.wire.packets import CommandRequest, GoalRequest, Mishap, Request
+from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest, Request
 from trirail.wire.records import Part
 from trirail.wire.vocabulary import Mode
 
-Triple = tuple[float, float, float]
-
-Given = tuple[Request | Mishap, int]
+Given = tuple[Request | Disturbance, int]
 """What the control is given in a cycle, and when, by the monotonic clock [ns]."""
 
 SETTLE = 0.1
 """How long the drives may take to leave their fault state after a reset [s]."""
 
 _COMMANDS = {
-    "enable": Event.ENABLE,
-    "disable": Event.DISABLE,
-    "stop": Event.STOP,
-    "quick_stop": Event.QUICK_STOP,
-    "reset": Event.RESET,
-    "pause": Event.PAUSE,
-    "resume": Event.RESUME,
-    "home": Event.HOME,
+    "enable": ModeEvent.ENABLE,
+    "disable": ModeEvent.DISABLE,
+    "stop": ModeEvent.STOP,
+    "quick_stop": ModeEvent.QUICK_STOP,
+    "reset": ModeEvent.RESET,
+    "pause": ModeEvent.PAUSE,
+    "resume": ModeEvent.RESUME,
+    "home": ModeEvent.HOME,
 }
-_OUTCOMES: dict[Event, Outcome] = {Event.STANDSTILL: "done", Event.ARRIVED: "done", Event.FAULT: "faulted"}
+_OUTCOMES: dict[ModeEvent, Outcome] = {
+    ModeEvent.STANDSTILL: "done",
+    ModeEvent.ARRIVED: "done",
+    ModeEvent.FAULT: "faulted",
+}
 """How a goal ends on an event after which it is not under way; else it is stopped."""
-_GO_ON = (Event.GOAL, Event.STANDSTILL, Event.ARRIVED, Event.POWERED, Event.RESUME, Event.ENABLE, Event.RESET)
+_GO_ON = (
+    ModeEvent.GOAL,
+    ModeEvent.STANDSTILL,
+    ModeEvent.ARRIVED,
+    ModeEvent.POWERED,
+    ModeEvent.RESUME,
+    ModeEvent.ENABLE,
+    ModeEvent.RESET,
+)
 """Events that leave alone what has been sent but not begun."""
 
 
@@ -63,10 +73,10 @@ class Control:
         self._drives = drives
         self._period = config.period
         self._goals = Goals(robot, config.limits, config.period)
-        self._course = Course(rest(STILL), config.period)
-        self._pilot = Pilot(self._goals, self._course, config.period)
-        self.desk = Desk()
-        self.dispatch = Dispatch(self.desk, self._pilot, self._course, config.motion.queue, config.period)
+        self._schedule = Schedule(rest(STILL), config.period)
+        self._planner = StepwisePlanner(self._goals, self._schedule, config.period)
+        self.ledger = Ledger()
+        self.goal_queue = GoalQueue(self.ledger, self._planner, self._schedule, config.motion.queue, config.period)
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
         self.measured = Measured(legs, config.period, step_length)
         self.setpoints = Setpoints(legs, Bounds(config.limits, config.period, EDGE), self.measured, step_length)
@@ -76,7 +86,7 @@ class Control:
         self._settle_cycles = max(3, round(SETTLE / config.period))
 
         self.cycles = 0
-        self.state: State = DISABLED
+        self.state: ModeState = DISABLED
         self.fault: str | None = None
         self._entered = 0
 
@@ -89,8 +99,8 @@ class Control:
         self.observe(feedback)
         try:
             for what, now_ns in given:
-                if isinstance(what, Mishap):
-                    self.happen(Event[what.event], what.reason)
+                if isinstance(what, Disturbance):
+                    self.happen(ModeEvent[what.event], what.reason)
                 else:
                     self.handle(what, now_ns)
             mark(Part.MODE)
@@ -111,11 +121,11 @@ class Control:
         self.setpoints.start()
         self._follow_measured()
         # What runs for the first time is slow: plan and check a motion now, not in a cycle.
-        nearby = Course(rest([value + 1e-3 for value in self.measured.pose]), self._period)
+        nearby = Schedule(rest([value + 1e-3 for value in self.measured.pose]), self._period)
         for goal in (PoseGoal(*self.measured.pose), SlidersGoal(feedback.position)):
             with contextlib.suppress(RefusedError):
                 nearby.take(finish(self._goals.plan(goal, nearby, 1.0)).runs)
-                finish(self._goals.laws.try_change(nearby.runs[0], 0.0, self.measured.pose))
+                finish(self._goals.time_scaling.try_change(nearby.runs[0], 0.0, self.measured.pose))
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
@@ -123,11 +133,11 @@ class Control:
         before = self.measured.feedback
         self.measured.take(feedback)
         for warning in feedback.warnings:
-            self.desk.tell("service", "warning", warning)
+            self.ledger.tell("service", "warning", warning)
         mode = self.state.mode
         if feedback.fault is not None:
             if mode is Mode.FAULT and feedback.fault != before.fault:
-                self.desk.tell("fault", "error", feedback.fault.message)  # the first one stays, but this came of it
+                self.ledger.tell("fault", "error", feedback.fault.message)  # the first one stays, but this came of it
             self.trip(feedback.fault.message)
         elif mode is Mode.ENABLING:
             self._power_up()
@@ -142,40 +152,40 @@ class Control:
             else:
                 if not feedback.homing:
                     self._homing_over()
-        self.desk.settle(self._verdict, self.state.mode)
+        self.ledger.settle(self._verdict, self.state.mode)
 
     def handle(self, request: Request, now_ns: int) -> None:
         """Take a request at a time of the monotonic clock: a command at once, a goal behind those before it."""
         try:
             if isinstance(request, GoalRequest):
-                self.dispatch.take(request, now_ns, self.cycles)
+                self.goal_queue.take(request, now_ns, self.cycles)
             elif isinstance(request, CommandRequest):
                 self._take_command(request)
             else:
-                self.desk.tell("refused", "warning", request.message, user=request.user)
+                self.ledger.tell("refused", "warning", request.message, user=request.user)
         except RefusedError as refusal:
-            self.desk.refuse(request, refusal)
+            self.ledger.refuse(request, refusal)
 
-    def happen(self, event: Event, reason: str) -> None:
+    def happen(self, event: ModeEvent, reason: str) -> None:
         """Let something happen that nobody asked for: the gateway is lost, ticks are late, the service ends."""
         self._withdraw(event, reason)
         decided = step(self.state, event)
         if isinstance(decided, Refusal) or decided.state == self.state:
             return
-        self.desk.tell("service", "warning", reason)
+        self.ledger.tell("service", "warning", reason)
         self._go(event, reason)
 
     def advance(self) -> None:
         """End a jog that nobody renews, plan one step further, and move the commanded state on by one period."""
-        released = self.desk.release(self.cycles) if self.state.mode is Mode.MOVING else None
+        released = self.ledger.release(self.cycles) if self.state.mode is Mode.MOVING else None
         if released is not None:
-            self._go(Event.RELEASE, f"goal {released.id} of {released.user} is not renewed")
-        beginning = self.dispatch.think(self.cycles, self._admit)
+            self._go(ModeEvent.RELEASE, f"goal {released.id} of {released.user} is not renewed")
+        beginning = self.goal_queue.think(self.cycles, self._admit)
         if beginning is not None:
-            self._go(Event.GOAL, f"goal {beginning.id} of {beginning.user}")
-        for _ in range(self._course.advance()):
-            self.desk.pass_on()
-        self.dispatch.expire(self.cycles)
+            self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}")
+        for _ in range(self._schedule.advance()):
+            self.ledger.pass_on()
+        self.goal_queue.expire(self.cycles)
 
     def solve(self) -> None:
         """Solve the sliders for the commanded state, by the paper's recursion; pass the last gate, or trip."""
@@ -186,9 +196,9 @@ class Control:
         if refused:
             self.trip(refused)
             return
-        course = self._course
-        if self.state.mode in (Mode.MOVING, Mode.STOPPING) and course.runs[0].stands and not course.turning:
-            self._stand(course.runs[0])
+        schedule = self._schedule
+        if self.state.mode in (Mode.MOVING, Mode.STOPPING) and schedule.runs[0].stands and not schedule.turning:
+            self._stand(schedule.runs[0])
 
     def write(self) -> None:
         """Send the setpoints."""
@@ -202,27 +212,27 @@ class Control:
     @property
     def commanded(self) -> MotionState:
         """The platform's motion commanded in this cycle."""
-        return self._course.commanded
+        return self._schedule.commanded
 
     @property
     def override(self) -> float:
         """The rate at which motions are to run."""
-        return self._pilot.override
+        return self._planner.override
 
     @property
     def progress(self) -> tuple[float, float]:
         """Share of the time of the goal under way that is over, and what remains of it [s]."""
-        course = self._course
-        if not course.runs or course.turning:
-            return 0.0, course.remaining
-        *stops, run = course.runs
+        schedule = self._schedule
+        if not schedule.runs or schedule.turning:
+            return 0.0, schedule.remaining
+        *stops, run = schedule.runs
         return run.progress, run.remaining + sum(stop.ends - stop.time for stop in stops)
 
     @property
     def target(self) -> Triple | None:
         """The pose that the running goal leads to; None without one, and for a jog."""
-        last = self._course.last
-        if self.desk.goal is None or self.desk.goal.is_jog or last is None:
+        last = self._schedule.last
+        if self.ledger.goal is None or self.ledger.goal.is_jog or last is None:
             return None
         x, y, phi = last.destination(self.commanded.pose)
         return (x, y, phi)
@@ -232,41 +242,41 @@ class Control:
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason
-        self.desk.tell("fault", "error", reason)
-        self._withdraw(Event.FAULT, reason)
-        self._go(Event.FAULT, reason)
+        self.ledger.tell("fault", "error", reason)
+        self._withdraw(ModeEvent.FAULT, reason)
+        self._go(ModeEvent.FAULT, reason)
 
     # ------------------------------------------------------------------ requests
 
     def _admit(self) -> bool:
         """Whether the robot is moving to a goal; RefusedError where it takes none."""
-        decided = step(self.state, Event.GOAL)
+        decided = step(self.state, ModeEvent.GOAL)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
         if not self.measured.homed:
             raise RefusedError("not_homed", "it is not known where the sliders are: send home first")
         return self.state.mode is Mode.MOVING
 
-    def _withdraw(self, event: Event, reason: str) -> None:
+    def _withdraw(self, event: ModeEvent, reason: str) -> None:
         """End what has been sent but not begun, where the robot is to stand."""
         if event not in _GO_ON:
-            self.dispatch.withdraw("faulted" if event is Event.FAULT else "stopped", reason)
+            self.goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason)
 
     def _take_command(self, request: CommandRequest) -> None:
         if request.name == "override":
             self._take_override(request)
             return
         event = _COMMANDS[request.name]
-        if event is Event.HOME and not self._can_home:
+        if event is ModeEvent.HOME and not self._can_home:
             raise RefusedError("nothing_to_home", "absolute encoders: there is nothing to home")
-        if request.goal is not None and self.dispatch.stop_alone(request.goal, f"{request.name} by {request.user}"):
-            self.desk.undertake(request, self.cycles)
+        if request.goal is not None and self.goal_queue.stop_alone(request.goal, f"{request.name} by {request.user}"):
+            self.ledger.undertake(request, self.cycles)
             return
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
-        if event is Event.PAUSE and self.desk.goal is not None and self.desk.goal.is_jog:
-            event = Event.STOP  # nobody would be at the key when it is resumed
+        if event is ModeEvent.PAUSE and self.ledger.goal is not None and self.ledger.goal.is_jog:
+            event = ModeEvent.STOP  # nobody would be at the key when it is resumed
         if decided.action is Action.POWER_UP:
             self.setpoints.check_rest()
             if self.measured.homed:
@@ -274,20 +284,20 @@ class Control:
         if decided.action is Action.CLEAR and self.measured.powered:
             raise RefusedError("stopping", still_powered(self.measured, self.fault))
         reason = f"{request.name} by {request.user}"
-        if event is Event.QUICK_STOP:
+        if event is ModeEvent.QUICK_STOP:
             self.trip(reason)
         else:
             self._withdraw(event, reason)
             self._go(event, reason)
-        self.desk.undertake(request, self.cycles)
+        self.ledger.undertake(request, self.cycles)
 
     def _take_override(self, request: CommandRequest) -> None:
         """Let this motion and those to come run at another rate."""
-        self._pilot.override = request.value if request.value is not None else 1.0
+        self._planner.override = request.value if request.value is not None else 1.0
         if self.state.mode is Mode.MOVING:
-            self._pilot.run_at(self.override)
-        self.desk.tell("service", "info", f"override {self.override:.0%} by {request.user}", user=request.user)
-        self.desk.undertake(request, self.cycles)
+            self._planner.run_at(self.override)
+        self.ledger.tell("service", "info", f"override {self.override:.0%} by {request.user}", user=request.user)
+        self.ledger.undertake(request, self.cycles)
 
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
@@ -299,7 +309,7 @@ class Control:
 
     # ------------------------------------------------------------------ from state to state
 
-    def _go(self, event: Event, reason: str) -> None:  # noqa: PLR0912  a branch for each action
+    def _go(self, event: ModeEvent, reason: str) -> None:  # noqa: PLR0912  a branch for each action
         """Step the modes and carry out the action."""
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
@@ -315,11 +325,11 @@ class Control:
                 self._drives.reset()
                 self.fault = None
             case Action.BRAKE if decided.state.paused:
-                self._pilot.run_at(0.0)
+                self._planner.run_at(0.0)
             case Action.BRAKE:
                 self._brake()
             case Action.RESUME:
-                self._pilot.run_at(self.override)
+                self._planner.run_at(self.override)
             case Action.HOME:
                 self._drives.home()
             case Action.STOP_HOMING:
@@ -330,33 +340,33 @@ class Control:
         if not self.state.has_goal:
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = "released" if before.released else "arrived"
-            self.desk.end(outcome, arrived if outcome == "done" else reason)
+            self.ledger.end(outcome, arrived if outcome == "done" else reason)
         if self.state.mode is not before.mode:
-            self.desk.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
+            self.ledger.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
-            self._course.take(deque())
-            self._pilot.stop_thinking()
+            self._schedule.take(deque())
+            self._planner.stop_thinking()
 
     def _brake(self) -> None:
         """Stop on the path of the motion under way; what was to follow it does not."""
-        course = self._course
-        course.keep()
-        course.forget()
-        if len(course.runs) > 1:  # it is stopping already, for a goal that is not to follow any more
-            course.runs.pop()
-        self._pilot.run_at(0.0)
+        schedule = self._schedule
+        schedule.keep()
+        schedule.forget()
+        if len(schedule.runs) > 1:  # it is stopping already, for a goal that is not to follow any more
+            schedule.runs.pop()
+        self._planner.run_at(0.0)
 
     def _stand(self, run: Run) -> None:
         """The motion has ended where it should, or its law has brought it to a standstill on the way."""
-        self._go(Event.ARRIVED if run.arrived else Event.STANDSTILL, "standstill")
+        self._go(ModeEvent.ARRIVED if run.arrived else ModeEvent.STANDSTILL, "standstill")
 
     def _power_up(self) -> None:
         """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""
         if all(state is PowerState.OPERATION_ENABLED for state in self.measured.feedback.state):
             if not self.measured.homed:
-                self._go(Event.POWERED, "all drives are enabled; where the sliders are is not known: send home")
+                self._go(ModeEvent.POWERED, "all drives are enabled; where the sliders are is not known: send home")
             elif self._rest_at_setpoints():
-                self._go(Event.POWERED, "all drives are enabled")
+                self._go(ModeEvent.POWERED, "all drives are enabled")
         elif self.cycles - self._entered > self._enable_cycles:
             waiting = [
                 f"drive {name} is {state}"
@@ -368,7 +378,7 @@ class Control:
 
     def _homing_over(self) -> None:
         """Hold where homing has ended, or was stopped."""
-        if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self._course.runs:
+        if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self._schedule.runs:
             return  # no homing has been under way
         if self.measured.homed:
             try:
@@ -379,9 +389,9 @@ class Control:
             if not self._rest_at_setpoints():
                 return
         if self.state.mode is Mode.STOPPING:
-            self._go(Event.STANDSTILL, "standstill")
+            self._go(ModeEvent.STANDSTILL, "standstill")
         else:
-            self._go(Event.HOMED, "all drives are homed")
+            self._go(ModeEvent.HOMED, "all drives are homed")
 
     def _rest_at_setpoints(self) -> bool:
         """Command the pose that belongs to the setpoints, at rest; trip where there is none."""
@@ -390,11 +400,11 @@ class Control:
         if pose is None:
             self.trip("the measured sliders belong to no pose")
             return False
-        self._course.commanded = rest(pose)
+        self._schedule.commanded = rest(pose)
         return True
 
     def _follow_measured(self) -> None:
         """Command the pose that is measured, and the sliders to where they are."""
         stopped_now = self.state.mode is Mode.FAULT and self._entered == self.cycles
-        self._course.commanded = rest(self.measured.pose)
+        self._schedule.commanded = rest(self.measured.pose)
         self.setpoints.follow(held=self.state.mode not in (Mode.DISABLED, Mode.FAULT), stopped_now=stopped_now)

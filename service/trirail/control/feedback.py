@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from trirail_drivers.interface import Feedback, PowerState
+from trirail_drivers.interface import Feedback, PowerState, Triple
 
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.robot import forward_into
 from trirail.motion.runs import STILL
 
-Triple = tuple[float, float, float]
-
 OLDEST = 3
 """The greatest age of a position that is looked at, in SYNCs: at the next one the drive is silent."""
-POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
+CAN_MOVE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 """States in which a drive can move its slider."""
 
 
@@ -40,7 +38,7 @@ class Measured:
     @property
     def powered(self) -> bool:
         """Whether any drive can still move its slider."""
-        return any(state in POWERED for state in self.feedback.state)
+        return any(state in CAN_MOVE for state in self.feedback.state)
 
     @property
     def homed(self) -> bool:

@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from trirail.control.ledger import Desk
-from trirail.control.stepwise_planner import Pilot
+from trirail.control.ledger import Ledger
+from trirail.control.stepwise_planner import StepwisePlanner
 from trirail.errors import RefusedError
-from trirail.motion.schedule import Course
+from trirail.motion.schedule import Schedule
 from trirail.wire.messages import Outcome, PoseGoal, VelocityGoal
 from trirail.wire.packets import GoalRequest
 
@@ -22,13 +22,13 @@ class _Sent(NamedTuple):
     cycle: float
 
 
-class Dispatch:
-    """Takes goals in their order to the pilot, and to the desk what becomes of them."""
+class GoalQueue:
+    """Takes goals in their order to the planner, and to the ledger what becomes of them."""
 
-    def __init__(self, desk: Desk, pilot: Pilot, course: Course, queue: int, period: float) -> None:
-        self._desk = desk
-        self._pilot = pilot
-        self._course = course
+    def __init__(self, ledger: Ledger, pilot: StepwisePlanner, schedule: Schedule, queue: int, period: float) -> None:
+        self._ledger = ledger
+        self._planner = pilot
+        self._schedule = schedule
         self._queue = queue
         self._period = period
         self._waiting: deque[_Sent] = deque()
@@ -37,34 +37,34 @@ class Dispatch:
     @property
     def idle(self) -> bool:
         """Whether no goal is being planned and none waits for that."""
-        return not self._waiting and not self._pilot.busy
+        return not self._waiting and not self._planner.busy
 
     def take(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
         """Take a goal in a cycle, at a time of the monotonic clock; it waits until those before it are planned."""
         age = (now_ns - request.received_ns) * 1e-9 / self._period
         sent = _Sent(request, cycle - age)
         self._waiting.append(sent)
-        self._desk.keep_alive(request, self._alive_until(sent))
+        self._ledger.keep_alive(request, self._alive_until(sent))
 
     def think(self, cycle: int, admit: Callable[[], bool]) -> GoalRequest | None:
         """Begin with the next goal if none is being planned, and take one step; return a goal that begins.
 
         `admit` raises RefusedError where the robot takes no goal, and says whether it is moving to one.
         """
-        if not self._pilot.busy and self._waiting:
+        if not self._planner.busy and self._waiting:
             self._planned = self._waiting.popleft()
             try:
                 self._consider(self._planned, cycle, admit)
             except RefusedError as refusal:
-                self._desk.refuse(self._planned.request, refusal)
+                self._ledger.refuse(self._planned.request, refusal)
         try:
-            if self._pilot.busy and self._planned is not None:
-                self._desk.check_id(self._planned.request)  # a jog may end while its renewal is being planned
-            taken = self._pilot.think()
+            if self._planner.busy and self._planned is not None:
+                self._ledger.check_id(self._planned.request)  # a jog may end while its renewal is being planned
+            taken = self._planner.think()
         except RefusedError as refusal:
-            self._pilot.give_up()
+            self._planner.give_up()
             if self._planned is not None:
-                self._desk.refuse(self._planned.request, refusal)
+                self._ledger.refuse(self._planned.request, refusal)
             return None
         if taken is None or self._planned is None:
             return None
@@ -72,64 +72,64 @@ class Dispatch:
         valid = request.goal.valid_for
         expires = sent + valid / self._period if valid is not None else math.inf
         same = [later for later in (self._planned, *self._waiting) if later.request.id == request.id]
-        self._desk.begin(request, taken, expires, max(map(self._alive_until, same)))
+        self._ledger.begin(request, taken, expires, max(map(self._alive_until, same)))
         return request
 
     def withdraw(self, outcome: Outcome, reason: str) -> None:
         """End what has been sent but not begun."""
         requests = [sent.request for sent in self._waiting]
-        if self._pilot.busy and self._planned is not None:
+        if self._planner.busy and self._planned is not None:
             requests.insert(0, self._planned.request)
-        self._pilot.give_up()
+        self._planner.give_up()
         self._waiting.clear()
         for request in requests:
-            self._desk.withdraw(request, outcome, reason)
+            self._ledger.withdraw(request, outcome, reason)
 
     def stop_alone(self, goal_id: str, reason: str) -> bool:
         """Stop a goal that has not begun; whether that was all. Raises RefusedError if it is not under way at all."""
-        if self._desk.goal is not None and self._desk.goal.id == goal_id:
+        if self._ledger.goal is not None and self._ledger.goal.id == goal_id:
             return False
-        for number, goal in enumerate(self._desk.goals):
+        for number, goal in enumerate(self._ledger.goals):
             if goal.id == goal_id:
                 self._drop(number, goal_id, "stopped", reason)
                 return True
-        if self._pilot.busy and self._planned is not None and self._planned.request.id == goal_id:
-            self._pilot.give_up()
-            self._desk.withdraw(self._planned.request, "stopped", reason)
+        if self._planner.busy and self._planned is not None and self._planned.request.id == goal_id:
+            self._planner.give_up()
+            self._ledger.withdraw(self._planned.request, "stopped", reason)
             return True
         for sent in self._waiting:
             if sent.request.id == goal_id:
                 self._waiting.remove(sent)
-                self._desk.withdraw(sent.request, "stopped", reason)
+                self._ledger.withdraw(sent.request, "stopped", reason)
                 return True
         raise RefusedError("no_goal", f"goal {goal_id!r} is not under way: it has ended, or never was")
 
     def expire(self, cycle: int) -> None:
         """Let go of waiting goals that can no more begin in time, and of those behind them."""
-        for number, goal in enumerate(self._desk.goals):
+        for number, goal in enumerate(self._ledger.goals):
             if number and cycle > goal.expires:
                 self._drop(number, goal.id, "expired", "it has not begun in time")
                 return
 
     def _consider(self, sent: _Sent, cycle: int, admit: Callable[[], bool]) -> None:
         """Begin to plan a goal, or refuse it."""
-        desk, request, goal = self._desk, sent.request, sent.request.goal
-        desk.check_id(request)
+        ledger, request, goal = self._ledger, sent.request, sent.request.goal
+        ledger.check_id(request)
         if request.withdrawn is not None:
-            desk.withdraw(request, "stopped", request.withdrawn)
+            ledger.withdraw(request, "stopped", request.withdrawn)
             return
-        if isinstance(goal, VelocityGoal) and not any((goal.x, goal.y, goal.phi)) and not desk.renewed_by(request):
+        if isinstance(goal, VelocityGoal) and not any((goal.x, goal.y, goal.phi)) and not ledger.renewed_by(request):
             raise RefusedError("no_velocity", "a jog of no velocity moves nothing: give it one along x, y or phi")
         moving = admit()
         if goal.valid_for is not None and cycle - sent.cycle > goal.valid_for / self._period:
             raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")
         if cycle > self._alive_until(sent):
             raise RefusedError("expired", "the jog came too late: its timeout was over before it could begin")
-        blend = desk.goals[-1].blend if moving and desk.goals and isinstance(goal, PoseGoal) else None
-        if blend is not None and len(desk.goals) > self._queue:
+        blend = ledger.goals[-1].blend if moving and ledger.goals and isinstance(goal, PoseGoal) else None
+        if blend is not None and len(ledger.goals) > self._queue:
             text = f"{self._queue} goals are waiting already (motion.queue): send it when one has ended"
-            raise RefusedError("queue_full", text, value=len(desk.goals), limit=self._queue)
-        self._pilot.plan(goal, blend)
+            raise RefusedError("queue_full", text, value=len(ledger.goals), limit=self._queue)
+        self._planner.plan(goal, blend)
 
     def _alive_until(self, sent: _Sent) -> float:
         """Return the cycle in which a jog ends that nobody renews; infinite for other goals."""
@@ -138,7 +138,7 @@ class Dispatch:
 
     def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: str) -> None:
         """End a goal that waits, and those behind it."""
-        self._desk.end("stopped", f"goal {goal_id} before it {outcome}", but=number + 1)
-        self._desk.end(outcome, reason, but=number)
-        self._course.runs[-1].drop(number - 1)
-        self._pilot.run_at(self._pilot.override)
+        self._ledger.end("stopped", f"goal {goal_id} before it {outcome}", but=number + 1)
+        self._ledger.end(outcome, reason, but=number)
+        self._schedule.runs[-1].drop(number - 1)
+        self._planner.run_at(self._planner.override)

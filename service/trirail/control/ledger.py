@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from trirail.control.stepwise_planner import Taken
+from trirail.control.stepwise_planner import AcceptedPlan
 from trirail.errors import RefusedError
 from trirail.wire.messages import Level, Outcome, PoseGoal, VelocityGoal
 from trirail.wire.packets import (
@@ -27,7 +27,7 @@ REMEMBERED_IDS = 10_000
 _LEVELS: dict[Outcome, Level] = {"faulted": "error", "rejected": "warning", "expired": "warning"}
 
 
-class Happening(NamedTuple):
+class Notice(NamedTuple):
     """Something to tell everyone, in the order in which it happened."""
 
     kind: str
@@ -57,14 +57,14 @@ class Goal(NamedTuple):
     """The limit before which a jog comes to rest."""
 
 
-class Desk:
-    """Keeps the goals and the commands under way; what it has to say waits in `answers` and `happenings`."""
+class Ledger:
+    """Keeps the goals and the commands under way; what it has to say waits in `answers` and `notices`."""
 
     def __init__(self) -> None:
         self.goals: deque[Goal] = deque()
         """The goal that the robot is moving to, and those to follow it."""
         self.answers: list[Answer] = []
-        self.happenings: list[Happening] = []
+        self.notices: list[Notice] = []
         self._commands: dict[str, deque[tuple[CommandRequest, int]]] = {}
         self._ended: dict[str, str | None] = {}
         """Goals that have ended, and the limit at which that was, for a jog."""
@@ -101,7 +101,7 @@ class Desk:
         self.goals[0] = goal._replace(released=True)
         return goal
 
-    def begin(self, request: GoalRequest, taken: Taken, expires: float, alive_until: float) -> None:
+    def begin(self, request: GoalRequest, taken: AcceptedPlan, expires: float, alive_until: float) -> None:
         """Accept a goal; those before it are preempted, unless it follows them or is the same jog afresh."""
         self.answers.append(
             Accepted(request.ticket, request.id, taken.duration, taken.slowed, taken.stops_first, taken.queued)
@@ -203,4 +203,4 @@ class Desk:
         user: str | None = None,
     ) -> None:
         """Note something that everyone is to know."""
-        self.happenings.append(Happening(kind, level, message, mode, id, outcome, user))
+        self.notices.append(Notice(kind, level, message, mode, id, outcome, user))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from trirail.wire.vocabulary import Mode
 
 
-class Event(Enum):
+class ModeEvent(Enum):
     """What can happen: requests, what the motion and the drives report, and what goes wrong."""
 
     ENABLE = auto()
@@ -46,7 +46,7 @@ class Action(Enum):
     STOP_HOMING = auto()
 
 
-class State(NamedTuple):
+class ModeState(NamedTuple):
     """A mode, and what is to come once the robot stands: its drives disabled, the same goal again, or a jog's end."""
 
     mode: Mode
@@ -63,7 +63,7 @@ class State(NamedTuple):
 class Step(NamedTuple):
     """The next state, and what to do on the way."""
 
-    state: State
+    state: ModeState
     action: Action = Action.NOTHING
 
 
@@ -74,17 +74,17 @@ class Refusal(NamedTuple):
     message: str
 
 
-DISABLED = State(Mode.DISABLED)
-ENABLING = State(Mode.ENABLING)
-HOMING = State(Mode.HOMING)
-HOLDING = State(Mode.HOLDING)
-MOVING = State(Mode.MOVING)
-STOPPING = State(Mode.STOPPING)
-STOPPING_TO_DISABLE = State(Mode.STOPPING, disable_after=True)
-PAUSING = State(Mode.STOPPING, paused=True)
-PAUSED = State(Mode.HOLDING, paused=True)
-RELEASING = State(Mode.STOPPING, released=True)
-FAULT = State(Mode.FAULT)
+DISABLED = ModeState(Mode.DISABLED)
+ENABLING = ModeState(Mode.ENABLING)
+HOMING = ModeState(Mode.HOMING)
+HOLDING = ModeState(Mode.HOLDING)
+MOVING = ModeState(Mode.MOVING)
+STOPPING = ModeState(Mode.STOPPING)
+STOPPING_TO_DISABLE = ModeState(Mode.STOPPING, disable_after=True)
+PAUSING = ModeState(Mode.STOPPING, paused=True)
+PAUSED = ModeState(Mode.HOLDING, paused=True)
+RELEASING = ModeState(Mode.STOPPING, released=True)
+FAULT = ModeState(Mode.FAULT)
 
 STATES = (
     DISABLED,
@@ -116,151 +116,151 @@ _NOT_PAUSED = Refusal("not_paused", "there is no paused goal to resume")
 _POWER_OFF = Step(DISABLED, Action.POWER_DOWN)
 _TRIP = Step(FAULT, Action.QUICK_STOP)
 
-_TABLE: dict[State, dict[Event, Step | Refusal]] = {
+_TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
     DISABLED: {
-        Event.ENABLE: Step(ENABLING, Action.POWER_UP),
-        Event.GOAL: _DISABLED,
-        Event.PAUSE: _NO_GOAL,
-        Event.RESUME: _NOT_PAUSED,
-        Event.HOME: _DISABLED,
-        Event.RESET: _NO_FAULT,
-        Event.QUICK_STOP: _TRIP,
-        Event.FAULT: _TRIP,
+        ModeEvent.ENABLE: Step(ENABLING, Action.POWER_UP),
+        ModeEvent.GOAL: _DISABLED,
+        ModeEvent.PAUSE: _NO_GOAL,
+        ModeEvent.RESUME: _NOT_PAUSED,
+        ModeEvent.HOME: _DISABLED,
+        ModeEvent.RESET: _NO_FAULT,
+        ModeEvent.QUICK_STOP: _TRIP,
+        ModeEvent.FAULT: _TRIP,
     },
     ENABLING: {
-        Event.DISABLE: _POWER_OFF,
-        Event.GOAL: _ENABLING,
-        Event.PAUSE: _NO_GOAL,
-        Event.RESUME: _NOT_PAUSED,
-        Event.STOP: _POWER_OFF,
-        Event.HOME: _ENABLING,
-        Event.RESET: _NO_FAULT,
-        Event.POWERED: Step(HOLDING),
-        Event.GATEWAY_LOST: _POWER_OFF,
-        Event.LATE: _POWER_OFF,
-        Event.SHUTDOWN: _POWER_OFF,
-        Event.QUICK_STOP: _TRIP,
-        Event.FAULT: _TRIP,
+        ModeEvent.DISABLE: _POWER_OFF,
+        ModeEvent.GOAL: _ENABLING,
+        ModeEvent.PAUSE: _NO_GOAL,
+        ModeEvent.RESUME: _NOT_PAUSED,
+        ModeEvent.STOP: _POWER_OFF,
+        ModeEvent.HOME: _ENABLING,
+        ModeEvent.RESET: _NO_FAULT,
+        ModeEvent.POWERED: Step(HOLDING),
+        ModeEvent.GATEWAY_LOST: _POWER_OFF,
+        ModeEvent.LATE: _POWER_OFF,
+        ModeEvent.SHUTDOWN: _POWER_OFF,
+        ModeEvent.QUICK_STOP: _TRIP,
+        ModeEvent.FAULT: _TRIP,
     },
     HOMING: {
-        Event.DISABLE: Step(STOPPING_TO_DISABLE, Action.STOP_HOMING),
-        Event.GOAL: _HOMING,
-        Event.STOP: Step(STOPPING, Action.STOP_HOMING),
-        Event.PAUSE: _NO_GOAL,
-        Event.RESUME: _NOT_PAUSED,
-        Event.RESET: _NO_FAULT,
-        Event.HOMED: Step(HOLDING),
-        Event.GATEWAY_LOST: Step(STOPPING, Action.STOP_HOMING),
-        Event.LATE: Step(STOPPING, Action.STOP_HOMING),
-        Event.SHUTDOWN: Step(STOPPING_TO_DISABLE, Action.STOP_HOMING),
-        Event.QUICK_STOP: _TRIP,
-        Event.FAULT: _TRIP,
+        ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE, Action.STOP_HOMING),
+        ModeEvent.GOAL: _HOMING,
+        ModeEvent.STOP: Step(STOPPING, Action.STOP_HOMING),
+        ModeEvent.PAUSE: _NO_GOAL,
+        ModeEvent.RESUME: _NOT_PAUSED,
+        ModeEvent.RESET: _NO_FAULT,
+        ModeEvent.HOMED: Step(HOLDING),
+        ModeEvent.GATEWAY_LOST: Step(STOPPING, Action.STOP_HOMING),
+        ModeEvent.LATE: Step(STOPPING, Action.STOP_HOMING),
+        ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE, Action.STOP_HOMING),
+        ModeEvent.QUICK_STOP: _TRIP,
+        ModeEvent.FAULT: _TRIP,
     },
     HOLDING: {
-        Event.DISABLE: _POWER_OFF,
-        Event.GOAL: Step(MOVING, Action.START),
-        Event.PAUSE: _NO_GOAL,
-        Event.RESUME: _NOT_PAUSED,
-        Event.HOME: Step(HOMING, Action.HOME),
-        Event.RESET: _NO_FAULT,
-        Event.SHUTDOWN: _POWER_OFF,
-        Event.QUICK_STOP: _TRIP,
-        Event.FAULT: _TRIP,
+        ModeEvent.DISABLE: _POWER_OFF,
+        ModeEvent.GOAL: Step(MOVING, Action.START),
+        ModeEvent.PAUSE: _NO_GOAL,
+        ModeEvent.RESUME: _NOT_PAUSED,
+        ModeEvent.HOME: Step(HOMING, Action.HOME),
+        ModeEvent.RESET: _NO_FAULT,
+        ModeEvent.SHUTDOWN: _POWER_OFF,
+        ModeEvent.QUICK_STOP: _TRIP,
+        ModeEvent.FAULT: _TRIP,
     },
     MOVING: {
-        Event.DISABLE: Step(STOPPING_TO_DISABLE, Action.BRAKE),
-        Event.GOAL: Step(MOVING, Action.START),
-        Event.STOP: Step(STOPPING, Action.BRAKE),
-        Event.PAUSE: Step(PAUSING, Action.BRAKE),
-        Event.RELEASE: Step(RELEASING, Action.BRAKE),
-        Event.HOME: _MOVING,
-        Event.RESET: _NO_FAULT,
-        Event.ARRIVED: Step(HOLDING),
-        Event.GATEWAY_LOST: Step(STOPPING, Action.BRAKE),
-        Event.LATE: Step(STOPPING, Action.BRAKE),
-        Event.SHUTDOWN: Step(STOPPING_TO_DISABLE, Action.BRAKE),
-        Event.QUICK_STOP: _TRIP,
-        Event.FAULT: _TRIP,
+        ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE, Action.BRAKE),
+        ModeEvent.GOAL: Step(MOVING, Action.START),
+        ModeEvent.STOP: Step(STOPPING, Action.BRAKE),
+        ModeEvent.PAUSE: Step(PAUSING, Action.BRAKE),
+        ModeEvent.RELEASE: Step(RELEASING, Action.BRAKE),
+        ModeEvent.HOME: _MOVING,
+        ModeEvent.RESET: _NO_FAULT,
+        ModeEvent.ARRIVED: Step(HOLDING),
+        ModeEvent.GATEWAY_LOST: Step(STOPPING, Action.BRAKE),
+        ModeEvent.LATE: Step(STOPPING, Action.BRAKE),
+        ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE, Action.BRAKE),
+        ModeEvent.QUICK_STOP: _TRIP,
+        ModeEvent.FAULT: _TRIP,
     },
     STOPPING: {
-        Event.DISABLE: Step(STOPPING_TO_DISABLE),
-        Event.GOAL: _STOPPING,
-        Event.PAUSE: _NO_GOAL,
-        Event.RESUME: _NOT_PAUSED,
-        Event.HOME: _STOPPING,
-        Event.RESET: _NO_FAULT,
-        Event.STANDSTILL: Step(HOLDING),
-        Event.ARRIVED: Step(HOLDING),
-        Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),
-        Event.QUICK_STOP: _TRIP,
-        Event.FAULT: _TRIP,
+        ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE),
+        ModeEvent.GOAL: _STOPPING,
+        ModeEvent.PAUSE: _NO_GOAL,
+        ModeEvent.RESUME: _NOT_PAUSED,
+        ModeEvent.HOME: _STOPPING,
+        ModeEvent.RESET: _NO_FAULT,
+        ModeEvent.STANDSTILL: Step(HOLDING),
+        ModeEvent.ARRIVED: Step(HOLDING),
+        ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE),
+        ModeEvent.QUICK_STOP: _TRIP,
+        ModeEvent.FAULT: _TRIP,
     },
     STOPPING_TO_DISABLE: {
-        Event.ENABLE: _DISABLING,
-        Event.GOAL: _DISABLING,
-        Event.PAUSE: _NO_GOAL,
-        Event.RESUME: _NOT_PAUSED,
-        Event.HOME: _DISABLING,
-        Event.RESET: _NO_FAULT,
-        Event.STANDSTILL: _POWER_OFF,
-        Event.ARRIVED: _POWER_OFF,
-        Event.QUICK_STOP: _TRIP,
-        Event.FAULT: _TRIP,
+        ModeEvent.ENABLE: _DISABLING,
+        ModeEvent.GOAL: _DISABLING,
+        ModeEvent.PAUSE: _NO_GOAL,
+        ModeEvent.RESUME: _NOT_PAUSED,
+        ModeEvent.HOME: _DISABLING,
+        ModeEvent.RESET: _NO_FAULT,
+        ModeEvent.STANDSTILL: _POWER_OFF,
+        ModeEvent.ARRIVED: _POWER_OFF,
+        ModeEvent.QUICK_STOP: _TRIP,
+        ModeEvent.FAULT: _TRIP,
     },
     PAUSING: {
-        Event.DISABLE: Step(STOPPING_TO_DISABLE),
-        Event.GOAL: Step(MOVING, Action.START),
-        Event.STOP: Step(STOPPING),
-        Event.RESUME: Step(MOVING, Action.RESUME),
-        Event.HOME: _PAUSED,
-        Event.RESET: _NO_FAULT,
-        Event.STANDSTILL: Step(PAUSED),
-        Event.ARRIVED: Step(HOLDING),
-        Event.GATEWAY_LOST: Step(STOPPING),
-        Event.LATE: Step(STOPPING),
-        Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),
-        Event.QUICK_STOP: _TRIP,
-        Event.FAULT: _TRIP,
+        ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE),
+        ModeEvent.GOAL: Step(MOVING, Action.START),
+        ModeEvent.STOP: Step(STOPPING),
+        ModeEvent.RESUME: Step(MOVING, Action.RESUME),
+        ModeEvent.HOME: _PAUSED,
+        ModeEvent.RESET: _NO_FAULT,
+        ModeEvent.STANDSTILL: Step(PAUSED),
+        ModeEvent.ARRIVED: Step(HOLDING),
+        ModeEvent.GATEWAY_LOST: Step(STOPPING),
+        ModeEvent.LATE: Step(STOPPING),
+        ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE),
+        ModeEvent.QUICK_STOP: _TRIP,
+        ModeEvent.FAULT: _TRIP,
     },
     PAUSED: {
-        Event.DISABLE: _POWER_OFF,
-        Event.GOAL: Step(MOVING, Action.START),
-        Event.STOP: Step(HOLDING),
-        Event.RESUME: Step(MOVING, Action.RESUME),
-        Event.HOME: _PAUSED,
-        Event.RESET: _NO_FAULT,
-        Event.GATEWAY_LOST: Step(HOLDING),
-        Event.SHUTDOWN: _POWER_OFF,
-        Event.QUICK_STOP: _TRIP,
-        Event.FAULT: _TRIP,
+        ModeEvent.DISABLE: _POWER_OFF,
+        ModeEvent.GOAL: Step(MOVING, Action.START),
+        ModeEvent.STOP: Step(HOLDING),
+        ModeEvent.RESUME: Step(MOVING, Action.RESUME),
+        ModeEvent.HOME: _PAUSED,
+        ModeEvent.RESET: _NO_FAULT,
+        ModeEvent.GATEWAY_LOST: Step(HOLDING),
+        ModeEvent.SHUTDOWN: _POWER_OFF,
+        ModeEvent.QUICK_STOP: _TRIP,
+        ModeEvent.FAULT: _TRIP,
     },
     RELEASING: {
-        Event.DISABLE: Step(STOPPING_TO_DISABLE),
-        Event.GOAL: Step(MOVING, Action.START),
-        Event.STOP: Step(STOPPING),
-        Event.RESUME: _NOT_PAUSED,
-        Event.HOME: _STOPPING,
-        Event.RESET: _NO_FAULT,
-        Event.STANDSTILL: Step(HOLDING),
-        Event.ARRIVED: Step(HOLDING),
-        Event.GATEWAY_LOST: Step(STOPPING),
-        Event.LATE: Step(STOPPING),
-        Event.SHUTDOWN: Step(STOPPING_TO_DISABLE),
-        Event.QUICK_STOP: _TRIP,
-        Event.FAULT: _TRIP,
+        ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE),
+        ModeEvent.GOAL: Step(MOVING, Action.START),
+        ModeEvent.STOP: Step(STOPPING),
+        ModeEvent.RESUME: _NOT_PAUSED,
+        ModeEvent.HOME: _STOPPING,
+        ModeEvent.RESET: _NO_FAULT,
+        ModeEvent.STANDSTILL: Step(HOLDING),
+        ModeEvent.ARRIVED: Step(HOLDING),
+        ModeEvent.GATEWAY_LOST: Step(STOPPING),
+        ModeEvent.LATE: Step(STOPPING),
+        ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE),
+        ModeEvent.QUICK_STOP: _TRIP,
+        ModeEvent.FAULT: _TRIP,
     },
     FAULT: {
-        Event.ENABLE: _FAULT,
-        Event.GOAL: _FAULT,
-        Event.PAUSE: _FAULT,
-        Event.RESUME: _FAULT,
-        Event.HOME: _FAULT,
-        Event.RESET: Step(DISABLED, Action.CLEAR),
+        ModeEvent.ENABLE: _FAULT,
+        ModeEvent.GOAL: _FAULT,
+        ModeEvent.PAUSE: _FAULT,
+        ModeEvent.RESUME: _FAULT,
+        ModeEvent.HOME: _FAULT,
+        ModeEvent.RESET: Step(DISABLED, Action.CLEAR),
     },
 }
 
 
-def step(state: State, event: Event) -> Step | Refusal:
+def step(state: ModeState, event: ModeEvent) -> Step | Refusal:
     """Decide what `event` does in `state`; what is not in the table changes nothing.
 
     What is already so is confirmed, not refused: enabling an enabled robot, stopping one that stands. The first

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from trirail.errors import RefusedError
 from trirail.motion.goals import Extension, Goals, Motion
 from trirail.motion.runs import Run
-from trirail.motion.schedule import Course
+from trirail.motion.schedule import Schedule
 from trirail.motion.steps import Steps
 from trirail.motion.time_scaling import SHARES
 from trirail.wire.messages import Goal, PoseGoal
@@ -19,7 +19,7 @@ ROUND = len(SHARES)
 """Steps that a change of rate has for itself before a goal is planned all the same: one try of every share."""
 
 
-class Taken(NamedTuple):
+class AcceptedPlan(NamedTuple):
     """A goal is the robot's now."""
 
     duration: float
@@ -32,14 +32,14 @@ class Taken(NamedTuple):
     """The limit before which a jog comes to rest."""
 
 
-class Pilot:
-    """Decides how the course goes on."""
+class StepwisePlanner:
+    """Decides how the schedule of motions goes on."""
 
-    def __init__(self, goals: Goals, course: Course, period: float) -> None:
+    def __init__(self, goals: Goals, schedule: Schedule, period: float) -> None:
         self.override = 1.0
         """The rate at which motions are to run."""
         self._goals = goals
-        self._course = course
+        self._schedule = schedule
         self._period = period
         self._goal: Goal | None = None
         self._blend: float | None = None
@@ -71,7 +71,7 @@ class Pilot:
         """The motion has ended: leave its rate alone."""
         self._change = None
 
-    def think(self) -> Taken | None:
+    def think(self) -> AcceptedPlan | None:
         """Take one step; return how a goal is reached once that is decided. Raises RefusedError if it cannot be.
 
         A change of rate goes first; where the sliders do not allow it yet, a goal does not wait for it: it is planned
@@ -82,7 +82,7 @@ class Pilot:
             if _ended(self._change):
                 self._change = None
             return None
-        if self._goal is None or self._course.turning:  # what is yet to begin cannot be planned from
+        if self._goal is None or self._schedule.turning:  # what is yet to begin cannot be planned from
             return None
         self._spent += 1
         if self._spent > MOST_STEPS:
@@ -100,47 +100,47 @@ class Pilot:
         return None
 
     def _begin(self, goal: Goal) -> Steps[Motion] | Steps[tuple[Run, Extension]]:
-        if self._blend is not None and isinstance(goal, PoseGoal) and self._course.runs:
+        if self._blend is not None and isinstance(goal, PoseGoal) and self._schedule.runs:
             return self._append(goal, self._blend)
-        return self._goals.plan(goal, self._course, self.override)
+        return self._goals.plan(goal, self._schedule, self.override)
 
     def _append(self, goal: PoseGoal, blend: float) -> Steps[tuple[Run, Extension]]:
-        run = self._course.runs[-1]
+        run = self._schedule.runs[-1]
         return run, (yield from self._goals.append(goal, run, blend))
 
-    def _take(self, decided: Motion | tuple[Run, Extension]) -> Taken | None:
+    def _take(self, decided: Motion | tuple[Run, Extension]) -> AcceptedPlan | None:
         """Carry out what has been decided."""
-        course = self._course
+        schedule = self._schedule
         self._steps, self._tried = None, 0
         if isinstance(decided, Motion):
             self._goal = self._change = None
-            waiting = max(0, decided.turn - course.cycle) * self._period if decided.turn is not None else 0.0
-            course.take(decided.runs, decided.turn)
+            waiting = max(0, decided.turn - schedule.cycle) * self._period if decided.turn is not None else 0.0
+            schedule.take(decided.runs, decided.turn)
             if decided.runs[-1].target != self.override:
                 self._change = self._run_at(self.override)
             duration = waiting + decided.duration
-            return Taken(duration, decided.slowed, decided.stops_first, queued=False, bound=decided.bound)
+            return AcceptedPlan(duration, decided.slowed, decided.stops_first, queued=False, bound=decided.bound)
         run, extension = decided
-        if not course.runs or course.runs[-1] is not run or run.at.s >= extension.s:
+        if not schedule.runs or schedule.runs[-1] is not run or run.at.s >= extension.s:
             return None  # the motion that it was to follow has ended: plan it anew
         self._goal = None
         run.append(extension.s, extension.path)
-        duration = course.remaining if run.target else math.inf
-        return Taken(duration, extension.slowed, stops_first=False, queued=True)
+        duration = schedule.remaining if run.target else math.inf
+        return AcceptedPlan(duration, extension.slowed, stops_first=False, queued=True)
 
     def _run_at(self, rate: float) -> Steps[None]:
         """Change the rate of the goal's motion; where that follows a stop on the old path, the stop stays as it is."""
-        course = self._course
-        while course.turning:
+        schedule = self._schedule
+        while schedule.turning:
             yield
-        if not course.runs:
+        if not schedule.runs:
             return
-        run = course.runs[-1]
-        if len(course.runs) == 1:
-            yield from self._goals.laws.change(run, rate, course.commanded.pose)
+        run = schedule.runs[-1]
+        if len(schedule.runs) == 1:
+            yield from self._goals.time_scaling.change(run, rate, schedule.commanded.pose)
         else:
-            start = run.state(0.0, course.commanded.pose).pose
-            begun = yield from self._goals.laws.begin(run.path, rate, start)
+            start = run.state(0.0, schedule.commanded.pose).pose
+            begun = yield from self._goals.time_scaling.begin(run.path, rate, start)
             run.change_law(begun.law, begun.target)
 
 

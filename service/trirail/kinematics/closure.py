@@ -32,7 +32,7 @@ __all__ = [
 ROUNDING = 1e-15  # part of the squares whose difference is (det J2)² that their rounding can make up
 LOOPS_OPEN, J2_SINGULAR = 4, 5  # codes of forward_into; 1 to 3 are the legs'
 
-LEGS = "Array(f8, 3, 'C', readonly=True)"  # numba's name for what Geometry.packed() returns
+LEGS_TYPE = "Array(f8, 3, 'C', readonly=True)"  # numba's name for what Geometry.packed() returns
 
 
 class ClosedLeg(NamedTuple):
@@ -78,7 +78,7 @@ def inverse_motion(legs: Array, motion: Array, out: Array) -> int:
     return 0
 
 
-@compiled(f"i8({LEGS}, f8[:, ::1], f8[:, ::1])")
+@compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, ::1])")
 def inverse_into(legs: Array, motion: Array, out: Array) -> int:
     """Write the motion of all joints for one motion of the platform; raises and allocates nothing.
 
@@ -89,7 +89,7 @@ def inverse_into(legs: Array, motion: Array, out: Array) -> int:
     return inverse_motion(legs, motion, out)
 
 
-@compiled(f"i8({LEGS}, f8[:, :, ::1], f8[:, :, ::1])")
+@compiled(f"i8({LEGS_TYPE}, f8[:, :, ::1], f8[:, :, ::1])")
 def inverse_batch(legs: Array, motion: Array, out: Array) -> int:
     """Do inverse_into for `motion` (3, N, 3) and `out` (6, N, 3); the codes of row k begin after 3 k."""
     for k in range(motion.shape[1]):
@@ -105,7 +105,7 @@ def _beta(closed: ClosedLeg) -> Vector:
     return closed.edge[1], -closed.edge[0], dot(closed.edge, closed.to_centre)
 
 
-@compiled(f"i8({LEGS}, f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])")
+@compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])")
 def jacobians_batch(legs: Array, poses: Array, j1: Array, j2: Array) -> int:
     """Write the diagonals of J1 and all of J2, (17), (N, 3, 3), for poses (N, 3); codes of inverse_batch."""
     for k in range(len(poses)):
@@ -158,7 +158,7 @@ def _loop_equation(a: Edge, b: Edge, c: Edge) -> Vector:
     )
 
 
-@compiled(f"UniTuple(f8, 3)({LEGS}, f8[::1])")
+@compiled(f"UniTuple(f8, 3)({LEGS_TYPE}, f8[::1])")
 def loop_equation(legs: Array, sliders: Array) -> Vector:
     """Return A, B, C [m] of the equation A cos phi + B sin phi = C that the three loops leave for phi.
 
@@ -202,7 +202,7 @@ def _forward(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
     return code
 
 
-@compiled(f"i8({LEGS}, f8[::1], f8[::1], f8[::1])")
+@compiled(f"i8({LEGS_TYPE}, f8[::1], f8[::1], f8[::1])")
 def forward_into(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
     """Write the pose at which the sliders stand as given; raises and allocates nothing.
 
@@ -213,7 +213,7 @@ def forward_into(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
     return _forward(legs, sliders, near, pose)
 
 
-@compiled(f"i8({LEGS}, f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+@compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, ::1], f8[:, ::1])")
 def forward_batch(legs: Array, sliders: Array, near: Array, poses: Array) -> int:
     """Do forward_into for arrays (N, 3); the codes of row k begin after 5 k."""
     for k in range(len(sliders)):

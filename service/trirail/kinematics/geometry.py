@@ -19,7 +19,7 @@ from trirail.kinematics.recursion import Joint, serial_leg
 
 __all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "singular_angles"]
 
-LEGS = "ABC"
+LEGS = ("A", "B", "C")
 PARALLEL = 1e-9  # |sin| of the angle between an edge and its rail up to which the leg counts as singular
 THETA_1 = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # (3)
 

@@ -1,1 +1,1 @@
-"""From a goal to a motion within every limit: paths, the laws of their time, planning and what is checked before."""
+"""From a goal to a motion within every limit: paths, how their time runs, planning and what is checked before."""

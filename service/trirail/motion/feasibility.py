@@ -11,9 +11,9 @@ import numpy as np
 from trirail.config import Limits
 from trirail.errors import RefusedError
 from trirail.kinematics.algebra import Array
-from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
-from trirail.motion.limits import COORDINATES, LEGS, Bounds, Violation
+from trirail.motion.limits import COORDINATES, Bounds, Violation
 from trirail.motion.path_sampling import survey
 from trirail.motion.paths import ROUNDING, Path, advance, constant
 from trirail.motion.runs import STILL
@@ -44,7 +44,7 @@ class Look(NamedTuple):
 
     worst: Array
     """Velocity, acceleration and jerk (4, 3) of the fastest slider, of x, y and phi, as shares of what plans use."""
-    bearable: bool
+    within_limits: bool
     """Whether sliders and platform can bear it, with what is kept for changes of rate."""
     beyond: float
     """When it is out of reach [s]; not a number where it never is."""

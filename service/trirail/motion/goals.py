@@ -17,9 +17,9 @@ from trirail.motion.paths import HALVINGS, Path, constant, value
 from trirail.motion.planner import TOO_FAST_IN_MOTION, Kinodynamic, Plan, Planner
 from trirail.motion.quintic import Point
 from trirail.motion.runs import MotionState, Run, rest, stretched
-from trirail.motion.schedule import Course
+from trirail.motion.schedule import Schedule
 from trirail.motion.steps import Steps, T
-from trirail.motion.time_scaling import Laws
+from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 
 SLOWEST = 0.05
@@ -39,7 +39,7 @@ class Motion(NamedTuple):
 
     runs: deque[Run]
     turn: int | None
-    """From which cycle of the course on; None for at once."""
+    """From which cycle of the schedule on; None for at once."""
     duration: float
     """From when it begins to arrival [s]."""
     slowed: float = 1.0
@@ -68,9 +68,9 @@ class Goals:
         self._checker = checker
         self._period = period
         self._planner = Planner(geometry, limits.platform, limits.slider, bounds, checker, period)
-        self.laws = Laws(geometry, limits.platform, checker, period)
+        self.time_scaling = TimeScaling(geometry, limits.platform, checker, period)
 
-    def plan(self, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
+    def plan(self, goal: Goal, schedule: Schedule, rate: float) -> Steps[Motion]:
         """Return the motion to a goal, its time to run at `rate`, from the commanded state of the motion under way.
 
         It begins at once where one step is enough to plan it. Else it begins from where the robot will be when it
@@ -79,16 +79,16 @@ class Goals:
         """
         self._check(goal)
         try:
-            found = _one_step(self._set_out(goal, course, rate))
+            found = _one_step(self._set_out(goal, schedule, rate))
         except RefusedError as error:
-            if course.commanded.at_rest or error.code == "wrong_start":
+            if schedule.commanded.at_rest or error.code == "wrong_start":
                 raise
             found = None
         if found is not None:
             return found
         yield
-        still = not course.runs
-        later = course if still else course.ahead(LEAD)
+        still = not schedule.runs
+        later = schedule if still else schedule.ahead(LEAD)
         yield
         sooner: Motion | None = None
         try:
@@ -140,36 +140,36 @@ class Goals:
         elif isinstance(goal, SlidersGoal):
             self._planner.check_sliders(goal.position)
 
-    def _set_out(self, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
+    def _set_out(self, goal: Goal, schedule: Schedule, rate: float) -> Steps[Motion]:
         """Plan from the commanded motion."""
-        start = course.commanded
+        start = schedule.commanded
         if start.at_rest:
             plan = yield from self._plan(goal, start)
-            run = yield from self.laws.begin(plan.path, rate, start.pose)
+            run = yield from self.time_scaling.begin(plan.path, rate, start.pose)
             return Motion(deque([run]), None, run.ends if rate else math.inf, plan.slowed, bound=plan.bound)
-        if course.runs[0].at.rate < SLOWEST:
+        if schedule.runs[0].at.rate < SLOWEST:
             raise TOO_FAST_IN_MOTION
-        for now in (course.runs[0].at.rate, 1.0):  # an override that the old path could take the new one may not
+        for now in (schedule.runs[0].at.rate, 1.0):  # an override that the old path could take the new one may not
             # The new path's time goes on at the rate of the old one's: in it, the motion is that much slower.
             velocity = [value / now for value in start.velocity]
             acceleration = [value / now**2 for value in start.acceleration]
             plan = yield from self._plan(goal, MotionState(start.pose, velocity, acceleration))
-            run = yield from self.laws.begin(plan.path, now, start.pose)
+            run = yield from self.time_scaling.begin(plan.path, now, start.pose)
             if run.target >= now:
-                final = yield from self.laws.possible(plan.path, 0.0, rate, start.pose)
+                final = yield from self.time_scaling.possible(plan.path, 0.0, rate, start.pose)
                 duration = plan.path.duration / final if final else math.inf
                 return Motion(deque([run]), None, duration, plan.slowed, bound=plan.bound)
         raise TOO_FAST_IN_MOTION
 
-    def _stop_first(self, goal: Goal, course: Course, rate: float) -> Steps[Motion]:
+    def _stop_first(self, goal: Goal, schedule: Schedule, rate: float) -> Steps[Motion]:
         """Plan from where the motion under way can be stopped."""
-        stop = course.runs[0].copy()
+        stop = schedule.runs[0].copy()
         stop.seams.clear()
         if stop.target != 0.0:
-            yield from self.laws.try_change(stop, 0.0, course.commanded.pose, STOPS)
-        end = stop.state(stop.ends - stop.time, course.commanded.pose).pose
+            yield from self.time_scaling.try_change(stop, 0.0, schedule.commanded.pose, STOPS)
+        end = stop.state(stop.ends - stop.time, schedule.commanded.pose).pose
         plan = yield from self._plan(goal, rest(end))
-        run = yield from self.laws.begin(plan.path, rate, end)
+        run = yield from self.time_scaling.begin(plan.path, rate, end)
         duration = stop.ends - stop.time + run.ends if rate else math.inf
         return Motion(deque([stop, run]), None, duration, plan.slowed, stops_first=True, bound=plan.bound)
 
@@ -219,7 +219,7 @@ class Goals:
         last = longer.reaches(longer.path.duration)
         if not math.isfinite(last):  # it is to stop before: it will go on at full speed at most, or be looked at anew
             law, first, last = constant(1.0), s, longer.path.duration
-        return self._checker.look(longer.path, law, first, last, _state(run.path, s).pose).bearable
+        return self._checker.look(longer.path, law, first, last, _state(run.path, s).pose).within_limits
 
 
 def _one_step(steps: Steps[T]) -> T | None:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from trirail.config import Limits
+from trirail.kinematics.geometry import LEGS
 from trirail.motion.paths import ROUNDING
 
-LEGS = ("A", "B", "C")
 COORDINATES = ("x", "y", "phi")
 UNITS = ("m", "m", "rad")
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trirail.kinematics.algebra import Array
-from trirail.kinematics.closure import LEGS, forward_motion, inverse_motion
+from trirail.kinematics.closure import LEGS_TYPE, forward_motion, inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.motion.paths import HALVINGS, ROUNDING, motion_at, reached, value_at
 
@@ -134,7 +134,7 @@ def _turns(way: Way, last: float, time: float, near: Array, motion: Array, slide
 
 
 @compiled()
-def _weigh(now: Array, then: Array, i: int, step: float, whole: bool, worst: Array) -> None:
+def _measure_bus_load(now: Array, then: Array, i: int, step: float, whole: bool, worst: Array) -> None:
     """Raise `worst` (3,) to the velocity, acceleration and jerk of column i of rows (position, velocity, acceleration).
 
     `then` are the rows a step later. `whole` tells whether the motion goes on for the whole step.
@@ -171,13 +171,14 @@ def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst:
             return time, last
         whole = time >= 0.0 and last <= until  # else it is the step from or to a standstill, in which nothing else is
         for i in range(3):
-            _weigh(sliders[1], sliders[0], i, step, whole, worst[0])
-            _weigh(motion[1], motion[0], i, step, whole, worst[1 + i])
+            _measure_bus_load(sliders[1], sliders[0], i, step, whole, worst[0])
+            _measure_bus_load(motion[1], motion[0], i, step, whole, worst[1 + i])
     return last, math.nan
 
 
 @compiled(
-    f"f8({LEGS}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[:, ::1])"
+    f"f8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], "
+    "f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
 def survey(
     legs: Array,

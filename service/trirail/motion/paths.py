@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trirail.kinematics.algebra import Array
-from trirail.kinematics.closure import LEGS, forward_motion
+from trirail.kinematics.closure import LEGS_TYPE, forward_motion
 from trirail.kinematics.compiled import compiled
 
 __all__ = ["Path", "advance", "constant", "motion_at", "reached", "value", "value_at"]
@@ -86,7 +86,7 @@ def motion_at(knots: Array, pieces: Array, law_knots: Array, law_pieces: Array, 
         out[1, i] *= rate
 
 
-@compiled(f"i8({LEGS}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], f8, f8[::1], f8[:, ::1])")
+@compiled(f"i8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], f8, f8[::1], f8[:, ::1])")
 def advance(
     legs: Array,
     knots: Array,

@@ -12,10 +12,10 @@ from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Tr
 from trirail.config import PlatformLimits, SliderLimits
 from trirail.errors import RefusedError
 from trirail.kinematics.algebra import Array
-from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.feasibility import Checker, excess, fastest
-from trirail.motion.limits import COORDINATES, LEGS, Bounds, beyond, told_apart
+from trirail.motion.limits import COORDINATES, Bounds, beyond, told_apart
 from trirail.motion.paths import Path, constant
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.ruckig_call import solved
@@ -159,7 +159,7 @@ class Planner:
         for _ in range(JOGS):
             ramp, brake, path = self._jog(start, [share * value for value in velocity], hold)
             found = self._checker.look(path, constant(1.0), 0.0, path.duration, start.pose)
-            if found.fits or (found.bearable and not start.at_rest):
+            if found.fits or (found.within_limits and not start.at_rest):
                 return Plan(path, 1.0 / share, bound)
             if math.isnan(found.beyond):
                 share *= ROOM / found.excess

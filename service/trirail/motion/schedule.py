@@ -7,7 +7,7 @@ from collections import deque
 from trirail.motion.runs import MotionState, Run
 
 
-class Course:
+class Schedule:
     """Runs, one after the other; each cycle is `advance`."""
 
     def __init__(self, commanded: MotionState, period: float) -> None:
@@ -70,9 +70,9 @@ class Course:
             self.runs.popleft()
         return passed
 
-    def ahead(self, cycles: int) -> Course:
-        """Return the course as it will be so many cycles later, if nothing happens in between."""
-        other = Course(self.commanded, self._period)
+    def ahead(self, cycles: int) -> Schedule:
+        """Return the schedule as it will be so many cycles later, if nothing happens in between."""
+        other = Schedule(self.commanded, self._period)
         other.runs = deque(run.copy() for run in self.runs)
         other._later = deque(run.copy() for run in self._later)
         other.cycle, other._turn = self.cycle, self._turn

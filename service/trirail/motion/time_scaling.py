@@ -21,8 +21,8 @@ FASTEST = 10.0
 """No rate is greater."""
 
 
-class Laws:
-    """Makes laws for the paths of one robot."""
+class TimeScaling:
+    """Makes the laws of time for the paths of one robot."""
 
     def __init__(self, geometry: Geometry, platform: PlatformLimits, checker: Checker, period: float) -> None:
         self._legs = geometry.packed()
@@ -65,7 +65,7 @@ class Laws:
                 return False
             if law is not None:
                 until = min(arrival(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
-                if self._checker.look(run.path, law, 0.0, until, pose).bearable:
+                if self._checker.look(run.path, law, 0.0, until, pose).within_limits:
                     run.change_law(law, rate)
                     return True
             yield

@@ -38,7 +38,7 @@ from trirail.wire.packets import (
     Kind,
     Refused,
     RefusedRequest,
-    Situation,
+    Status,
     Welcome,
     decode_answer,
     message,
@@ -284,7 +284,7 @@ class Gateway:
         match answer:
             case Happened(event):
                 self._event.put(msgspec.json.encode(event))
-            case Situation() | Welcome():
+            case Status() | Welcome():
                 self._states.update(answer)
             case Accepted(ticket, goal_id, duration, slowed, stops_first, queued):
                 expected = duration if math.isfinite(duration) else None

@@ -8,9 +8,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from trirail.control.ledger import REMEMBERED_IDS, Happening
+from trirail.control.ledger import REMEMBERED_IDS, Notice
 from trirail.wire.messages import Event
-from trirail.wire.packets import Answer, Farewell, GoalRequest, Happened, Input, Situation
+from trirail.wire.packets import Answer, ControlInput, Farewell, GoalRequest, Happened, Status
 from trirail.wire.vocabulary import Mode
 
 FROZEN, CYCLES = 0.5, 3
@@ -38,9 +38,9 @@ class LastWords:
     def take(self, said: Answer | GoalRequest) -> None:
         """Take what the loop says, or a goal that it is given."""
         match said:
-            case Input(given=GoalRequest() as request) | (GoalRequest() as request):
+            case ControlInput(given=GoalRequest() as request) | (GoalRequest() as request):
                 self._begun(request.id, request.user)
-            case Situation(goal=str(goal_id)):
+            case Status(goal=str(goal_id)):
                 self._begun(goal_id, None)
             case Happened(event):
                 self._seq = event.seq
@@ -73,10 +73,10 @@ class LastWords:
         reason = self.reason
         if not reason:
             return []
-        missing = [Happening("fault", "error", reason)]
+        missing = [Notice("fault", "error", reason)]
         for goal_id, user in self._open.items():
             words = f"goal {goal_id} faulted: {reason}"
-            missing.append(Happening("goal", "error", words, id=goal_id, outcome="faulted", user=user))
-        missing.append(Happening("mode", "info", f"{Mode.FAULT}: {reason}", mode=Mode.FAULT))
+            missing.append(Notice("goal", "error", words, id=goal_id, outcome="faulted", user=user))
+        missing.append(Notice("mode", "info", f"{Mode.FAULT}: {reason}", mode=Mode.FAULT))
         t, wall = cycle * self._period, time.time()
         return [Event(self._seq + n, t, cycle, wall, **what._asdict()) for n, what in enumerate(missing, 1)]

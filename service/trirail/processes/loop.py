@@ -16,7 +16,7 @@ from trirail_drivers.interface import DriveFault, Drives
 
 from trirail.config import Config
 from trirail.control.control import Control, Given
-from trirail.control.modes import Event as ModeEvent
+from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import warm_up
 from trirail.processes import realtime
 from trirail.processes.clock import Tick, Ticker
@@ -24,13 +24,13 @@ from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.wire.links import Port
 from trirail.wire.messages import Event
 from trirail.wire.packets import (
+    ControlInput,
+    Disturbance,
     DrivesFault,
     Farewell,
-    Input,
     Kind,
-    Mishap,
     Request,
-    Situation,
+    Status,
     Welcome,
     decode_remark,
     decode_request,
@@ -77,7 +77,7 @@ class Loop:
         self._max_overruns = config.watchdogs.max_overruns
         self._epoch = time.time()
         self._welcome = message(Welcome(lacking, drives.bus_load, self._epoch))
-        self._situation = message(Situation(None, 1.0, None))
+        self._status = message(Status(None, 1.0, None))
         self._bitrate = config.can.bitrate
         self._bus_load = 0.0
         self._bits = drives.traffic
@@ -99,7 +99,7 @@ class Loop:
         self._answers: deque[bytes] = deque()
         self._told = 0
         self._inputs = 0
-        self._given: list[Input] = []
+        self._given: list[ControlInput] = []
         self._fault: DriveFault | None = None
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
         self._batch = bytearray(1 + self._batch_size * LAYOUT.size)
@@ -111,7 +111,7 @@ class Loop:
 
     def run(self, ticker: Ticker) -> None:
         """Run cycles until told to end and the robot stands without power."""
-        self._meet()  # so that a recorder that is there has every cycle from the first
+        self._accept_peers()  # so that a recorder that is there has every cycle from the first
         self._drives.sync()
         self.control.start(self._drives.read())
         while not self._over():
@@ -153,7 +153,7 @@ class Loop:
                 return
             yield decode_request(memoryview(packet)[1:])
 
-    def _watch(self, tick: Tick, fault: DriveFault | None) -> Iterator[Mishap]:
+    def _watch(self, tick: Tick, fault: DriveFault | None) -> Iterator[Disturbance]:
         """Count what the ticker missed; yield what has happened: late ticks, a lost gateway, a wish to end."""
         if fault is not self._fault:
             self._fault = fault
@@ -164,14 +164,14 @@ class Loop:
             if self._late_streak > self._max_overruns:
                 text = f"{self._late_streak} ticks missed in a row: the machine is too busy"
                 self._late_streak = 0
-                yield Mishap(ModeEvent.LATE.name, text)
+                yield Disturbance(ModeEvent.LATE.name, text)
         else:
             self._late_streak = 0
         if (lost := self._gateway_lost()) is not None:
-            yield Mishap(ModeEvent.GATEWAY_LOST.name, lost)
+            yield Disturbance(ModeEvent.GATEWAY_LOST.name, lost)
         if self.ending and self._ending_since is None:
             self._ending_since = self.control.cycles
-            yield Mishap(ModeEvent.SHUTDOWN.name, "the service is ending: controlled stop, drives disabled")
+            yield Disturbance(ModeEvent.SHUTDOWN.name, "the service is ending: controlled stop, drives disabled")
 
     def _gateway_lost(self) -> str | None:
         """Return how the gateway has been lost in this cycle; None where it has not."""
@@ -186,10 +186,10 @@ class Loop:
             self._gateway_frozen = False
         return None
 
-    def _note(self, tick: Tick, given: Request | Mishap | DrivesFault) -> None:
+    def _note(self, tick: Tick, given: Request | Disturbance | DrivesFault) -> None:
         """Keep what the control is given in this cycle, for the recorder."""
         self._inputs += 1
-        self._given.append(Input(self._inputs, self.control.cycles, tick.deadline_ns + tick.lateness_ns, given))
+        self._given.append(ControlInput(self._inputs, self.control.cycles, tick.deadline_ns + tick.lateness_ns, given))
 
     def _over(self) -> bool:
         if self._ending_since is None:
@@ -234,8 +234,8 @@ class Loop:
         self._batched += 1
         if self._batched == self._batch_size:
             self._flush()
-        if control.desk.answers or control.desk.happenings or self._given:
-            self._speak()
+        if control.ledger.answers or control.ledger.notices or self._given:
+            self._pass_on()
         if self._answers:
             self._send_answers()
 
@@ -250,74 +250,76 @@ class Loop:
         if self._capture is not None and self._recorder.connected:
             for frames in self._capture.take():
                 self._recorder.send(bytes((Kind.FRAMES,)) + frames)
-        self._weigh()
+        self._measure_bus_load()
         self._listen()
-        self._meet()
+        self._accept_peers()
         self._send_events()
 
-    def _weigh(self) -> None:
+    def _measure_bus_load(self) -> None:
         """Once a second, work out how much of the bus is in use, and tell it."""
         cycles = self.control.cycles - self._weighed_at
         if cycles * self._period >= 1.0:
             bits, self._bits = self._drives.traffic - self._bits, self._drives.traffic
             self._bus_load = round(bits / (cycles * self._period * self._bitrate), 3)
             self._weighed_at += cycles
-            self._situate()
+            self._publish_status()
 
     def _listen(self) -> None:
         """Tell everyone what the recorder has to say, and if it has gone."""
         packet = self._recorder.receive()
         if self._recorder.take_lost() and self._recorded:
             self._recorded = False
-            self.control.desk.tell("service", "warning", "the recorder has gone: nothing is recorded until it is back")
+            self.control.ledger.tell(
+                "service", "warning", "the recorder has gone: nothing is recorded until it is back"
+            )
         if packet is None:
             return
         self._recorded = True
         try:
             remark = decode_remark(memoryview(packet)[1:])
         except msgspec.DecodeError as error:  # the recorder must not be able to stop the robot
-            self.control.desk.tell("service", "warning", f"the recorder said something unreadable: {error}")
+            self.control.ledger.tell("service", "warning", f"the recorder said something unreadable: {error}")
         else:
-            self.control.desk.tell("service", remark.level, remark.message)
+            self.control.ledger.tell("service", remark.level, remark.message)
 
-    def _meet(self) -> None:
+    def _accept_peers(self) -> None:
         """Take new peers."""
         for port in (self._gateway, self._recorder):
             if port.accept():
                 port.send(self._welcome)
-                port.send(self._situation)
+                port.send(self._status)
                 if port is self._gateway:
                     self._told = 0
 
-    def _speak(self) -> None:
+    def _pass_on(self) -> None:
         """Answer requests, number what has happened, and pass on what the control was given."""
-        control, desk = self.control, self.control.desk
+        control, ledger = self.control, self.control.ledger
         for given in self._given:
             self._recorder.send(message(given))
         self._given.clear()
-        for happening in desk.happenings:
+        for notice in ledger.notices:
             self._events += 1
             t = control.cycles * self._period
-            event = Event(self._events, t, control.cycles, time.time(), **happening._asdict())
+            event = Event(self._events, t, control.cycles, time.time(), **notice._asdict())
             packet = told(event)
             self._kept.append(packet)
             self._recorder.send(packet)
-        desk.happenings.clear()
-        self._situate()
+        ledger.notices.clear()
+        self._publish_status()
         self._send_events()
-        self._answers.extend(map(message, desk.answers))
-        desk.answers.clear()
+        self._answers.extend(map(message, ledger.answers))
+        ledger.answers.clear()
 
-    def _situate(self) -> None:
+    def _publish_status(self) -> None:
         """Tell what records do not say, where that has changed."""
-        control, goal = self.control, self.control.desk.goal
+        control, goal = self.control, self.control.ledger.goal
         goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
         fault = quoted(control.fault) if control.fault else None
-        situation = message(Situation(goal_id, control.override, fault, control.target, self._bus_load, counts))
-        if situation != self._situation:
-            self._situation = situation
-            self._gateway.send(situation)
-            self._recorder.send(situation)
+        status = message(Status(goal_id, control.override, fault, control.target, self._bus_load, counts))
+        if status != self._status:
+            self._status = status
+            self._gateway.send(status)
+            self._recorder.send(status)
 
     def _send_answers(self) -> None:
         """Answer some requests; what the gateway is too slow for waits, what it has gone without is nobody's."""

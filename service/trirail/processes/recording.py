@@ -16,7 +16,7 @@ from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.links import Closed, Link
 from trirail.wire.messages import Level
-from trirail.wire.packets import Answer, Happened, Input, Kind, Remark, Situation, Welcome, decode_answer, message
+from trirail.wire.packets import Answer, ControlInput, Happened, Kind, Remark, Status, Welcome, decode_answer, message
 from trirail.wire.records import last_cycle
 
 GATHER = 0.14
@@ -71,10 +71,10 @@ class Intake:
             case Happened(event):
                 recorder.event(event)
                 box.event(event)
-            case Input():
+            case ControlInput():
                 recorder.given(said)
                 box.given(said)
-            case Situation():
+            case Status():
                 recorder.target(said.target)
                 box.stands("target", said.target)
             case Welcome():

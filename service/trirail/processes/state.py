@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from trirail_drivers.interface import PowerState
+from trirail_drivers.interface import PowerState, Triple
 
 from trirail.config import Config
-from trirail.wire.messages import Commanded, GoalState, LoopState, Percentiles, Sliders, State, Traffic, Triple
-from trirail.wire.packets import Situation, Welcome
+from trirail.wire.messages import Commanded, GoalState, LoopState, Percentiles, Sliders, State, Traffic
+from trirail.wire.packets import Status, Welcome
 from trirail.wire.vocabulary import MODES, Mode
 
 WINDOW = 60.0
@@ -34,14 +34,14 @@ class StateMaker:
         self._velocity = self._acceleration = np.zeros(3)
         self._error_max = np.zeros(3)
         self._welcome = Welcome((), 0.0, 0.0)
-        self._situation = Situation(None, 1.0, None)
+        self._status = Status(None, 1.0, None)
 
-    def update(self, news: Situation | Welcome) -> None:
+    def update(self, news: Status | Welcome) -> None:
         """Take in what the loop says beside its records."""
         if isinstance(news, Welcome):
             self._welcome = news
         else:
-            self._situation = news
+            self._status = news
 
     def records(self, rows: NDArray[np.void]) -> None:
         """Take in a batch of records."""
@@ -71,8 +71,8 @@ class StateMaker:
         """Make the state of the newest record."""
         row = self._newest
         lateness, cycle = self._statistics
-        goal = self._situation.goal
-        a, b, c = self._situation.counts
+        goal = self._status.goal
+        a, b, c = self._status.counts
         return State(
             seq=int(row["cycle"]),
             t=round(int(row["cycle"]) * self._period, 9),
@@ -96,12 +96,12 @@ class StateMaker:
                 status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
                 traffic=(Traffic(*a), Traffic(*b), Traffic(*c)),
             ),
-            goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._situation.target)
+            goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._status.target)
             if goal
             else None,
-            override=self._situation.override,
+            override=self._status.override,
             lease=None,
-            faults=(self._situation.fault,) if self._situation.fault else (),
+            faults=(self._status.fault,) if self._status.fault else (),
             loop=LoopState(
                 rate_hz=self._rate_hz,
                 cycles=int(row["cycle"]),
@@ -109,7 +109,7 @@ class StateMaker:
                 lateness_us=lateness,
                 cycle_us=cycle,
                 bus_load=self._welcome.bus_load,
-                bus_load_measured=self._situation.bus_load,
+                bus_load_measured=self._status.bus_load,
                 lacking=self._welcome.lacking,
             ),
         )

@@ -16,7 +16,7 @@ from trirail.errors import ServiceError
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.retention import BLACK_BOX
 from trirail.wire.messages import Event
-from trirail.wire.packets import Input
+from trirail.wire.packets import ControlInput
 from trirail.wire.records import last_cycle
 
 BEFORE = 60.0
@@ -59,7 +59,7 @@ class BlackBox:
         if event.kind == "fault":
             self._faults.append(event)
 
-    def given(self, what: Input) -> None:
+    def given(self, what: ControlInput) -> None:
         """Take what the control was given."""
         self._keep(methodcaller("given", what))
 

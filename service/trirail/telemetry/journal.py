@@ -17,7 +17,7 @@ from rerun.chunk import Chunk
 from trirail.telemetry import columns
 from trirail.telemetry.columns import SECOND, Column
 from trirail.wire.messages import Event, Level
-from trirail.wire.packets import CommandRequest, DrivesFault, GoalRequest, Input, Mishap
+from trirail.wire.packets import CommandRequest, ControlInput, Disturbance, DrivesFault, GoalRequest
 
 EVENTS, REQUESTS = "/events", "/requests"
 TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
@@ -36,7 +36,7 @@ class Entry(NamedTuple):
     """Wall clock [s since 1970]."""
     text: str
     level: Level = "info"
-    message: Event | Input | None = None
+    message: Event | ControlInput | None = None
     """The message itself; None for what the recorder has to say."""
 
 
@@ -45,7 +45,7 @@ def said(event: Event) -> Entry:
     return Entry(EVENTS, event.t, event.time, event.message, event.level, event)
 
 
-def given(what: Input, rate_hz: int, wall_offset_ns: int) -> Entry:
+def given(what: ControlInput, rate_hz: int, wall_offset_ns: int) -> Entry:
     """Return what the control was given, at the nominal time of its cycle."""
     wall = (what.now_ns + wall_offset_ns) / SECOND
     return Entry(REQUESTS, what.cycle / rate_hz, wall, _words(what), message=what)
@@ -73,13 +73,13 @@ def _nanoseconds(seconds: Iterable[float]) -> np.ndarray[tuple[int], np.dtype[np
     return np.array([round(value * SECOND) for value in seconds])
 
 
-def _words(what: Input) -> str:
+def _words(what: ControlInput) -> str:
     match what.given:
         case GoalRequest(id=name, user=user, goal=goal):
             return f"goal {name} of {user}: {type(goal).__name__.removesuffix('Goal').lower()}"
         case CommandRequest(name=name, user=user):
             return f"{name} by {user}"
-        case Mishap(event=event, reason=reason):
+        case Disturbance(event=event, reason=reason):
             return f"{event.lower().replace('_', ' ')}: {reason}"
         case DrivesFault(message=message):
             return message or "the drives' fault is over"

@@ -33,7 +33,7 @@ from trirail.telemetry.columns import SECOND, structs
 from trirail.telemetry.journal import EVENTS, JSON, REQUESTS
 from trirail.telemetry.scene import FIELDS
 from trirail.wire.messages import Event
-from trirail.wire.packets import Input
+from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE
 
 # What an RRD file is made of: Rerun's crate re_log_encoding, src/rrd/frames.rs.
@@ -80,7 +80,7 @@ class Recording(NamedTuple):
     """The log, in order."""
     texts: dict[str, str]
     """Text documents that hold for the whole session, by entity path: /configuration, /software."""
-    requests: tuple[Input, ...] = ()
+    requests: tuple[ControlInput, ...] = ()
     """What the control was given, in order: goals and commands, each with the cycle that took it, and mishaps."""
 
 
@@ -203,10 +203,10 @@ def _events(chunks: list[Chunk]) -> list[Line]:
     return sorted(lines, key=lambda line: line.t)
 
 
-def _requests(chunks: list[Chunk], path: Path) -> tuple[Input, ...]:
+def _requests(chunks: list[Chunk], path: Path) -> tuple[ControlInput, ...]:
     rows = [text for chunk in chunks for text in chunk.to_record_batch().column(JSON.component).flatten().to_pylist()]
     try:
-        found = [msgspec.json.decode(row, type=Input) for row in rows]
+        found = [msgspec.json.decode(row, type=ControlInput) for row in rows]
     except msgspec.DecodeError as error:
         raise ServiceError(f"{path}: written by another version: its requests cannot be read: {error}") from error
     return tuple(sorted(found, key=lambda given: given.seq))

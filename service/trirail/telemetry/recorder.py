@@ -20,7 +20,7 @@ from trirail.telemetry.shown_robot import Subject
 from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Show
 from trirail.wire.messages import Event
-from trirail.wire.packets import Input
+from trirail.wire.packets import ControlInput
 from trirail.wire.records import LAYOUT, last_cycle
 
 RECORDS_HZ = 5
@@ -137,7 +137,7 @@ class Recorder:
         """Take an event."""
         self._show.event(event)
 
-    def given(self, what: Input) -> None:
+    def given(self, what: ControlInput) -> None:
         """Take what the control was given."""
         self._show.given(what)
 

@@ -78,13 +78,13 @@ class Scene:
             table = curves.with_limits(values, self._plots[path])
             parts.append(Column(path, SCALARS, columns.scalars(table)))
         chunks = columns.chunks(self._timelines.of(newest), parts)
-        return chunks + self._situation(records)
+        return chunks + self._status(records)
 
     def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
         """Return the pose that the goal leads to from the time of `record` on; None for no goal."""
         return columns.chunks(self._timelines.of(record.reshape(1)), [drawing.goal(self._parts, pose)])
 
-    def _situation(self, records: NDArray[np.void]) -> list[Chunk]:
+    def _status(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return mode and outline of the workspace at the first record, where the mode changes, and as φ changes."""
         changed = np.diff(records["mode"], prepend=len(MODES)) != 0
         some = np.arange(0, len(records), max(1, self._rate_hz // OUTLINES_HZ))

@@ -18,7 +18,7 @@ from trirail.telemetry.journal import EVENTS, Entry
 from trirail.telemetry.scene import Scene
 from trirail.telemetry.shown_robot import Subject
 from trirail.wire.messages import Event, Level
-from trirail.wire.packets import Input
+from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE, unpack
 
 APPLICATION = "trirail"
@@ -103,7 +103,7 @@ class Show:
         """Take an event."""
         self._entries.append(journal.said(event))
 
-    def given(self, what: Input) -> None:
+    def given(self, what: ControlInput) -> None:
         """Take what the control was given."""
         self._entries.append(journal.given(what, self._rate_hz, self._wall_offset_ns))
 

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta, Struct
+from trirail_drivers.interface import Triple
 
 from trirail.wire.sizes import MAX_NAME, MAX_POINTS
 from trirail.wire.text import ID_RULE, is_id, quoted
@@ -20,7 +21,6 @@ LOWEST_OVERRIDE = 1.0
 Identifier = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
 Level = Literal["info", "warning", "error"]
 Outcome = Literal["done", "rejected", "preempted", "stopped", "expired", "faulted"]
-Triple = tuple[float, float, float]
 # Floors and ceilings: far beyond what a robot does, far from where numbers lose their digits.
 Coordinate = Annotated[float, Meta(ge=-1e3, le=1e3)]
 """x, y or a slider's position [m], phi [rad], or their velocities."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from enum import IntEnum
 
 from msgspec import Struct, msgpack, structs
-from trirail_drivers.interface import Counts
+from trirail_drivers.interface import Counts, Triple
 
-from trirail.wire.messages import Event, Goal, Level, Triple
+from trirail.wire.messages import Event, Goal, Level
 from trirail.wire.sizes import MAX_PACKET
 
 
@@ -99,7 +99,7 @@ class Farewell(Struct, frozen=True, tag=True):
     """Loop to both: it has ended as it should, with drives that have no power. Without it, the loop has died."""
 
 
-class Situation(Struct, frozen=True, tag=True):
+class Status(Struct, frozen=True, tag=True):
     """Loop to both: what records do not say and the state needs; sent when it changes."""
 
     goal: str | None
@@ -112,7 +112,7 @@ class Situation(Struct, frozen=True, tag=True):
     counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
 
 
-class Mishap(Struct, frozen=True, tag=True):
+class Disturbance(Struct, frozen=True, tag="Mishap"):  # as recordings have it
     """Something that nobody asked for, as Control.happen takes it."""
 
     event: str
@@ -127,7 +127,7 @@ class DrivesFault(Struct, frozen=True, tag=True):
     """None when nothing is any more."""
 
 
-class Input(Struct, frozen=True, tag=True):
+class ControlInput(Struct, frozen=True, tag="Input"):  # as recordings have it
     """Loop to recorder: what the control was given in a cycle, beside the feedback that is in its record.
 
     Together they are all that setpoints depend on.
@@ -138,7 +138,7 @@ class Input(Struct, frozen=True, tag=True):
     cycle: int
     now_ns: int
     """The monotonic clock then: how old a goal was."""
-    given: GoalRequest | CommandRequest | RefusedRequest | Mishap | DrivesFault
+    given: GoalRequest | CommandRequest | RefusedRequest | Disturbance | DrivesFault
 
 
 class Remark(Struct, frozen=True, tag=True):
@@ -149,7 +149,7 @@ class Remark(Struct, frozen=True, tag=True):
 
 
 Request = GoalRequest | CommandRequest | RefusedRequest
-Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Situation | Input
+Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Status | ControlInput
 
 encode = msgpack.Encoder().encode
 decode_request = msgpack.Decoder(Request).decode
