@@ -44,7 +44,9 @@ class Can(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [can]: any python-can interface, or "simulated" (three drives inside the process)."""
 
     interface: Name
+    """`simulated`, or the name of a python-can interface, as `socketcan`."""
     channel: Name = ""
+    """The interface's channel, as `can0`."""
     bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
     """Bits per second: for the bus load, and for interfaces that set it themselves."""
     simulated: Simulated = Simulated()
@@ -73,6 +75,7 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     """One drive: section [drives.A], [drives.B] or [drives.C]."""
 
     node: NodeId
+    """The drive's node id: 1 to 127 on CANopen, 0 to 62 of an ODrive."""
     counts_per_metre: Annotated[float, Meta(ge=1e-3, le=1e12)]
     """The drive's own unit of position, per metre of the slider: counts of a CiA 402 drive, turns of an ODrive."""
     direction: Literal[1, -1] = 1
@@ -89,6 +92,7 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [drives]: what all three share, and one table for each."""
 
     protocol: Literal["cia402", "odrive"]
+    """What the drives speak: CiA 402 on CANopen, or ODrive's CANSimple."""
     A: Drive
     B: Drive
     C: Drive

@@ -45,16 +45,22 @@ class LegTable(Struct, frozen=True, forbid_unknown_fields=True):
     """One leg of a robot as built: [[geometry.leg]], metres and radians, as trirail.kinematics.geometry.Leg."""
 
     anchor: Point
+    """A point of the rail, x and y in the base frame [m]."""
     rail_angle: Angle
+    """Direction of the rail, in which the slider position rises, from the base's x axis [rad]."""
     home: Coordinate
+    """Where on the rail the slider reads zero, from the anchor along the rail [m]."""
     edge_point: Point
+    """The platform's point that is at the slider's pin when lambda_32 is zero, in the platform's frame [m]."""
     edge_angle: Angle
+    """Direction of the platform's edge that slides in the pin, in the platform's frame [rad]."""
 
 
 class GeometryTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [geometry]: the paper's symmetric robot by `l0`, or three measured legs."""
 
     l0: Annotated[float, Meta(ge=0.001, le=100.0)] | None = None
+    """From the centre to each summit of the fixed triangle [m]; instead of three legs."""
     leg: tuple[LegTable, LegTable, LegTable] | None = None
 
 
@@ -62,11 +68,17 @@ class PlatformLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [limits.platform]: for x, y [m] and phi [rad]."""
 
     velocity: tuple[Velocity, Velocity, Velocity]
+    """Greatest rates of x, y [m/s] and phi [rad/s]."""
     acceleration: tuple[Acceleration, Acceleration, Acceleration]
+    """Greatest accelerations of x, y [m/s²] and phi [rad/s²]."""
     jerk: tuple[Jerk, Jerk, Jerk]
+    """Greatest jerks of x, y [m/s³] and phi [rad/s³]."""
     x: Range
+    """Least and greatest x of the platform's centre [m]."""
     y: Range
+    """Least and greatest y of the platform's centre [m]."""
     phi: tuple[Angle, Angle]
+    """Least and greatest angle of the platform [rad], singularity_margin away from every singular one."""
 
 
 class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
@@ -77,8 +89,11 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     passive: Range
     """Travel of lambda_32 along the platform's edges [m]."""
     velocity: Velocity
+    """Greatest rate of each slider [m/s]."""
     acceleration: Acceleration
+    """Greatest acceleration of each slider [m/s²]."""
     jerk: Jerk
+    """Greatest jerk of each slider [m/s³]."""
     following_error: Distance
     """Setpoint less measured position beyond which everything stops [m]."""
 
@@ -103,9 +118,11 @@ class Loop(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [loop]."""
 
     rate_hz: Annotated[int, Meta(ge=1, le=4000)]
+    """Cycles a second: SYNCs, setpoints and records; a cycle is a whole number of microseconds."""
     realtime: Literal["off", "prefer", "enforce"] = "prefer"
     """Whether SCHED_FIFO, locked memory and a pinned processor are done without, wished for, or demanded."""
     priority: Annotated[int, Meta(ge=1, le=99)] = 80
+    """The loop's priority among SCHED_FIFO threads."""
     cpu: Annotated[int, Meta(ge=0, le=8191)] | None = None
     """The processor to stay on; the last one that the process may use when absent."""
 
@@ -114,6 +131,7 @@ class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [zenoh]."""
 
     listen: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=64)] = ("tcp/127.0.0.1:7447",)
+    """Zenoh locators at which clients find the service; the loopback's is for this machine alone."""
 
 
 class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
@@ -122,6 +140,7 @@ class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     directory: Name = "recordings"
     """Where recordings go, relative to where the service was started."""
     state_hz: Annotated[int, Meta(ge=1, le=200)] = 50
+    """How often a second the state is published."""
     live_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
     """Loopback port of the live Rerun server; 0 for none."""
     live_mb: Annotated[float, Meta(ge=1.0, le=4096.0)] = 64.0

@@ -12,7 +12,7 @@ import msgspec
 from cyclopts import App, CycloptsError, Parameter
 
 from trirail import __version__
-from trirail.cli import math_commands, recording_commands, terminal
+from trirail.cli import config_commands, math_commands, recording_commands, terminal
 from trirail.errors import TrirailError
 from trirail.wire.zenoh_session import DEFAULT_LOCATOR
 
@@ -354,6 +354,7 @@ def view(
     return viewer.run(file, service.robot, service.connect, web=web, records=records, say=say)
 
 
+app.command(config_commands.app)
 app.command(math_commands.ik)
 app.command(math_commands.fk)
 app.command(math_commands.workspace)

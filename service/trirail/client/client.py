@@ -54,15 +54,17 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class Result(NamedTuple):
-    """How a goal ended."""
+    """How a goal ended; every goal does, exactly once."""
 
     id: str
     outcome: str
+    """done, rejected, preempted, stopped, expired or faulted."""
     message: str
+    """One line for people: why."""
 
 
 class Goal:
-    """A goal that the service has accepted."""
+    """A goal that the service has accepted. It is the service's from then on: this object only follows it."""
 
     def __init__(self, goal_id: str, robot: Robot) -> None:
         self.id = goal_id
@@ -88,14 +90,18 @@ class Goal:
         return f"{self.duration:.2f} s" if self.duration is not None else "no expected end while the override is 0"
 
     def cancel(self) -> None:
-        """Stop it, if it is under way or waits for another one; return when that is done.
+        """Stop it, if it is under way or waits for another one; return when the robot stands, or it waits no more.
 
-        Other goals go on, but those that wait for this one. Raises RefusedError if it has ended.
+        Other goals go on, but those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
+        ServiceError if nobody answers.
         """
         self._robot.command("stop", msgspec.json.encode(Stop(self.id)))
 
     def wait(self, timeout: float | None = None) -> Result:
-        """Wait for its end. Raises TimeoutError if that takes longer than `timeout` seconds."""
+        """Wait for its end, however it ends; look at `outcome` of the result.
+
+        Raises TimeoutError if that takes longer than `timeout` seconds; the goal itself goes on.
+        """
         if not self._ended.wait(timeout) or self._result is None:
             raise TimeoutError(f"goal {self.id} has not ended within {timeout:g} s")
         return self._result
@@ -106,7 +112,12 @@ class Goal:
 
 
 class Jog:
-    """A velocity that is kept alive while the context lasts; `result` tells afterwards how it ended."""
+    """A velocity that is kept alive while the context lasts; `result` tells afterwards how it ended.
+
+    It is renewed three times in each time-out, by a thread of its own. A program that hangs or dies renews it no more,
+    and the robot brakes: the time-out is real time, at every override. What has run out or was paused is over; begin
+    a new one. `error` tells whether it could not be renewed. Leaving the context waits for the standstill.
+    """
 
     def __init__(self, robot: Robot, velocity: tuple[float, float, float], timeout: float) -> None:
         self._robot = robot
@@ -152,7 +163,10 @@ class Jog:
 class Robot:
     """A connection to one robot's service; several threads may share it.
 
-    Raises ServiceError where there is no service, RefusedError where it says no.
+    `name` is that of the robot's configuration, `connect` the Zenoh locator of its service or of a router, `user` who
+    is told to have sent goals and commands (the login name if absent). Poses are x, y [m] of the platform's centre in
+    the base frame and its angle phi [rad], counterclockwise. Any call raises ServiceError where nobody answers and
+    RefusedError, with code, slider, value and limit, where the service says no; nothing moves because of that call.
     """
 
     def __init__(
@@ -206,10 +220,13 @@ class Robot:
         valid_for: float | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> Goal:
-        """Send a pose goal [m, rad]; return once it is accepted.
+        """Send a pose goal, x, y [m] and phi [rad] in the base frame; return once it is accepted.
 
-        With `blend` [m] the next pose goal waits for this one, and begins that near to its end; without it, the next
-        goal preempts this one. `limits` are lower ones than the platform's.
+        The platform goes straight in pose space where its start allows. `speed` is a fraction of full speed, (0, 1]:
+        0.5 takes twice as long over the same path. With `blend` [m] the next pose goal waits for this one, and begins
+        when no point of the platform is farther than that from where it is to be; without it, the next goal preempts
+        this one. `limits` are lower ones than the platform's. A goal that has not begun within `valid_for` [s] expires.
+        Its `id` must be new; one is made if absent. Raises RefusedError: out of reach, not enabled, stopping, ….
         """
         return self.send(
             lambda name: PoseGoal(
@@ -228,7 +245,11 @@ class Robot:
         valid_for: float | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> Goal:
-        """Send a goal for the sliders A, B, C [m]; return once it is accepted."""
+        """Send a goal for the sliders A, B, C, their lambda_10 [m]; return once it is accepted.
+
+        Straight in slider space where the start allows; also the way out of a pose that move_to refuses. `speed`,
+        `valid_for` and `id` as of move_to.
+        """
         return self.send(lambda name: SlidersGoal((a, b, c), speed=speed, valid_for=valid_for, id=name), id)
 
     def follow(
@@ -238,11 +259,16 @@ class Robot:
         stretch: bool = False,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> Goal:
-        """Send a timed trajectory that begins where the robot stands; return once it is accepted."""
+        """Send a timed trajectory that begins where the robot stands; return once it is accepted.
+
+        A point is t [s], x, y [m] and phi [rad], and where it is known, velocity and acceleration of the three.
+        Quintic between the points; where they have no velocity it is that between their neighbours, zero at the ends.
+        One that is too fast for a slider is refused, or slowed as a whole with `stretch`.
+        """
         return self.send(lambda name: TrajectoryGoal(tuple(points), stretch=stretch, id=name), id)
 
     def jog(self, *, x: float = 0.0, y: float = 0.0, phi: float = 0.0, timeout: float = 0.2) -> Jog:
-        """Move at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
+        """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
 
         with robot.jog(x=0.01):
             wait_for_the_key_to_be_released()
@@ -250,7 +276,7 @@ class Robot:
         return Jog(self, (x, y, phi), timeout)
 
     def send(self, make: Callable[[str], _Message], id: str | None = None) -> Goal:  # noqa: A002
-        """Send the goal that `make` makes for an id; return once it is accepted."""
+        """Send the goal that `make` makes for an id, any of trirail.wire.messages.Goal; return once it is accepted."""
         goal_id = id or uuid.uuid4().hex[:12]
         try:
             message = make(goal_id)
@@ -269,7 +295,7 @@ class Robot:
         return goal
 
     def enable(self) -> None:
-        """Power the drives up; return when the robot holds."""
+        """Power the drives up; return when the robot holds where it stands. Confirmed at once if it does already."""
         self.command("enable")
 
     def disable(self) -> None:
@@ -277,15 +303,15 @@ class Robot:
         self.command("disable")
 
     def stop(self) -> None:
-        """Stop within the limits; return when the robot stands."""
+        """Stop on the path within the limits' jerk; return when the robot stands. No goal is taken until then."""
         self.command("stop")
 
     def quick_stop(self) -> None:
-        """Stop every drive by its own ramp, as fast as it can; the robot is in fault afterwards."""
+        """Stop every drive by its own ramp, as fast as it can; the robot is in fault until reset, without power."""
         self.command("quick_stop")
 
     def reset(self) -> None:
-        """Clear a fault whose cause is gone; the robot is disabled afterwards."""
+        """Clear a fault whose cause is gone; the robot is disabled afterwards. RefusedError while the cause lasts."""
         self.command("reset")
 
     def home(self) -> None:
@@ -293,7 +319,7 @@ class Robot:
         self.command("home")
 
     def pause(self) -> None:
-        """Stop on the path; return when the robot stands. The goal is kept for resume."""
+        """Stop on the path; return when the robot stands. The goal is kept for resume, a jog is not."""
         self.command("pause")
 
     def resume(self) -> None:
@@ -309,7 +335,10 @@ class Robot:
         self.command("override", msgspec.json.encode(content))
 
     def command(self, name: str, content: bytes | None = None) -> CommandReply:
-        """Send a command; return once the service confirms that it has been carried out."""
+        """Send a command by its name on the wire; return once the service confirms that it has been carried out.
+
+        `content` is its JSON, where it has any: Override or Stop of trirail.wire.messages.
+        """
         within = HOME_WITHIN if name == "home" else REPLY_WITHIN
         return self._ask(self._key("cmd", self.user, name), CommandReply, content, within)
 
@@ -320,7 +349,10 @@ class Robot:
     # ------------------------------------------------------------------ what the service tells
 
     def state(self, timeout: float = 2.0) -> State:
-        """Return the newest state."""
+        """Return the next state that is published. Raises ServiceError if none comes within `timeout` seconds.
+
+        `pose` is measured, from the measured sliders; `commanded` is what the drives were told. SI units and radians.
+        """
         for state in self.states(timeout):
             return state
         raise ServiceError(self._nobody())

@@ -36,19 +36,27 @@ HOME = np.zeros(3)
 class Motion(NamedTuple):
     """Motion of the joints of legs A, B, C: each field (3,) or (N, 3), in m, m/s or m/s²."""
 
-    position: Array  # lambda_10, the sliders
-    velocity: Array  # v_10
-    acceleration: Array  # gamma_10
-    passive_position: Array  # lambda_32, along the platform's edges
-    passive_velocity: Array  # v_32
-    passive_acceleration: Array  # gamma_32
+    position: Array
+    """lambda_10, the sliders on their rails from where they read zero [m]."""
+    velocity: Array
+    """v_10 [m/s]."""
+    acceleration: Array
+    """gamma_10 [m/s²]."""
+    passive_position: Array
+    """lambda_32, the sliders' pins along the platform's edges [m]."""
+    passive_velocity: Array
+    """v_32 [m/s]."""
+    passive_acceleration: Array
+    """gamma_32 [m/s²]."""
 
 
 def inverse(geometry: Geometry, pose: ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0) -> Motion:
     """Return the motion of all joints for a motion of the platform, by (9) to (19).
 
-    `velocity` and `acceleration` are the time derivatives of the pose, of its shape, or (3,) for all rows.
-    KinematicsError if a number is not finite, or where the edge of a leg is parallel to its rail.
+    `pose` is x, y [m] and phi [rad] in the base frame, (3,) or (N, 3). `velocity` [m/s, m/s, rad/s] and `acceleration`
+    [m/s², m/s², rad/s²] are its time derivatives, of its shape, or (3,) for all rows; at rest if not given. Limits
+    of travel are not looked at. Raises KinematicsError, with leg, value and limit, if a number is not finite, or where
+    the edge of a leg is parallel to its rail, sin(phi + edge_angle - rail_angle) = 0.
     """
     pose = np.asarray(pose, dtype=np.float64)
     rows = _rows("pose", pose)
@@ -65,11 +73,11 @@ def inverse(geometry: Geometry, pose: ArrayLike, velocity: ArrayLike = 0.0, acce
 
 
 def forward(geometry: Geometry, sliders: ArrayLike, near: ArrayLike | None = None) -> Array:
-    """Return the pose, phi in (-pi, pi], at which the sliders stand as given.
+    """Return the pose, x, y [m] and phi in (-pi, pi], at which the sliders A, B, C stand as given [m], by (11).
 
     Of the two poses that close the loops it is the one that can be reached from the pose `near`, (0, 0, 0)
     if not given, without passing a singularity of J2. `near` has the shape of `sliders`, or (3,) for all
-    rows. The symmetric robot does not need it in its usable range, -2 pi/3 < phi < pi/3. KinematicsError if
+    rows. The symmetric robot does not need it in its usable range, -2 pi/3 < phi < pi/3. Raises KinematicsError if
     a number is not finite, if no pose closes the loops, or if that pose or `near` is singular.
     """
     sliders = np.asarray(sliders, dtype=np.float64)
@@ -88,7 +96,8 @@ def forward(geometry: Geometry, sliders: ArrayLike, near: ArrayLike | None = Non
 def jacobians(geometry: Geometry, pose: ArrayLike) -> tuple[Array, Array]:
     """Return J1 and J2 of (16) to (18), (3, 3) or (N, 3, 3): J1 @ slider velocity = J2 @ platform velocity.
 
-    J1 is diagonal. The last column of J2 is in metres, the rest has no unit. KinematicsError as from inverse.
+    `pose` as of inverse. J1 is diagonal. The last column of J2 is in metres, the rest has no unit. Neither is
+    inverted here, so J2 may be singular. Raises KinematicsError as inverse does, where J1 is.
     """
     pose = np.asarray(pose, dtype=np.float64)
     given = np.empty((_rows("pose", pose), 3))

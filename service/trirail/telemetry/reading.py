@@ -1,6 +1,6 @@
 """Recordings read into numpy: every cycle's record bit for bit, the log of events, and the texts beside them.
 
-from trirail.telemetry.reading import read
+from trirail import read
 recording = read(Path("recordings/demo-20260101-120000.rrd"))
 error = recording.records["following_error"]      # (N, 3) [m]; the fields are those of trirail.wire.records
 session = join([read(path) for path in parts])    # of a session whose recording was rotated, in any order
@@ -85,9 +85,11 @@ class Recording(NamedTuple):
 
 
 def read(path: Path) -> Recording:
-    """Read a recording; of one that was cut off, all that is whole.
+    """Read a recording; of one that was cut off, or is still being written, all that is whole.
 
-    Raises ServiceError if the file cannot be read, is not a recording, or holds no records.
+    Rerun's own format (.rrd); the file is not changed. Fields, units and frames of the records are those of
+    trirail.wire.records.FIELDS: SI units and radians, sliders in the order A, B, C, poses in the base frame.
+    Raises ServiceError if the file cannot be read, is not a recording, holds no records, or is of another version.
     """
     with _whole(path) as whole:
         chunks = _chunks(whole, path)

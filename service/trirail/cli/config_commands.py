@@ -1,0 +1,177 @@
+"""`trirail config`: the configurations that are shipped, copies of them to start from, and what a file comes to."""
+
+from __future__ import annotations
+
+import json as json_text
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from cyclopts import App
+
+from trirail.cli import terminal
+from trirail.cli.math_commands import Flag
+from trirail.config import SIM, load
+from trirail.errors import ConfigError
+
+FOLDER = SIM.parent
+"""Where the shipped configurations are: in the installed package, or in a checkout."""
+
+app = App(name="config", help="List the shipped configurations, copy one to start from, show what a file comes to.")
+
+_Tables = dict[str, Any]
+
+
+@app.default
+def shipped(*, json: Annotated[bool, Flag] = False) -> int:
+    """List what `trirail config copy` can copy, each with what it is for.
+
+    Parameters
+    ----------
+    json
+        Print one JSON object instead of words.
+    """
+    files = shipped_files()
+    if json:
+        terminal.json({"folder": str(FOLDER), "files": files})
+        return 0
+    width = max(map(len, files))
+    for name, purpose in files.items():
+        terminal.say(f"{name:{width}}  {purpose}")
+    terminal.say(f"in {FOLDER}; one to start from: trirail config copy sim.toml my.toml")
+    return 0
+
+
+@app.command
+def copy(name: str, dest: Path | None = None, /, *, json: Annotated[bool, Flag] = False) -> int:
+    """Copy a shipped configuration, or the systemd unit, to change it; never over a file that exists.
+
+    Parameters
+    ----------
+    name
+        As `trirail config` lists it; ".toml" may be left out.
+    dest
+        File or folder; the folder one is in, if absent.
+    json
+        Print one JSON object instead of words.
+    """
+    source = _find(name)
+    target = dest or Path()
+    if target.is_dir():
+        target /= source.name
+    try:
+        with target.open("xb") as file, source.open("rb") as given:
+            shutil.copyfileobj(given, file)
+    except FileExistsError:
+        raise ConfigError(f"{target} exists already: name another file") from None
+    except OSError as error:
+        raise ConfigError(f"{target}: {error.strerror}") from error
+    if json:
+        terminal.json({"source": str(source), "file": str(target)})
+    else:
+        terminal.say(f"{target}: a copy of the shipped {source.name}")
+    return 0
+
+
+@app.command
+def show(config: Path | None = None, /, *, json: Annotated[bool, Flag] = False) -> int:
+    """Print what a configuration comes to, every default filled in, and where it differs from the shipped sim.toml.
+
+    What is printed is a configuration again.
+
+    Parameters
+    ----------
+    config
+        Configuration file; the simulated robot if absent.
+    json
+        Print one JSON object instead of words.
+    """
+    effective, simulated = (_tables(path) for path in (config or SIM, SIM))
+    different = {
+        key: {"value": value, SIM.name: other} for key, value, other in _paired(effective, simulated) if value != other
+    }
+    if json:
+        terminal.json({"config": effective, "differences": different})
+        return 0
+    for line in toml(effective, simulated):
+        terminal.say(line)
+    return 0
+
+
+def toml(tables: _Tables, other: _Tables, path: str = "") -> Iterator[str]:
+    """Write tables as TOML; a comment says where `other` has something else."""
+    inner = {key: value for key, value in tables.items() if _is_tables(value)}
+    plain = {key: value for key, value in tables.items() if key not in inner}
+    if path and (plain or not inner):
+        yield ""
+        yield f"[{path}]"
+    for key, value in plain.items():
+        was = other.get(key)
+        if value is not None:
+            yield f"{key} = {_literal(value)}" + ("" if value == was else f"  # {SIM.name}: {_said(was)}")
+        elif was is not None:
+            yield f"# no {key}; {SIM.name}: {_said(was)}"
+    for key, value in inner.items():
+        name, was = f"{path}.{key}" if path else key, other.get(key)
+        if isinstance(value, dict):
+            yield from toml(value, was if isinstance(was, dict) else {}, name)
+            continue
+        for number, table in enumerate(value):
+            yield ""
+            yield f"[[{name}]]"
+            beside = was[number] if isinstance(was, list) else {}
+            yield from toml(table, beside)
+
+
+def shipped_files() -> dict[str, str]:
+    """Return the names of the shipped files, each with the line that says what it is for."""
+    return {path.name: _purpose(path) for path in _shipped()}
+
+
+def _shipped() -> list[Path]:
+    return sorted([*FOLDER.glob("*.toml"), *FOLDER.glob("*.service")])
+
+
+def _purpose(path: Path) -> str:
+    """Return the first line of a file, the comment that says what it is for."""
+    with path.open(encoding="utf-8") as file:
+        return file.readline().lstrip("# ").rstrip(":\n")
+
+
+def _find(name: str) -> Path:
+    for path in _shipped():
+        if name in (path.name, path.stem if path.suffix == ".toml" else path.name):
+            return path
+    raise ConfigError(f"no configuration {name!r} is shipped: there are {', '.join(path.name for path in _shipped())}")
+
+
+def _tables(path: Path) -> _Tables:
+    """Return a file's configuration as tables, arrays as lists."""
+    tables: _Tables = json_text.loads(msgspec.json.encode(load(path)))
+    return tables
+
+
+def _paired(tables: _Tables, other: _Tables, path: str = "") -> Iterator[tuple[str, object, object]]:
+    """Yield each key of either, by its whole path, with both values; None for none."""
+    for key in {**tables, **other}:
+        name = f"{path}.{key}" if path else key
+        value, was = tables.get(key), other.get(key)
+        if isinstance(value, dict) or isinstance(was, dict):
+            yield from _paired(value or {}, was or {}, name)
+        else:
+            yield name, value, was
+
+
+def _is_tables(value: object) -> bool:
+    return isinstance(value, dict) or (isinstance(value, list) and bool(value) and isinstance(value[0], dict))
+
+
+def _literal(value: object) -> str:
+    """Write a value as TOML; its strings, numbers, booleans and arrays are written as in JSON."""
+    return json_text.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _said(value: object) -> str:
+    return "none" if value is None else _literal(value)

@@ -1,0 +1,43 @@
+"""configs/README.md names every key of the configuration, and says of each what it means."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import config_reference
+import msgspec
+import pytest
+from trirail.config import SIM, load
+
+ROWS = [
+    (headings, key, row)
+    for headings, kind, _ in config_reference.sections()
+    for key, *row in config_reference.keys(kind)
+]
+
+
+def test_the_file_is_what_the_types_say() -> None:
+    written = config_reference.FILE.read_text(encoding="utf-8")
+    assert written == config_reference.reference(), "run python tools/config_reference.py"
+
+
+@pytest.mark.parametrize(("headings", "key", "row"), ROWS, ids=lambda value: value if isinstance(value, str) else "")
+def test_every_key_says_what_it_means(headings: tuple[str, ...], key: str, row: list[str]) -> None:
+    _, _, meaning = row
+    assert len(meaning) > 15, f"{headings[0]} {key} has no docstring"
+    assert meaning.endswith("."), meaning
+
+
+def leaves(value: Any, path: str = "") -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from leaves(inner, f"{path}.{key}" if path else key)
+    else:
+        yield path
+
+
+def test_every_key_of_a_file_that_is_shipped_is_in_the_reference() -> None:
+    told = {f"{heading.strip('[]')}.{key}" for headings, key, _ in ROWS for heading in headings}
+    for path in SIM.parent.glob("*.toml"):
+        for key in leaves(msgspec.to_builtins(load(path))):
+            tables = {"geometry.leg", "drives.A.homing", "drives.B.homing", "drives.C.homing"}  # None where absent
+            assert key in told | tables, key

@@ -1,0 +1,139 @@
+"""The examples do what they say: all of them against one service of their own."""
+
+import ast
+import csv
+import os
+import pty
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from patience import patient
+from trirail import Robot
+from trirail.client import own_service
+
+EXAMPLES = Path(__file__).parents[1] / "tools/examples"
+WITHIN = 60.0
+
+
+class Service(NamedTuple):
+    """A service that nobody else can reach."""
+
+    locator: str
+    recording: Path
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    folder = tmp_path_factory.mktemp("ex")
+    config, locator = own_service.private(folder)
+    recording = folder / "examples.rrd"
+    with own_service.service(patient(config), recording):
+        yield Service(locator, recording)
+
+
+def run(name: str, *arguments: object) -> list[str]:
+    """Run an example to its end; return the lines that it prints."""
+    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=WITHIN, check=False)
+    assert done.returncode == 0, done.stderr + done.stdout
+    return done.stdout.splitlines()
+
+
+def pose(service: Service) -> tuple[float, float, float]:
+    with Robot("demo", service.locator) as robot:
+        return robot.state().commanded.pose
+
+
+def test_each_is_short_begins_with_what_it_does_and_is_run_here() -> None:
+    here = Path(__file__).read_text(encoding="utf-8")
+    for path in EXAMPLES.glob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= 40, path.name
+        assert ast.get_docstring(ast.parse(text)), path.name
+        assert f'"{path.name}"' in here, f"{path.name} is not run by any test"
+
+
+def test_the_kinematics_alone() -> None:
+    lines = run("kinematics_alone.py")
+    assert float(lines[2].split(":")[1].split()[0]) < 1e-12
+    assert float(lines[3].split(":")[1]) < 1e-12
+    assert lines[4].startswith("leg A: edge parallel to its rail at phi = 1.04719755 rad")
+
+
+@pytest.mark.slow
+def test_move_and_wait(service: Service) -> None:
+    assert run("move_and_wait.py", "demo", service.locator)[-1].endswith("done: arrived")
+    assert pose(service) == pytest.approx((0.02, -0.01, 0.1), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_a_goal_that_is_refused_is_said_and_the_exit_code_tells(service: Service, tmp_path: Path) -> None:
+    script = tmp_path / "far.py"
+    script.write_text((EXAMPLES / "move_and_wait.py").read_text(encoding="utf-8").replace("x=0.02", "x=2.0"))
+    command = [sys.executable, str(script), "demo", service.locator]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=WITHIN, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("refused (")
+
+
+@pytest.mark.slow
+def test_a_stream_of_goals_blends(service: Service) -> None:
+    lines = run("stream_of_goals.py", "demo", service.locator)
+    assert ["passed on the way" in line for line in lines] == [True, True, True, False]
+    assert pose(service) == pytest.approx((0.03, 0.03, 0.0), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_a_jog_lasts_while_the_key_is_held(service: Service) -> None:
+    with Robot("demo", service.locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN)
+    ours, theirs = pty.openpty()
+    command = [sys.executable, str(EXAMPLES / "jog_with_a_key.py"), "demo", service.locator]
+    with subprocess.Popen(command, stdin=theirs, stdout=subprocess.PIPE, text=True) as jogging:
+        assert jogging.stdout is not None
+        assert jogging.stdout.readline() == "hold a key\n"
+        os.write(ours, b"d")  # and then no more: the key has been let go
+        words, x, y, phi = jogging.stdout.readline().rsplit(maxsplit=3)
+        os.write(ours, b"x")
+        assert jogging.wait(WITHIN) == 0
+    os.close(ours)
+    os.close(theirs)
+    assert words == "stands at"
+    assert 0.005 < float(x) < 0.1
+    assert abs(float(y)) < 1e-4
+    assert abs(float(phi)) < 1e-3
+
+
+@pytest.mark.slow
+def test_a_file_is_followed(service: Service) -> None:
+    lines = run("follow_a_file.py", EXAMPLES / "circle.csv", "demo", service.locator)
+    assert lines[0] == "41 points in 4.0 s"
+    assert lines[1].endswith("done: arrived")
+
+
+@pytest.mark.slow
+def test_what_is_watched_is_logged(service: Service, tmp_path: Path) -> None:
+    run("watch_and_log.py", tmp_path / "log.csv", 0.5, "demo", service.locator)
+    with (tmp_path / "log.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[-1]["t"]) - float(rows[0]["t"]) >= 0.4
+    assert {row["mode"] for row in rows} <= {"holding", "disabled"}
+
+
+@pytest.mark.slow
+def test_a_recording_is_read_while_it_is_written(service: Service) -> None:
+    lines = run("recording_to_numpy.py", service.recording)
+    assert "cycles" in lines[0]
+    assert lines[1].count("µm") == 3
+
+
+@pytest.mark.slow
+def test_zenoh_and_json_alone_are_enough(service: Service) -> None:
+    lines = run("plain_zenoh.py", "demo", service.locator)
+    assert lines[-1].startswith("done goal")
+    assert pose(service) == pytest.approx((0.0, 0.02, -0.1), abs=1e-9)

@@ -1,0 +1,45 @@
+"""What `from trirail import …` offers, and what each name costs: nothing is loaded that was not asked for."""
+
+import importlib
+import subprocess
+import sys
+
+import pytest
+import trirail
+
+HEAVY = ("numba", "numpy", "zenoh", "rerun", "can", "canopen", "ruckig", "rich", "cyclopts")
+
+
+def loaded_by(statement: str) -> set[str]:
+    """Return the heavy packages that a new interpreter has loaded after a statement."""
+    code = f"import sys\n{statement}\nprint(*(name for name in {HEAVY} if name in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("statement", "loaded"),
+    [
+        ("import trirail; trirail.__version__; dir(trirail)", set()),
+        ("from trirail import TrirailError, RefusedError, ServiceError, ConfigError, KinematicsError", set()),
+        ("from trirail import Robot", {"numpy", "zenoh"}),
+        ("from trirail import Geometry, Leg, inverse, forward, jacobians", {"numba", "numpy"}),
+        ("from trirail import read", {"numba", "numpy", "rerun"}),
+    ],
+)
+def test_each_name_loads_what_it_needs_and_no_more(statement: str, loaded: set[str]) -> None:
+    assert loaded_by(statement) == loaded
+
+
+def test_every_public_name_is_there_and_is_the_one_at_its_home() -> None:
+    assert set(trirail.__all__) == {*trirail._HOME, "__version__"}
+    assert set(trirail.__all__) <= set(dir(trirail))
+    for name, home in trirail._HOME.items():
+        assert getattr(trirail, name) is getattr(importlib.import_module(home), name)
+
+
+def test_what_is_not_there_is_said_as_python_does() -> None:
+    with pytest.raises(AttributeError, match="module 'trirail' has no attribute 'Robbot'"):
+        trirail.Robbot  # noqa: B018
+    with pytest.raises(ImportError, match="cannot import name 'Robbot'"):
+        from trirail import Robbot  # noqa: F401

@@ -1,0 +1,83 @@
+"""JSON Schemas of the messages, for clients in other languages: python tools/message_schemas.py [--check].
+
+They are made from the types of trirail.wire.messages and shipped in service/trirail/wire/schemas, one file for each
+kind of message. With --check nothing is written; exit 1 if a file is not what the types say.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import docstrings
+import msgspec
+from trirail.wire import messages
+
+FOLDER = Path(messages.__file__).parent / "schemas"
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+MESSAGES: dict[str, tuple[Any, str]] = {
+    "goal": (messages.Goal, "What is sent to goal/<user>: a goal of one of the kinds."),
+    "goal-reply": (messages.GoalReply, "The reply to a goal that is accepted."),
+    "command-override": (messages.Override, "The content of cmd/<user>/override."),
+    "command-stop": (messages.Stop, "The content, if any, of cmd/<user>/stop."),
+    "command": (messages.NoContent, "The content, if any, of the other commands."),
+    "command-reply": (messages.CommandReply, "The reply to a command that has been carried out."),
+    "error-reply": (messages.ErrorReply, "The error reply to a goal or command that is refused, or that fails."),
+    "state": (messages.State, "What is published on state."),
+    "event": (messages.Event, "What is published on event."),
+    "info": (messages.Info, "The reply to a query on info."),
+}
+"""By file: the type, and where the message is met."""
+
+
+def schemas() -> dict[str, str]:
+    """Return the text of each schema by its file's name."""
+    made = {}
+    for name, (kind, where) in MESSAGES.items():
+        (schema,), definitions = msgspec.json.schema_components(
+            [kind], schema_hook=_anything, ref_template="#/$defs/{name}"
+        )
+        for struct, definition in definitions.items():
+            for field, text in docstrings.fields(getattr(messages, struct)).items():
+                definition["properties"][field]["description"] = text
+        whole = {"$schema": DIALECT, "title": f"trirail: {name}", "description": where, **schema, "$defs": definitions}
+        made[f"{name}.json"] = json.dumps(whole, indent=2, ensure_ascii=False) + "\n"
+    return made
+
+
+def _anything(kind: type) -> dict[str, Any]:
+    """Allow every value where the type does, as in the limits and geometry of Info, which are the configuration's."""
+    if kind is object:
+        return {"description": "As in the configuration."}
+    raise NotImplementedError
+
+
+def stale(folder: Path = FOLDER) -> list[str]:
+    """Return the names of files that are missing, superfluous, or not what the types say."""
+    made = schemas()
+    there = {path.name: path.read_text(encoding="utf-8") for path in folder.glob("*.json")}
+    return sorted(name for name in {*made, *there} if made.get(name) != there.get(name))
+
+
+def main() -> int:
+    """Write the files, or check them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if a file is not current")
+    if parser.parse_args().check:
+        for name in (old := stale()):
+            print(f"{FOLDER / name} is not what the types say: run python tools/message_schemas.py")
+        return 1 if old else 0
+    FOLDER.mkdir(exist_ok=True)
+    for path in FOLDER.glob("*.json"):
+        path.unlink()
+    for name, text in schemas().items():
+        (FOLDER / name).write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
