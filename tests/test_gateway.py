@@ -105,7 +105,7 @@ session = open_client(sys.argv[1])
 never = threading.Event()
 stuck = zenoh.handlers.Callback(lambda reply: never.wait(), indirect=False)
 for _ in range(3000):
-    zenoh_session.get("trirail/demo/info", stuck, timeout=60.0)
+    session.get("trirail/demo/info", stuck, timeout=60.0)
 print("asked", flush=True)
 never.wait()
 """

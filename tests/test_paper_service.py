@@ -172,5 +172,5 @@ def test_the_service_does_what_the_paper_computes(tmp_path: Path, capsys: pytest
 def test_what_the_service_refuses_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     too_fast = [msgspec.structs.replace(point, t=point.t / 20.0) for point in points(EXAMPLES[0])]
     monkeypatch.setattr(paper_service, "points", lambda _: too_fast)
-    with pytest.raises(RefusedError, match=r"the service refused rotation: the trajectory is .* too fast for a slider"):
+    with pytest.raises(RefusedError, match=r"the service refused rotation: the trajectory is .* times too fast"):
         paper_service.drive(tmp_path / "a.rrd", lambda _: None)

@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 import rerun as rr
 from numpy.typing import NDArray
+from rerun.chunk import RrdReader
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
+from trirail.telemetry import reading
 from trirail.telemetry.columns import Column, Timelines, chunks, structs
 from trirail.telemetry.reading import read
 from trirail.telemetry.recorder import Recorder
@@ -206,3 +208,20 @@ def test_records_of_another_version_are_refused_by_field(tmp_path: Path, layout:
     stream.disconnect()
     with pytest.raises(ServiceError, match=rf"a\.rrd: written by another version: its records differ in {differs}$"):
         read(path)
+
+
+def test_a_file_that_grows_while_it_is_read_is_read_up_to_a_whole_message(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = written(tmp_path / "a.rrd", made.records(0.2), close=False)
+    reader = RrdReader
+
+    def slow_reader(path: Path) -> object:
+        if path == tmp_path / "a.rrd":
+            with path.open("ab") as file:  # the beginning of the next message
+                file.write((tmp_path / "a.rrd").read_bytes()[-40:-20])
+        return reader(path)
+
+    monkeypatch.setattr(reading, "RrdReader", slow_reader)
+    assert len(read(tmp_path / "a.rrd").records) == 200
+    recorder.close()

@@ -91,8 +91,15 @@ def read(path: Path) -> Recording:
     trirail.wire.records.FIELDS: SI units and radians, sliders in the order A, B, C, poses in the base frame.
     Raises ServiceError if the file cannot be read, is not a recording, holds no records, or is of another version.
     """
-    with _whole(path) as whole:
-        chunks = _chunks(whole, path)
+    size = path.stat().st_size if path.is_file() else 0
+    try:
+        with _whole(path) as whole:
+            chunks = _chunks(whole, path)
+    except ServiceError:
+        if not path.is_file() or path.stat().st_size == size:
+            raise
+        with _whole(path, growing=True) as whole:  # it was being written while Rerun read it
+            chunks = _chunks(whole, path)
     records, t, wall = _records([chunk for chunk in chunks if chunk.entity_path == "/record"], path)
     return Recording(
         name=next(iter(_static(chunks, "RecordingInfo:name").values()), ""),
@@ -124,15 +131,18 @@ def join(parts: Sequence[Recording]) -> Recording:
 
 
 @contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Give the file itself or, if its last message was cut off, a copy without that: Rerun would read none of it."""
+def _whole(path: Path, *, growing: bool = False) -> Iterator[Path]:
+    """Give the file itself or, if its last message was cut off, a copy without that: Rerun would read none of it.
+
+    Of one that is growing, always a copy.
+    """
     try:
         size, length = path.stat().st_size, _whole_length(path)
     except FileError as error:
         raise ServiceError(str(error)) from error
     except OSError as error:
         raise ServiceError(f"{path}: {error.strerror}") from error
-    if length == size:
+    if length == size and not growing:
         yield path
         return
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
