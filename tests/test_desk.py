@@ -13,6 +13,9 @@ from trirail.control.stepwise_planner import AcceptedPlan
 from trirail.errors import RefusedError
 from trirail.wire.messages import PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest
+from trirail.wire.vocabulary import Command
+
+NAMES = list(Command)
 
 POSE = PoseGoal(x=0.0, y=0.0, phi=0.0, blend=0.01)
 JOG = VelocityGoal(x=0.01, y=0.0, phi=0.0)
@@ -134,7 +137,7 @@ def test_a_refused_goal_has_ended(code: str, outcome: str) -> None:
 
 def test_a_refused_command_is_answered_and_told() -> None:
     ledger = Ledger()
-    ledger.refuse(CommandRequest(6, "bob", "resume"), RefusedError("not_paused", "nothing is paused"))
+    ledger.refuse(CommandRequest(6, "bob", Command.RESUME), RefusedError("not_paused", "nothing is paused"))
     assert ledger.answers == [Refused(6, "not_paused", "nothing is paused")]
     (said,) = ledger.notices
     assert (said.kind, said.level, said.message, said.user) == (
@@ -149,20 +152,20 @@ def test_each_command_is_answered_once_when_its_verdict_is_there(verdicts: list[
     """Those without a verdict wait for one, however long; those with one are not asked about again."""
     ledger = Ledger()
     for ticket, _ in enumerate(verdicts):
-        ledger.undertake(CommandRequest(ticket, "ann", f"c{ticket}"), 100 + ticket)
-    asked_about: list[tuple[str, int]] = []
+        ledger.undertake(CommandRequest(ticket, "ann", NAMES[ticket]), 100 + ticket)
+    asked_about: list[tuple[Command, int]] = []
 
-    def verdict(name: str, since: int) -> str | None:
+    def verdict(name: Command, since: int) -> str | None:
         asked_about.append((name, since))
-        return verdicts[int(name[1:])]
+        return verdicts[NAMES.index(name)]
 
     for _ in range(rounds):
         ledger.settle(verdict, "holding")
     assert ledger.answers == [
-        Refused(n, "failed", f"c{n} failed: {said}") if said else Confirmed(n, f"c{n}", "holding")
+        Refused(n, "failed", f"{NAMES[n]} failed: {said}") if said else Confirmed(n, NAMES[n], "holding")
         for n, said in enumerate(verdicts)
         if said is not None
     ]
-    first = [(f"c{n}", 100 + n) for n in range(len(verdicts))]
+    first = [(NAMES[n], 100 + n) for n in range(len(verdicts))]
     waiting = [each for each, said in zip(first, verdicts, strict=True) if said is None]
     assert asked_about == first + waiting * (rounds - 1)

@@ -20,13 +20,14 @@ from trirail.wire.packets import (
     Welcome,
 )
 from trirail.wire.records import FIELDS, LAYOUT, Record, pack_into, unpack
+from trirail.wire.vocabulary import Command
 
 
 @pytest.mark.parametrize(
     "request_",
     [
         GoalRequest(1, "ann", "g", PoseGoal(x=0.1, y=0.2, phi=0.3, speed=0.5, valid_for=1.0), 5),
-        CommandRequest(2, "ann", "stop"),
+        CommandRequest(2, "ann", Command.STOP),
         RefusedRequest("ann", "no"),
     ],
 )
@@ -40,7 +41,7 @@ def test_requests(request_: Request) -> None:
     "answer",
     [
         Accepted(1, "g", 0.5, 1.0, False, True),
-        Confirmed(2, "stop", "holding"),
+        Confirmed(2, Command.STOP, "holding"),
         Refused(3, "out_of_workspace", "no", "A", 0.4, 0.3),
         Happened(Event(1, 0.5, 500, 1.0, "goal", "info", "goal g done", id="g", outcome="done")),
         Status("g", 1.0, None),

@@ -11,6 +11,7 @@ from trirail.client.client import Goal, Result, Robot
 from trirail.telemetry.reading import Line, Recording
 from trirail.wire.messages import Event, PoseGoal
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Request
+from trirail.wire.vocabulary import Command
 
 
 class Heard:
@@ -47,7 +48,7 @@ def ended(cycle: int, name: str, outcome: Any) -> Line:
 
 def test_none_goes_before_the_goals_that_had_ended() -> None:
     rows = records(0.2)
-    stop: Request = CommandRequest(3, "ann", "stop")
+    stop: Request = CommandRequest(3, "ann", Command.STOP)
     recording = Recording(
         name="demo",
         records=rows,

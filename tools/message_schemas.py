@@ -10,7 +10,7 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import docstrings
 import msgspec
@@ -22,8 +22,10 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 MESSAGES: dict[str, tuple[Any, str]] = {
     "goal": (messages.Goal, "What is sent to goal/<user>: a goal of one of the kinds."),
     "goal-reply": (messages.GoalReply, "The reply to a goal that is accepted."),
-    "command-override": (messages.Override, "The content of cmd/<user>/override."),
-    "command-stop": (messages.Stop, "The content, if any, of cmd/<user>/stop."),
+    **{
+        f"command-{name}": (kind, f"The content{', if any,' * (type(None) in get_args(kind))} of cmd/<user>/{name}.")
+        for name, kind in messages.CONTENT.items()
+    },
     "command": (messages.NoContent, "The content, if any, of the other commands."),
     "command-reply": (messages.CommandReply, "The reply to a command that has been carried out."),
     "error-reply": (messages.ErrorReply, "The error reply to a goal or command that is refused, or that fails."),

@@ -29,7 +29,7 @@ from trirail.motion.steps import finish
 from trirail.wire.messages import Outcome, PoseGoal, SlidersGoal
 from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest, Request
 from trirail.wire.records import Part
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 
 Given = tuple[Request | Disturbance, int]
 """What the control is given in a cycle, and when, by the monotonic clock [ns]."""
@@ -37,16 +37,6 @@ Given = tuple[Request | Disturbance, int]
 SETTLE = 0.1
 """How long the drives may take to leave their fault state after a reset [s]."""
 
-_COMMANDS = {
-    "enable": ModeEvent.ENABLE,
-    "disable": ModeEvent.DISABLE,
-    "stop": ModeEvent.STOP,
-    "quick_stop": ModeEvent.QUICK_STOP,
-    "reset": ModeEvent.RESET,
-    "pause": ModeEvent.PAUSE,
-    "resume": ModeEvent.RESUME,
-    "home": ModeEvent.HOME,
-}
 _OUTCOMES: dict[ModeEvent, Outcome] = {
     ModeEvent.STANDSTILL: "done",
     ModeEvent.ARRIVED: "done",
@@ -263,10 +253,10 @@ class Control:
             self.goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason)
 
     def _take_command(self, request: CommandRequest) -> None:
-        if request.name == "override":
+        if request.name is Command.OVERRIDE:
             self._take_override(request)
             return
-        event = _COMMANDS[request.name]
+        event = ModeEvent[request.name.name]
         if event is ModeEvent.HOME and not self._can_home:
             raise RefusedError("nothing_to_home", "absolute encoders: there is nothing to home")
         if request.goal is not None and self.goal_queue.stop_alone(request.goal, f"{request.name} by {request.user}"):
@@ -302,7 +292,7 @@ class Control:
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
 
-    def _verdict(self, name: str, since: int) -> str | None:
+    def _verdict(self, name: Command, since: int) -> str | None:
         """Say what has become of a command that came in a cycle: trirail.control.completion.verdict."""
         settled = self.cycles - since >= self._settle_cycles
         return verdict(name, self.state.mode, self.fault, self.measured, settled=settled)

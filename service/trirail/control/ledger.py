@@ -19,6 +19,7 @@ from trirail.wire.packets import (
     RefusedRequest,
     Request,
 )
+from trirail.wire.vocabulary import Command
 
 REMEMBERED_IDS = 10_000
 """Goals whose ids may not be used again; older ones are forgotten."""
@@ -65,7 +66,7 @@ class Ledger:
         """The goal that the robot is moving to, and those to follow it."""
         self.answers: list[Answer] = []
         self.notices: list[Notice] = []
-        self._commands: dict[str, deque[tuple[CommandRequest, int]]] = {}
+        self._commands: dict[Command, deque[tuple[CommandRequest, int]]] = {}
         self._ended: dict[str, str | None] = {}
         """Goals that have ended, and the limit at which that was, for a jog."""
 
@@ -175,7 +176,7 @@ class Ledger:
         """Take a command on; it is answered once it has been carried out."""
         self._commands.setdefault(request.name, deque()).append((request, cycle))
 
-    def settle(self, verdict: Callable[[str, int], str | None], mode: str) -> None:
+    def settle(self, verdict: Callable[[Command, int], str | None], mode: str) -> None:
         """Answer the commands that are done or never will be.
 
         `verdict`, given a command's name and the cycle it came in, is "" for done, None for not yet, else why not.

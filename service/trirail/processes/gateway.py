@@ -27,7 +27,7 @@ from trirail.processes.state import StateMaker
 from trirail.telemetry.provenance import versions
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.links import Closed, Link
-from trirail.wire.messages import CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
+from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -46,15 +46,8 @@ from trirail.wire.packets import (
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_UNREAD
 from trirail.wire.text import is_name, quoted
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 
-COMMANDS = ("enable", "disable", "stop", "quick_stop", "reset", "home", "pause", "resume", "override")
-CONTENT: dict[str, tuple[Any, str]] = {
-    "override": (Override, 'override takes {"percent": 0, or 1 to 200}'),
-    "stop": (Stop | None, 'stop takes nothing, or {"goal": id}'),
-}
-"""What commands may carry; the others carry nothing."""
-STOPPING = ("stop", "disable", "quick_stop", "pause")
 AT_ONCE = 256
 """Messages from Zenoh that are read before the loop is listened to again."""
 BACKLOG = 5_000
@@ -208,25 +201,28 @@ class Gateway:
             self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
 
     def _command(self, incoming: Incoming) -> None:
-        user, name = boundary.names(incoming.key, self._key("cmd"), ("user", "command"))
-        if name not in COMMANDS:
-            raise RefusedError("unknown_command", f"{quoted(name)}: no such command; there are {', '.join(COMMANDS)}")
-        kind, takes = CONTENT.get(name, (NoContent | None, f"{name} takes no content"))
-        content = boundary.decode(incoming.payload, kind, takes, incoming.encoding)
+        user, called = boundary.names(incoming.key, self._key("cmd"), ("user", "command"))
+        try:
+            name = Command(called)
+        except ValueError as error:
+            problem = f"{quoted(called)}: no such command; there are {', '.join(Command)}"
+            raise RefusedError("unknown_command", problem) from error
+        takes = f"{name} takes {name.content}"
+        content = boundary.decode(incoming.payload, CONTENT.get(name, NoContent | None), takes, incoming.encoding)
         share = content.percent / 100.0 if isinstance(content, Override) else None
         goal = content.goal if isinstance(content, Stop) else None
         reason = f"{name} by {user}"
         if goal is not None and self._withdraw(incoming, goal, reason):
             return
-        if len(self._commands) >= UNDER_WAY and name not in STOPPING:
+        if len(self._commands) >= UNDER_WAY and not name.stops:
             raise RefusedError("busy", f"{len(self._commands)} commands are under way already: send fewer")
         self._tickets += 1
         if not self._link.send(message(CommandRequest(self._tickets, user, name, share, goal))):
             raise RefusedError("busy", "too many requests at once: send it again")
         self._commands.add(self._tickets)
-        within = self._home_within if name == "home" else REPLY_WITHIN
+        within = self._home_within if name is Command.HOME else REPLY_WITHIN
         self._waiting[self._tickets] = _Waiting(incoming, time.monotonic() + within)
-        if name in STOPPING and goal is None:
+        if name.stops and goal is None:
             replace = msgspec.structs.replace
             self._backlog = deque((waiting, replace(request, withdrawn=reason)) for waiting, request in self._backlog)
 
@@ -235,7 +231,7 @@ class Gateway:
         for number, (waiting, request) in enumerate(self._backlog):
             if request.id == goal_id:
                 self._backlog[number] = waiting, msgspec.structs.replace(request, withdrawn=reason)
-                self._replies.send(incoming, CommandReply("stop", self._states.newest().mode))
+                self._replies.send(incoming, CommandReply(Command.STOP, self._states.newest().mode))
                 return True
         return False
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -12,6 +12,7 @@ from trirail_drivers.interface import Triple
 
 from trirail.wire.sizes import MAX_NAME, MAX_POINTS
 from trirail.wire.text import ID_RULE, is_id, quoted
+from trirail.wire.vocabulary import Command
 
 SHORTEST_PIECE = 1e-4
 """Least time between two points of a trajectory [s]: below, its derivatives lose their digits."""
@@ -144,6 +145,10 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
 
 class NoContent(Struct, frozen=True, forbid_unknown_fields=True):
     """The content of the other commands."""
+
+
+CONTENT: dict[Command, Any] = {Command.OVERRIDE: Override, Command.STOP: Stop | None}
+"""What commands carry, with None where they may come without; those that are not here, NoContent | None."""
 
 
 def _check(message: Struct) -> None:

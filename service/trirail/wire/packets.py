@@ -9,6 +9,7 @@ from trirail_drivers.interface import Counts, Triple
 
 from trirail.wire.messages import Event, Goal, Level
 from trirail.wire.sizes import MAX_PACKET
+from trirail.wire.vocabulary import Command
 
 
 class Kind(IntEnum):
@@ -36,7 +37,7 @@ class CommandRequest(Struct, frozen=True, tag=True):
 
     ticket: int
     user: str
-    name: str
+    name: Command
     value: float | None = None
     """The rate, for override."""
     goal: str | None = None
@@ -65,7 +66,7 @@ class Confirmed(Struct, frozen=True, tag=True):
     """Loop to gateway: the command has been carried out."""
 
     ticket: int
-    name: str
+    name: Command
     mode: str
 
 
