@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from trirail.errors import RefusalCode
 from trirail.wire import packets
 from trirail.wire.messages import Event, PoseGoal
 from trirail.wire.packets import (
@@ -42,7 +43,7 @@ def test_requests(request_: Request) -> None:
     [
         Accepted(1, "g", 0.5, 1.0, False, True),
         Confirmed(2, Command.STOP, "holding"),
-        Refused(3, "out_of_workspace", "no", "A", 0.4, 0.3),
+        Refused(3, RefusalCode.OUT_OF_WORKSPACE, "no", "A", 0.4, 0.3),
         Happened(Event(1, 0.5, 500, 1.0, "goal", "info", "goal g done", id="g", outcome="done")),
         Status("g", 1.0, None),
         Welcome(("SCHED_FIFO: no",), 0.75, 1.0),

@@ -14,6 +14,7 @@ from typing import Any, get_args
 
 import docstrings
 import msgspec
+from trirail.errors import RefusalCode
 from trirail.wire import messages
 
 FOLDER = Path(messages.__file__).parent / "schemas"
@@ -44,6 +45,12 @@ def schemas() -> dict[str, str]:
             [kind], schema_hook=_anything, ref_template="#/$defs/{name}"
         )
         for struct, definition in definitions.items():
+            if struct == RefusalCode.__name__:
+                del definition["enum"]
+                definition["oneOf"] = [
+                    {"const": code, "description": f"{code.meaning}; {code.remedy}"} for code in RefusalCode
+                ]
+                continue
             for field, text in docstrings.fields(getattr(messages, struct)).items():
                 definition["properties"][field]["description"] = text
         whole = {"$schema": DIALECT, "title": f"trirail: {name}", "description": where, **schema, "$defs": definitions}

@@ -23,7 +23,7 @@ import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.listener import Listener
-from trirail.errors import RefusedError, ServiceError, TrirailError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import (
     CommandReply,
@@ -156,7 +156,9 @@ class Jog:
             try:
                 self._send()
             except TrirailError as error:
-                if not (isinstance(error, RefusedError) and error.code == "at_limit"):  # that is how it should end
+                if not (
+                    isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
+                ):  # that is how it should end
                     self.error = error
                 return
 
@@ -282,7 +284,7 @@ class Robot:
         try:
             message = make(goal_id)
         except ValueError as error:
-            raise RefusedError("malformed", f"not a goal: {error}") from error
+            raise RefusedError(RefusalCode.MALFORMED, f"not a goal: {error}") from error
         goal = Goal(goal_id, self)
         with self._goals_lock:
             goal = self._goals.setdefault(goal_id, goal)
@@ -332,7 +334,7 @@ class Robot:
         try:
             content = Override(percent)
         except ValueError as error:
-            raise RefusedError("malformed", f"no override: {error}") from error
+            raise RefusedError(RefusalCode.MALFORMED, f"no override: {error}") from error
         self.command(Command.OVERRIDE, msgspec.json.encode(content))
 
     def command(self, name: str, content: bytes | None = None) -> CommandReply:

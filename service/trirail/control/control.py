@@ -20,7 +20,7 @@ from trirail.control.ledger import Ledger
 from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeState, Refusal, step
 from trirail.control.setpoints import Setpoints
 from trirail.control.stepwise_planner import StepwisePlanner
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.goals import Goals
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
@@ -244,7 +244,7 @@ class Control:
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
         if not self.measured.homed:
-            raise RefusedError("not_homed", "it is not known where the sliders are: send home first")
+            raise RefusedError(RefusalCode.NOT_HOMED, "it is not known where the sliders are: send home first")
         return self.state.mode is Mode.MOVING
 
     def _withdraw(self, event: ModeEvent, reason: str) -> None:
@@ -258,7 +258,7 @@ class Control:
             return
         event = ModeEvent[request.name.name]
         if event is ModeEvent.HOME and not self._can_home:
-            raise RefusedError("nothing_to_home", "absolute encoders: there is nothing to home")
+            raise RefusedError(RefusalCode.NOTHING_TO_HOME, "absolute encoders: there is nothing to home")
         if request.goal is not None and self.goal_queue.stop_alone(request.goal, f"{request.name} by {request.user}"):
             self.ledger.undertake(request, self.cycles)
             return
@@ -272,7 +272,7 @@ class Control:
             if self.measured.homed:
                 self.setpoints.check_start()
         if decided.action is Action.CLEAR and self.measured.powered:
-            raise RefusedError("stopping", still_powered(self.measured, self.fault))
+            raise RefusedError(RefusalCode.STOPPING, still_powered(self.measured, self.fault))
         reason = f"{request.name} by {request.user}"
         if event is ModeEvent.QUICK_STOP:
             self.trip(reason)

@@ -18,7 +18,7 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_a
 
 from trirail import __version__
 from trirail.config import Config, geometry
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox, Incoming
 from trirail.processes.last_words import LastWords
@@ -146,7 +146,7 @@ class Gateway:
                 *(waiting.incoming for waiting in self._waiting.values()),
                 *(goal[0] for goal in self._backlog),
             ]:
-                self._replies.send(incoming, ErrorReply("ended", "the service has ended"))
+                self._replies.send(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
             self._replies.close()
 
     def end(self) -> None:
@@ -171,13 +171,13 @@ class Gateway:
         except Closed:
             raise
         except Exception as error:  # noqa: BLE001 - a message that is read wrongly must not end the gateway
-            self._refuse(incoming, RefusedError("internal", f"internal error, please report it: {error!r}"))
+            self._refuse(incoming, RefusedError(RefusalCode.INTERNAL, f"internal error, please report it: {error!r}"))
 
     def _goal(self, incoming: Incoming) -> None:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
         goal: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
         if len(self._backlog) >= BACKLOG or self._backlog_bytes + incoming.size > MAX_UNREAD:
-            raise RefusedError("busy", f"{len(self._backlog)} goals are waiting already: send fewer")
+            raise RefusedError(RefusalCode.BUSY, f"{len(self._backlog)} goals are waiting already: send fewer")
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
         request = GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns())
@@ -206,7 +206,7 @@ class Gateway:
             name = Command(called)
         except ValueError as error:
             problem = f"{quoted(called)}: no such command; there are {', '.join(Command)}"
-            raise RefusedError("unknown_command", problem) from error
+            raise RefusedError(RefusalCode.UNKNOWN_COMMAND, problem) from error
         takes = f"{name} takes {name.content}"
         content = boundary.decode(incoming.payload, CONTENT.get(name, NoContent | None), takes, incoming.encoding)
         share = content.percent / 100.0 if isinstance(content, Override) else None
@@ -215,10 +215,10 @@ class Gateway:
         if goal is not None and self._withdraw(incoming, goal, reason):
             return
         if len(self._commands) >= UNDER_WAY and not name.stops:
-            raise RefusedError("busy", f"{len(self._commands)} commands are under way already: send fewer")
+            raise RefusedError(RefusalCode.BUSY, f"{len(self._commands)} commands are under way already: send fewer")
         self._tickets += 1
         if not self._link.send(message(CommandRequest(self._tickets, user, name, share, goal))):
-            raise RefusedError("busy", "too many requests at once: send it again")
+            raise RefusedError(RefusalCode.BUSY, "too many requests at once: send it again")
         self._commands.add(self._tickets)
         within = self._home_within if name is Command.HOME else REPLY_WITHIN
         self._waiting[self._tickets] = _Waiting(incoming, time.monotonic() + within)
@@ -237,7 +237,7 @@ class Gateway:
 
     def _too_much(self, incoming: Incoming) -> None:
         """Answer what there is no room for; called by Zenoh's threads."""
-        self._replies.send(incoming, ErrorReply("busy", "too many messages at once: send fewer"))
+        self._replies.send(incoming, ErrorReply(RefusalCode.BUSY, "too many messages at once: send fewer"))
 
     def _refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
         """Answer what cannot be taken; tell everyone too, since a put has no answer."""
@@ -319,7 +319,7 @@ class Gateway:
     def _give_up_late(self) -> None:
         now = time.monotonic()
         for ticket in [ticket for ticket, waiting in self._waiting.items() if waiting.deadline < now]:
-            self._answer(ticket, ErrorReply("timeout", "not carried out in time"))
+            self._answer(ticket, ErrorReply(RefusalCode.TIMEOUT, "not carried out in time"))
 
     def _key(self, *parts: str) -> str:
         return zenoh_session.key(self._robot, *parts)

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Meta, Struct
 from trirail_drivers.interface import Triple
 
+from trirail.errors import RefusalCode
 from trirail.wire.sizes import MAX_NAME, MAX_POINTS
 from trirail.wire.text import ID_RULE, is_id, quoted
 from trirail.wire.vocabulary import Command
@@ -186,9 +187,10 @@ class CommandReply(Struct, frozen=True):
 
 
 class ErrorReply(Struct, frozen=True, omit_defaults=True):
-    """A goal or command was refused; nothing moved because of it."""
+    """A goal or command was refused, and nothing moved because of it, or a command could not be carried out."""
 
-    code: str
+    code: RefusalCode
+    """Why, for programs; a client takes a code that it does not know for "other"."""
     message: str
     slider: str | None = None
     value: float | None = None

@@ -7,6 +7,7 @@ from enum import IntEnum
 from msgspec import Struct, msgpack, structs
 from trirail_drivers.interface import Counts, Triple
 
+from trirail.errors import RefusalCode
 from trirail.wire.messages import Event, Goal, Level
 from trirail.wire.sizes import MAX_PACKET
 from trirail.wire.vocabulary import Command
@@ -74,7 +75,7 @@ class Refused(Struct, frozen=True, tag=True):
     """Loop to gateway: neither goal nor command was taken."""
 
     ticket: int
-    code: str
+    code: RefusalCode
     message: str
     slider: str | None = None
     value: float | None = None
