@@ -172,7 +172,7 @@ class Control:
             self._go(ModeEvent.RELEASE, f"goal {released.id} of {released.user} is not renewed")
         beginning = self.goal_queue.think(self.cycles, self._admit)
         if beginning is not None:
-            self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}")
+            self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
         for _ in range(self._schedule.advance()):
             self.ledger.pass_on()
         self.goal_queue.expire(self.cycles)
@@ -299,8 +299,8 @@ class Control:
 
     # ------------------------------------------------------------------ from state to state
 
-    def _go(self, event: ModeEvent, reason: str) -> None:  # noqa: PLR0912  a branch for each action
-        """Step the modes and carry out the action."""
+    def _go(self, event: ModeEvent, reason: str, goal: GoalRequest | None = None) -> None:  # noqa: PLR0912  one branch an action
+        """Step the modes and carry out the action; `goal` is the one that begins."""
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             return
@@ -332,7 +332,8 @@ class Control:
             arrived = "released" if before.released else "arrived"
             self.ledger.end(outcome, arrived if outcome == "done" else reason)
         if self.state.mode is not before.mode:
-            self.ledger.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
+            whose, who = (goal.id, goal.user) if goal else (None, None)
+            self.ledger.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode, id=whose, user=who)
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
             self._schedule.take(deque())
             self._planner.stop_thinking()

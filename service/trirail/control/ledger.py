@@ -39,6 +39,7 @@ class Notice(NamedTuple):
     mode: str | None = None
     id: str | None = None
     outcome: Outcome | None = None
+    reason: str | None = None
     user: str | None = None
 
 
@@ -174,7 +175,8 @@ class Ledger:
         self._ended[goal_id] = bound
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]
-        self.tell("goal", level, f"goal {goal_id} {outcome}: {reason}", id=goal_id, outcome=outcome, user=user)
+        words = f"goal {goal_id} {outcome}: {reason}"
+        self.tell("goal", level, words, id=goal_id, outcome=outcome, reason=reason, user=user)
 
     # ------------------------------------------------------------------ commands
 
@@ -207,7 +209,8 @@ class Ledger:
         mode: str | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
         outcome: Outcome | None = None,
+        reason: str | None = None,
         user: str | None = None,
     ) -> None:
         """Note something that everyone is to know."""
-        self.notices.append(Notice(kind, level, message, mode, id, outcome, user))
+        self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, user))

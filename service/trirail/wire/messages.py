@@ -213,10 +213,13 @@ class Event(Struct, frozen=True, omit_defaults=True):
     mode: str | None = None
     """The mode entered, with kind mode."""
     id: str | None = None
-    """The goal's id, with kind goal."""
+    """With kind goal, the goal that has ended; with kind mode, the goal with which the robot was set in motion."""
     outcome: Outcome | None = None
     """How the goal ended, with kind goal."""
+    reason: str | None = None
+    """Why it ended so, with kind goal; the message has it too."""
     user: str | None = None
+    """Who sent the goal, or what was refused."""
 
 
 class Commanded(Struct, frozen=True):

@@ -170,5 +170,6 @@ def told(event: Event) -> bytes:
     if len(packet) <= MAX_PACKET:
         return packet
     words = f"{event.message[:1000]}… ({len(event.message)} characters)"
+    reason = event.reason and f"{event.reason[:1000]}…"
     name, user = (text and text[:100] for text in (event.id, event.user))
-    return message(Happened(structs.replace(event, message=words, id=name, user=user)))
+    return message(Happened(structs.replace(event, message=words, id=name, reason=reason, user=user)))
