@@ -302,7 +302,6 @@ class State(Struct, frozen=True):
     sliders: Sliders
     goal: GoalState | None
     override: float
-    lease: str | None
     faults: tuple[str, ...]
     loop: LoopState
 
