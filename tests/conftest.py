@@ -20,7 +20,7 @@ from trirail.control.control import Control, Given
 from trirail.control.ledger import Notice
 from trirail.wire.messages import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers import frames
 from trirail_drivers.bus import PROTOCOLS
 from trirail_drivers.simulated import SimulatedDrive, simulated_bus
@@ -137,7 +137,7 @@ class Rig:
     def command(self, name: str, value: float | None = None) -> Answer:
         """Send a command and run until it is answered."""
         ticket = next(self._tickets)
-        self.cycle(CommandRequest(ticket, "ann", name, value))
+        self.cycle(CommandRequest(ticket, "ann", Command(name), value))
         self.until(lambda: self._answered(ticket))
         return self.answers[-1]
 
@@ -158,7 +158,7 @@ class Rig:
 
     def order(self, name: str, value: float | None = None) -> None:
         """Send a command in this cycle and do not wait for its answer."""
-        self.cycle(CommandRequest(next(self._tickets), "ann", name, value))
+        self.cycle(CommandRequest(next(self._tickets), "ann", Command(name), value))
 
     def _answered(self, ticket: int) -> bool:
         return bool(self.answers) and getattr(self.answers[-1], "ticket", None) == ticket

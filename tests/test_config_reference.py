@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
+import config_limits
 import config_reference
 import msgspec
 import pytest
@@ -25,6 +26,31 @@ def test_every_key_says_what_it_means(headings: tuple[str, ...], key: str, row: 
     _, _, meaning = row
     assert len(meaning) > 15, f"{headings[0]} {key} has no docstring"
     assert meaning.endswith("."), meaning
+
+
+@pytest.mark.parametrize(
+    "ends",
+    ["timeout", "following_error", "velocity", "acceleration", "jerk", "passive", "_margin", "overruns", "heartbeat"],
+)
+def test_every_limit_and_time_out_is_in_the_table_of_where_they_stand(ends: str) -> None:
+    told = {place for bound in config_limits.BOUNDS for place in bound.places}
+    homing = {f"drives.{drive}.homing." for drive in "BC"}  # as those of A
+    for key in config_reference.names():
+        own = key.startswith(("can.", "drives.A.simulated", *homing)) or (".homing." in key and ends != "timeout")
+        assert own or not key.endswith(ends) or key in told, key
+
+
+def test_a_place_that_is_not_there_cannot_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for place in ("watchdogs.patience", "trirail.processes.gateway:IMPATIENCE s"):
+        monkeypatch.setattr(config_limits, "BOUNDS", [config_limits.Bound("A thing", (place,), "it is refused")])
+        with pytest.raises(KeyError, match=r"patience|IMPATIENCE"):
+            config_limits.table(config_reference.names())
+
+
+def test_the_service_bounds_the_following_error_before_the_drives_do_in_every_file_that_is_shipped() -> None:
+    for path in SIM.parent.glob("*.toml"):
+        config = load(path)
+        assert config.limits.slider.following_error < config.drives.following_error, path.name
 
 
 def leaves(value: Any, path: str = "") -> Iterator[str]:

@@ -10,9 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.control.ledger import REMEMBERED_IDS, Ledger
 from trirail.control.stepwise_planner import AcceptedPlan
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.messages import PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest
+from trirail.wire.vocabulary import Command
+
+NAMES = list(Command)
 
 POSE = PoseGoal(x=0.0, y=0.0, phi=0.0, blend=0.01)
 JOG = VelocityGoal(x=0.01, y=0.0, phi=0.0)
@@ -86,7 +89,9 @@ def test_an_id_is_good_for_one_goal(ledger: Ledger) -> None:
     with pytest.raises(RefusedError, match="goal id 'g1' has been used") as refused:
         ledger.check_id(asked("g1"))
     ledger.refuse(asked("g1", ticket=9, user="bob"), refused.value)
-    assert ledger.answers == [Refused(9, "duplicate_id", "goal id 'g1' has been used: every goal needs its own")]
+    assert ledger.answers == [
+        Refused(9, RefusalCode.DUPLICATE_ID, "goal id 'g1' has been used: every goal needs its own")
+    ]
     assert len(ended(ledger)) == 3  # the one that had the id ended once
     assert ledger.notices[-1][:3] == ("refused", "warning", "goal id 'g1' has been used: every goal needs its own")
     ledger.check_id(asked("g9"))
@@ -111,19 +116,22 @@ def test_a_jog_is_renewed_by_velocities_of_its_id_alone() -> None:
     ledger.begin(asked("j", JOG, ticket=2), AT_ONCE, 100.0, math.inf)
     assert [answer.ticket for answer in ledger.answers if isinstance(answer, Accepted)] == [1, 2]
     assert len(ledger.goals) == 1
-    ledger.refuse(asked("j", JOG, ticket=3), RefusedError("limit", "too fast", slider="A", value=2.0, limit=1.0))
+    ledger.refuse(
+        asked("j", JOG, ticket=3), RefusedError(RefusalCode.TOO_FAST, "too fast", slider="A", value=2.0, limit=1.0)
+    )
     ledger.withdraw(asked("j", JOG, ticket=4), "stopped", "stop by ann")
     assert ended(ledger) == []  # the jog itself goes on
     assert ledger.answers[-2:] == [
-        Refused(3, "limit", "too fast", "A", 2.0, 1.0),
-        Refused(4, "stopped", "goal j stopped before it began: stop by ann"),
+        Refused(3, RefusalCode.TOO_FAST, "too fast", "A", 2.0, 1.0),
+        Refused(4, RefusalCode.STOPPED, "goal j stopped before it began: stop by ann"),
     ]
     ledger.end("stopped", "stop by ann")
     assert ended(ledger) == [("j", "stopped", "ann")]
 
 
-@pytest.mark.parametrize(("code", "outcome"), [("expired", "expired"), ("out_of_reach", "rejected")])
-def test_a_refused_goal_has_ended(code: str, outcome: str) -> None:
+@pytest.mark.parametrize("code", set(RefusalCode) - {RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT})
+def test_a_refused_goal_has_ended(code: RefusalCode) -> None:
+    outcome = "expired" if code is RefusalCode.EXPIRED else "rejected"
     ledger = Ledger()
     ledger.refuse(asked("g", ticket=5, user="bob"), RefusedError(code, "it cannot be"))
     assert ledger.answers == [Refused(5, code, "it cannot be")]
@@ -134,13 +142,13 @@ def test_a_refused_goal_has_ended(code: str, outcome: str) -> None:
 
 def test_a_refused_command_is_answered_and_told() -> None:
     ledger = Ledger()
-    ledger.refuse(CommandRequest(6, "bob", "resume"), RefusedError("not_paused", "nothing is paused"))
-    assert ledger.answers == [Refused(6, "not_paused", "nothing is paused")]
+    ledger.refuse(CommandRequest(6, "bob", Command.RESUME), RefusedError(RefusalCode.NOT_PAUSED, "nothing is paused"))
+    assert ledger.answers == [Refused(6, RefusalCode.NOT_PAUSED, "nothing is paused")]
     (said,) = ledger.notices
     assert (said.kind, said.level, said.message, said.user) == (
         "refused", "warning", "resume refused: nothing is paused", "bob",
     )  # fmt: skip
-    ledger.refuse(RefusedRequest("bob", "unreadable"), RefusedError("syntax", "unreadable"))
+    ledger.refuse(RefusedRequest("bob", "unreadable"), RefusedError(RefusalCode.MALFORMED, "unreadable"))
     assert len(ledger.answers) == len(ledger.notices) == 1  # the gateway has answered it
 
 
@@ -149,20 +157,20 @@ def test_each_command_is_answered_once_when_its_verdict_is_there(verdicts: list[
     """Those without a verdict wait for one, however long; those with one are not asked about again."""
     ledger = Ledger()
     for ticket, _ in enumerate(verdicts):
-        ledger.undertake(CommandRequest(ticket, "ann", f"c{ticket}"), 100 + ticket)
-    asked_about: list[tuple[str, int]] = []
+        ledger.undertake(CommandRequest(ticket, "ann", NAMES[ticket]), 100 + ticket)
+    asked_about: list[tuple[Command, int]] = []
 
-    def verdict(name: str, since: int) -> str | None:
+    def verdict(name: Command, since: int) -> str | None:
         asked_about.append((name, since))
-        return verdicts[int(name[1:])]
+        return verdicts[NAMES.index(name)]
 
     for _ in range(rounds):
         ledger.settle(verdict, "holding")
     assert ledger.answers == [
-        Refused(n, "failed", f"c{n} failed: {said}") if said else Confirmed(n, f"c{n}", "holding")
+        Refused(n, RefusalCode.FAILED, f"{NAMES[n]} failed: {said}") if said else Confirmed(n, NAMES[n], "holding")
         for n, said in enumerate(verdicts)
         if said is not None
     ]
-    first = [(f"c{n}", 100 + n) for n in range(len(verdicts))]
+    first = [(NAMES[n], 100 + n) for n in range(len(verdicts))]
     waiting = [each for each, said in zip(first, verdicts, strict=True) if said is None]
     assert asked_about == first + waiting * (rounds - 1)

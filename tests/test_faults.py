@@ -15,7 +15,7 @@ from conftest import CONFIG, Rig, changed
 from test_homing import incremental
 from trirail.config import Config
 from trirail.wire.packets import CommandRequest, Confirmed, Refused
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers import frames
 from trirail_drivers.interface import PowerState
 
@@ -115,13 +115,13 @@ def moving(rig: FaultRig) -> None:
 
 def stopping(rig: FaultRig) -> None:
     moving(rig)
-    rig.cycle(CommandRequest(0, "ann", "stop", None))
+    rig.cycle(CommandRequest(0, "ann", Command.STOP, None))
     assert rig.mode is Mode.STOPPING
 
 
 def homing(rig: FaultRig) -> None:
     holding(rig)
-    rig.cycle(CommandRequest(0, "ann", "home"))
+    rig.cycle(CommandRequest(0, "ann", Command.HOME))
     rig.cycles(100)
     assert rig.mode is Mode.HOMING
     assert rig.control.measured.feedback.follows == (False, True, True)

@@ -16,6 +16,7 @@ from trirail.processes.gateway import PATIENCE, UNDER_WAY, Gateway
 from trirail.processes.inbox import Incoming
 from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, RefusedRequest, Request
+from trirail.wire.vocabulary import Command
 
 
 class FakeLink:
@@ -44,8 +45,31 @@ def goal(gateway: Gateway, name: str) -> None:
     gateway._handle(Incoming("goal", "trirail/demo/goal/ann", len(content), content, "", None))
 
 
-def command(gateway: Gateway, name: str) -> None:
-    gateway._handle(Incoming("cmd", f"trirail/demo/cmd/ann/{name}", 0, b"", "", None))
+def command(gateway: Gateway, name: str, content: bytes = b"") -> None:
+    gateway._handle(Incoming("cmd", f"trirail/demo/cmd/ann/{name}", len(content), content, "", None))
+
+
+@pytest.mark.parametrize("name", Command)
+def test_every_command_is_passed_on(rig: Rig, name: Command) -> None:
+    gateway, link = rig
+    command(gateway, name, b'{"percent": 50}' if name is Command.OVERRIDE else b"")
+    assert link.sent == [CommandRequest(1, "ann", name, 0.5 if name is Command.OVERRIDE else None)]
+
+
+@pytest.mark.parametrize("name", Command)
+def test_what_a_command_does_not_take_is_refused_with_what_it_takes(rig: Rig, name: Command) -> None:
+    gateway, link = rig
+    command(gateway, name, b'{"odd": 1}')
+    (said,) = link.sent
+    assert isinstance(said, RefusedRequest)
+    assert said.message.startswith(f"{name} takes {name.content}: ")
+
+
+def test_a_command_that_there_is_not_is_refused_with_those_that_there_are(rig: Rig) -> None:
+    gateway, link = rig
+    command(gateway, "dance")
+    names = "enable, disable, stop, quick_stop, reset, home, pause, resume, override"
+    assert link.sent == [RefusedRequest("ann", f"dance: no such command; there are {names}")]
 
 
 def test_a_goal_that_has_waited_too_long_does_not_begin(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,9 +96,9 @@ def test_many_commands_are_refused_but_never_a_stop(rig: Rig) -> None:
         command(gateway, name)
     passed = [request.name for request in link.sent if isinstance(request, CommandRequest)]
     assert passed == ["resume"] * UNDER_WAY + ["stop", "quick_stop", "disable", "pause"]
-    gateway._hear(packets.message(Confirmed(1, "resume", "holding")), lambda: None)
+    gateway._hear(packets.message(Confirmed(1, Command.RESUME, "holding")), lambda: None)
     for ticket in (UNDER_WAY + 1, UNDER_WAY + 2, UNDER_WAY + 3, UNDER_WAY + 4):
-        gateway._hear(packets.message(Confirmed(ticket, "stop", "holding")), lambda: None)
+        gateway._hear(packets.message(Confirmed(ticket, Command.STOP, "holding")), lambda: None)
     command(gateway, "reset")
     last = link.sent[-1]
     assert isinstance(last, CommandRequest)

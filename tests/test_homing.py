@@ -18,7 +18,7 @@ from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import inverse
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers import config, frames
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.interface import PowerState
@@ -71,7 +71,7 @@ def modes(rig: Rig) -> list[int]:
 
 def begin(rig: Rig, cycles: int = 0) -> None:
     """Send home, and let so many cycles pass."""
-    rig.cycle(CommandRequest(99, "ann", "home"))
+    rig.cycle(CommandRequest(99, "ann", Command.HOME))
     assert rig.mode is Mode.HOMING
     rig.cycles(cycles)
 
@@ -125,7 +125,7 @@ def test_only_what_is_not_absolute_is_homed() -> None:
     assert rig.control.measured.feedback.homed == (False, True, False)
     rig.enable()
     seen = set()
-    rig.cycle(CommandRequest(99, "ann", "home"))
+    rig.cycle(CommandRequest(99, "ann", Command.HOME))
     while rig.mode is Mode.HOMING:
         seen.add(tuple(modes(rig)))
         rig.cycle()
@@ -379,7 +379,7 @@ def test_a_fault_stops_it_at_once_and_it_can_begin_again(rig: Rig, cause: str, w
     rig.enable()
     begin(rig, when)
     if cause == "quick_stop":
-        rig.cycle(CommandRequest(7, "ann", "quick_stop"))
+        rig.cycle(CommandRequest(7, "ann", Command.QUICK_STOP))
     elif cause == "emergency":
         rig.drives[1].fail(0x4310)
     else:

@@ -8,11 +8,12 @@ from trirail.telemetry import journal
 from trirail.telemetry.journal import EVENTS, REQUESTS, Entry
 from trirail.wire.messages import Event, Level, PoseGoal
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
+from trirail.wire.vocabulary import Command
 
 SAID = 1_700_000_000_500_000_000
 EVENT = Event(7, 1.25, 1250, 1_700_000_000.5, "goal", "warning", "goal g expired", id="g")
 GOAL = ControlInput(3, 1250, 5_000_000_000, GoalRequest(1, "ann", "g", PoseGoal(0.01, 0.0, 0.0), 4_999_000_000))
-STOP = ControlInput(4, 1300, 5_050_000_000, CommandRequest(2, "ann", "stop"))
+STOP = ControlInput(4, 1300, 5_050_000_000, CommandRequest(2, "ann", Command.STOP))
 
 
 def test_lines_of_one_log_are_one_chunk_with_their_own_times() -> None:

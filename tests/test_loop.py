@@ -29,7 +29,7 @@ from trirail.wire.packets import (
     message,
 )
 from trirail.wire.records import unpack
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 
 
 class Shell:
@@ -52,7 +52,7 @@ class Shell:
 
     def enabled(self) -> None:
         self.cycles(self.rig.config.loop.rate_hz // BATCHES_PER_SECOND)  # by then the gateway is accepted
-        self.gateway.send(message(CommandRequest(1, "ann", "enable")))
+        self.gateway.send(message(CommandRequest(1, "ann", Command.ENABLE)))
         self.cycles(20)
         assert self.loop.control.state.mode is Mode.HOLDING
 
@@ -282,8 +282,8 @@ def test_a_stop_behind_a_flood_of_commands_is_carried_out_while_they_arrive(shel
     shell.cycles(100)
     assert shell.mode() is Mode.MOVING
     for ticket in range(100, 200):
-        shell.gateway.send(message(CommandRequest(ticket, "eve", "override", 1.0)))
-    shell.gateway.send(message(CommandRequest(200, "ann", "stop")))
+        shell.gateway.send(message(CommandRequest(ticket, "eve", Command.OVERRIDE, 1.0)))
+    shell.gateway.send(message(CommandRequest(200, "ann", Command.STOP)))
     shell.cycles(100 // REQUESTS_A_CYCLE + 1)
     assert shell.mode() is Mode.STOPPING
     shell.cycles(400)
@@ -296,7 +296,7 @@ def test_an_answer_waits_for_a_gateway_that_is_slow(shell: Shell, monkeypatch: p
     with monkeypatch.context() as full:
         full.setattr(shell.ports[0], "send", lambda _packet: False)
         for ticket in range(100, 130):
-            shell.gateway.send(message(CommandRequest(ticket, "ann", "stop")))
+            shell.gateway.send(message(CommandRequest(ticket, "ann", Command.STOP)))
         shell.cycles(50)
     shell.cycles(10)
     assert answered(shell.received()) == list(range(100, 130))
@@ -304,7 +304,7 @@ def test_an_answer_waits_for_a_gateway_that_is_slow(shell: Shell, monkeypatch: p
 
 def test_nobody_is_told_what_a_gateway_that_is_gone_was_asked(shell: Shell, tmp_path: Path) -> None:
     shell.enabled()
-    shell.gateway.send(message(CommandRequest(100, "ann", "stop")))
+    shell.gateway.send(message(CommandRequest(100, "ann", Command.STOP)))
     shell.gateway.close()
     shell.cycles(30)
     shell.gateway = links.connect(tmp_path / "gateway")

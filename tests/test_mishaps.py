@@ -12,7 +12,7 @@ from trirail.telemetry.reading import Recording
 from trirail.wire.messages import PoseGoal
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Kind, decode_answer, message
 from trirail.wire.records import unpack
-from trirail.wire.vocabulary import MODES, Mode
+from trirail.wire.vocabulary import MODES, Command, Mode
 
 __all__ = ["shell"]
 
@@ -30,9 +30,9 @@ def recorded(shell: Shell) -> Recording:
 def lose_a_drive(shell: Shell) -> None:
     shell.rig.drives[1].fail(0x4310)
     shell.cycles(150)
-    shell.gateway.send(message(CommandRequest(3, "ann", "reset")))
+    shell.gateway.send(message(CommandRequest(3, "ann", Command.RESET)))
     shell.cycles(300)
-    shell.gateway.send(message(CommandRequest(4, "ann", "enable")))
+    shell.gateway.send(message(CommandRequest(4, "ann", Command.ENABLE)))
 
 
 def push_a_slider(shell: Shell) -> None:

@@ -25,7 +25,7 @@ from trirail.motion.schedule import Schedule
 from trirail.motion.steps import Steps
 from trirail.wire.messages import Goal, OwnLimits, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, GoalRequest
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 
 MEDIUM = slower(CONFIG, velocity=0.3, acceleration=4.5, jerk=120.0)
 """Sliders for which the platform's motions are a little too fast."""
@@ -267,11 +267,11 @@ def test_a_waiting_goal_can_be_stopped_alone(rig: Rig) -> None:
     rig.enable()
     for number, pose in enumerate(SQUARE):
         rig.send(f"q{number}", PoseGoal(*pose, blend=0.01))
-    rig.cycle(CommandRequest(99, "ann", "stop", goal="q2"))
+    rig.cycle(CommandRequest(99, "ann", Command.STOP, goal="q2"))
     rig.until(rig.holds)
     assert sorted(rig.outcomes()) == [("q0", "done"), ("q1", "done"), ("q2", "stopped"), ("q3", "stopped")]
     assert rig.control.commanded.pose == pytest.approx(SQUARE[1], abs=1e-9)
-    rig.cycle(CommandRequest(100, "ann", "stop", goal="q2"))
+    rig.cycle(CommandRequest(100, "ann", Command.STOP, goal="q2"))
     assert refusal(rig.answers[-1]).code == "no_goal"
     assert_within_limits(rig)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from trirail.errors import RefusalCode
 from trirail.wire import packets
 from trirail.wire.messages import Event, PoseGoal
 from trirail.wire.packets import (
@@ -20,13 +21,14 @@ from trirail.wire.packets import (
     Welcome,
 )
 from trirail.wire.records import FIELDS, LAYOUT, Record, pack_into, unpack
+from trirail.wire.vocabulary import Command
 
 
 @pytest.mark.parametrize(
     "request_",
     [
         GoalRequest(1, "ann", "g", PoseGoal(x=0.1, y=0.2, phi=0.3, speed=0.5, valid_for=1.0), 5),
-        CommandRequest(2, "ann", "stop"),
+        CommandRequest(2, "ann", Command.STOP),
         RefusedRequest("ann", "no"),
     ],
 )
@@ -40,8 +42,8 @@ def test_requests(request_: Request) -> None:
     "answer",
     [
         Accepted(1, "g", 0.5, 1.0, False, True),
-        Confirmed(2, "stop", "holding"),
-        Refused(3, "out_of_workspace", "no", "A", 0.4, 0.3),
+        Confirmed(2, Command.STOP, "holding"),
+        Refused(3, RefusalCode.OUT_OF_WORKSPACE, "no", "A", 0.4, 0.3),
         Happened(Event(1, 0.5, 500, 1.0, "goal", "info", "goal g done", id="g", outcome="done")),
         Status("g", 1.0, None),
         Welcome(("SCHED_FIFO: no",), 0.75, 1.0),

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from paper_motions import EXAMPLES, QUANTITIES, Curves, computed
 from paper_service import Driven
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.telemetry.palette import SLIDERS
 
 PANELS = [f"figure_{number:02}" for number in range(3, 12)]
@@ -180,7 +180,9 @@ def test_errors_are_one_line(
         assert capsys.readouterr().err == f"paper: cannot write pictures to {taken}: File exists\n"
 
     def refuse(*_: object) -> None:
-        raise RefusedError("too_fast", "the service refused rotation: the trajectory is 2 times too fast for a slider")
+        raise RefusedError(
+            RefusalCode.TOO_FAST, "the service refused rotation: the trajectory is 2 times too fast for a slider"
+        )
 
     with monkeypatch.context() as refusing:
         refusing.setattr(paper, "drive", refuse)

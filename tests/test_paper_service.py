@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Literal
 
 import conftest
 import msgspec
@@ -17,7 +18,7 @@ from trirail.client import own_service
 from trirail.config import SIM, load
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry.reading import Line, Recording
-from trirail.wire.messages import TrajectoryGoal
+from trirail.wire.messages import Event, TrajectoryGoal
 from trirail.wire.packets import Accepted
 from trirail.wire.records import DTYPE
 from trirail.wire.sizes import MAX_MESSAGE
@@ -45,8 +46,14 @@ def recording(example: Example, first: int = 40, lost: slice = slice(0, 0)) -> R
     records["position"][first + REACHED : first + n + REACHED] = span["commanded_position"]
     records = np.delete(records, lost)
     times = records["cycle"] * PERIOD
-    began = Line((100 + first) * PERIOD, np.datetime64(0, "ns"), "INFO", "moving: goal g of paper")
-    return Recording("demo", records, times, np.zeros(len(records), "datetime64[ns]"), [began], {})
+    events = [line(100 + first, "g")]
+    return Recording("demo", records, times, np.zeros(len(records), "datetime64[ns]"), events, {})
+
+
+def line(cycle: int, goal: str, kind: Literal["mode", "goal"] = "mode") -> Line:
+    """A line of the log that names a goal: one with which the robot was set in motion, or one that has ended."""
+    event = Event(1, cycle * PERIOD, cycle, 0.0, kind, "info", "", id=goal)
+    return Line(event.t, np.datetime64(0, "ns"), "INFO", event.message, event)
 
 
 # ---------------------------------------------------------------------- what is sent
@@ -108,8 +115,7 @@ def test_a_motion_is_cut_out_in_time(first: int) -> None:
 
 def test_the_motion_is_found_by_its_goal() -> None:
     made = recording(EXAMPLES[0])
-    other = made.events[0]._replace(t=0.101, text="moving: goal g2 of paper")
-    later = made.events[0]._replace(t=3.5, text="goal g of paper")
+    other, later = line(101, "g2"), line(3500, "g", "goal")
     assert len(driven(made._replace(events=[other, *made.events, later]), "g", PERIOD).measured) == 3000
     with pytest.raises(ServiceError, match="says 0 times, not once, that goal g3 began"):
         driven(made, "g3", PERIOD)

@@ -5,12 +5,16 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
+import pytest
+from conftest import Rig
 from made import records
-from trirail.analysis.resend import _send
+from trirail.analysis.resend import _beginnings, _Heard, _send
+from trirail.analysis.summary import _goals
 from trirail.client.client import Goal, Result, Robot
 from trirail.telemetry.reading import Line, Recording
 from trirail.wire.messages import Event, PoseGoal
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Request
+from trirail.wire.vocabulary import Command
 
 
 class Heard:
@@ -45,9 +49,31 @@ def ended(cycle: int, name: str, outcome: Any) -> Line:
     return Line(event.t, np.datetime64(0, "ns"), "INFO", "", event)
 
 
+ODD = ["g", "my goal", "goal of ann", "moving: goal x of", "done: ", "ü: ∅"]
+"""Ids that a sentence cannot be taken apart for."""
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_the_goal_that_set_the_robot_in_motion_and_why_it_ended_are_told_in_fields(rig: Rig, name: str) -> None:
+    rig.enable()
+    begins = rig.control.cycles
+    rig.goal(name, 0.01, 0.0, 0.0, speed=0.5)
+    rig.command(Command.STOP)
+    events = [Event(n, 0.0, begins, 0.0, **notice._asdict()) for n, notice in enumerate(rig.notices, 1)]
+    lines = [Line(0.0, np.datetime64(0, "ns"), "INFO", event.message, event) for event in events]
+    recording = Recording("demo", records(0.2), np.zeros(0), np.zeros(0, "datetime64[ns]"), lines, {})
+    assert _beginnings(recording) == [(name, begins)]
+    (ended,) = (summed for summed in _goals(recording, 1e-3) if summed.id == name)
+    assert (ended.outcome, ended.message) == ("stopped", "stop by ann")
+    heard = _Heard(cast("Robot", None))
+    for event in events:
+        heard._take(event)
+    assert heard.began == {name: begins}
+
+
 def test_none_goes_before_the_goals_that_had_ended() -> None:
     rows = records(0.2)
-    stop: Request = CommandRequest(3, "ann", "stop")
+    stop: Request = CommandRequest(3, "ann", Command.STOP)
     recording = Recording(
         name="demo",
         records=rows,

@@ -15,7 +15,7 @@ from trirail.motion.goals import PlannedMotion
 from trirail.motion.steps import Steps
 from trirail.wire.messages import PoseGoal, SlidersGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 
 PERIOD = CONFIG.period
 PROMPT = round(0.05 / PERIOD)
@@ -29,7 +29,7 @@ def answer_to(rig: Rig, ticket: int) -> Answer | None:
 def confirmed_after(rig: Rig, name: str, within: int) -> int:
     """Send a command beside what waits; return after how many cycles it is confirmed."""
     ticket = 10**6 + len(rig.rows)
-    rig.cycle(CommandRequest(ticket, "bob", name))
+    rig.cycle(CommandRequest(ticket, "bob", Command(name)))
     for number in range(within):
         answer = answer_to(rig, ticket)
         if answer is not None:
@@ -137,7 +137,7 @@ def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow:
 
 def test_stop_of_the_running_goal_stops_the_robot_and_what_waits(slow: Rig) -> None:
     planned(slow, FAR, "g1")
-    slow.cycle(CommandRequest(99, "ann", "stop", goal="running"))
+    slow.cycle(CommandRequest(99, "ann", Command.STOP, goal="running"))
     slow.until(slow.holds)
     assert slow.outcomes() == [("g1", "stopped"), ("running", "stopped")]
 
@@ -146,7 +146,7 @@ def test_stop_of_the_running_goal_stops_the_robot_and_what_waits(slow: Rig) -> N
 def test_stop_of_a_goal_that_has_not_begun_leaves_the_others(slow: Rig, waiting: str) -> None:
     planned(slow, FAR, "g1")
     slow.post("g2", PoseGoal(0.0, 0.03, 0.0))
-    slow.cycle(CommandRequest(99, "ann", "stop", goal="g1" if waiting == "planned" else "g2"))
+    slow.cycle(CommandRequest(99, "ann", Command.STOP, goal="g1" if waiting == "planned" else "g2"))
     assert (
         isinstance(answer_to(slow, 99), Confirmed) or slow.until(lambda: isinstance(answer_to(slow, 99), Confirmed)) < 3
     )
@@ -162,7 +162,7 @@ def test_a_goal_that_has_ended_cannot_be_stopped(rig: Rig) -> None:
     rig.enable()
     rig.goal("g1", 0.01, 0.0, 0.0)
     rig.until(rig.holds)
-    rig.cycle(CommandRequest(99, "ann", "stop", goal="g1"))
+    rig.cycle(CommandRequest(99, "ann", Command.STOP, goal="g1"))
     answer = answer_to(rig, 99)
     assert isinstance(answer, Refused)
     assert answer.code == "no_goal"
@@ -316,11 +316,11 @@ def play(rig: Rig, steps: list[tuple[object, int]]) -> None:
     """Send all of it without waiting for any answer."""
     for number, (what, wait) in enumerate(steps, start=1):
         if isinstance(what, float):
-            rig.cycle(CommandRequest(number, "ann", "override", what))
+            rig.cycle(CommandRequest(number, "ann", Command.OVERRIDE, what))
         elif what == "cancel":
-            rig.cycle(CommandRequest(number, "ann", "stop", goal=f"g{number - 1}"))
+            rig.cycle(CommandRequest(number, "ann", Command.STOP, goal=f"g{number - 1}"))
         elif isinstance(what, str):
-            rig.cycle(CommandRequest(number, "ann", what))
+            rig.cycle(CommandRequest(number, "ann", Command(what)))
         else:
             rig.cycle(GoalRequest(number, "ann", f"g{number}", what, round(rig.now * 1e9)))  # type: ignore[arg-type]
         rig.cycles(wait)

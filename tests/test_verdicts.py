@@ -9,7 +9,7 @@ from conftest import CONFIG
 from trirail.config import geometry
 from trirail.control.completion import still_powered, verdict
 from trirail.control.feedback import Measured
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.interface import DriveFault, Feedback, PowerState
 
 P = PowerState
@@ -37,7 +37,7 @@ def one(state: PowerState, index: int) -> Measured:
 
 @pytest.mark.parametrize("mode", Mode)
 def test_enable_is_over_when_the_robot_is_no_longer_powering_up(mode: Mode) -> None:
-    said = verdict("enable", mode, WHY if mode is Mode.FAULT else None, saying(), settled=True)
+    said = verdict(Command.ENABLE, mode, WHY if mode is Mode.FAULT else None, saying(), settled=True)
     expected = {Mode.ENABLING: NOT_YET, Mode.FAULT: WHY, Mode.DISABLED: "disabled while powering up"}
     assert said == expected.get(mode, DONE)
 
@@ -46,21 +46,21 @@ def test_enable_is_over_when_the_robot_is_no_longer_powering_up(mode: Mode) -> N
 def test_disable_is_over_when_the_robot_stands_and_no_drive_can_move(mode: Mode, index: int, state: P) -> None:
     can_move = state in CAN_MOVE
     expected = NOT_YET if can_move or mode is Mode.STOPPING else DONE
-    assert verdict("disable", mode, None, one(state, index), settled=True) == expected
-    assert verdict("quick_stop", mode, None, one(state, index), settled=True) == (NOT_YET if can_move else DONE)
+    assert verdict(Command.DISABLE, mode, None, one(state, index), settled=True) == expected
+    assert verdict(Command.QUICK_STOP, mode, None, one(state, index), settled=True) == (NOT_YET if can_move else DONE)
 
 
-@pytest.mark.parametrize("name", ["disable", "quick_stop"])
-def test_a_drive_that_keeps_its_power_in_the_end_fails_the_command(name: str) -> None:
+@pytest.mark.parametrize("name", [Command.DISABLE, Command.QUICK_STOP])
+def test_a_drive_that_keeps_its_power_in_the_end_fails_the_command(name: Command) -> None:
     late, silent = DriveFault("B", "timeout", 0, "it has not stopped"), DriveFault("B", "silent", 0, WHY)
     assert verdict(name, Mode.FAULT, WHY, saying(OFF, ON, OFF, fault=late), settled=True) == "it has not stopped"
     assert verdict(name, Mode.FAULT, WHY, saying(OFF, ON, OFF, fault=silent), settled=True) is NOT_YET
-    assert verdict("stop", Mode.STOPPING, WHY, saying(OFF, ON, OFF, fault=late), settled=True) is NOT_YET
+    assert verdict(Command.STOP, Mode.STOPPING, WHY, saying(OFF, ON, OFF, fault=late), settled=True) is NOT_YET
 
 
-@pytest.mark.parametrize("name", ["stop", "pause"])
+@pytest.mark.parametrize("name", [Command.STOP, Command.PAUSE])
 @pytest.mark.parametrize("mode", Mode)
-def test_a_stop_is_over_when_the_robot_stands(name: str, mode: Mode) -> None:
+def test_a_stop_is_over_when_the_robot_stands(name: Command, mode: Mode) -> None:
     expected = NOT_YET if mode is Mode.STOPPING else DONE
     assert verdict(name, mode, None, saying(ON, ON, ON), settled=True) == expected
 
@@ -73,12 +73,12 @@ def test_home_is_done_when_every_drive_is_homed(mode: Mode, homed: tuple[bool, b
     without = {None: "stopped before every drive was homed", WHY: WHY}
     for latched, why in without.items():
         expected = NOT_YET if under_way else DONE if all(homed) else why
-        assert verdict("home", mode, latched, measured, settled=True) == expected
+        assert verdict(Command.HOME, mode, latched, measured, settled=True) == expected
 
 
-@pytest.mark.parametrize("name", ["resume", "override"])
+@pytest.mark.parametrize("name", [Command.RESUME, Command.OVERRIDE])
 @pytest.mark.parametrize("mode", Mode)
-def test_what_changes_the_rate_is_done_at_once(name: str, mode: Mode) -> None:
+def test_what_changes_the_rate_is_done_at_once(name: Command, mode: Mode) -> None:
     assert verdict(name, mode, None, saying(ON, ON, ON), settled=False) == DONE
 
 
@@ -87,8 +87,8 @@ def test_reset_is_done_when_the_drives_had_time_and_none_is_in_fault(settled: bo
     measured = one(state, index)
     faulty = state in (P.FAULT, P.FAULT_REACTION_ACTIVE)
     expected = DONE if settled and not faulty else NOT_YET
-    assert verdict("reset", Mode.DISABLED, None, measured, settled=settled) == expected
-    assert verdict("reset", Mode.FAULT, WHY, measured, settled=settled) == f"the cause is still there: {WHY}"
+    assert verdict(Command.RESET, Mode.DISABLED, None, measured, settled=settled) == expected
+    assert verdict(Command.RESET, Mode.FAULT, WHY, measured, settled=settled) == f"the cause is still there: {WHY}"
 
 
 @pytest.mark.parametrize(("index", "state"), [*product(range(3), P)])

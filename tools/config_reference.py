@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import config_limits
 import docstrings
 from msgspec import inspect as mi
 from trirail.cli.config_commands import shipped_files
@@ -81,6 +82,16 @@ def keys(kind: type) -> Iterator[tuple[str, str, str, str]]:
             yield field.encode_name, allowed(field.type), default, said.get(field.encode_name, "")
 
 
+def names() -> set[str]:
+    """Return every key by its whole name, as limits.slider.velocity."""
+    return {
+        f"{heading.strip('[]')}.{key}"
+        for headings, kind, _ in sections()
+        for heading in headings
+        for key, *_ in keys(kind)
+    }
+
+
 def allowed(kind: mi.Type) -> str:
     """Say in words which values a type takes."""
     match kind:
@@ -104,7 +115,7 @@ def allowed(kind: mi.Type) -> str:
 def reference() -> str:
     """Return the text of the file."""
     files = "\n".join(f"- [{name}]({name}): {purpose}" for name, purpose in shipped_files().items())
-    parts = [HEAD.format(files=files)]
+    parts = [HEAD.format(files=files), config_limits.table(names())]
     for headings, kind, needed in sections():
         title = ", ".join(f"`{heading}`" for heading in headings) + ("" if needed else ", may be absent")
         doc = _SECTION.sub("", " ".join((kind.__doc__ or "").split()))

@@ -10,10 +10,11 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import docstrings
 import msgspec
+from trirail.errors import RefusalCode
 from trirail.wire import messages
 
 FOLDER = Path(messages.__file__).parent / "schemas"
@@ -22,8 +23,10 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 MESSAGES: dict[str, tuple[Any, str]] = {
     "goal": (messages.Goal, "What is sent to goal/<user>: a goal of one of the kinds."),
     "goal-reply": (messages.GoalReply, "The reply to a goal that is accepted."),
-    "command-override": (messages.Override, "The content of cmd/<user>/override."),
-    "command-stop": (messages.Stop, "The content, if any, of cmd/<user>/stop."),
+    **{
+        f"command-{name}": (kind, f"The content{', if any,' * (type(None) in get_args(kind))} of cmd/<user>/{name}.")
+        for name, kind in messages.CONTENT.items()
+    },
     "command": (messages.NoContent, "The content, if any, of the other commands."),
     "command-reply": (messages.CommandReply, "The reply to a command that has been carried out."),
     "error-reply": (messages.ErrorReply, "The error reply to a goal or command that is refused, or that fails."),
@@ -42,6 +45,12 @@ def schemas() -> dict[str, str]:
             [kind], schema_hook=_anything, ref_template="#/$defs/{name}"
         )
         for struct, definition in definitions.items():
+            if struct == RefusalCode.__name__:
+                del definition["enum"]
+                definition["oneOf"] = [
+                    {"const": code, "description": f"{code.meaning}; {code.remedy}"} for code in RefusalCode
+                ]
+                continue
             for field, text in docstrings.fields(getattr(messages, struct)).items():
                 definition["properties"][field]["description"] = text
         whole = {"$schema": DIALECT, "title": f"trirail: {name}", "description": where, **schema, "$defs": definitions}

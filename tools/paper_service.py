@@ -85,7 +85,8 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     That time ran like this throughout is checked by the progress in each record.
     """
     records = recording.records
-    began = [line.t for line in recording.events if line.text == f"{Mode.MOVING}: goal {goal} of {USER}"]
+    said = [(line.t, line.event) for line in recording.events if line.event is not None]
+    began = [t for t, event in said if event.kind == "mode" and event.id == goal]
     if len(began) != 1:
         raise ServiceError(f"the recording's log says {len(began)} times, not once, that goal {goal} began")
     first = int(np.searchsorted(recording.t, began[0] - period / 2.0))

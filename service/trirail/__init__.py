@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from trirail.client.client import Robot
-    from trirail.errors import ConfigError, KinematicsError, RefusedError, ServiceError, TrirailError
+    from trirail.errors import ConfigError, KinematicsError, RefusalCode, RefusedError, ServiceError, TrirailError
     from trirail.kinematics.geometry import Geometry, Leg
     from trirail.kinematics.robot import forward, inverse, jacobians
     from trirail.telemetry.reading import read
@@ -26,6 +26,7 @@ __all__ = [
     "Geometry",
     "KinematicsError",
     "Leg",
+    "RefusalCode",
     "RefusedError",
     "Robot",
     "ServiceError",
@@ -41,7 +42,7 @@ __version__ = version("trirail")
 
 _HOMES = {
     "trirail.client.client": ("Robot",),
-    "trirail.errors": ("ConfigError", "KinematicsError", "RefusedError", "ServiceError", "TrirailError"),
+    "trirail.errors": ("ConfigError", "KinematicsError", "RefusalCode", "RefusedError", "ServiceError", "TrirailError"),
     "trirail.kinematics.geometry": ("Geometry", "Leg"),
     "trirail.kinematics.robot": ("forward", "inverse", "jacobians"),
     "trirail.telemetry.reading": ("read",),

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
+from typing import Self
+
 from trirail_drivers.errors import TrirailError
 
-__all__ = ["ConfigError", "KinematicsError", "RefusedError", "ServiceError", "TrirailError"]
+__all__ = ["ConfigError", "KinematicsError", "RefusalCode", "RefusedError", "ServiceError", "TrirailError"]
 
 
 class ConfigError(TrirailError):
@@ -28,12 +31,108 @@ class KinematicsError(TrirailError, ValueError):
         self.limit = limit
 
 
+class RefusalCode(StrEnum):
+    """Why a goal or command is refused, or was not carried out; for people, the message beside it says more."""
+
+    meaning: str
+    """What it means, in one line."""
+    remedy: str
+    """What the sender can do."""
+
+    # What was sent.
+    MALFORMED = (
+        "malformed",
+        "not a message of its kind: a field is missing, unknown or impossible",
+        "send what the schema allows",
+    )
+    TOO_LARGE = "too_large", "more bytes than are read", "send a smaller message"
+    UNKNOWN_ENCODING = "unknown_encoding", "neither JSON nor msgpack", "name the encoding, or none for JSON"
+    UNKNOWN_KEY = "unknown_key", "no such key below the robot's name", "use a key of the table"
+    WILDCARD = "wildcard", "a key for more than one robot or user", "name one of each"
+    BAD_NAME = "bad_name", "a robot or user with other than letters, digits, - and _", "use another name"
+    UNKNOWN_COMMAND = "unknown_command", "no such command", "send one of those that the message names"
+    DUPLICATE_ID = "duplicate_id", "the goal's id has been used", "give every goal an id of its own, or none"
+
+    # What the robot's mode allows.
+    NOT_ENABLED = "not_enabled", "the drives have no power yet", "send enable, and wait for it"
+    NOT_HOMED = "not_homed", "where the sliders are is not known", "send home"
+    HOMING = "homing", "the robot is homing", "wait until the mode is holding"
+    MOVING = "moving", "the robot moves, or a goal is paused", "send stop first"
+    STOPPING = "stopping", "the robot has not come to rest yet", "send it again when it stands"
+    FAULT = "fault", "the robot is in fault", "remove the cause, then send reset and enable"
+    NO_FAULT = "no_fault", "there is no fault to reset", "none is needed"
+    NO_GOAL = "no_goal", "no such goal is under way", "none is needed"
+    NOT_PAUSED = "not_paused", "no goal is paused", "send a goal"
+    NOTHING_TO_HOME = "nothing_to_home", "the encoders are absolute", "none is needed"
+    NOT_AT_REST = "not_at_rest", "a slider is moved from outside", "enable when it stands"
+
+    # The way to the goal.
+    OUT_OF_WORKSPACE = (
+        "out_of_workspace",
+        "the goal, its path or the robot is outside of its limits",
+        "choose another goal; sliders moves out of where goto cannot",
+    )
+    SINGULAR = (
+        "singular",
+        "the robot is singular there, or its sliders belong to no pose",
+        "choose another path; move the sliders",
+    )
+    ABOVE_LIMIT = "above_limit", "a limit of the goal's own is above the robot's", "lower it"
+    TOO_FAST = (
+        "too_fast",
+        "too fast for a slider or the platform",
+        "give it more time, or send a trajectory with stretch",
+    )
+    WRONG_START = (
+        "wrong_start",
+        "a trajectory that does not begin as the robot stands",
+        "go to its first point first, at rest",
+    )
+    WRONG_END = "wrong_end", "a trajectory that ends in motion", "let it end at rest"
+    NO_PLAN = "no_plan", "no motion to it was found from the present one", "send it again when the robot holds"
+    NO_VELOCITY = "no_velocity", "a jog that moves nothing", "give it a velocity"
+    AT_LIMIT = "at_limit", "the jog has ended at a limit", "begin a new one, away from it"
+    JOG_OVER = "jog_over", "the jog was not renewed in time", "begin a new one"
+
+    # Too late, too much, or not carried out.
+    EXPIRED = "expired", "the goal could not begin in time", "send it again, or with a longer valid_for"
+    QUEUE_FULL = "queue_full", "as many goals wait for each other as may", "send it when one has ended"
+    BUSY = "busy", "more messages, goals or commands at once than are kept", "send fewer"
+    STOPPED = "stopped", "the robot was told to stop before the goal began", "send it again"
+    FAULTED = (
+        "faulted",
+        "the robot went into fault before the goal began",
+        "remove the cause, send reset and enable, then the goal",
+    )
+    FAILED = "failed", "the command was taken but could not be carried out", "see the message"
+    TIMEOUT = "timeout", "not carried out in time", "look at the state, then send it again"
+    ENDED = "ended", "the service has ended", "start it"
+    INTERNAL = "internal", "an error of the service's own", "please report it"
+    OTHER = "other", "a code that this client does not know; no service sends it", "see the message"
+
+    def __new__(cls, code: str, meaning: str = "", remedy: str = "") -> Self:
+        """Make a member of its row; with a code alone the enumeration looks it up."""
+        member = str.__new__(cls, code)
+        member._value_ = code
+        member.meaning, member.remedy = meaning, remedy
+        return member
+
+    @classmethod
+    def _missing_(cls, value: object) -> RefusalCode | None:
+        """Take a code of a newer service for OTHER: the refusal is one all the same."""
+        return cls.OTHER if isinstance(value, str) else None
+
+
 class RefusedError(TrirailError):
-    """The service said no to a goal or command; carries the fields of its error reply."""
+    """The service said no to a goal or command, or a client sees that it would; has the fields of an error reply.
+
+    `code` says why, for programs. Where one slider or value is at fault, `slider` is "A", "B" or "C", `value` what was
+    asked of it, and `limit` what is allowed: SI units and radians.
+    """
 
     def __init__(
         self,
-        code: str,
+        code: RefusalCode,
         message: str,
         *,
         slider: str | None = None,

@@ -1,14 +1,13 @@
 """A recorded session's goals and commands, sent once more to a running service; its setpoints beside the recorded ones.
 
 Requests go out with the spacing that they had. Every motion that began at rest is compared from its first cycle on, as
-the logs of both sessions name it; how goals that interrupt each other come out depends on the moment, to a cycle.
+the events of both sessions name it; how goals that interrupt each other come out depends on the moment, to a cycle.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-import re
 import threading
 import time
 import uuid
@@ -35,7 +34,6 @@ END_WITHIN = 60.0
 """How long the last goals may take to end [s]."""
 HEARD_WITHIN = 2.0
 """How much later than a goal's end its last records may come [s]."""
-_BEGAN = re.compile(rf"{Mode.MOVING}: goal (?P<id>\S+) of ")
 _MOVING = MODES.index(Mode.MOVING)
 
 
@@ -101,8 +99,8 @@ class _Heard:
                 self._take(event)
 
     def _take(self, event: Event) -> None:
-        if found := _BEGAN.match(event.message):
-            self.began[found["id"]] = event.cycle
+        if event.kind == "mode" and event.id is not None:
+            self.began[event.id] = event.cycle
 
 
 def _check_start(recording: Recording, robot: Robot) -> None:
@@ -165,13 +163,8 @@ def _await(goals: Iterable[Goal]) -> None:
 
 def _beginnings(recording: Recording) -> list[tuple[str, int]]:
     """Return the goals with which motions began, each with its cycle."""
-    cycles = recording.records["cycle"]
-    found = ((_BEGAN.match(line.text), line.t) for line in recording.events)
-    return [
-        (match["id"], int(cycles[min(len(cycles) - 1, int(np.searchsorted(recording.t, t - 1e-6)))]))
-        for match, t in found
-        if match
-    ]
+    said = (line.event for line in recording.events if line.event is not None and line.event.kind == "mode")
+    return [(event.id, event.cycle) for event in said if event.id is not None]
 
 
 def _motion(records: NDArray[np.void], began: int | None) -> NDArray[np.float64]:

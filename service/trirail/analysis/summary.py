@@ -164,8 +164,7 @@ def _goals(recording: Recording, period: float) -> Iterator[GoalSummary]:
 def _end(event: Event | None, given: float) -> tuple[str, float, float | None, str]:
     if event is None:
         return UNKNOWN, given, None, "its end is not in the recording"
-    _, _, reason = event.message.partition(f"{event.outcome}: ")
-    return event.outcome or UNKNOWN, given, event.t, reason
+    return event.outcome or UNKNOWN, given, event.t, event.reason or event.message
 
 
 def _is_fault(line: Line) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +15,7 @@ from cyclopts import App, CycloptsError, Parameter
 from trirail import __version__
 from trirail.cli import config_commands, math_commands, recording_commands, terminal
 from trirail.errors import TrirailError
+from trirail.wire.vocabulary import Command
 from trirail.wire.zenoh_session import DEFAULT_LOCATOR
 
 if TYPE_CHECKING:
@@ -198,63 +200,15 @@ def follow(
         return _follow(service, robot, goal, wait, f"{file.name}: {len(points)} points")
 
 
-@app.command
-def pause(*, service: Service = HERE) -> int:
-    """Stop on the path and keep the goal."""
-    return _command("pause", service)
-
-
-@app.command
-def resume(*, service: Service = HERE) -> int:
-    """Go on with a paused goal."""
-    return _command("resume", service)
-
-
-@app.command
+@app.command(name=Command.OVERRIDE, help=Command.OVERRIDE.help)
 def override(percent: float, /, *, service: Service = HERE) -> int:
-    """Let motions run at a share of full speed, 0 or 1 to 200 %, never beyond the limits."""
+    """Send the one command that takes a number; its help is the command's, as of the others below."""
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
         robot.override(percent)
     _print(service, {"override": percent}, f"override: {percent:g} %")
     return 0
-
-
-@app.command
-def enable(*, service: Service = HERE) -> int:
-    """Power the drives up and hold."""
-    return _command("enable", service)
-
-
-@app.command
-def disable(*, service: Service = HERE) -> int:
-    """Stop and take power off the drives."""
-    return _command("disable", service)
-
-
-@app.command
-def stop(*, service: Service = HERE) -> int:
-    """Stop the robot within its limits."""
-    return _command("stop", service)
-
-
-@app.command
-def quick_stop(*, service: Service = HERE) -> int:
-    """Stop every drive as fast as it can; the robot is in fault until a reset."""
-    return _command("quick_stop", service)
-
-
-@app.command
-def reset(*, service: Service = HERE) -> int:
-    """Clear a fault whose cause is gone; the robot stays without power."""
-    return _command("reset", service)
-
-
-@app.command
-def home(*, service: Service = HERE) -> int:
-    """Find where the sliders are, where the encoders are not absolute: one drive after the other, slowly."""
-    return _command("home", service)
 
 
 @app.command
@@ -362,13 +316,23 @@ app.command(recording_commands.replay)
 app.command(recording_commands.report)
 
 
-def _command(name: str, service: Service) -> int:
-    from trirail.client.client import Robot
+def _tells(name: Command) -> Callable[..., int]:
+    """Return the command of the command line that sends one without content."""
 
-    with Robot(service.robot, service.connect) as robot:
-        reply = robot.command(name)
-    _print(service, msgspec.to_builtins(reply), f"{name}: done, the robot is {reply.mode}")
-    return 0
+    def tell(*, service: Service = HERE) -> int:
+        from trirail.client.client import Robot
+
+        with Robot(service.robot, service.connect) as robot:
+            reply = robot.command(name)
+        _print(service, msgspec.to_builtins(reply), f"{name}: done, the robot is {reply.mode}")
+        return 0
+
+    return tell
+
+
+for each in Command:
+    if each is not Command.OVERRIDE:
+        app.command(_tells(each), name=each.replace("_", "-"), help=each.help)
 
 
 def _follow(service: Service, robot: Robot, goal: Goal, wait: bool, title: str) -> int:

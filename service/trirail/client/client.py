@@ -23,7 +23,7 @@ import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.listener import Listener
-from trirail.errors import RefusedError, ServiceError, TrirailError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import (
     CommandReply,
@@ -44,6 +44,7 @@ from trirail.wire.messages import (
 from trirail.wire.messages import Goal as _Message
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.text import quoted
+from trirail.wire.vocabulary import Command
 
 REPLY_WITHIN = 20.0
 """How long a command may take to be carried out [s]."""
@@ -95,7 +96,7 @@ class Goal:
         Other goals go on, but those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
         ServiceError if nobody answers.
         """
-        self._robot.command("stop", msgspec.json.encode(Stop(self.id)))
+        self._robot.command(Command.STOP, msgspec.json.encode(Stop(self.id)))
 
     def wait(self, timeout: float | None = None) -> Result:
         """Wait for its end, however it ends; look at `outcome` of the result.
@@ -155,7 +156,9 @@ class Jog:
             try:
                 self._send()
             except TrirailError as error:
-                if not (isinstance(error, RefusedError) and error.code == "at_limit"):  # that is how it should end
+                if not (
+                    isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
+                ):  # that is how it should end
                     self.error = error
                 return
 
@@ -281,7 +284,7 @@ class Robot:
         try:
             message = make(goal_id)
         except ValueError as error:
-            raise RefusedError("malformed", f"not a goal: {error}") from error
+            raise RefusedError(RefusalCode.MALFORMED, f"not a goal: {error}") from error
         goal = Goal(goal_id, self)
         with self._goals_lock:
             goal = self._goals.setdefault(goal_id, goal)
@@ -296,50 +299,50 @@ class Robot:
 
     def enable(self) -> None:
         """Power the drives up; return when the robot holds where it stands. Confirmed at once if it does already."""
-        self.command("enable")
+        self.command(Command.ENABLE)
 
     def disable(self) -> None:
         """Stop, then take power off; return when the drives have none."""
-        self.command("disable")
+        self.command(Command.DISABLE)
 
     def stop(self) -> None:
         """Stop on the path within the limits' jerk; return when the robot stands. No goal is taken until then."""
-        self.command("stop")
+        self.command(Command.STOP)
 
     def quick_stop(self) -> None:
         """Stop every drive by its own ramp, as fast as it can; the robot is in fault until reset, without power."""
-        self.command("quick_stop")
+        self.command(Command.QUICK_STOP)
 
     def reset(self) -> None:
         """Clear a fault whose cause is gone; the robot is disabled afterwards. RefusedError while the cause lasts."""
-        self.command("reset")
+        self.command(Command.RESET)
 
     def home(self) -> None:
         """Home the drives whose positions are not absolute; return when all are and the robot holds."""
-        self.command("home")
+        self.command(Command.HOME)
 
     def pause(self) -> None:
         """Stop on the path; return when the robot stands. The goal is kept for resume, a jog is not."""
-        self.command("pause")
+        self.command(Command.PAUSE)
 
     def resume(self) -> None:
         """Go on with a paused goal."""
-        self.command("resume")
+        self.command(Command.RESUME)
 
     def override(self, percent: float) -> None:
         """Let this motion and those to come run at a share of full speed, 0 or 1 to 200 %, within the limits."""
         try:
             content = Override(percent)
         except ValueError as error:
-            raise RefusedError("malformed", f"no override: {error}") from error
-        self.command("override", msgspec.json.encode(content))
+            raise RefusedError(RefusalCode.MALFORMED, f"no override: {error}") from error
+        self.command(Command.OVERRIDE, msgspec.json.encode(content))
 
     def command(self, name: str, content: bytes | None = None) -> CommandReply:
         """Send a command by its name on the wire; return once the service confirms that it has been carried out.
 
         `content` is its JSON, where it has any: Override or Stop of trirail.wire.messages.
         """
-        within = HOME_WITHIN if name == "home" else REPLY_WITHIN
+        within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
         return self._ask(self._key("cmd", self.user, name), CommandReply, content, within)
 
     def info(self) -> Info:

@@ -2,44 +2,47 @@
 
 from __future__ import annotations
 
+from typing import assert_never
+
 from trirail_drivers.interface import NAMES, PowerState
 
 from trirail.control.feedback import CAN_MOVE, Measured
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 
 _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 
 
-def verdict(name: str, mode: Mode, latched: str | None, measured: Measured, *, settled: bool) -> str | None:
+def verdict(name: Command, mode: Mode, latched: str | None, measured: Measured, *, settled: bool) -> str | None:
     """Return "" when a command is carried out, None while it is not, else why it never will be.
 
     `latched` is the reason of the fault, if there is one. `settled` tells whether the drives have had the time that
     they may take to leave their fault state.
     """
     fault = measured.feedback.fault
-    if name in ("disable", "quick_stop") and fault is not None and fault.cause == "timeout":
+    if name in (Command.DISABLE, Command.QUICK_STOP) and fault is not None and fault.cause == "timeout":
         return fault.message
     match name:
-        case "enable":
+        case Command.ENABLE:
             if mode is Mode.ENABLING:
                 return None
             return "" if mode not in (Mode.FAULT, Mode.DISABLED) else latched or "disabled while powering up"
-        case "disable":
+        case Command.DISABLE:
             return None if mode is Mode.STOPPING or measured.powered else ""
-        case "stop" | "pause":
+        case Command.STOP | Command.PAUSE:
             return None if mode is Mode.STOPPING else ""
-        case "home":
+        case Command.HOME:
             if mode in (Mode.HOMING, Mode.STOPPING):
                 return None
             return "" if measured.homed else latched or "stopped before every drive was homed"
-        case "resume" | "override":
+        case Command.RESUME | Command.OVERRIDE:
             return ""
-        case "reset":
+        case Command.RESET:
             if mode is Mode.FAULT:
                 return f"the cause is still there: {latched}"
             return "" if settled and not any(state in _FAULTY for state in measured.feedback.state) else None
-        case _:
+        case Command.QUICK_STOP:
             return None if measured.powered else ""
+    assert_never(name)
 
 
 def still_powered(measured: Measured, latched: str | None) -> str:

@@ -20,7 +20,7 @@ from trirail.control.ledger import Ledger
 from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeState, Refusal, step
 from trirail.control.setpoints import Setpoints
 from trirail.control.stepwise_planner import StepwisePlanner
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.goals import Goals
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
@@ -29,7 +29,7 @@ from trirail.motion.steps import finish
 from trirail.wire.messages import Outcome, PoseGoal, SlidersGoal
 from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest, Request
 from trirail.wire.records import Part
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 
 Given = tuple[Request | Disturbance, int]
 """What the control is given in a cycle, and when, by the monotonic clock [ns]."""
@@ -37,16 +37,6 @@ Given = tuple[Request | Disturbance, int]
 SETTLE = 0.1
 """How long the drives may take to leave their fault state after a reset [s]."""
 
-_COMMANDS = {
-    "enable": ModeEvent.ENABLE,
-    "disable": ModeEvent.DISABLE,
-    "stop": ModeEvent.STOP,
-    "quick_stop": ModeEvent.QUICK_STOP,
-    "reset": ModeEvent.RESET,
-    "pause": ModeEvent.PAUSE,
-    "resume": ModeEvent.RESUME,
-    "home": ModeEvent.HOME,
-}
 _OUTCOMES: dict[ModeEvent, Outcome] = {
     ModeEvent.STANDSTILL: "done",
     ModeEvent.ARRIVED: "done",
@@ -182,7 +172,7 @@ class Control:
             self._go(ModeEvent.RELEASE, f"goal {released.id} of {released.user} is not renewed")
         beginning = self.goal_queue.think(self.cycles, self._admit)
         if beginning is not None:
-            self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}")
+            self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
         for _ in range(self._schedule.advance()):
             self.ledger.pass_on()
         self.goal_queue.expire(self.cycles)
@@ -254,7 +244,7 @@ class Control:
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
         if not self.measured.homed:
-            raise RefusedError("not_homed", "it is not known where the sliders are: send home first")
+            raise RefusedError(RefusalCode.NOT_HOMED, "it is not known where the sliders are: send home first")
         return self.state.mode is Mode.MOVING
 
     def _withdraw(self, event: ModeEvent, reason: str) -> None:
@@ -263,12 +253,12 @@ class Control:
             self.goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason)
 
     def _take_command(self, request: CommandRequest) -> None:
-        if request.name == "override":
+        if request.name is Command.OVERRIDE:
             self._take_override(request)
             return
-        event = _COMMANDS[request.name]
+        event = ModeEvent[request.name.name]
         if event is ModeEvent.HOME and not self._can_home:
-            raise RefusedError("nothing_to_home", "absolute encoders: there is nothing to home")
+            raise RefusedError(RefusalCode.NOTHING_TO_HOME, "absolute encoders: there is nothing to home")
         if request.goal is not None and self.goal_queue.stop_alone(request.goal, f"{request.name} by {request.user}"):
             self.ledger.undertake(request, self.cycles)
             return
@@ -282,7 +272,7 @@ class Control:
             if self.measured.homed:
                 self.setpoints.check_start()
         if decided.action is Action.CLEAR and self.measured.powered:
-            raise RefusedError("stopping", still_powered(self.measured, self.fault))
+            raise RefusedError(RefusalCode.STOPPING, still_powered(self.measured, self.fault))
         reason = f"{request.name} by {request.user}"
         if event is ModeEvent.QUICK_STOP:
             self.trip(reason)
@@ -302,15 +292,15 @@ class Control:
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
 
-    def _verdict(self, name: str, since: int) -> str | None:
+    def _verdict(self, name: Command, since: int) -> str | None:
         """Say what has become of a command that came in a cycle: trirail.control.completion.verdict."""
         settled = self.cycles - since >= self._settle_cycles
         return verdict(name, self.state.mode, self.fault, self.measured, settled=settled)
 
     # ------------------------------------------------------------------ from state to state
 
-    def _go(self, event: ModeEvent, reason: str) -> None:  # noqa: PLR0912  a branch for each action
-        """Step the modes and carry out the action."""
+    def _go(self, event: ModeEvent, reason: str, goal: GoalRequest | None = None) -> None:  # noqa: PLR0912  one branch an action
+        """Step the modes and carry out the action; `goal` is the one that begins."""
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             return
@@ -342,7 +332,8 @@ class Control:
             arrived = "released" if before.released else "arrived"
             self.ledger.end(outcome, arrived if outcome == "done" else reason)
         if self.state.mode is not before.mode:
-            self.ledger.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode)
+            whose, who = (goal.id, goal.user) if goal else (None, None)
+            self.ledger.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode, id=whose, user=who)
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
             self._schedule.take(deque())
             self._planner.stop_thinking()

@@ -7,9 +7,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from trirail.control.ledger import Ledger
+from trirail.control.ledger import Ledger, Withdrawal
 from trirail.control.stepwise_planner import StepwisePlanner
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.schedule import Schedule
 from trirail.wire.messages import Outcome, PoseGoal, VelocityGoal
 from trirail.wire.packets import GoalRequest
@@ -75,7 +75,7 @@ class GoalQueue:
         self._ledger.begin(request, taken, expires, max(map(self._alive_until, same)))
         return request
 
-    def withdraw(self, outcome: Outcome, reason: str) -> None:
+    def withdraw(self, outcome: Withdrawal, reason: str) -> None:
         """End what has been sent but not begun."""
         requests = [sent.request for sent in self._waiting]
         if self._planner.busy and self._planned is not None:
@@ -102,7 +102,7 @@ class GoalQueue:
                 self._waiting.remove(sent)
                 self._ledger.withdraw(sent.request, "stopped", reason)
                 return True
-        raise RefusedError("no_goal", f"goal {goal_id!r} is not under way: it has ended, or never was")
+        raise RefusedError(RefusalCode.NO_GOAL, f"goal {goal_id!r} is not under way: it has ended, or never was")
 
     def expire(self, cycle: int) -> None:
         """Let go of waiting goals that can no more begin in time, and of those behind them."""
@@ -119,16 +119,18 @@ class GoalQueue:
             ledger.withdraw(request, "stopped", request.withdrawn)
             return
         if isinstance(goal, VelocityGoal) and not any((goal.x, goal.y, goal.phi)) and not ledger.renewed_by(request):
-            raise RefusedError("no_velocity", "a jog of no velocity moves nothing: give it one along x, y or phi")
+            raise RefusedError(
+                RefusalCode.NO_VELOCITY, "a jog of no velocity moves nothing: give it one along x, y or phi"
+            )
         moving = admit()
         if goal.valid_for is not None and cycle - sent.cycle > goal.valid_for / self._period:
-            raise RefusedError("expired", f"the goal came too late: it was valid for {goal.valid_for:g} s")
+            raise RefusedError(RefusalCode.EXPIRED, f"the goal came too late: it was valid for {goal.valid_for:g} s")
         if cycle > self._alive_until(sent):
-            raise RefusedError("expired", "the jog came too late: its timeout was over before it could begin")
+            raise RefusedError(RefusalCode.EXPIRED, "the jog came too late: its timeout was over before it could begin")
         blend = ledger.goals[-1].blend if moving and ledger.goals and isinstance(goal, PoseGoal) else None
         if blend is not None and len(ledger.goals) > self._queue:
             text = f"{self._queue} goals are waiting already (motion.queue): send it when one has ended"
-            raise RefusedError("queue_full", text, value=len(ledger.goals), limit=self._queue)
+            raise RefusedError(RefusalCode.QUEUE_FULL, text, value=len(ledger.goals), limit=self._queue)
         self._planner.plan(goal, blend)
 
     def _alive_until(self, sent: _Sent) -> float:

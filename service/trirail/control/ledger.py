@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from trirail.control.stepwise_planner import AcceptedPlan
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.messages import Level, Outcome, PoseGoal, VelocityGoal
 from trirail.wire.packets import (
     Accepted,
@@ -19,7 +19,10 @@ from trirail.wire.packets import (
     RefusedRequest,
     Request,
 )
+from trirail.wire.vocabulary import Command
 
+Withdrawal = Literal["stopped", "faulted"]
+"""How a goal ends that has been sent but did not begin: the outcome in its event, and the code of its refusal."""
 REMEMBERED_IDS = 10_000
 """Goals whose ids may not be used again; older ones are forgotten."""
 
@@ -36,6 +39,7 @@ class Notice(NamedTuple):
     mode: str | None = None
     id: str | None = None
     outcome: Outcome | None = None
+    reason: str | None = None
     user: str | None = None
 
 
@@ -65,7 +69,7 @@ class Ledger:
         """The goal that the robot is moving to, and those to follow it."""
         self.answers: list[Answer] = []
         self.notices: list[Notice] = []
-        self._commands: dict[str, deque[tuple[CommandRequest, int]]] = {}
+        self._commands: dict[Command, deque[tuple[CommandRequest, int]]] = {}
         self._ended: dict[str, str | None] = {}
         """Goals that have ended, and the limit at which that was, for a jog."""
 
@@ -82,11 +86,13 @@ class Ledger:
         running = any(goal.id == goal_id for goal in self.goals)
         if isinstance(request.goal, VelocityGoal) and (bound := self._ended.get(goal_id)):
             text = f"jog {goal_id!r} has ended at the limit of {bound}: begin a new one, away from it"
-            raise RefusedError("at_limit", text)
+            raise RefusedError(RefusalCode.AT_LIMIT, text)
         if goal_id in self._ended or (running and not self.renewed_by(request)):
-            raise RefusedError("duplicate_id", f"goal id {goal_id!r} has been used: every goal needs its own")
+            raise RefusedError(RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has been used: every goal needs its own")
         if self.goal is not None and self.goal.released and self.renewed_by(request):
-            raise RefusedError("jog_over", f"jog {goal_id!r} was not renewed in time and is over: begin a new one")
+            raise RefusedError(
+                RefusalCode.JOG_OVER, f"jog {goal_id!r} was not renewed in time and is over: begin a new one"
+            )
 
     def keep_alive(self, request: GoalRequest, until: float) -> None:
         """Let the jog under way go on until a cycle, if this renews it."""
@@ -129,9 +135,11 @@ class Ledger:
             self._ending(goal.id, goal.user, outcome, f"at the limit of {bound}" if bound else reason, bound)
         self.goals.extend(kept)
 
-    def withdraw(self, request: GoalRequest, outcome: Outcome, reason: str) -> None:
+    def withdraw(self, request: GoalRequest, outcome: Withdrawal, reason: str) -> None:
         """Answer that a goal has ended before it began."""
-        self.answers.append(Refused(request.ticket, outcome, f"goal {request.id} {outcome} before it began: {reason}"))
+        self.answers.append(
+            Refused(request.ticket, RefusalCode(outcome), f"goal {request.id} {outcome} before it began: {reason}")
+        )
         if not self.renewed_by(request):
             self._ending(request.id, request.user, outcome, reason)
 
@@ -143,10 +151,10 @@ class Ledger:
         self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))
         if isinstance(request, CommandRequest):
             self.tell("refused", "warning", f"{request.name} refused: {text}", user=request.user)
-        elif refusal.code in ("duplicate_id", "at_limit"):
+        elif refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT):
             self.tell("refused", "warning", text, user=request.user)
         else:
-            outcome: Outcome = "expired" if refusal.code == "expired" else "rejected"
+            outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
             if self.renewed_by(request):
                 self.tell("refused", "warning", text, user=request.user)
             else:
@@ -167,7 +175,8 @@ class Ledger:
         self._ended[goal_id] = bound
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]
-        self.tell("goal", level, f"goal {goal_id} {outcome}: {reason}", id=goal_id, outcome=outcome, user=user)
+        words = f"goal {goal_id} {outcome}: {reason}"
+        self.tell("goal", level, words, id=goal_id, outcome=outcome, reason=reason, user=user)
 
     # ------------------------------------------------------------------ commands
 
@@ -175,7 +184,7 @@ class Ledger:
         """Take a command on; it is answered once it has been carried out."""
         self._commands.setdefault(request.name, deque()).append((request, cycle))
 
-    def settle(self, verdict: Callable[[str, int], str | None], mode: str) -> None:
+    def settle(self, verdict: Callable[[Command, int], str | None], mode: str) -> None:
         """Answer the commands that are done or never will be.
 
         `verdict`, given a command's name and the cycle it came in, is "" for done, None for not yet, else why not.
@@ -185,7 +194,7 @@ class Ledger:
             while under_way and (why := verdict(name, under_way[0][1])) is not None:
                 request, _ = under_way.popleft()
                 if why:
-                    self.answers.append(Refused(request.ticket, "failed", f"{name} failed: {why}"))
+                    self.answers.append(Refused(request.ticket, RefusalCode.FAILED, f"{name} failed: {why}"))
                 else:
                     self.answers.append(Confirmed(request.ticket, name, mode))
 
@@ -200,7 +209,8 @@ class Ledger:
         mode: str | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
         outcome: Outcome | None = None,
+        reason: str | None = None,
         user: str | None = None,
     ) -> None:
         """Note something that everyone is to know."""
-        self.notices.append(Notice(kind, level, message, mode, id, outcome, user))
+        self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, user))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import Enum, auto
 from typing import NamedTuple
 
+from trirail.errors import RefusalCode
 from trirail.wire.vocabulary import Mode
 
 
@@ -70,7 +71,7 @@ class Step(NamedTuple):
 class Refusal(NamedTuple):
     """The event makes no sense in this mode: the state stays."""
 
-    code: str
+    code: RefusalCode
     message: str
 
 
@@ -100,18 +101,20 @@ STATES = (
     FAULT,
 )
 
-_NO_FAULT = Refusal("no_fault", "there is no fault to reset")
-_DISABLED = Refusal("not_enabled", "the robot is disabled: send enable first")
-_ENABLING = Refusal("not_enabled", "the drives are still powering up: send it again when the mode is holding")
-_HOMING = Refusal("homing", "the robot is homing: send the goal when the mode is holding")
-_MOVING = Refusal("moving", "the robot is moving: send stop, then home")
-_PAUSED = Refusal("moving", "a goal is paused: send stop, then home")
-_STOPPING = Refusal("stopping", "the robot is stopping: send it again when the mode is holding")
-_DISABLING = Refusal("stopping", "the robot is stopping to be disabled: send enable when the mode is disabled")
-_FAULT = Refusal("fault", "the robot is in fault: remove the cause, then send reset and enable")
+_NO_FAULT = Refusal(RefusalCode.NO_FAULT, "there is no fault to reset")
+_DISABLED = Refusal(RefusalCode.NOT_ENABLED, "the robot is disabled: send enable first")
+_ENABLING = Refusal(RefusalCode.NOT_ENABLED, "the drives are still powering up: send it again when the mode is holding")
+_HOMING = Refusal(RefusalCode.HOMING, "the robot is homing: send the goal when the mode is holding")
+_MOVING = Refusal(RefusalCode.MOVING, "the robot is moving: send stop, then home")
+_PAUSED = Refusal(RefusalCode.MOVING, "a goal is paused: send stop, then home")
+_STOPPING = Refusal(RefusalCode.STOPPING, "the robot is stopping: send it again when the mode is holding")
+_DISABLING = Refusal(
+    RefusalCode.STOPPING, "the robot is stopping to be disabled: send enable when the mode is disabled"
+)
+_FAULT = Refusal(RefusalCode.FAULT, "the robot is in fault: remove the cause, then send reset and enable")
 
-_NO_GOAL = Refusal("no_goal", "there is no goal under way")
-_NOT_PAUSED = Refusal("not_paused", "there is no paused goal to resume")
+_NO_GOAL = Refusal(RefusalCode.NO_GOAL, "there is no goal under way")
+_NOT_PAUSED = Refusal(RefusalCode.NOT_PAUSED, "there is no paused goal to resume")
 
 _POWER_OFF = Step(DISABLED, Action.POWER_DOWN)
 _TRIP = Step(FAULT, Action.QUICK_STOP)

@@ -8,7 +8,7 @@ import numpy as np
 from trirail_drivers.interface import NAMES, PowerState
 
 from trirail.control.feedback import Measured
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.limits import Bounds
@@ -93,7 +93,8 @@ class Setpoints:
         for name, setpoint, position in zip(NAMES, self.rows[0], self._measured.feedback.position, strict=True):
             if not abs(setpoint - position) <= self._step:
                 raise RefusedError(
-                    "not_at_rest", f"slider {name} moves too fast for its setpoint to follow: enable when it stands"
+                    RefusalCode.NOT_AT_REST,
+                    f"slider {name} moves too fast for its setpoint to follow: enable when it stands",
                 )
 
     def check_start(self) -> None:
@@ -103,11 +104,13 @@ class Setpoints:
         self._motion[:] = 0.0
         self._motion[0] = pose or math.nan
         if pose is None or inverse_into(self._legs, self._motion, self._sliders):
-            raise RefusedError("singular", "the measured sliders belong to no pose: move them by hand, then enable")
+            raise RefusedError(
+                RefusalCode.SINGULAR, "the measured sliders belong to no pose: move them by hand, then enable"
+            )
         violation = self._bounds.pose(pose) or self._bounds.setpoint(self._sliders.tolist())
         if violation:
             raise RefusedError(
-                "out_of_workspace",
+                RefusalCode.OUT_OF_WORKSPACE,
                 f"the robot stands outside its limits: {violation}; move it inside by hand, then enable",
                 value=violation.value,
                 limit=violation.limit,

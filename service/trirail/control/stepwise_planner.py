@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.goals import Extension, Goals, PlannedMotion
 from trirail.motion.runs import Run
 from trirail.motion.schedule import Schedule
@@ -87,7 +87,9 @@ class StepwisePlanner:
         self._spent += 1
         if self._spent > MOST_STEPS:
             self.give_up()
-            raise RefusedError("no_plan", f"no motion to it was found in {MOST_STEPS} steps: send the goal again")
+            raise RefusedError(
+                RefusalCode.NO_PLAN, f"no motion to it was found in {MOST_STEPS} steps: send the goal again"
+            )
         try:
             if self._steps is None:
                 self._steps = self._begin(self._goal)

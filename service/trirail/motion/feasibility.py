@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trirail.config import Limits
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
@@ -124,12 +124,12 @@ class Checker:
         where = f"the path leads out of the workspace after {max(0.0, time) / path.duration:.0%} of its time"
         rows = self._rows(path, time, pose)
         if rows is None:
-            return RefusedError("singular", f"{where}: the robot is singular there")
+            return RefusedError(RefusalCode.SINGULAR, f"{where}: the robot is singular there")
         violation = self._beyond(*rows)
         if violation is None:
-            return RefusedError("out_of_workspace", where)
+            return RefusedError(RefusalCode.OUT_OF_WORKSPACE, where)
         return RefusedError(
-            "out_of_workspace",
+            RefusalCode.OUT_OF_WORKSPACE,
             f"{where}: {violation}",
             slider=violation.what if violation.what in LEGS else None,
             value=violation.value,

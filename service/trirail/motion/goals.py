@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trirail.config import Limits
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
@@ -81,7 +81,7 @@ class Goals:
         try:
             found = _one_step(self._set_out(goal, schedule, rate))
         except RefusedError as error:
-            if schedule.commanded.at_rest or error.code == "wrong_start":
+            if schedule.commanded.at_rest or error.code is RefusalCode.WRONG_START:
                 raise
             found = None
         if found is not None:
@@ -130,7 +130,9 @@ class Goals:
                 return Extension(end, plan.path, plan.slowed)
             yield  # it is faster than at full speed, by an override
             plan = Plan(stretched(plan.path, SLOWER), SLOWER * plan.slowed)
-        raise RefusedError("no_plan", "no motion follows at this override: send the goal again when it is lower")
+        raise RefusedError(
+            RefusalCode.NO_PLAN, "no motion follows at this override: send the goal again when it is lower"
+        )
 
     def _check(self, goal: Goal) -> None:
         """Refuse what can be reached from nowhere."""

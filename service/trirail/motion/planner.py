@@ -10,7 +10,7 @@ import numpy as np
 from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 
 from trirail.config import PlatformLimits, SliderLimits
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
@@ -45,7 +45,7 @@ STANDS = 1e-6
 """Velocity at the ends of a trajectory that counts as rounding, and is taken for none [m/s, rad/s]."""
 
 TOO_FAST_IN_MOTION = RefusedError(
-    "too_fast", "from its present motion the robot cannot take this path within its sliders' limits"
+    RefusalCode.TOO_FAST, "from its present motion the robot cannot take this path within its sliders' limits"
 )
 
 
@@ -94,7 +94,7 @@ class Planner:
         """Raise RefusedError, with coordinate, value and limit, if a pose is out of the workspace."""
         if violation := self._bounds.pose(target):
             raise RefusedError(
-                "out_of_workspace",
+                RefusalCode.OUT_OF_WORKSPACE,
                 f"the goal is out of the workspace: {violation}",
                 value=violation.value,
                 limit=violation.limit,
@@ -107,7 +107,7 @@ class Planner:
             if not low <= position <= high:
                 limit = low if position < low else high
                 text = beyond(f"slider {name}: position", position, limit, "m")
-                raise RefusedError("out_of_workspace", text, slider=name, value=position, limit=limit)
+                raise RefusedError(RefusalCode.OUT_OF_WORKSPACE, text, slider=name, value=position, limit=limit)
 
     def lowered(
         self, velocity: Sequence[float] | None, acceleration: Sequence[float] | None, jerk: Sequence[float] | None
@@ -119,7 +119,7 @@ class Planner:
                     text = "limits.{} of {} is {}: the robot's limit is {}".format(
                         name, coordinate, *told_apart(value, limit)
                     )
-                    raise RefusedError("above_limit", text, value=value, limit=limit)
+                    raise RefusedError(RefusalCode.ABOVE_LIMIT, text, value=value, limit=limit)
         return Kinodynamic(
             velocity or self._platform.velocity,
             acceleration or self._platform.acceleration,
@@ -190,7 +190,7 @@ class Planner:
             return Plan(path)
         if not stretch:
             raise RefusedError(
-                "too_fast",
+                RefusalCode.TOO_FAST,
                 f"the trajectory is {slower:.3g} times too fast for {fastest(worst)}: "
                 f'let it take {slower * path.duration:.3g} s, or send it with "stretch": true',
                 value=slower,
@@ -247,7 +247,7 @@ class Planner:
                 return slow, factor
             factor *= found * A_HAIR_MORE
             yield
-        raise RefusedError("too_fast", f"the path does not fit its limits even {factor:.3g} times slower")
+        raise RefusedError(RefusalCode.TOO_FAST, f"the path does not fit its limits even {factor:.3g} times slower")
 
     def _jog(self, start: MotionState, velocity: Sequence[float], hold: float) -> tuple[float, float, Path]:
         """Return how long it takes to reach a velocity, and to brake from it, and the whole path."""
@@ -291,7 +291,9 @@ class Planner:
             request.max_jerk = [share * limit for limit in limits.jerk]
             if solved(self._ruckig, request, trajectory):
                 return from_ruckig(trajectory, in_sliders)
-        raise RefusedError("no_plan", "no motion leads there from the present one: send the goal again when it holds")
+        raise RefusedError(
+            RefusalCode.NO_PLAN, "no motion leads there from the present one: send the goal again when it holds"
+        )
 
 
 def _check_ends(points: Sequence[Point], start: MotionState) -> None:
@@ -300,16 +302,16 @@ def _check_ends(points: Sequence[Point], start: MotionState) -> None:
     What they begin or end with of an acceleration counts as the jerk over one cycle that it is (Checker.look).
     """
     if not start.at_rest:
-        raise RefusedError("wrong_start", "the robot moves: send the trajectory when it stands")
+        raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it stands")
     for name, given, stands in zip(COORDINATES, points[0].pose, start.pose, strict=True):
         if abs(given - stands) > START:
             text = "the trajectory begins at {} = {}, the robot is at {}: go there first".format(
                 name, *told_apart(given, stands)
             )
-            raise RefusedError("wrong_start", text, value=given, limit=stands)
+            raise RefusedError(RefusalCode.WRONG_START, text, value=given, limit=stands)
     ends = (
-        ("wrong_start", "begins", "let it begin at rest, as the robot stands", points[0]),
-        ("wrong_end", "ends", "let it end at rest", points[-1]),
+        (RefusalCode.WRONG_START, "begins", "let it begin at rest, as the robot stands", points[0]),
+        (RefusalCode.WRONG_END, "ends", "let it end at rest", points[-1]),
     )
     for code, does, remedy, point in ends:
         for name, unit, value in zip(COORDINATES, ("m/s", "m/s", "rad/s"), point.velocity or STILL, strict=True):

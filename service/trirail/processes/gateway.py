@@ -17,7 +17,7 @@ import zenoh
 from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_advanced_publisher
 
 from trirail.config import Config, geometry
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox, Incoming
 from trirail.processes.last_words import LastWords
@@ -26,7 +26,7 @@ from trirail.processes.state import StateMaker
 from trirail.telemetry.provenance import software, versions
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.links import Closed, Link
-from trirail.wire.messages import CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
+from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -45,15 +45,8 @@ from trirail.wire.packets import (
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_UNREAD
 from trirail.wire.text import is_name, quoted
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Command, Mode
 
-COMMANDS = ("enable", "disable", "stop", "quick_stop", "reset", "home", "pause", "resume", "override")
-CONTENT: dict[str, tuple[Any, str]] = {
-    "override": (Override, 'override takes {"percent": 0, or 1 to 200}'),
-    "stop": (Stop | None, 'stop takes nothing, or {"goal": id}'),
-}
-"""What commands may carry; the others carry nothing."""
-STOPPING = ("stop", "disable", "quick_stop", "pause")
 AT_ONCE = 256
 """Messages from Zenoh that are read before the loop is listened to again."""
 BACKLOG = 5_000
@@ -152,7 +145,7 @@ class Gateway:
                 *(waiting.incoming for waiting in self._waiting.values()),
                 *(goal[0] for goal in self._backlog),
             ]:
-                self._replies.send(incoming, ErrorReply("ended", "the service has ended"))
+                self._replies.send(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
             self._replies.close()
 
     def end(self) -> None:
@@ -177,13 +170,13 @@ class Gateway:
         except Closed:
             raise
         except Exception as error:  # noqa: BLE001 - a message that is read wrongly must not end the gateway
-            self._refuse(incoming, RefusedError("internal", f"internal error, please report it: {error!r}"))
+            self._refuse(incoming, RefusedError(RefusalCode.INTERNAL, f"internal error, please report it: {error!r}"))
 
     def _goal(self, incoming: Incoming) -> None:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
         goal: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
         if len(self._backlog) >= BACKLOG or self._backlog_bytes + incoming.size > MAX_UNREAD:
-            raise RefusedError("busy", f"{len(self._backlog)} goals are waiting already: send fewer")
+            raise RefusedError(RefusalCode.BUSY, f"{len(self._backlog)} goals are waiting already: send fewer")
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
         request = GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns())
@@ -207,25 +200,28 @@ class Gateway:
             self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
 
     def _command(self, incoming: Incoming) -> None:
-        user, name = boundary.names(incoming.key, self._key("cmd"), ("user", "command"))
-        if name not in COMMANDS:
-            raise RefusedError("unknown_command", f"{quoted(name)}: no such command; there are {', '.join(COMMANDS)}")
-        kind, takes = CONTENT.get(name, (NoContent | None, f"{name} takes no content"))
-        content = boundary.decode(incoming.payload, kind, takes, incoming.encoding)
+        user, called = boundary.names(incoming.key, self._key("cmd"), ("user", "command"))
+        try:
+            name = Command(called)
+        except ValueError as error:
+            problem = f"{quoted(called)}: no such command; there are {', '.join(Command)}"
+            raise RefusedError(RefusalCode.UNKNOWN_COMMAND, problem) from error
+        takes = f"{name} takes {name.content}"
+        content = boundary.decode(incoming.payload, CONTENT.get(name, NoContent | None), takes, incoming.encoding)
         share = content.percent / 100.0 if isinstance(content, Override) else None
         goal = content.goal if isinstance(content, Stop) else None
         reason = f"{name} by {user}"
         if goal is not None and self._withdraw(incoming, goal, reason):
             return
-        if len(self._commands) >= UNDER_WAY and name not in STOPPING:
-            raise RefusedError("busy", f"{len(self._commands)} commands are under way already: send fewer")
+        if len(self._commands) >= UNDER_WAY and not name.stops:
+            raise RefusedError(RefusalCode.BUSY, f"{len(self._commands)} commands are under way already: send fewer")
         self._tickets += 1
         if not self._link.send(message(CommandRequest(self._tickets, user, name, share, goal))):
-            raise RefusedError("busy", "too many requests at once: send it again")
+            raise RefusedError(RefusalCode.BUSY, "too many requests at once: send it again")
         self._commands.add(self._tickets)
-        within = self._home_within if name == "home" else REPLY_WITHIN
+        within = self._home_within if name is Command.HOME else REPLY_WITHIN
         self._waiting[self._tickets] = _Waiting(incoming, time.monotonic() + within)
-        if name in STOPPING and goal is None:
+        if name.stops and goal is None:
             replace = msgspec.structs.replace
             self._backlog = deque((waiting, replace(request, withdrawn=reason)) for waiting, request in self._backlog)
 
@@ -234,13 +230,13 @@ class Gateway:
         for number, (waiting, request) in enumerate(self._backlog):
             if request.id == goal_id:
                 self._backlog[number] = waiting, msgspec.structs.replace(request, withdrawn=reason)
-                self._replies.send(incoming, CommandReply("stop", self._states.newest().mode))
+                self._replies.send(incoming, CommandReply(Command.STOP, self._states.newest().mode))
                 return True
         return False
 
     def _too_much(self, incoming: Incoming) -> None:
         """Answer what there is no room for; called by Zenoh's threads."""
-        self._replies.send(incoming, ErrorReply("busy", "too many messages at once: send fewer"))
+        self._replies.send(incoming, ErrorReply(RefusalCode.BUSY, "too many messages at once: send fewer"))
 
     def _refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
         """Answer what cannot be taken; tell everyone too, since a put has no answer."""
@@ -322,7 +318,7 @@ class Gateway:
     def _give_up_late(self) -> None:
         now = time.monotonic()
         for ticket in [ticket for ticket, waiting in self._waiting.items() if waiting.deadline < now]:
-            self._answer(ticket, ErrorReply("timeout", "not carried out in time"))
+            self._answer(ticket, ErrorReply(RefusalCode.TIMEOUT, "not carried out in time"))
 
     def _key(self, *parts: str) -> str:
         return zenoh_session.key(self._robot, *parts)

@@ -76,7 +76,7 @@ class LastWords:
         missing = [Notice("fault", "error", reason)]
         for goal_id, user in self._open.items():
             words = f"goal {goal_id} faulted: {reason}"
-            missing.append(Notice("goal", "error", words, id=goal_id, outcome="faulted", user=user))
+            missing.append(Notice("goal", "error", words, id=goal_id, outcome="faulted", reason=reason, user=user))
         missing.append(Notice("mode", "info", f"{Mode.FAULT}: {reason}", mode=Mode.FAULT))
         t, wall = cycle * self._period, time.time()
         return [Event(self._seq + n, t, cycle, wall, **what._asdict()) for n, what in enumerate(missing, 1)]

@@ -100,7 +100,6 @@ class StateMaker:
             if goal
             else None,
             override=self._status.override,
-            lease=None,
             faults=(self._status.fault,) if self._status.fault else (),
             loop=LoopState(
                 rate_hz=self._rate_hz,

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from trirail_drivers.interface import PowerState
 
-from trirail.errors import RefusedError
+from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.records import LAYOUT, unpack
 from trirail.wire.sizes import MAX_MESSAGE
 from trirail.wire.text import NAME_RULE, is_name, printable, quoted
@@ -39,10 +39,10 @@ def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:
     """
     form = "/".join((prefix, *(f"<{name}>" for name in wanted)))
     if "*" in key:
-        raise RefusedError("wildcard", f"{quoted(key)}: name one robot and one user, as {form}")
+        raise RefusedError(RefusalCode.WILDCARD, f"{quoted(key)}: name one robot and one user, as {form}")
     parts = key.removeprefix(f"{prefix}/").split("/")
     if not key.startswith(f"{prefix}/") or len(parts) != len(wanted):
-        raise RefusedError("unknown_key", f"{quoted(key)}: no such key; there is {form}")
+        raise RefusedError(RefusalCode.UNKNOWN_KEY, f"{quoted(key)}: no such key; there is {form}")
     check_name(parts[0], "user")
     return parts
 
@@ -50,14 +50,14 @@ def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:
 def check_name(name: str, whose: str) -> str:
     """Return what may name a robot or user. Raises RefusedError."""
     if not is_name(name):
-        raise RefusedError("bad_name", f"{whose} {quoted(name)!r} cannot be in a key: {NAME_RULE} are taken")
+        raise RefusedError(RefusalCode.BAD_NAME, f"{whose} {quoted(name)!r} cannot be in a key: {NAME_RULE} are taken")
     return name
 
 
 def check_size(size: int) -> None:
     """Raise RefusedError for more bytes than are decoded."""
     if size > MAX_MESSAGE:
-        raise RefusedError("too_large", f"the message has {size} bytes: at most {MAX_MESSAGE} are taken")
+        raise RefusedError(RefusalCode.TOO_LARGE, f"the message has {size} bytes: at most {MAX_MESSAGE} are taken")
 
 
 def encoding(name: str) -> str:
@@ -65,7 +65,7 @@ def encoding(name: str) -> str:
     read_as = _READ_AS.get(name.split(";", maxsplit=1)[0])
     if read_as is None:
         problem = f"encoding {quoted(name)}: JSON ({JSON}, also where none is given) and {MSGPACK} are taken"
-        raise RefusedError("unknown_encoding", problem)
+        raise RefusedError(RefusalCode.UNKNOWN_ENCODING, problem)
     return read_as
 
 
@@ -76,9 +76,9 @@ def decode(payload: bytes, kind: Any, what: str, encoded: str = JSON) -> Any:
     try:
         return _decoder(kind, read_as).decode(payload or _NULL[read_as])
     except RecursionError as error:
-        raise RefusedError("malformed", f"{what}: nested too deep") from error
+        raise RefusedError(RefusalCode.MALFORMED, f"{what}: nested too deep") from error
     except (msgspec.MsgspecError, ValueError, OverflowError) as error:
-        raise RefusedError("malformed", f"{what}: {quoted(_plain(error))}") from error
+        raise RefusedError(RefusalCode.MALFORMED, f"{what}: {quoted(_plain(error))}") from error
 
 
 def encode(content: msgspec.Struct, encoded: str = JSON) -> bytes:
@@ -89,11 +89,13 @@ def encode(content: msgspec.Struct, encoded: str = JSON) -> bytes:
 def batch(payload: bytes) -> bytes:
     """Return packed records: at least one, all whole, of cycles that follow each other. Raises RefusedError."""
     if not payload or len(payload) % LAYOUT.size:
-        raise RefusedError("malformed", f"not records: {len(payload)} bytes, and each record has {LAYOUT.size}")
+        raise RefusedError(
+            RefusalCode.MALFORMED, f"not records: {len(payload)} bytes, and each record has {LAYOUT.size}"
+        )
     rows = unpack(payload)
     known = np.all(rows["mode"] < len(MODES)) and np.all(rows["drive_state"] < len(PowerState))
     if not known or rows["cycle"][0] < 0 or np.any(np.diff(rows["cycle"]) != 1):
-        raise RefusedError("malformed", "not records: modes, states or cycles that there are not")
+        raise RefusedError(RefusalCode.MALFORMED, "not records: modes, states or cycles that there are not")
     return payload
 
 

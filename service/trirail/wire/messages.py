@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 from trirail_drivers.interface import Triple
 
+from trirail.errors import RefusalCode
 from trirail.wire.sizes import MAX_NAME, MAX_POINTS
 from trirail.wire.text import ID_RULE, is_id, quoted
+from trirail.wire.vocabulary import Command
 
 SHORTEST_PIECE = 1e-4
 """Least time between two points of a trajectory [s]: below, its derivatives lose their digits."""
@@ -146,6 +148,10 @@ class NoContent(Struct, frozen=True, forbid_unknown_fields=True):
     """The content of the other commands."""
 
 
+CONTENT: dict[Command, Any] = {Command.OVERRIDE: Override, Command.STOP: Stop | None}
+"""What commands carry, with None where they may come without; those that are not here, NoContent | None."""
+
+
 def _check(message: Struct) -> None:
     """Refuse ids that cannot be shown, and numbers that are not finite, also in messages that were never decoded."""
     for name in message.__struct_fields__:
@@ -181,9 +187,10 @@ class CommandReply(Struct, frozen=True):
 
 
 class ErrorReply(Struct, frozen=True, omit_defaults=True):
-    """A goal or command was refused; nothing moved because of it."""
+    """A goal or command was refused, and nothing moved because of it, or a command could not be carried out."""
 
-    code: str
+    code: RefusalCode
+    """Why, for programs; a client takes a code that it does not know for "other"."""
     message: str
     slider: str | None = None
     value: float | None = None
@@ -206,10 +213,13 @@ class Event(Struct, frozen=True, omit_defaults=True):
     mode: str | None = None
     """The mode entered, with kind mode."""
     id: str | None = None
-    """The goal's id, with kind goal."""
+    """With kind goal, the goal that has ended; with kind mode, the goal with which the robot was set in motion."""
     outcome: Outcome | None = None
     """How the goal ended, with kind goal."""
+    reason: str | None = None
+    """Why it ended so, with kind goal; the message has it too."""
     user: str | None = None
+    """Who sent the goal, or what was refused."""
 
 
 class Commanded(Struct, frozen=True):
@@ -292,7 +302,6 @@ class State(Struct, frozen=True):
     sliders: Sliders
     goal: GoalState | None
     override: float
-    lease: str | None
     faults: tuple[str, ...]
     loop: LoopState
 

@@ -7,8 +7,10 @@ from enum import IntEnum
 from msgspec import Struct, msgpack, structs
 from trirail_drivers.interface import Counts, Triple
 
+from trirail.errors import RefusalCode
 from trirail.wire.messages import Event, Goal, Level
 from trirail.wire.sizes import MAX_PACKET
+from trirail.wire.vocabulary import Command
 
 
 class Kind(IntEnum):
@@ -36,7 +38,7 @@ class CommandRequest(Struct, frozen=True, tag=True):
 
     ticket: int
     user: str
-    name: str
+    name: Command
     value: float | None = None
     """The rate, for override."""
     goal: str | None = None
@@ -65,7 +67,7 @@ class Confirmed(Struct, frozen=True, tag=True):
     """Loop to gateway: the command has been carried out."""
 
     ticket: int
-    name: str
+    name: Command
     mode: str
 
 
@@ -73,7 +75,7 @@ class Refused(Struct, frozen=True, tag=True):
     """Loop to gateway: neither goal nor command was taken."""
 
     ticket: int
-    code: str
+    code: RefusalCode
     message: str
     slider: str | None = None
     value: float | None = None
@@ -168,5 +170,6 @@ def told(event: Event) -> bytes:
     if len(packet) <= MAX_PACKET:
         return packet
     words = f"{event.message[:1000]}… ({len(event.message)} characters)"
+    reason = event.reason and f"{event.reason[:1000]}…"
     name, user = (text and text[:100] for text in (event.id, event.user))
-    return message(Happened(structs.replace(event, message=words, id=name, user=user)))
+    return message(Happened(structs.replace(event, message=words, id=name, reason=reason, user=user)))

@@ -1,8 +1,9 @@
-"""The words that processes and clients share: what the robot can be doing."""
+"""The words that processes and clients share: what the robot can be doing, and what it can be told."""
 
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Self
 
 
 class Mode(StrEnum):
@@ -19,3 +20,44 @@ class Mode(StrEnum):
 
 MODES = tuple(Mode)
 """In the order in which records number them."""
+
+
+class Command(StrEnum):
+    """What the robot can be told beside goals: the name on the wire, one line of help, and what follows from it.
+
+    Each has, held by tests: an event of trirail.control.modes under the same name (but for override, which changes no
+    mode), a rule in trirail.control.completion, content in trirail.wire.messages.CONTENT, a method of
+    trirail.client.client.Robot, and a command of the command line.
+    """
+
+    help: str
+    """What it does, in one line for people."""
+    stops: bool
+    """Whether it brings motion to rest: it overtakes whatever waits, and goals sent before it do not begin."""
+    content: str
+    """What it takes, in words; its type is in trirail.wire.messages.CONTENT."""
+
+    ENABLE = "enable", "Power the drives up and hold."
+    DISABLE = "disable", "Stop and take power off the drives.", True
+    STOP = "stop", "Stop the robot within its limits.", True, 'nothing, or {"goal": id}'
+    QUICK_STOP = "quick_stop", "Stop every drive as fast as it can; the robot is in fault until a reset.", True
+    RESET = "reset", "Clear a fault whose cause is gone; the robot stays without power."
+    HOME = (
+        "home",
+        "Find where the sliders are, where the encoders are not absolute: one drive after the other, slowly.",
+    )
+    PAUSE = "pause", "Stop on the path and keep the goal.", True
+    RESUME = "resume", "Go on with a paused goal."
+    OVERRIDE = (
+        "override",
+        "Let motions run at a share of full speed, 0 or 1 to 200 %, never beyond the limits.",
+        False,
+        '{"percent": 0, or 1 to 200}',
+    )
+
+    def __new__(cls, name: str, help: str = "", stops: bool = False, content: str = "no content") -> Self:  # noqa: A002
+        """Make a member of its row; with a name alone, as for Command("stop"), the enumeration looks it up."""
+        member = str.__new__(cls, name)
+        member._value_ = name
+        member.help, member.stops, member.content = help, stops, content
+        return member

@@ -1,0 +1,90 @@
+"""Every command is known in every room through which it goes: Command is the table, the rooms follow from it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import message_schemas
+import msgspec
+import pytest
+from conftest import CONFIG, Rig
+from trirail.cli.commands import app
+from trirail.client.client import Robot
+from trirail.config import geometry
+from trirail.control.completion import verdict
+from trirail.control.feedback import Measured
+from trirail.control.modes import ModeEvent
+from trirail.wire import packets
+from trirail.wire.messages import CONTENT, CommandReply
+from trirail.wire.packets import Confirmed, Refused
+from trirail.wire.vocabulary import Command, Mode
+from trirail_drivers.interface import Feedback, PowerState
+
+GUIDE = Path(__file__).parents[1] / "service/README.md"
+every_command = pytest.mark.parametrize("name", Command)
+
+
+def test_modes_have_an_event_for_every_command_but_the_one_that_only_changes_the_rate() -> None:
+    assert {name.name for name in Command} - set(ModeEvent.__members__) == {"OVERRIDE"}
+
+
+@every_command
+@pytest.mark.parametrize("mode", Mode)
+def test_in_every_mode_there_is_a_rule_when_a_command_is_carried_out(name: Command, mode: Mode) -> None:
+    off = PowerState.SWITCH_ON_DISABLED
+    measured = Measured(geometry(CONFIG.geometry).packed(), CONFIG.period, 1e-3)
+    measured.start(Feedback((0.0, 0.0, 0.0), (off, off, off), None))
+    assert isinstance(verdict(name, mode, "why", measured, settled=True), str | None)
+
+
+def test_what_is_no_command_is_not_judged_as_one(rig: Rig) -> None:
+    with pytest.raises(AssertionError):
+        verdict("dance", Mode.HOLDING, None, rig.control.measured, settled=True)  # type: ignore[arg-type]
+    odd = packets.encode(packets.CommandRequest(1, "ann", "dance"))  # type: ignore[arg-type]
+    with pytest.raises(msgspec.ValidationError, match="dance"):
+        packets.decode_request(odd)
+
+
+@every_command
+@pytest.mark.parametrize("enabled", [False, True])
+def test_the_control_answers_every_command(rig: Rig, name: Command, enabled: bool) -> None:
+    if enabled:
+        rig.enable()
+    assert isinstance(rig.command(name), Confirmed | Refused)
+    assert rig.control.fault is None or name is Command.QUICK_STOP
+
+
+@every_command
+def test_a_client_has_a_method_for_every_command(name: Command) -> None:
+    sent: list[str] = []
+
+    class Deaf(Robot):
+        def __init__(self) -> None:
+            pass
+
+        def command(self, name: str, content: bytes | None = None) -> CommandReply:
+            sent.append(name)
+            return CommandReply(name, "holding")
+
+    getattr(Deaf(), name)(*(50.0,) * (name is Command.OVERRIDE))
+    assert sent == [name]
+
+
+@every_command
+def test_the_command_line_has_every_command_and_helps_with_it(name: Command) -> None:
+    typed = name.replace("_", "-")
+    assert name.help.endswith(".")
+    assert app[typed].help == name.help
+    app.parse_args([typed, *["50"] * (name is Command.OVERRIDE)], exit_on_error=False, print_error=False)
+
+
+@every_command
+def test_what_a_command_may_carry_has_a_type_words_and_a_schema(name: Command) -> None:
+    assert (name in CONTENT) == (name.content != "no content")
+    assert (name in CONTENT) == (message_schemas.FOLDER / f"command-{name}.json").exists()
+
+
+def test_the_guide_names_every_command() -> None:
+    (row,) = re.findall(r"^\| `cmd/<user>/<name>` .*$", GUIDE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert {name for name in Command if f"`{name}`" not in row} == set()

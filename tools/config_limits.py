@@ -1,0 +1,80 @@
+"""Which limit and which time-out stands where, and why there: a table of configs/README.md, for config_reference.py.
+
+A place is a key of the configuration, `section.key`, or what is fixed: a constant of a module with its unit,
+`module:NAME s`. Both are looked up when the table is made: none can be named that is not there, and what is fixed is
+told with the value in force.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import NamedTuple
+
+
+class Bound(NamedTuple):
+    """Something that is bounded: in words, where that stands, and what happens beyond."""
+
+    what: str
+    places: tuple[str, ...]
+    beyond: str
+
+
+INTRODUCTION = """\
+## Where a limit or time-out stands
+
+What the robot may do is in `[limits]`; what is asked of the drives, and by whom it is watched where they watch
+themselves, in `[drives]`; what the service watches, in `[watchdogs]`. What depends on no robot is fixed.
+A following error is bounded twice on purpose: by the drives, which go on watching when the service is dead, and by the
+service, which stops all three at once and whose limit should be the lower one.
+"""
+
+BOUNDS = (
+    Bound("Travel of sliders and platform", ("limits.slider.position", "limits.slider.passive", "limits.platform.x",
+          "limits.platform.y", "limits.platform.phi"), "a goal is refused, `out_of_workspace`"),
+    Bound("Nearness to a singular angle", ("limits.singularity_margin",), "the configuration is refused"),
+    Bound("Velocity, acceleration, jerk", ("limits.slider.velocity", "limits.slider.acceleration", "limits.slider.jerk",
+          "limits.platform.velocity", "limits.platform.acceleration", "limits.platform.jerk"),
+          "a goal is slowed; a trajectory without `stretch` is refused, `too_fast`"),
+    Bound("Following error, watched by the service", ("limits.slider.following_error",), "fault, all three stop"),
+    Bound("Following error, watched by the drives", ("drives.following_error",), "fault of that drive, all three stop"),
+    Bound("Ramp of a quick stop", ("drives.quick_stop_deceleration",), "none: it is what the drives brake with"),
+    Bound("Power up after `enable`", ("watchdogs.enable_timeout",), "fault"),
+    Bound("Power off after a quick stop or `disable`", ("drives.stop_timeout",), "fault; the command fails"),
+    Bound("A drive's answer while it is set up", ("drives.sdo_timeout",), "the service does not start"),
+    Bound("Heartbeats of drives and service", ("drives.heartbeat",), "fault or the drive's own stop, after three"),
+    Bound("Homing of one drive", ("drives.A.homing.timeout",), "fault"),
+    Bound("The bus takes no frames", ("trirail_drivers.wire:UNSENT_CYCLES cycles",), "fault"),
+    Bound("Ticks missed in a row", ("watchdogs.max_overruns",), "controlled stop"),
+    Bound("No sign of life from the gateway", ("watchdogs.gateway_timeout",), "controlled stop"),
+    Bound("No sign of life from a process", ("trirail.processes.supervisor:SILENT s",),
+          "it is killed; a gateway is started again, with the loop the service ends"),
+    Bound("Controlled stop when the service ends", ("trirail.processes.loop:SHUTDOWN s",), "the drives' quick stop"),
+    Bound("Goals that wait for the one under way", ("motion.queue",), "refused, `queue_full`"),
+    Bound("Wait of a goal for those before it", ("trirail.processes.gateway:PATIENCE s",),
+          "refused, `stopped`; a goal may have its own, `valid_for`: `expired`"),
+    Bound("Renewal of a jog", (), "the robot brakes, `jog_over`"),
+    Bound("A command, as the service waits for it", ("trirail.processes.gateway:REPLY_WITHIN s",),
+          "error `timeout`; for `home` later by the time-outs of homing"),
+    Bound("A command, as the client waits for it", ("trirail.client.client:REPLY_WITHIN s",
+          "trirail.client.client:HOME_WITHIN s"), "`ServiceError`; the longer one is for `home`"),
+    Bound("Size of recordings", ("telemetry.rotate_minutes", "telemetry.rotate_mb", "telemetry.keep_mb"),
+          "another file begins, the oldest is deleted"),
+)  # fmt: skip
+
+
+def table(known: set[str]) -> str:
+    """Return the table. `known` are the keys of the configuration; KeyError for a place that is not there."""
+    rows = [f"| {what} | {', '.join(_said(place, known) for place in places) or 'each goal, `timeout`'} | {beyond} |"
+            for what, places, beyond in BOUNDS]  # fmt: skip
+    return "\n".join([INTRODUCTION, "| what is bounded | where | beyond it |", "|---|---|---|", *rows]) + "\n"
+
+
+def _said(place: str, known: set[str]) -> str:
+    module, _, constant = place.partition(":")
+    if constant:
+        name, unit = constant.split(" ")
+        return f"fixed: {vars(importlib.import_module(module))[name]:g} {unit}, `{name}` in `{module}`"
+    if place not in known:
+        raise KeyError(place)
+    section, _, key = place.rpartition(".")
+    return f"`[{section}] {key}`"
