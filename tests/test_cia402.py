@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import can
 import canopen
 import msgspec
 import pytest
-from trirail_drivers import frames
+from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.settings import interpolation_period, settings_of
 from trirail_drivers.config import Drive, Drives, Homing
 from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState, Triple
+from trirail_drivers.protocols import CIA402
 from trirail_drivers.scaling import scale_of
-from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDevice, SimulatedDrive
+from trirail_drivers.simulated import Frames, Servo, SimulatedBus, SimulatedDevice, SimulatedDrive
 from trirail_drivers.simulated.dictionary import Entry
+from trirail_drivers.simulated.faults import Faults
 
 P = PowerState
 PERIOD = 0.001
@@ -55,14 +57,16 @@ class Clock:
 class Bus(SimulatedBus):
     """The simulated bus, with a record of what the master sends, ways to break it, and waits in no time."""
 
-    def __init__(self, drives: Sequence[SimulatedDevice], clock: Clock) -> None:
+    def __init__(
+        self, drives: Sequence[SimulatedDevice], clock: Clock, fault_frames: Mapping[str, Frames] = CIA402.fault_frames
+    ) -> None:
         self.time = clock
         self.sent: list[tuple[int, bytes]] = []
         self.broken = False
         self.shutdowns = 0
         self.late: int | None = None
         """On a real bus, a cycle reads the answers to the SYNC before its own: how many of these are left."""
-        super().__init__(drives, clock)
+        super().__init__(drives, clock, Faults(drives, [1.0] * len(drives), fault_frames))
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if self.broken:

@@ -24,6 +24,7 @@ from trirail_drivers.interface import Feedback, PowerState, Triple
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.drives import SETTLING, Odrive
 from trirail_drivers.odrive.frames import AxisState, Error, Result
+from trirail_drivers.protocols import ODRIVE
 from trirail_drivers.simulated import Servo, SimulatedOdrive
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
 
@@ -63,7 +64,7 @@ class Rig:
             )
             for drive, start in zip(config.each, START, strict=True)
         ]
-        self.bus = Bus(self.devices, self.clock)
+        self.bus = Bus(self.devices, self.clock, ODRIVE.fault_frames)
         self.drives = Odrive(self.bus, 1_000_000, config, self.clock)
         self.target = START
 

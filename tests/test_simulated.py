@@ -8,8 +8,9 @@ from struct import pack, unpack
 import can
 import pytest
 from trirail_drivers import config
+from trirail_drivers.bus import simulated_bus
 from trirail_drivers.interface import PowerState
-from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive, simulated_bus
+from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from trirail_drivers.simulated.drive import EDS
 
 NODE = 5

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from trirail_drivers import axis, frames
+from trirail_drivers import axis
+from trirail_drivers.cia402 import frames
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.scaling import Scale
 

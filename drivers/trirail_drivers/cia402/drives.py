@@ -14,10 +14,11 @@ from collections.abc import Callable
 
 import can
 
-from trirail_drivers import config, frames, load
-from trirail_drivers.cia402 import setup
+from trirail_drivers import config, load
+from trirail_drivers.cia402 import frames, setup
 from trirail_drivers.cia402.axis import Axis
 from trirail_drivers.cia402.homing import Homing
+from trirail_drivers.frames import data_frame
 from trirail_drivers.interface import NAMES, DriveFault, Feedback, PowerState, Triple
 from trirail_drivers.scaling import scale_of
 from trirail_drivers.wire import Wire
@@ -63,10 +64,8 @@ class Cia402:
             self._wire.listen(frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
             self._wire.listen(frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
         self._homing = Homing(self._axes, drives, self._wire.send)
-        self._sync = frames.message(frames.SYNC, b"")
-        self._heartbeat = frames.message(
-            frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL)
-        )
+        self._sync = data_frame(frames.SYNC, b"")
+        self._heartbeat = data_frame(frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL))
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._off_by = math.inf
@@ -90,7 +89,7 @@ class Cia402:
         A drive in fault is not an error here; feedback tells of it and `reset` clears it.
         """
         rate = 1.0 / period
-        self.bus_load = load.checked(rate, self._bitrate, self._drives)
+        self.bus_load = frames.TRAFFIC.checked(rate, self._bitrate, self._drives.heartbeat)
         scales = tuple(axis.scale for axis in self._axes)
         starts = setup.configure(self._wire.bus, self._drives, scales, period, self._clock)
         for axis, start in zip(self._axes, starts, strict=True):
@@ -132,7 +131,7 @@ class Cia402:
             axis.answers.read_over()
             if axis.mute:
                 axis.mute = False
-                self._wire.send(frames.message(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
+                self._wire.send(data_frame(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
             fault = axis.fault(now, self._wanted) if self._wire.fault is None else None
             if fault is not None:
                 self._wire.fail(fault)
@@ -176,7 +175,7 @@ class Cia402:
                 text = f"drive {axis.name}: cannot take setpoint {metres:g} m, {rate:g} m/s"
                 self._wire.fail(DriveFault(axis.name, "setpoint", 0, text))
                 return
-            messages.append(frames.message(frames.RPDO2 + axis.node, data))
+            messages.append(data_frame(frames.RPDO2 + axis.node, data))
         for axis, message in zip(self._axes, messages, strict=True):
             if not self._wire.send(message):
                 axis.setpoints_lost += 1
@@ -248,9 +247,9 @@ class Cia402:
             self._wait_for_standstill()
         off = frames.CONTROLWORD.pack(frames.DISABLE_VOLTAGE)
         for axis in self._axes:
-            self._wire.send(frames.message(frames.RPDO1 + axis.node, off))
+            self._wire.send(data_frame(frames.RPDO1 + axis.node, off))
             # PDOs are heard in NMT operational only, SDOs in pre-operational too: two bytes for object 6040h.
-            self._wire.send(frames.message(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00"))
+            self._wire.send(data_frame(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00"))
         for axis in self._axes:
             self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
         with contextlib.suppress(can.CanError, OSError):
@@ -263,7 +262,7 @@ class Cia402:
             word = self._word(axis, now)
             repeat = axis.command_age >= REPEAT_AFTER and self._is_not_followed(axis, word)
             if (word != axis.controlword or repeat) and self._wire.send(
-                frames.message(frames.RPDO1 + axis.node, frames.CONTROLWORD.pack(word))
+                data_frame(frames.RPDO1 + axis.node, frames.CONTROLWORD.pack(word))
             ):
                 axis.controlword = word
                 axis.command_age = 0

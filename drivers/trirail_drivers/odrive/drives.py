@@ -104,7 +104,7 @@ class Odrive:
         A drive with errors is not an error here; feedback tells of it and `reset` clears it.
         """
         rate = 1.0 / period
-        self.bus_load = load.checked(rate, self._bitrate, self._drives)
+        self.bus_load = frames.TRAFFIC.checked(rate, self._bitrate, self._drives.heartbeat)
         self._period = period
         setup.configure(self._wire, self._axes, self._drives, self._clock)
         if warning := load.warning(rate, self.bus_load):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -17,8 +17,7 @@ from trirail_drivers.interface import NAMES, PowerState
 from trirail_drivers.simulated.devices import SimulatedDevice
 from trirail_drivers.simulated.drive import SimulatedDrive
 from trirail_drivers.simulated.emergency import Emergencies
-from trirail_drivers.simulated.faultlines import CANOPEN, ODRIVE, Condition, Fault, FaultSyntaxError, Frames, parse
-from trirail_drivers.simulated.odrive import SimulatedOdrive
+from trirail_drivers.simulated.faultlines import Condition, Fault, FaultSyntaxError, Frames, parse
 
 MOVING: Final = 1e-3
 """A slider moves from this speed on [m/s]."""
@@ -64,13 +63,17 @@ class Faults:
         self,
         drives: Sequence[SimulatedDevice],
         counts_per_metre: Sequence[float],
+        frames: Mapping[str, Frames],
         seed: int = 0,
         tell: Callable[[str], None] = _to_nobody,
     ) -> None:
-        """`counts_per_metre`: negative where counts fall as the slider rises. `tell`: hears what begins and ends."""
+        """`counts_per_metre`: negative where counts fall as the slider rises. `frames`: those that lines can name.
+
+        `tell`: hears what begins and ends.
+        """
         self.tell = tell
         self._drives = drives
-        self._names = ODRIVE if any(isinstance(drive, SimulatedOdrive) for drive in drives) else CANOPEN
+        self._frames = frames
         self._scales = counts_per_metre
         self._random = random.Random(seed)
         self._active: list[_Active] = []
@@ -101,7 +104,7 @@ class Faults:
 
     def add(self, line: str) -> None:
         """Take up a line. Raises FaultSyntaxError."""
-        fault = parse(line, self._names)
+        fault = parse(line, self._frames)
         if fault.name == "emcy":
             for index in fault.drives:
                 if not isinstance(self._drives[index], SimulatedDrive):
