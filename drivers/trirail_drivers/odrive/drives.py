@@ -11,37 +11,29 @@ clocks, none or two of them in a cycle now and then, and nobody could tell their
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import math
 import struct
 import time
 from collections import deque
-from collections.abc import Callable
 
 import can
 
-from trirail_drivers import config, load
+from trirail_drivers import config
 from trirail_drivers.axis import MISSED_ANSWERS
-from trirail_drivers.interface import NAMES, DriveFault, Feedback, Triple
+from trirail_drivers.driver import Clock, Driver
+from trirail_drivers.interface import DriveFault, Feedback, Triple
 from trirail_drivers.odrive import frames, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
 from trirail_drivers.ramp import braked
-from trirail_drivers.scaling import scale_of
-from trirail_drivers.wire import Wire
 
 SETTLING = 0.05
 """How long a drive holds at the end of a quick stop before its power is taken off, for its servo to catch up [s]."""
 
-Clock = Callable[[], float]
 
-
-class Odrive:
-    """Three drives on one CAN bus; see trirail_drivers.interface.Drives.
-
-    A fault of one drive is a fault of the robot: what is latched takes all three down their quick-stop ramps
-    beginning in the same cycle, and `enable` does nothing until `reset`.
+class Odrive(Driver[OdriveAxis]):
+    """Three ODrives on one CAN bus.
 
     An ODrive has no quick stop of its own. Its Estop and its idle state let the motor coast, and to put it into
     velocity control with a ramp is to change modes under power, which ODrive advises against, to a ramp that CANSimple
@@ -53,15 +45,7 @@ class Odrive:
 
     def __init__(self, bus: can.BusABC, bitrate: int, drives: config.Drives, clock: Clock = time.monotonic) -> None:
         setup.check_nodes(drives)
-        self.bus_load = 0.0
-        self._bitrate = bitrate
-        self._drives = drives
-        self._clock = clock
-        self._axes = tuple(
-            OdriveAxis(name, drive.node, scale_of(name, drive), drives.heartbeat)
-            for name, drive in zip(NAMES, drives.each, strict=True)
-        )
-        self._wire = Wire(bus, self._stop)
+        super().__init__(bus, bitrate, drives, clock, OdriveAxis)
         for axis in self._axes:
             for number, handler in (
                 (frames.GET_VERSION, axis.on_version),
@@ -73,7 +57,6 @@ class Odrive:
         self._requests = tuple(frames.request(axis.node, frames.GET_ENCODER_ESTIMATES) for axis in self._axes)
         self._error_requests = itertools.cycle(frames.request(axis.node, frames.GET_ERROR) for axis in self._axes)
         self._errors_due: float | None = None
-        self._period = 0.0
         self._enabled = False
         self._braking: float | None = None
         """Time since a quick stop has brought the setpoints to a standstill [s]; None where none is under way."""
@@ -85,17 +68,6 @@ class Odrive:
         """Positions that the bus has taken last [m]."""
         self._due: deque[Triple | None] = deque([None] * MISSED_ANSWERS, maxlen=MISSED_ANSWERS)
         """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
-        self._off_by = math.inf
-        """When the drives must have lost their power [s]; inf where that was not asked for, or has been told of."""
-        self._asked = ""
-        """By what that was asked for."""
-        self._synced = 0.0
-        self._closed = False
-
-    @property
-    def traffic(self) -> int:
-        """Bits of all frames on the bus since the start, each with worst-case stuffing."""
-        return self._wire.traffic
 
     def configure(self, period: float) -> None:
         """Find the drives and leave them without power, for a cycle of `period` seconds.
@@ -103,12 +75,8 @@ class Odrive:
         Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout for a drive that is not there.
         A drive with errors is not an error here; feedback tells of it and `reset` clears it.
         """
-        rate = 1.0 / period
-        self.bus_load = frames.TRAFFIC.checked(rate, self._bitrate, self._drives.heartbeat)
-        self._period = period
+        self._set_period(period, frames.TRAFFIC)
         setup.configure(self._wire, self._axes, self._drives, self._clock)
-        if warning := load.warning(rate, self.bus_load):
-            self._wire.warn(warning)
 
     def sync(self) -> None:
         """Send the setpoints written since the last cycle, which are in force on arrival; ask for the positions.
@@ -148,8 +116,7 @@ class Odrive:
             fault = self._found(now)
             if fault is not None:
                 self._wire.fail(fault)
-        if now >= self._off_by:
-            self._take_power_off()
+        self._watch_stopping(now)
         a, b, c = self._axes
         on = self._enabled
         return Feedback(
@@ -171,8 +138,7 @@ class Odrive:
             return
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             if not self._sendable(axis, metres, rate):
-                text = f"drive {axis.name}: cannot take setpoint {metres:g} m, {rate:g} m/s"
-                self._wire.fail(DriveFault(axis.name, "setpoint", 0, text))
+                self._refuse_setpoint(axis, metres, rate)
                 return
         self._next = position, velocity
         if self._clock() - self._synced > self._period:
@@ -216,7 +182,7 @@ class Odrive:
         if self._braking is not None:
             return
         self._give_time_to_stop("quick stop")
-        powering = self._enabled or any(axis.powered for axis in self._axes)
+        powering = self._enabled or self._powered()
         self._enabled = False
         if self._sent is None or not powering:
             self._command()
@@ -239,39 +205,19 @@ class Odrive:
             if axis.errors:
                 self._wire.send(frames.command(axis.node, frames.CLEAR_ERRORS, frames.CLEAR.pack(0)))
 
-    def close(self) -> None:
-        """Leave the drives without power, and let go of the bus.
-
-        Drives that still have power are first brought to a standstill by the ramp.
-        """
-        if self._closed:
-            return
-        self._closed = True
-        with contextlib.suppress(can.CanError, OSError):
-            self._wait_for_standstill()
+    def _leave(self) -> None:
         idle = frames.AXIS_STATE.pack(AxisState.IDLE)
         for axis in self._axes:
             self._wire.send(frames.command(axis.node, frames.SET_AXIS_STATE, idle))
-        with contextlib.suppress(can.CanError, OSError):
-            self._wire.bus.shutdown()
 
-    def _stop(self) -> None:
-        """Drives that have power, or are getting it, are stopped with the first fault."""
-        if self._enabled:
-            self.quick_stop()
+    def _wants_power(self) -> bool:
+        return self._enabled
 
-    def _give_time_to_stop(self, asked: str) -> None:
-        self._off_by, self._asked = self._clock() + self._drives.stop_timeout, asked
+    def _powered(self) -> bool:
+        return any(axis.powered for axis in self._axes)
 
-    def _take_power_off(self) -> None:
-        """Tell of a drive that has not stopped in time, once; none is led down the ramp any longer."""
-        self._off_by = math.inf
+    def _give_up_stopping(self) -> None:
         self._braking = None
-        for axis in self._axes:
-            fault = axis.late_for(self._asked, self._drives.stop_timeout)
-            if fault is not None:
-                self._wire.fault = fault
-                return
 
     def _found(self, now: float) -> DriveFault | None:
         """The first thing that is wrong."""
@@ -355,13 +301,8 @@ class Odrive:
         )
         return (a, b, c), (da, db, dc)
 
-    def _wait_for_standstill(self) -> None:
-        """Go on with the cycle until no drive has power, for as long as a stop may take."""
-        if not any(axis.powered for axis in self._axes):
-            return
-        self.quick_stop()
-        deadline = self._clock() + self._drives.stop_timeout
-        while any(axis.powered for axis in self._axes) and (now := self._clock()) < deadline:
+    def _wait_for_standstill(self, deadline: float) -> None:
+        while self._powered() and (now := self._clock()) < deadline:  # the cycle goes on, for it leads the ramp
             self.sync()
             while (left := now + self._period - self._clock()) > 0.0:
                 message = self._wire.bus.recv(left)
