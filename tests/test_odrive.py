@@ -22,8 +22,9 @@ from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState, Triple
 from trirail_drivers.odrive import frames
-from trirail_drivers.odrive.drives import SETTLING, Odrive
+from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.odrive.frames import AxisState, Error, Result
+from trirail_drivers.odrive.setpoints import SETTLING
 from trirail_drivers.protocols import ODRIVE
 from trirail_drivers.simulated import Servo, SimulatedOdrive
 from trirail_drivers.simulated.faultlines import FaultSyntaxError

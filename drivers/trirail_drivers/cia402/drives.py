@@ -23,11 +23,6 @@ from trirail_drivers.interface import Feedback, PowerState, Triple
 REPEAT_AFTER = 3
 """A controlword that a drive does not follow is sent again after so many SYNCs: the frame may be lost."""
 
-_ON_THE_WAY = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON)
-"""States from which a drive that is to be enabled goes on by controlwords."""
-_CAN_MOVE_OR_SOON = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED)
-"""States in which no drive stays that has been told to stop or to lose power."""
-
 
 class Cia402(Driver[Axis]):
     """Three CiA 402 drives on one CAN bus."""
@@ -207,29 +202,13 @@ class Cia402(Driver[Axis]):
         """Send the controlwords that are due: one transition per drive at a time."""
         now = self._clock()
         for axis in self._axes:
-            word = self._word(axis, now)
-            repeat = axis.command_age >= REPEAT_AFTER and self._is_not_followed(axis, word)
+            word = axis.word(now, self._next)
+            repeat = axis.command_age >= REPEAT_AFTER and axis.is_not_followed(word, self._next)
             if (word != axis.controlword or repeat) and self._wire.send(
                 data_frame(frames.RPDO1 + axis.node, frames.CONTROLWORD.pack(word))
             ):
                 axis.controlword = word
                 axis.command_age = 0
-
-    def _word(self, axis: Axis, now: float) -> int:
-        """The controlword that a drive is to have now."""
-        if axis.state is PowerState.FAULT and now < axis.reset_until:
-            # Bit 7 stays up until the drive is out of fault: some look at it once in a few cycles only.
-            return frames.FAULT_RESET
-        word = frames.controlword(axis.state, self._next)
-        return word | axis.mode_bits if word == frames.ENABLE_OPERATION else word
-
-    def _is_not_followed(self, axis: Axis, word: int) -> bool:
-        """Whether a controlword, by what the drive says, has not taken it where it is to go."""
-        if self._next is PowerState.OPERATION_ENABLED:
-            return axis.state in _ON_THE_WAY or not axis.cyclic  # of its mode's bits the state does not tell
-        if axis.state is PowerState.QUICK_STOP_ACTIVE:
-            return word == frames.DISABLE_VOLTAGE
-        return axis.state in _CAN_MOVE_OR_SOON
 
     @property
     def _next(self) -> frames.Wanted:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import struct
 import time
 from collections import deque
 
@@ -26,10 +25,7 @@ from trirail_drivers.interface import DriveFault, Feedback, Triple
 from trirail_drivers.odrive import frames, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
-from trirail_drivers.ramp import braked
-
-SETTLING = 0.05
-"""How long a drive holds at the end of a quick stop before its power is taken off, for its servo to catch up [s]."""
+from trirail_drivers.odrive.setpoints import Setpoints
 
 
 class Odrive(Driver[OdriveAxis]):
@@ -58,14 +54,7 @@ class Odrive(Driver[OdriveAxis]):
         self._error_requests = itertools.cycle(frames.request(axis.node, frames.GET_ERROR) for axis in self._axes)
         self._errors_due: float | None = None
         self._enabled = False
-        self._braking: float | None = None
-        """Time since a quick stop has brought the setpoints to a standstill [s]; None where none is under way."""
-        self._next: tuple[Triple, Triple] | None = None
-        """Setpoints [m], [m/s] to be sent at the next SYNC."""
-        self._sent: tuple[Triple, Triple] | None = None
-        """Setpoints sent last; None where no drive has been sent any since enabling."""
-        self._in_force: list[float] = []
-        """Positions that the bus has taken last [m]."""
+        self._setpoints = Setpoints(self._axes, self._wire, drives.quick_stop_deceleration)
         self._due: deque[Triple | None] = deque([None] * MISSED_ANSWERS, maxlen=MISSED_ANSWERS)
         """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
 
@@ -76,6 +65,7 @@ class Odrive(Driver[OdriveAxis]):
         A drive with errors is not an error here; feedback tells of it and `reset` clears it.
         """
         self._set_period(period, frames.TRAFFIC)
+        self._setpoints.period = period
         setup.configure(self._wire, self._axes, self._drives, self._clock)
 
     def sync(self) -> None:
@@ -92,12 +82,9 @@ class Odrive(Driver[OdriveAxis]):
                 axis.heard = now
                 axis.answers.forgive()
         self._wire.receive(now)
-        self._due.append(self._sent[0] if self._sent is not None else None)
-        if self._braking is not None:
-            self._brake()
-        # Without power none is sent: a drive that has missed losing it is to stay where the ramp has ended.
-        if self._next is not None and (self._enabled or self._braking is not None):
-            self._set(*self._next)
+        sent = self._setpoints.sent
+        self._due.append(sent[0] if sent is not None else None)
+        self._setpoints.step(self._enabled)
         self._command()
         for axis, request in zip(self._axes, self._requests, strict=True):
             self._wire.send(request)
@@ -134,13 +121,12 @@ class Odrive(Driver[OdriveAxis]):
         Setpoints that are not finite, or beyond what a message holds, are not sent but a fault of cause "setpoint".
         During a quick stop they are left aside.
         """
-        if self._braking is not None:
+        if self._setpoints.stopping:
             return
-        for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
-            if not self._sendable(axis, metres, rate):
-                self._refuse_setpoint(axis, metres, rate)
-                return
-        self._next = position, velocity
+        if (axis := self._setpoints.take(position, velocity)) is not None:
+            number = self._axes.index(axis)
+            self._refuse_setpoint(axis, position[number], velocity[number])
+            return
         if self._clock() - self._synced > self._period:
             for axis in self._axes:
                 axis.setpoints_late += 1
@@ -153,8 +139,7 @@ class Odrive(Driver[OdriveAxis]):
         if self._wire.fault is not None or self._enabled:
             return
         self._enabled = True
-        self._braking = self._sent = None
-        self._in_force = []
+        self._setpoints.begin()
         self._off_by = math.inf
         for axis in self._axes:
             axis.powered_up = False
@@ -170,7 +155,7 @@ class Odrive(Driver[OdriveAxis]):
         """Take power off; meant for a robot at standstill. A drive that keeps it is a fault, of cause "timeout"."""
         self._give_time_to_stop("disable")
         self._enabled = False
-        self._braking = None
+        self._setpoints.abandon()
         self._command()
 
     def quick_stop(self) -> None:
@@ -179,20 +164,15 @@ class Odrive(Driver[OdriveAxis]):
         A drive that has it after `stop_timeout` is told to lose it at once, and is a fault, of cause "timeout", that
         takes the place of the one that stopped it.
         """
-        if self._braking is not None:
+        if self._setpoints.stopping:
             return
         self._give_time_to_stop("quick stop")
         powering = self._enabled or self._powered()
         self._enabled = False
-        if self._sent is None or not powering:
+        if self._setpoints.sent is None or not powering:
             self._command()
-            return
-        self._braking = 0.0
-        # The position in force stays; what the drives are to run on with is less from now on.
-        a, b, c = self._in_force
-        _, slower = self._braked(self._sent[1])
-        self._set((a, b, c), slower)
-        self._next = None
+        else:
+            self._setpoints.stop()
 
     def reset(self) -> None:
         """Forget the fault and clear the drives' own; never powers them up. What persists is found again."""
@@ -217,7 +197,7 @@ class Odrive(Driver[OdriveAxis]):
         return any(axis.powered for axis in self._axes)
 
     def _give_up_stopping(self) -> None:
-        self._braking = None
+        self._setpoints.abandon()
 
     def _found(self, now: float) -> DriveFault | None:
         """The first thing that is wrong."""
@@ -238,26 +218,6 @@ class Odrive(Driver[OdriveAxis]):
                 )
         return None
 
-    def _sendable(self, axis: OdriveAxis, metres: float, rate: float) -> bool:
-        try:
-            frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
-        except (ValueError, OverflowError, struct.error):
-            return False
-        return math.isfinite(metres)  # a float that is not a number is packed like any other
-
-    def _set(self, position: Triple, velocity: Triple) -> None:
-        """Send setpoints; each is in force when it arrives."""
-        self._sent = sent = position, velocity
-        self._in_force = self._in_force or list(position)
-        for number, (axis, metres, rate) in enumerate(zip(self._axes, position, velocity, strict=True)):
-            data = frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
-            if self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
-                self._in_force[number] = metres
-            else:
-                axis.setpoints_lost += 1
-            if self._sent is not sent:
-                return  # what could not be sent has begun a quick stop, whose setpoints are newer
-
     def _command(self) -> None:
         """Ask drives for the state they should be in, once, and again where a heartbeat shows another."""
         for axis in self._axes:
@@ -274,32 +234,8 @@ class Odrive(Driver[OdriveAxis]):
     def _wanted(self) -> AxisState | None:
         """The state that drives should be in now; None leaves them as they are."""
         if not self._enabled:
-            return AxisState.IDLE if self._braking is None else None
-        return AxisState.CLOSED_LOOP_CONTROL if self._sent is not None else None
-
-    def _brake(self) -> None:
-        """One period further down the ramp; at its end, power off.
-
-        Where the bus takes no setpoint the time goes on, but the place does not: a drive that hears nothing stands
-        soon, and is not to catch up with the ramp when the bus is back.
-        """
-        if self._sent is None or self._braking is None:
-            return
-        _, velocity = self._sent
-        self._next = self._braked(velocity)
-        if any(velocity):
-            return
-        self._braking += self._period
-        if self._braking > SETTLING:
-            self._braking = None
-
-    def _braked(self, velocity: Triple) -> tuple[Triple, Triple]:
-        """Setpoints one period further down the ramp from those in force, of this velocity."""
-        deceleration, period = self._drives.quick_stop_deceleration, self._period
-        (a, da), (b, db), (c, dc) = (
-            braked(place, rate, deceleration, period) for place, rate in zip(self._in_force, velocity, strict=True)
-        )
-        return (a, b, c), (da, db, dc)
+            return None if self._setpoints.stopping else AxisState.IDLE
+        return AxisState.CLOSED_LOOP_CONTROL if self._setpoints.sent is not None else None
 
     def _wait_for_standstill(self, deadline: float) -> None:
         while self._powered() and (now := self._clock()) < deadline:  # the cycle goes on, for it leads the ramp
