@@ -13,6 +13,7 @@ from types import ModuleType
 import pytest
 import test_cia402
 import test_odrive
+from rigs import Bus, DeviceRig
 from test_cia402 import PERIOD
 from trirail_drivers.cia402 import frames as canopen
 from trirail_drivers.cia402 import homing, sdo, settings
@@ -211,32 +212,26 @@ def test_odrive_states_and_errors() -> None:
 # ---------------------------------------------------------------------- what is on the bus
 
 
-class Device:
-    """A simulated drive, the frames it sends, and the time."""
-
-    def __init__(self, drive: SimulatedDrive | SimulatedOdrive) -> None:
-        self.drive = drive
-        self.now = 100.0
-        self.heard: list[str] = []
-        drive.connect(lambda can_id, data: self.heard.append(f"{can_id:03X}#{data.hex().upper()}"), self.now)
-
-    def take(self) -> list[str]:
-        heard, self.heard = self.heard, []
-        return heard
+class Device(DeviceRig[SimulatedDrive | SimulatedOdrive]):
+    """A simulated drive, asked and heard in candump's form."""
 
     def answer(self, frame: str) -> list[str]:
-        """What it answers to a frame in candump's form, as 601#4041600000000000 or 069#R."""
+        """What it answers to a frame as 601#4041600000000000 or 069#R."""
         can_id, _, data = frame.partition("#")
         if data == "R":
             self.drive.receive_remote(int(can_id, 16), self.now)
         else:
             self.drive.receive(int(can_id, 16), bytes.fromhex(data), self.now)
-        return self.take()
+        return self.said()
 
-    def wait(self, seconds: float) -> list[str]:
+    def said(self) -> list[str]:
+        return [f"{can_id:03X}#{data.hex().upper()}" for can_id, data in self.take()]
+
+    def after(self, seconds: float) -> list[str]:
+        """What it says when it is looked at for the first time after so long."""
         self.now += seconds
         self.drive.poll(self.now)
-        return self.take()
+        return self.said()
 
 
 def servo(position: float) -> Servo:
@@ -259,28 +254,28 @@ PDOS = (
 
 def test_a_simulated_cia402_drive_by_its_bytes() -> None:
     device = Device(SimulatedDrive(5, servo(0x0012_3456)))
-    assert device.take() == ["705#00"]  # boot-up
+    assert device.said() == ["705#00"]  # boot-up
     # SDO, expedited: device type 1000h, a servo as CiA 402 has it; one, two, four bytes; an object that is not there.
     assert device.answer("605#4000100000000000") == ["585#4300100092010200"]
     assert device.answer("605#2F60600008000000") == ["585#6060600000000000"]
     assert device.answer("605#2B17100064000000") == ["585#6017100000000000"]
-    assert device.wait(0.001) == ["705#7F"]
+    assert device.after(0.001) == ["705#7F"]
     assert device.answer("605#2306100010270000") == ["585#6006100000000000"]
     assert device.answer("605#4000300000000000") == ["585#8000300000000206"]
     for request in PDOS:
         assert device.answer(f"605#{request}") == [f"585#60{request[2:8]}00000000"]
     assert device.answer("000#0105") == ["185#5002"]  # start node 5: switch on disabled
     assert device.answer("080#") == ["285#56341200"]
-    assert device.wait(0.1) == ["705#05"]
+    assert device.after(0.1) == ["705#05"]
     # Shutdown, switch on, enable operation, quick stop.
     for controlword, statusword in (("0600", "3102"), ("0700", "3302"), ("0F00", "3712"), ("0200", "1702")):
         assert device.answer(f"205#{controlword}") == [f"185#{statusword}"]
         assert device.answer("080#")[0] == "285#56341200"
-        device.wait(0.001)
+        device.after(0.001)
     assert device.answer("605#4041600000000000") == ["585#4B41600050020000"]  # at rest it ends at once
     device.drive.fail(0x4310)
-    assert device.take() == ["085#1043090000000000"]  # drive excess temperature; generic, and temperature
-    assert device.wait(0.001) == ["185#1F02"]  # fault reaction, then fault
+    assert device.said() == ["085#1043090000000000"]  # drive excess temperature; generic, and temperature
+    assert device.after(0.001) == ["185#1F02"]  # fault reaction, then fault
     assert device.answer("080#")[1:] == ["185#1802"]
     assert device.answer("205#0000") == []
     assert device.answer("205#8000") == ["085#0000000000000000", "185#5002"]
@@ -291,15 +286,15 @@ def test_a_simulated_cia402_drive_by_its_bytes() -> None:
 
 def test_a_simulated_odrive_by_its_bytes() -> None:
     device = Device(SimulatedOdrive(3, servo(1.5), heartbeat=0.1, friction=50.0))
-    assert device.wait(0.0) == ["061#0000000001000000"]  # idle
+    assert device.after(0.0) == ["061#0000000001000000"]  # idle
     assert device.answer("060#R") == ["060#0204043A00060A00"]
     assert device.answer("063#R") == ["063#0000000000000000"]
     assert device.answer("069#R") == ["069#0000C03F00000000"]  # 1.5 turns, at rest
     assert device.answer("06B#0300000001000000") == []  # position control, passthrough
     assert device.answer("067#0800000000000000") == []  # closed loop control
-    assert device.wait(0.1) == ["061#0000000008000000"]
+    assert device.after(0.1) == ["061#0000000008000000"]
     assert device.answer("06C#0000004000000000") == []  # 2.0 turns
-    device.wait(0.01)
+    device.after(0.01)
     assert device.answer("069#R")[0].startswith("069#00000040")
     assert device.answer("062#") == []  # Estop
     assert device.answer("063#R") == ["063#0000000200000002"]
@@ -307,7 +302,7 @@ def test_a_simulated_odrive_by_its_bytes() -> None:
     assert device.answer("063#R") == ["063#0000000000000000"]
 
 
-def sent(bus: test_cia402.Bus) -> list[str]:
+def sent(bus: Bus) -> list[str]:
     frames, bus.sent[:] = [f"{can_id:03X}#{data.hex().upper()}" for can_id, data in bus.sent], []
     return frames
 
