@@ -15,7 +15,6 @@ from trirail_drivers import canerrors, files
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES, PowerState
 from trirail_drivers.simulated.devices import SimulatedDevice
-from trirail_drivers.simulated.drive import SimulatedDrive
 from trirail_drivers.simulated.emergency import Emergencies
 from trirail_drivers.simulated.faultlines import Condition, Fault, FaultSyntaxError, Frames, parse
 
@@ -107,7 +106,7 @@ class Faults:
         fault = parse(line, self._frames)
         if fault.name == "emcy":
             for index in fault.drives:
-                if not isinstance(self._drives[index], SimulatedDrive):
+                if self._drives[index].emergencies is None:
                     raise FaultSyntaxError(f"{line}: drive {NAMES[index]} has no EMCY; as in: {NAMES[index]} fault 200")
         if self.idle:
             self._now = self._clock()
@@ -271,8 +270,8 @@ class Faults:
                 drive.servo.forced_velocity = 0.0
 
     def _emergencies(self, fault: Fault) -> list[Emergencies]:
-        struck = (self._drives[index] for index in fault.drives)
-        return [drive.errors for drive in struck if isinstance(drive, SimulatedDrive)]
+        struck = (self._drives[index].emergencies for index in fault.drives)
+        return [emergencies for emergencies in struck if emergencies is not None]
 
     def _fail(self, fault: Fault) -> None:
         for index in fault.drives:
