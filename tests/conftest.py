@@ -21,9 +21,10 @@ from trirail.control.ledger import Notice
 from trirail.wire.messages import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers import frames
-from trirail_drivers.bus import PROTOCOLS
-from trirail_drivers.simulated import SimulatedDrive, simulated_bus
+from trirail_drivers.bus import simulated_bus
+from trirail_drivers.cia402 import frames
+from trirail_drivers.protocols import PROTOCOLS
+from trirail_drivers.simulated import SimulatedDrive
 
 CONFIG = load(SIM)
 
@@ -77,7 +78,8 @@ class Rig:
         self.sent: list[can.Message] = []
         self._send = self.bus.send
         self.bus.send = self._note  # type: ignore[assignment,method-assign]
-        self.driver = PROTOCOLS[config.drives.protocol](self.bus, config.can.bitrate, config.drives, lambda: self.now)
+        driver = PROTOCOLS[config.drives.protocol].driver
+        self.driver = driver(self.bus, config.can.bitrate, config.drives, lambda: self.now)
         self.driver.configure(config.period)
         if delay is not None:
             delay_answers(self.bus, delay, lambda: self.now)

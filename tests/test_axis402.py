@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from trirail_drivers import frames
+from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.axis import Axis
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.scaling import Scale

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
 import canopen
 import msgspec
 import pytest
-from trirail_drivers import frames
+from rigs import START, STEP, Bus, Clock, DriverRig, ideal_servo
+from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.settings import interpolation_period, settings_of
 from trirail_drivers.config import Drive, Drives, Homing
 from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
-from trirail_drivers.interface import Feedback, PowerState, Triple
+from trirail_drivers.interface import PowerState
 from trirail_drivers.scaling import scale_of
-from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDevice, SimulatedDrive
+from trirail_drivers.simulated import SimulatedDrive
 from trirail_drivers.simulated.dictionary import Entry
 
 P = PowerState
-PERIOD = 0.001
-START = (0.01, -0.02, 0.03)
+PERIOD = STEP
 ZERO = (0.0, 0.0, 0.0)
 CONFIG = Drives(
     protocol="cia402",
@@ -42,95 +42,16 @@ def changed(name: str, **keys: object) -> Drives:
     return msgspec.structs.replace(CONFIG, **{name: msgspec.structs.replace(getattr(CONFIG, name), **keys)})
 
 
-class Clock:
-    """Time that passes when told to."""
+class Rig(DriverRig[SimulatedDrive, Cia402]):
+    """CiA 402 drives, and what each was told."""
 
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-class Bus(SimulatedBus):
-    """The simulated bus, with a record of what the master sends, ways to break it, and waits in no time."""
-
-    def __init__(self, drives: Sequence[SimulatedDevice], clock: Clock) -> None:
-        self.time = clock
-        self.sent: list[tuple[int, bytes]] = []
-        self.broken = False
-        self.shutdowns = 0
-        self.late: int | None = None
-        """On a real bus, a cycle reads the answers to the SYNC before its own: how many of these are left."""
-        super().__init__(drives, clock)
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        if self.broken:
-            raise can.CanOperationError("Transmit buffer full")
-        self.sent.append((msg.arbitration_id, bytes(msg.data)))
-        if msg.arbitration_id == frames.SYNC and self.late is not None:
-            self.late = len(self._arrived)
-        super().send(msg, timeout)
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        if self.late is not None:
-            if not self.late:
-                return None
-            self.late -= 1
-        end = self.time.now + (timeout or 0.0)
-        while (message := super().recv(0)) is None and self.time.now < end:
-            self.time.now += PERIOD
-        return message
-
-    def inject(self, can_id: int, data: bytes, **flags: bool) -> None:
-        message = can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **flags})
-        self._arrived.append(message)
-
-    def shutdown(self) -> None:
-        self.shutdowns += 1
-        super().shutdown()
-
-
-class Rig:
-    """Three simulated drives, the driver, and a loop that holds position."""
+    enabled_within = 10
 
     def __init__(self, config: Drives = CONFIG) -> None:
-        self.clock = Clock()
-        self.devices = [
-            SimulatedDrive(
-                drive.node,
-                Servo(
-                    round(drive.direction * (start - drive.offset) * drive.counts_per_metre),
-                    time_constant=0.0,
-                    max_velocity=2.0 * drive.counts_per_metre,
-                    max_acceleration=1000.0 * drive.counts_per_metre,
-                ),
-            )
-            for drive, start in zip(config.each, START, strict=True)
-        ]
-        self.bus = Bus(self.devices, self.clock)
-        self.config = config
-        self.drives = Cia402(self.bus, 1_000_000, config, self.clock)
+        super().__init__(config, Cia402)
 
-    def cycle(self, position: Triple | None = None, velocity: Triple = ZERO) -> Feedback:
-        self.clock.now += PERIOD
-        self.drives.sync()
-        feedback = self.drives.read()
-        self.drives.write(feedback.position if position is None else position, velocity)
-        return feedback
-
-    def cycles(self, n: int) -> Feedback:
-        for _ in range(n - 1):
-            self.cycle()
-        return self.cycle()
-
-    def enable(self) -> Feedback:
-        self.drives.enable()
-        for _ in range(10):
-            feedback = self.cycle()
-            if feedback.state == (P.OPERATION_ENABLED,) * 3:
-                return feedback
-        raise AssertionError(f"not enabled: {feedback}")
+    def device(self, drive: Drive, counts: float) -> SimulatedDrive:
+        return SimulatedDrive(drive.node, ideal_servo(drive, round(counts)))
 
     def sent_to(self, base: int) -> list[list[bytes]]:
         """What each drive was sent on the identifiers of one service."""
@@ -138,15 +59,6 @@ class Rig:
 
     def controlwords(self) -> list[list[int]]:
         return [[frames.CONTROLWORD.unpack(data)[0] for data in each] for each in self.sent_to(frames.RPDO1)]
-
-    def found(self, cause: str, within: int) -> Feedback:
-        """Cycle until there is a fault, and see that it has this cause."""
-        for _ in range(within):
-            feedback = self.cycle()
-            if feedback.fault is not None:
-                assert feedback.fault.cause == cause
-                return feedback
-        raise AssertionError(f"no fault: {feedback}")
 
 
 @pytest.fixture
@@ -160,8 +72,7 @@ def new() -> Iterator[Rig]:
 @pytest.fixture
 def ready(new: Rig) -> Rig:
     """Drives that are set up, without power."""
-    new.drives.configure(PERIOD)
-    new.bus.sent.clear()
+    new.ready()
     return new
 
 
@@ -371,20 +282,20 @@ class TestConfigure:
 
     def test_two_nodes_of_one_number_are_refused(self) -> None:
         config = Drives(protocol="cia402", A=CONFIG.A, B=CONFIG.A, C=CONFIG.C)
-        bus = Bus([], Clock())
+        bus = Bus([], Clock(), {})
         with pytest.raises(DriveError, match="must differ, but are 1, 1, 9, 126"):
             Cia402(bus, 1_000_000, config).configure(PERIOD)
 
     def test_node_0_is_no_drives(self) -> None:
         config = Drives(protocol="cia402", A=Drive(node=0, counts_per_metre=1e6), B=CONFIG.B, C=CONFIG.C)
         with pytest.raises(DriveError, match="node id 0 is all nodes' on CANopen"):
-            Cia402(Bus([], Clock()), 1_000_000, config).configure(PERIOD)
+            Cia402(Bus([], Clock(), {}), 1_000_000, config).configure(PERIOD)
 
     @pytest.mark.parametrize("heartbeat", [0.0001, 30.0])
     def test_heartbeat_beyond_a_drives_range_is_refused(self, heartbeat: float) -> None:
         config = Drives(protocol="cia402", A=CONFIG.A, B=CONFIG.B, C=CONFIG.C, heartbeat=heartbeat)
         with pytest.raises(DriveError, match=r"heartbeat .*0\.001 to 21\.845|highest rate that fits"):
-            Cia402(Bus([], Clock()), 1_000_000, config).configure(PERIOD)
+            Cia402(Bus([], Clock(), {}), 1_000_000, config).configure(PERIOD)
 
     def test_dead_bus(self, new: Rig) -> None:
         new.bus.broken = True

@@ -20,7 +20,7 @@ from trirail.motion.runs import MotionState, rest
 from trirail.wire.messages import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, Confirmed, GoalRequest, Refused
 from trirail.wire.vocabulary import Mode
-from trirail_drivers import frames
+from trirail_drivers.cia402 import frames
 from trirail_drivers.interface import PowerState
 
 PERIOD = CONFIG.period

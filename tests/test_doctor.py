@@ -18,9 +18,9 @@ from trirail.cli.doctor import Check, Machine
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
 from trirail.processes.clock import Tick
-from trirail_drivers.bus import PROTOCOLS
+from trirail_drivers.bus import simulated_bus
 from trirail_drivers.errors import BusError
-from trirail_drivers.simulated import simulated_bus
+from trirail_drivers.protocols import PROTOCOLS
 
 CONFIGS = SIM.parent
 SIMULATED = load(SIM)
@@ -107,6 +107,13 @@ def test_each_fault_of_a_machine_is_named_with_its_remedy(
     assert "\n" not in found.found + found.remedy
 
 
+@pytest.mark.parametrize(("protocol", "verdict"), [("cia402", "ok"), ("odrive", "warning")])
+def test_the_queue_takes_two_cycles_of_the_protocol(protocol: str, verdict: str) -> None:
+    machine = msgspec.structs.replace(GOOD, link=link(txqlen=20))
+    checks = doctor.examine(changed(REAL, "drives", protocol=protocol), machine)
+    assert [check.verdict for check in checks if check.name == "can0 queue"] == [verdict]
+
+
 def test_simulated_drives_need_no_real_machine() -> None:
     desktop = msgspec.structs.replace(GOOD, preempt_rt=False, af_can=False, isolated=(), link=None)
     assert not bad(doctor.examine(SIMULATED, desktop))
@@ -163,7 +170,7 @@ def test_the_bus_load_is_judged_as_the_driver_does(protocol: str, rate: int, bit
     config = changed(config, "loop", rate_hz=rate)
     clock = count(1000.0, 1e-6)
     bus = simulated_bus(config.can, config.drives, lambda: next(clock))
-    driver = PROTOCOLS[protocol](bus, bitrate, config.drives, lambda: next(clock))
+    driver = PROTOCOLS[protocol].driver(bus, bitrate, config.drives, lambda: next(clock))
     check = doctor.load(config)
     refused = ""
     try:

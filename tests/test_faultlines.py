@@ -12,11 +12,12 @@ from pathlib import Path
 
 import can
 import pytest
-from trirail_drivers import frames
+from trirail_drivers.cia402 import frames
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
+from trirail_drivers.protocols import CIA402, ODRIVE, PROTOCOLS
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
-from trirail_drivers.simulated.faultlines import HELP, ODRIVE, Condition, FaultSyntaxError, parse
+from trirail_drivers.simulated.faultlines import HELP, Condition, FaultSyntaxError, parse
 from trirail_drivers.simulated.faults import Faults
 from trirail_drivers.unixbus import UnixBus
 
@@ -33,7 +34,7 @@ class Rig:
         servo = (Servo(0.0, time_constant=0.0, max_velocity=2e6, max_acceleration=1e9) for _ in range(3))
         drives = [SimulatedDrive(node, each) for node, each in enumerate(servo, start=1)]
         self.said: list[str] = []
-        self.faults = Faults(drives, [SCALE, -SCALE, SCALE], seed=7, tell=self.said.append)
+        self.faults = Faults(drives, [SCALE, -SCALE, SCALE], CIA402.fault_frames, seed=7, tell=self.said.append)
         self.drives = drives
         self.bus = SimulatedBus(drives, lambda: self.now, self.faults)
         for drive in drives:
@@ -73,7 +74,7 @@ def rig() -> Iterator[Rig]:
 
 
 def test_a_line_with_everything() -> None:
-    fault = parse("at 2.5 when B moving with 0.25 all delay 0.002 tpdo2 0x7F for 3 frames")
+    fault = parse("at 2.5 when B moving with 0.25 all delay 0.002 tpdo2 0x7F for 3 frames", CIA402.fault_frames)
     assert (fault.name, fault.drives, fault.value) == ("delay", (0, 1, 2), 0.002)
     assert (fault.delay, fault.condition, fault.chance) == (2.5, Condition(1, "moving"), 0.25)
     assert (fault.duration, fault.number) == (math.inf, 3)
@@ -82,7 +83,7 @@ def test_a_line_with_everything() -> None:
 
 
 def test_frames_of_odrives_have_the_names_of_their_manual() -> None:
-    chosen = parse("B drop set_input_pos heartbeat position-request", ODRIVE).frames
+    chosen = parse("B drop set_input_pos heartbeat position-request", ODRIVE.fault_frames).frames
     sent = [(True, 0xEC), (False, 0xE1), (True, 0xE9), (False, 0xE9), (True, 0xE1), (True, 0x0C)]
     assert [[each.match(*frame, 7) for each in chosen] for frame in sent] == [
         [True, False, False],
@@ -91,14 +92,14 @@ def test_frames_of_odrives_have_the_names_of_their_manual() -> None:
         *[[False, False, False]] * 3,
     ]
     with pytest.raises(FaultSyntaxError, match='unknown frames "tpdo2"; known are set_axis_state, '):
-        parse("B drop tpdo2", ODRIVE)
+        parse("B drop tpdo2", ODRIVE.fault_frames)
 
 
 @pytest.mark.parametrize("line", ["B emcy 4310", "B fault 4310", "B reboot"])
 def test_what_happens_in_a_moment_lasts_only_if_told_to(line: str) -> None:
-    assert parse(line).duration == 0.0
-    assert parse(f"{line} for 2").duration == 2.0
-    assert parse("B silent").duration == math.inf
+    assert parse(line, CIA402.fault_frames).duration == 0.0
+    assert parse(f"{line} for 2", CIA402.fault_frames).duration == 2.0
+    assert parse("B silent", CIA402.fault_frames).duration == math.inf
 
 
 @pytest.mark.parametrize(
@@ -134,7 +135,7 @@ def test_what_happens_in_a_moment_lasts_only_if_told_to(line: str) -> None:
 )
 def test_a_wrong_line_is_answered_with_what_would_be_right(line: str, right: str) -> None:
     with pytest.raises(FaultSyntaxError) as caught:
-        parse(line)
+        parse(line, CIA402.fault_frames)
     text = str(caught.value)
     assert "\n" not in text
     assert re.search(right.replace("?", r"\?"), text)
@@ -143,7 +144,7 @@ def test_a_wrong_line_is_answered_with_what_would_be_right(line: str, right: str
 def test_help_names_every_word() -> None:
     from trirail_drivers.simulated import faultlines
 
-    names = (*faultlines.CANOPEN, *faultlines.ODRIVE)
+    names = [*faultlines.EITHER, *(name for each in PROTOCOLS.values() for name in each.fault_frames)]
     for word in (*faultlines._KINDS, *names, *faultlines.CONDITIONS, "at", "when", "with", "for"):
         assert re.search(rf"(?<![\w-]){re.escape(word)}(?![\w-])", HELP), word
 

@@ -16,7 +16,7 @@ from test_homing import incremental
 from trirail.config import Config
 from trirail.wire.packets import CommandRequest, Confirmed, Refused
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers import frames
+from trirail_drivers.cia402 import frames
 from trirail_drivers.interface import PowerState
 
 REAL = changed(CONFIG, missed_syncs=3)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail_drivers import frames
+from trirail_drivers.cia402 import frames
+from trirail_drivers.frames import frame_bits
 from trirail_drivers.interface import PowerState
 
 P = PowerState
@@ -13,14 +14,14 @@ P = PowerState
 
 @pytest.mark.parametrize(("n", "bits"), [(0, 55), (1, 65), (2, 75), (4, 95), (6, 115), (8, 135)])
 def test_worst_case_frame_length(n: int, bits: int) -> None:
-    assert frames.frame_bits(n) == bits
+    assert frame_bits(n) == bits
 
 
 @given(n=st.integers(0, 8), pattern=st.integers(0, 2**98 - 1))
 def test_no_content_makes_a_frame_longer_than_the_worst_case(n: int, pattern: int) -> None:
     open_to_stuffing = 34 + 8 * n
     bits = [pattern >> i & 1 for i in range(open_to_stuffing)]
-    assert open_to_stuffing + _stuff_bits(bits) + 13 <= frames.frame_bits(n)
+    assert open_to_stuffing + _stuff_bits(bits) + 13 <= frame_bits(n)
 
 
 def _stuff_bits(bits: list[int]) -> int:
@@ -37,17 +38,18 @@ def _stuff_bits(bits: list[int]) -> int:
 
 def test_worst_case_is_reached() -> None:
     bits = [0] * 5 + [i // 4 % 2 ^ 1 for i in range(34 + 64 - 5)]
-    assert 34 + 64 + _stuff_bits(bits) + 13 == frames.frame_bits(8)
+    assert 34 + 64 + _stuff_bits(bits) + 13 == frame_bits(8)
 
 
 def test_a_kilohertz_fills_three_quarters_of_a_megabit() -> None:
-    assert frames.CYCLE_BITS == 745
-    assert frames.bus_load(1000, 1_000_000, 0.1) == pytest.approx(0.75, abs=0.001)
+    assert frames.TRAFFIC.cycle_bits == 745
+    assert frames.TRAFFIC.bus_load(1000, 1_000_000, 0.1) == pytest.approx(0.75, abs=0.001)
 
 
 @given(bitrate=st.sampled_from([125_000, 250_000, 500_000, 1_000_000]), heartbeat=st.floats(0.05, 1.0))
 def test_the_highest_rate_fills_the_bus(bitrate: int, heartbeat: float) -> None:
-    assert frames.bus_load(frames.highest_rate(bitrate, heartbeat), bitrate, heartbeat) == pytest.approx(1.0)
+    rate = frames.TRAFFIC.highest_rate(bitrate, heartbeat)
+    assert frames.TRAFFIC.bus_load(rate, bitrate, heartbeat) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(

@@ -19,10 +19,12 @@ from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import inverse
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers import config, frames
+from trirail_drivers import config
+from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
+from trirail_drivers.simulated.faults import Faults
 
 PERIOD = CONFIG.period
 HOMES = (-0.01, 0.012, 0.02)
@@ -491,7 +493,7 @@ class Shared(SimulatedBus):
 
     def __init__(self, drives: list[SimulatedDrive]) -> None:
         self._lock = threading.Lock()
-        super().__init__(drives)
+        super().__init__(drives, time.monotonic, Faults(drives, [1.0] * len(drives), {}))
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         with self._lock:

@@ -15,21 +15,21 @@ from conftest import CONFIG as ROBOT
 from conftest import Rig as ControlRig
 from conftest import changed
 from numpy.typing import NDArray
-from test_cia402 import Bus, Clock
+from rigs import START, STEP, Bus, Clock, DriverRig, ideal_servo
 from trirail.config import Config
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout
-from trirail_drivers.interface import Feedback, PowerState, Triple
+from trirail_drivers.interface import Feedback, PowerState
 from trirail_drivers.odrive import frames
-from trirail_drivers.odrive.drives import SETTLING, Odrive
+from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.odrive.frames import AxisState, Error, Result
-from trirail_drivers.simulated import Servo, SimulatedOdrive
+from trirail_drivers.odrive.setpoints import SETTLING
+from trirail_drivers.simulated import SimulatedOdrive
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
 
 P = PowerState
-PERIOD = 0.001
-START = (0.01, -0.02, 0.03)
+PERIOD = STEP
 ZERO = (0.0, 0.0, 0.0)
 SPEED = (0.5, 0.4, -0.3)
 CONFIG = Drives(
@@ -42,49 +42,20 @@ CONFIG = Drives(
 COMMANDS = {frames.SET_AXIS_STATE, frames.SET_CONTROLLER_MODE, frames.CLEAR_ERRORS, frames.ESTOP}
 
 
-class Rig:
-    """Three simulated ODrives, the driver, and a loop that holds position."""
+class Rig(DriverRig[SimulatedOdrive, Odrive]):
+    """ODrives, how they are moved, and what each was told."""
+
+    enabled_within = 150
 
     def __init__(self, config: Drives = CONFIG, watchdog: float = 0.02) -> None:
-        self.config = config
-        self.clock = Clock()
-        self.devices = [
-            SimulatedOdrive(
-                drive.node,
-                Servo(
-                    drive.direction * (start - drive.offset) * drive.counts_per_metre,
-                    time_constant=0.0,
-                    max_velocity=2.0 * drive.counts_per_metre,
-                    max_acceleration=1000.0 * drive.counts_per_metre,
-                ),
-                heartbeat=0.1,
-                friction=2.0 * drive.counts_per_metre,
-                watchdog=watchdog,
-            )
-            for drive, start in zip(config.each, START, strict=True)
-        ]
-        self.bus = Bus(self.devices, self.clock)
-        self.drives = Odrive(self.bus, 1_000_000, config, self.clock)
+        self._watchdog = watchdog
+        super().__init__(config, Odrive)
         self.target = START
 
-    def cycle(self, position: Triple | None = None, velocity: Triple = ZERO) -> Feedback:
-        self.clock.now += PERIOD
-        self.drives.sync()
-        feedback = self.drives.read()
-        self.drives.write(feedback.position if position is None else position, velocity)
-        return feedback
-
-    def cycles(self, number: int) -> Feedback:
-        for _ in range(number - 1):
-            self.cycle()
-        return self.cycle()
-
-    def enable(self) -> None:
-        self.drives.enable()
-        for _ in range(150):
-            if self.cycle().state == (P.OPERATION_ENABLED,) * 3:
-                return
-        raise AssertionError(self.drives.read())
+    def device(self, drive: Drive, counts: float) -> SimulatedOdrive:
+        servo = ideal_servo(drive, counts)
+        friction = 2.0 * drive.counts_per_metre
+        return SimulatedOdrive(drive.node, servo, heartbeat=0.1, friction=friction, watchdog=self._watchdog)
 
     def move(self, cycles: int = 100) -> Feedback:
         """Move on with constant speed; stop looking when there is a fault."""
@@ -95,15 +66,6 @@ class Rig:
             if feedback.fault is not None:
                 break
         return feedback
-
-    def found(self, cause: str, within: int) -> Feedback:
-        """Cycle until there is a fault, and see that it has this cause."""
-        for _ in range(within):
-            feedback = self.cycle()
-            if feedback.fault is not None:
-                assert feedback.fault.cause == cause
-                return feedback
-        raise AssertionError(f"no fault: {feedback}")
 
     def commands(self) -> list[list[tuple[int, int]]]:
         """What each drive was told: number and first byte of each command, without setpoints and requests."""
@@ -138,8 +100,7 @@ def new() -> Iterator[Rig]:
 @pytest.fixture
 def ready(new: Rig) -> Rig:
     """Drives that were found, without power."""
-    new.drives.configure(PERIOD)
-    new.bus.sent.clear()
+    new.ready()
     return new
 
 
@@ -214,7 +175,7 @@ class TestConfigure:
     def test_node_ids_that_cannot_be(self, node: int) -> None:
         drives = msgspec.structs.replace(CONFIG, C=Drive(node=node, counts_per_metre=25.0))
         with pytest.raises(DriveError, match=f"must differ and be 0 to 62, but are 0, 7, {node}"):
-            Odrive(Bus([], Clock()), 1_000_000, drives)
+            Odrive(Bus([], Clock(), {}), 1_000_000, drives)
 
     def test_dead_bus(self, new: Rig) -> None:
         new.bus.broken = True

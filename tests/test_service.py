@@ -35,7 +35,7 @@ from trirail.telemetry.reading import read
 from trirail.wire.messages import Event, GoalReply, OwnLimits, State
 from trirail.wire.vocabulary import MODES, Mode
 from trirail.wire.zenoh_session import open_client
-from trirail_drivers import frames
+from trirail_drivers.cia402 import frames
 from trirail_drivers.odrive import frames as odrive_frames
 
 pytestmark = pytest.mark.slow

@@ -7,9 +7,11 @@ from struct import pack, unpack
 
 import can
 import pytest
+from rigs import DeviceRig
 from trirail_drivers import config
+from trirail_drivers.bus import simulated_bus
 from trirail_drivers.interface import PowerState
-from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive, simulated_bus
+from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from trirail_drivers.simulated.drive import EDS
 
 NODE = 5
@@ -21,34 +23,15 @@ Frame = tuple[int, bytes]
 S = PowerState
 
 
-class Rig:
-    """One drive (1 µm a count, 2 m/s, 100 m/s² at most), the frames it sends, and the time."""
+class Rig(DeviceRig[SimulatedDrive]):
+    """A CiA 402 drive (1 µm a count, 2 m/s, 100 m/s² at most)."""
 
     def __init__(self, time_constant: float = 0.0) -> None:
         self.servo = Servo(START, time_constant=time_constant, max_velocity=2e6, max_acceleration=1e8)
-        self.drive = SimulatedDrive(NODE, self.servo)
-        self.now = 100.0
-        self.frames: list[Frame] = []
-        self.drive.connect(lambda can_id, data: self.frames.append((can_id, data)), self.now)
+        super().__init__(SimulatedDrive(NODE, self.servo))
 
     def state(self) -> PowerState:
         return self.drive.state
-
-    def take(self) -> list[Frame]:
-        frames, self.frames = self.frames, []
-        return frames
-
-    def send(self, can_id: int, data: bytes = b"") -> list[Frame]:
-        self.drive.receive(can_id, data, self.now)
-        return self.take()
-
-    def wait(self, seconds: float, step: float = 0.0005) -> list[Frame]:
-        """Let time pass with nothing on the bus, polling the drive."""
-        end = self.now + seconds
-        while self.now < end - 1e-9:
-            self.now = min(self.now + step, end)
-            self.drive.poll(self.now)
-        return self.take()
 
     def nmt(self, command: int, node: int = NODE) -> list[Frame]:
         return self.send(0x000, bytes([command, node]))

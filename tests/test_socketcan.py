@@ -13,12 +13,13 @@ from collections.abc import Callable, Iterator
 
 import can
 import pytest
-from trirail_drivers import bus, frames
+from trirail_drivers import bus
+from trirail_drivers.bus import simulated_bus
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Can, Drive, Drives, Simulated
 from trirail_drivers.errors import BusError
+from trirail_drivers.frames import data_frame
 from trirail_drivers.interface import Feedback, PowerState
-from trirail_drivers.simulated import simulated_bus
 
 NAME = f"vcan{os.getpid() % 100_000}"
 SECTION = Can(interface="socketcan", channel=NAME, simulated=Simulated(missed_syncs=1000))
@@ -133,7 +134,7 @@ def until(driver: Cia402, condition: Callable[[Feedback], bool], position: float
 
 def test_frames_pass_between_two_sockets(interface: str) -> None:
     with bus.open_bus(SECTION, DRIVES) as one, bus.open_bus(SECTION, DRIVES) as other:
-        one.send(frames.message(0x123, b"\x01\x02"))
+        one.send(data_frame(0x123, b"\x01\x02"))
         arrived = other.recv(WITHIN)
         assert arrived is not None
         assert (arrived.arbitration_id, bytes(arrived.data)) == (0x123, b"\x01\x02")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import errno
+import struct
 from collections import deque
 
 import can
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail_drivers import frames
+from trirail_drivers.frames import data_frame, frame_bits
 from trirail_drivers.interface import DriveFault
 from trirail_drivers.wire import Wire
 
@@ -46,7 +47,7 @@ class Listener:
         self.told: list[tuple[str, int, str]] = []
 
     def take(self, data: bytearray, now: float) -> None:
-        frames.POSITION.unpack(data)
+        struct.Struct("<i").unpack(data)
         self.heard.append((bytes(data), now))
 
     def tell(self, cause: str, code: int, text: str) -> None:
@@ -70,7 +71,7 @@ class Rig:
     def cycle(self, *, full: bool = False) -> None:
         self.wire.begin()
         self.bus.failing = FULL if full else None
-        self.wire.send(frames.message(0x80, b""))
+        self.wire.send(data_frame(0x80, b""))
 
 
 @pytest.fixture
@@ -96,7 +97,7 @@ def test_a_queue_that_is_full_in_three_cycles_in_a_row_is_a_fault(full: list[boo
 
 def test_a_queue_that_was_full_before_the_first_cycle_counts_as_one_cycle(rig: Rig) -> None:
     rig.bus.failing = FULL
-    rig.wire.send(frames.message(0x80, b""))
+    rig.wire.send(data_frame(0x80, b""))
     rig.cycle(full=True)
     assert rig.wire.fault is None
     rig.cycle(full=True)
@@ -114,11 +115,11 @@ def test_frames_are_taken_in_by_the_thousand_and_then_the_cycle_goes_on(rig: Rig
 
 @pytest.mark.parametrize("length", range(9))
 def test_traffic_counts_each_frame_with_its_worst_stuffing(rig: Rig, length: int) -> None:
-    rig.wire.send(frames.message(0x123, bytes(length)))
-    assert rig.wire.traffic == frames.frame_bits(length)
+    rig.wire.send(data_frame(0x123, bytes(length)))
+    assert rig.wire.traffic == frame_bits(length)
     rig.arrive(0x456, bytes(length))
     rig.wire.receive(0.0)
-    assert rig.wire.traffic == 2 * frames.frame_bits(length)
+    assert rig.wire.traffic == 2 * frame_bits(length)
 
 
 def test_only_data_frames_of_the_identifier_are_heard(rig: Rig) -> None:

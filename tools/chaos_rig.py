@@ -24,7 +24,7 @@ from trirail.processes.interpreter import child
 from trirail.telemetry.reading import Recording, read
 from trirail.telemetry.sinks import HOST, free_port
 from trirail.wire.messages import State
-from trirail_drivers import frames
+from trirail_drivers.cia402 import frames
 from trirail_drivers.unixbus import UnixBus
 
 ROOT = Path(__file__).parents[1]

@@ -20,9 +20,10 @@ from types import FrameType
 import can
 from trirail.config import load
 from trirail.errors import TrirailError
+from trirail_drivers.bus import simulated_bus
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES
-from trirail_drivers.simulated import SimulatedBus, simulated_bus
+from trirail_drivers.simulated import SimulatedBus
 from trirail_drivers.simulated.faultlines import HELP, FaultSyntaxError
 from trirail_drivers.unixbus import UnixBus
 

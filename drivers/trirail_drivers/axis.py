@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 from trirail_drivers.answers import Answers
 from trirail_drivers.interface import Counts, DriveFault
@@ -12,7 +13,7 @@ MISSED_ANSWERS = 3
 MISSED_HEARTBEATS = 3
 
 
-class Axis:
+class Axis(ABC):
     """One drive's name, node, position and first event since faults were last reset."""
 
     __slots__ = (
@@ -60,6 +61,10 @@ class Axis:
     def made(self, cause: str, code: int, text: str) -> DriveFault:
         """A fault of this drive."""
         return DriveFault(self.name, cause, code, f"drive {self.name}: {text}")
+
+    @abstractmethod
+    def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
+        """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not."""
 
     def silence(self, now: float) -> DriveFault | None:
         """The fault that the drive is not heard any more, at time `now`."""

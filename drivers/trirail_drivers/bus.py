@@ -12,21 +12,16 @@ import can
 
 from trirail_drivers import canerrors, config
 from trirail_drivers.capture import Capture, CapturedBus
-from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import Drives
-from trirail_drivers.odrive.drives import Odrive
-from trirail_drivers.simulated import simulated_bus
+from trirail_drivers.protocols import PROTOCOLS
+from trirail_drivers.simulated import SimulatedBus
+from trirail_drivers.simulated.faults import Faults
 from trirail_drivers.unixbus import UnixBus
 
 # What python-can would say of a failure is in the BusError; standard error is for that one line.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
-PROTOCOLS: dict[str, Callable[[can.BusABC, int, config.Drives, Callable[[], float]], Drives]] = {
-    "cia402": Cia402,
-    "odrive": Odrive,
-}
-"""The driver of each protocol that [drives] may name."""
 NETWORK_INTERFACES = Path("/sys/class/net")
 IFF_UP = 0x1
 """Flag of a network interface that is up (linux/if.h)."""
@@ -71,10 +66,21 @@ def connect(
     if capture is not None:
         bus = CapturedBus(bus, capture)
     try:
-        return PROTOCOLS[drives.protocol](bus, section.bitrate, drives, clock)
+        return PROTOCOLS[drives.protocol].driver(bus, section.bitrate, drives, clock)
     except DriveError:
         bus.shutdown()
         raise
+
+
+def simulated_bus(
+    section: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic
+) -> SimulatedBus:
+    """The three drives of a configuration on a bus of their own, at rest where `can.simulated.start` says."""
+    protocol = PROTOCOLS[drives.protocol]
+    starts = zip(drives.each, section.simulated.start, strict=True)
+    devices = [protocol.simulated_drive(section.simulated, drives, drive, start) for drive, start in starts]
+    scales = [drive.direction * drive.counts_per_metre for drive in drives.each]
+    return SimulatedBus(devices, clock, Faults(devices, scales, protocol.fault_frames))
 
 
 def _explained(section: config.Can, error: Exception) -> str:

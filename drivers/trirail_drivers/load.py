@@ -2,38 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
-from trirail_drivers import config, frames
 from trirail_drivers.errors import BusError
-from trirail_drivers.odrive import frames as odrive_frames
 
 HIGH: Final = 0.8
 """Worst-case share of the bus from which on people are warned: what is not cyclic has to wait."""
 
-_LOAD: Final = {"cia402": frames.bus_load, "odrive": odrive_frames.bus_load}
-_HIGHEST: Final = {"cia402": frames.highest_rate, "odrive": odrive_frames.highest_rate}
 
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """What three drives of one protocol and the service put on the bus; bits are those of the worst stuffing."""
 
-def bus_load(rate_hz: float, bitrate: int, drives: config.Drives) -> float:
-    """Worst-case share of the bus that all frames take; 1.0 is full."""
-    return _LOAD[drives.protocol](rate_hz, bitrate, drives.heartbeat)
+    cycle_bits: int
+    """Bits of one cycle's frames."""
+    background: Callable[[float], float]
+    """Bits per second that do not depend on the cycle, of the heartbeats' period [s]."""
+    most_sent: int
+    """Frames that the service sends in one cycle at most."""
 
+    def bus_load(self, rate_hz: float, bitrate: int, heartbeat: float) -> float:
+        """Worst-case share of the bus that all frames take; 1.0 is full."""
+        return (rate_hz * self.cycle_bits + self.background(heartbeat)) / bitrate
 
-def highest_rate(bitrate: int, drives: config.Drives) -> float:
-    """The cycle rate [Hz] that fills the bus; 0 where the heartbeats alone do."""
-    return max(0.0, _HIGHEST[drives.protocol](bitrate, drives.heartbeat))
+    def highest_rate(self, bitrate: int, heartbeat: float) -> float:
+        """The cycle rate [Hz] that fills the bus; 0 where what does not depend on the cycle fills it alone."""
+        return max(0.0, (bitrate - self.background(heartbeat)) / self.cycle_bits)
 
-
-def checked(rate_hz: float, bitrate: int, drives: config.Drives) -> float:
-    """The bus load of a cycle; BusError with the highest rate that fits if this one does not."""
-    load = bus_load(rate_hz, bitrate, drives)
-    if load > 1.0:
-        raise BusError(
-            f"{rate_hz:g} Hz takes {load:.0%} of the bus at {bitrate} bit/s; "
-            f"the highest rate that fits is {highest_rate(bitrate, drives):.0f} Hz"
-        )
-    return load
+    def checked(self, rate_hz: float, bitrate: int, heartbeat: float) -> float:
+        """The bus load of a cycle; BusError with the highest rate that fits if this one does not."""
+        load = self.bus_load(rate_hz, bitrate, heartbeat)
+        if load > 1.0:
+            raise BusError(
+                f"{rate_hz:g} Hz takes {load:.0%} of the bus at {bitrate} bit/s; "
+                f"the highest rate that fits is {self.highest_rate(bitrate, heartbeat):.0f} Hz"
+            )
+        return load
 
 
 def warning(rate_hz: float, load: float) -> str:

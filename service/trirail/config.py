@@ -296,6 +296,7 @@ def _type_at(path: str) -> Any:
 def _check(config: Config) -> None:
     """Refuse what is well-formed but impossible."""
     from trirail_drivers import config_checks
+    from trirail_drivers.requirements import Requirements
 
     robot = geometry(config.geometry)
     platform, slider = config.limits.platform, config.limits.slider
@@ -330,22 +331,9 @@ def _check(config: Config) -> None:
             f"loop.rate_hz = {config.loop.rate_hz}: a cycle must be a whole number of microseconds, "
             "as with 100, 200, 250, 400, 500, 800, 1000"
         )
-    if config.drives.protocol == "odrive":
-        _check_canopen_only(config)
     places = (*slider.position, *(config.can.simulated.start if config.can.interface == "simulated" else ()))
-    motion = config_checks.Motion(config.period, min(places), max(places), slider.velocity, slider.following_error)
+    required = Requirements(config.period, min(places), max(places), slider.velocity, slider.following_error)
     try:
-        config_checks.check(config.drives, motion)
+        config_checks.check(config.drives, required)
     except DriveError as error:
         raise ConfigError(str(error)) from error
-
-
-def _check_canopen_only(config: Config) -> None:
-    for name, drive in zip(NAMES, config.drives.each, strict=True):
-        if drive.homing is not None:
-            raise ConfigError(
-                f"drives.{name}.homing: homing is CiA 402's, an ODrive must know its position at power-on; "
-                "leave the table out"
-            )
-        if drive.eds is not None:
-            raise ConfigError(f"drives.{name}.eds = {drive.eds}: an ODrive has no object dictionary; leave it out")

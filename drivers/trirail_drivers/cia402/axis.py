@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from trirail_drivers import axis, frames
+from trirail_drivers import axis
+from trirail_drivers.cia402 import frames
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.scaling import Scale
 
@@ -15,6 +16,10 @@ RESET_TIME = 2 * frames.STATUS_PERIOD
 _NMT_STATES = {frames.STOPPED: "stopped", frames.PRE_OPERATIONAL: "pre-operational"}
 _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
 _WITHOUT_POWER = (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.SWITCH_ON_DISABLED)
+_ON_THE_WAY = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON)
+"""States from which a drive that is to be enabled goes on by controlwords."""
+_CAN_MOVE_OR_SOON = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED)
+"""States in which no drive stays that has been told to stop or to lose power."""
 
 
 class Axis(axis.Axis):
@@ -159,6 +164,22 @@ class Axis(axis.Axis):
             self.left_operational = False
             self.answers.forgive()
             self.status_heard = now
+
+    def word(self, now: float, wanted: frames.Wanted) -> int:
+        """The controlword that the drive is to have at time `now`, on its way to the state that is `wanted`."""
+        if self.state is PowerState.FAULT and now < self.reset_until:
+            # Bit 7 stays up until the drive is out of fault: some look at it once in a few cycles only.
+            return frames.FAULT_RESET
+        word = frames.controlword(self.state, wanted)
+        return word | self.mode_bits if word == frames.ENABLE_OPERATION else word
+
+    def is_not_followed(self, word: int, wanted: frames.Wanted) -> bool:
+        """Whether a controlword, by what the drive says, has not taken it where it is to go."""
+        if wanted is PowerState.OPERATION_ENABLED:
+            return self.state in _ON_THE_WAY or not self.cyclic  # of its mode's bits the state does not tell
+        if self.state is PowerState.QUICK_STOP_ACTIVE:
+            return word == frames.DISABLE_VOLTAGE
+        return self.state in _CAN_MOVE_OR_SOON
 
     def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
         """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not.

@@ -12,7 +12,7 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from trirail_drivers import frames
+from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.settings import INVALID, NO_REMOTE_REQUEST
 from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from trirail_drivers import frames
+from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.homing import CYCLIC_SYNCHRONOUS_POSITION
 from trirail_drivers.config import Drive, Drives, Homing
 from trirail_drivers.errors import DriveError

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import can
 
-from trirail_drivers import frames
-from trirail_drivers.cia402 import eds
+from trirail_drivers.cia402 import eds, frames
 from trirail_drivers.cia402.homing import CYCLIC_SYNCHRONOUS_POSITION, HOMING
 from trirail_drivers.cia402.sdo import Client, Clock, Remote
 from trirail_drivers.cia402.settings import Setting, check_nodes, settings_of

@@ -11,37 +11,25 @@ clocks, none or two of them in a cycle now and then, and nobody could tell their
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import math
-import struct
 import time
 from collections import deque
-from collections.abc import Callable
 
 import can
 
-from trirail_drivers import config, load
+from trirail_drivers import config
 from trirail_drivers.axis import MISSED_ANSWERS
-from trirail_drivers.interface import NAMES, DriveFault, Feedback, Triple
+from trirail_drivers.driver import Clock, Driver
+from trirail_drivers.interface import DriveFault, Feedback, Triple
 from trirail_drivers.odrive import frames, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
-from trirail_drivers.ramp import braked
-from trirail_drivers.scaling import scale_of
-from trirail_drivers.wire import Wire
-
-SETTLING = 0.05
-"""How long a drive holds at the end of a quick stop before its power is taken off, for its servo to catch up [s]."""
-
-Clock = Callable[[], float]
+from trirail_drivers.odrive.setpoints import Setpoints
 
 
-class Odrive:
-    """Three drives on one CAN bus; see trirail_drivers.interface.Drives.
-
-    A fault of one drive is a fault of the robot: what is latched takes all three down their quick-stop ramps
-    beginning in the same cycle, and `enable` does nothing until `reset`.
+class Odrive(Driver[OdriveAxis]):
+    """Three ODrives on one CAN bus.
 
     An ODrive has no quick stop of its own. Its Estop and its idle state let the motor coast, and to put it into
     velocity control with a ramp is to change modes under power, which ODrive advises against, to a ramp that CANSimple
@@ -53,15 +41,7 @@ class Odrive:
 
     def __init__(self, bus: can.BusABC, bitrate: int, drives: config.Drives, clock: Clock = time.monotonic) -> None:
         setup.check_nodes(drives)
-        self.bus_load = 0.0
-        self._bitrate = bitrate
-        self._drives = drives
-        self._clock = clock
-        self._axes = tuple(
-            OdriveAxis(name, drive.node, scale_of(name, drive), drives.heartbeat)
-            for name, drive in zip(NAMES, drives.each, strict=True)
-        )
-        self._wire = Wire(bus, self._stop)
+        super().__init__(bus, bitrate, drives, clock, OdriveAxis)
         for axis in self._axes:
             for number, handler in (
                 (frames.GET_VERSION, axis.on_version),
@@ -73,29 +53,10 @@ class Odrive:
         self._requests = tuple(frames.request(axis.node, frames.GET_ENCODER_ESTIMATES) for axis in self._axes)
         self._error_requests = itertools.cycle(frames.request(axis.node, frames.GET_ERROR) for axis in self._axes)
         self._errors_due: float | None = None
-        self._period = 0.0
         self._enabled = False
-        self._braking: float | None = None
-        """Time since a quick stop has brought the setpoints to a standstill [s]; None where none is under way."""
-        self._next: tuple[Triple, Triple] | None = None
-        """Setpoints [m], [m/s] to be sent at the next SYNC."""
-        self._sent: tuple[Triple, Triple] | None = None
-        """Setpoints sent last; None where no drive has been sent any since enabling."""
-        self._in_force: list[float] = []
-        """Positions that the bus has taken last [m]."""
+        self._setpoints = Setpoints(self._axes, self._wire, drives.quick_stop_deceleration)
         self._due: deque[Triple | None] = deque([None] * MISSED_ANSWERS, maxlen=MISSED_ANSWERS)
         """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
-        self._off_by = math.inf
-        """When the drives must have lost their power [s]; inf where that was not asked for, or has been told of."""
-        self._asked = ""
-        """By what that was asked for."""
-        self._synced = 0.0
-        self._closed = False
-
-    @property
-    def traffic(self) -> int:
-        """Bits of all frames on the bus since the start, each with worst-case stuffing."""
-        return self._wire.traffic
 
     def configure(self, period: float) -> None:
         """Find the drives and leave them without power, for a cycle of `period` seconds.
@@ -103,12 +64,9 @@ class Odrive:
         Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout for a drive that is not there.
         A drive with errors is not an error here; feedback tells of it and `reset` clears it.
         """
-        rate = 1.0 / period
-        self.bus_load = load.checked(rate, self._bitrate, self._drives)
-        self._period = period
+        self._set_period(period, frames.TRAFFIC)
+        self._setpoints.period = period
         setup.configure(self._wire, self._axes, self._drives, self._clock)
-        if warning := load.warning(rate, self.bus_load):
-            self._wire.warn(warning)
 
     def sync(self) -> None:
         """Send the setpoints written since the last cycle, which are in force on arrival; ask for the positions.
@@ -124,12 +82,9 @@ class Odrive:
                 axis.heard = now
                 axis.answers.forgive()
         self._wire.receive(now)
-        self._due.append(self._sent[0] if self._sent is not None else None)
-        if self._braking is not None:
-            self._brake()
-        # Without power none is sent: a drive that has missed losing it is to stay where the ramp has ended.
-        if self._next is not None and (self._enabled or self._braking is not None):
-            self._set(*self._next)
+        sent = self._setpoints.sent
+        self._due.append(sent[0] if sent is not None else None)
+        self._setpoints.step(self._enabled)
         self._command()
         for axis, request in zip(self._axes, self._requests, strict=True):
             self._wire.send(request)
@@ -148,8 +103,7 @@ class Odrive:
             fault = self._found(now)
             if fault is not None:
                 self._wire.fail(fault)
-        if now >= self._off_by:
-            self._take_power_off()
+        self._watch_stopping(now)
         a, b, c = self._axes
         on = self._enabled
         return Feedback(
@@ -167,14 +121,12 @@ class Odrive:
         Setpoints that are not finite, or beyond what a message holds, are not sent but a fault of cause "setpoint".
         During a quick stop they are left aside.
         """
-        if self._braking is not None:
+        if self._setpoints.stopping:
             return
-        for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
-            if not self._sendable(axis, metres, rate):
-                text = f"drive {axis.name}: cannot take setpoint {metres:g} m, {rate:g} m/s"
-                self._wire.fail(DriveFault(axis.name, "setpoint", 0, text))
-                return
-        self._next = position, velocity
+        if (axis := self._setpoints.take(position, velocity)) is not None:
+            number = self._axes.index(axis)
+            self._refuse_setpoint(axis, position[number], velocity[number])
+            return
         if self._clock() - self._synced > self._period:
             for axis in self._axes:
                 axis.setpoints_late += 1
@@ -187,8 +139,7 @@ class Odrive:
         if self._wire.fault is not None or self._enabled:
             return
         self._enabled = True
-        self._braking = self._sent = None
-        self._in_force = []
+        self._setpoints.begin()
         self._off_by = math.inf
         for axis in self._axes:
             axis.powered_up = False
@@ -204,7 +155,7 @@ class Odrive:
         """Take power off; meant for a robot at standstill. A drive that keeps it is a fault, of cause "timeout"."""
         self._give_time_to_stop("disable")
         self._enabled = False
-        self._braking = None
+        self._setpoints.abandon()
         self._command()
 
     def quick_stop(self) -> None:
@@ -213,20 +164,15 @@ class Odrive:
         A drive that has it after `stop_timeout` is told to lose it at once, and is a fault, of cause "timeout", that
         takes the place of the one that stopped it.
         """
-        if self._braking is not None:
+        if self._setpoints.stopping:
             return
         self._give_time_to_stop("quick stop")
-        powering = self._enabled or any(axis.powered for axis in self._axes)
+        powering = self._enabled or self._powered()
         self._enabled = False
-        if self._sent is None or not powering:
+        if self._setpoints.sent is None or not powering:
             self._command()
-            return
-        self._braking = 0.0
-        # The position in force stays; what the drives are to run on with is less from now on.
-        a, b, c = self._in_force
-        _, slower = self._braked(self._sent[1])
-        self._set((a, b, c), slower)
-        self._next = None
+        else:
+            self._setpoints.stop()
 
     def reset(self) -> None:
         """Forget the fault and clear the drives' own; never powers them up. What persists is found again."""
@@ -239,39 +185,19 @@ class Odrive:
             if axis.errors:
                 self._wire.send(frames.command(axis.node, frames.CLEAR_ERRORS, frames.CLEAR.pack(0)))
 
-    def close(self) -> None:
-        """Leave the drives without power, and let go of the bus.
-
-        Drives that still have power are first brought to a standstill by the ramp.
-        """
-        if self._closed:
-            return
-        self._closed = True
-        with contextlib.suppress(can.CanError, OSError):
-            self._wait_for_standstill()
+    def _leave(self) -> None:
         idle = frames.AXIS_STATE.pack(AxisState.IDLE)
         for axis in self._axes:
             self._wire.send(frames.command(axis.node, frames.SET_AXIS_STATE, idle))
-        with contextlib.suppress(can.CanError, OSError):
-            self._wire.bus.shutdown()
 
-    def _stop(self) -> None:
-        """Drives that have power, or are getting it, are stopped with the first fault."""
-        if self._enabled:
-            self.quick_stop()
+    def _wants_power(self) -> bool:
+        return self._enabled
 
-    def _give_time_to_stop(self, asked: str) -> None:
-        self._off_by, self._asked = self._clock() + self._drives.stop_timeout, asked
+    def _powered(self) -> bool:
+        return any(axis.powered for axis in self._axes)
 
-    def _take_power_off(self) -> None:
-        """Tell of a drive that has not stopped in time, once; none is led down the ramp any longer."""
-        self._off_by = math.inf
-        self._braking = None
-        for axis in self._axes:
-            fault = axis.late_for(self._asked, self._drives.stop_timeout)
-            if fault is not None:
-                self._wire.fault = fault
-                return
+    def _give_up_stopping(self) -> None:
+        self._setpoints.abandon()
 
     def _found(self, now: float) -> DriveFault | None:
         """The first thing that is wrong."""
@@ -292,26 +218,6 @@ class Odrive:
                 )
         return None
 
-    def _sendable(self, axis: OdriveAxis, metres: float, rate: float) -> bool:
-        try:
-            frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
-        except (ValueError, OverflowError, struct.error):
-            return False
-        return math.isfinite(metres)  # a float that is not a number is packed like any other
-
-    def _set(self, position: Triple, velocity: Triple) -> None:
-        """Send setpoints; each is in force when it arrives."""
-        self._sent = sent = position, velocity
-        self._in_force = self._in_force or list(position)
-        for number, (axis, metres, rate) in enumerate(zip(self._axes, position, velocity, strict=True)):
-            data = frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
-            if self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
-                self._in_force[number] = metres
-            else:
-                axis.setpoints_lost += 1
-            if self._sent is not sent:
-                return  # what could not be sent has begun a quick stop, whose setpoints are newer
-
     def _command(self) -> None:
         """Ask drives for the state they should be in, once, and again where a heartbeat shows another."""
         for axis in self._axes:
@@ -328,40 +234,11 @@ class Odrive:
     def _wanted(self) -> AxisState | None:
         """The state that drives should be in now; None leaves them as they are."""
         if not self._enabled:
-            return AxisState.IDLE if self._braking is None else None
-        return AxisState.CLOSED_LOOP_CONTROL if self._sent is not None else None
+            return None if self._setpoints.stopping else AxisState.IDLE
+        return AxisState.CLOSED_LOOP_CONTROL if self._setpoints.sent is not None else None
 
-    def _brake(self) -> None:
-        """One period further down the ramp; at its end, power off.
-
-        Where the bus takes no setpoint the time goes on, but the place does not: a drive that hears nothing stands
-        soon, and is not to catch up with the ramp when the bus is back.
-        """
-        if self._sent is None or self._braking is None:
-            return
-        _, velocity = self._sent
-        self._next = self._braked(velocity)
-        if any(velocity):
-            return
-        self._braking += self._period
-        if self._braking > SETTLING:
-            self._braking = None
-
-    def _braked(self, velocity: Triple) -> tuple[Triple, Triple]:
-        """Setpoints one period further down the ramp from those in force, of this velocity."""
-        deceleration, period = self._drives.quick_stop_deceleration, self._period
-        (a, da), (b, db), (c, dc) = (
-            braked(place, rate, deceleration, period) for place, rate in zip(self._in_force, velocity, strict=True)
-        )
-        return (a, b, c), (da, db, dc)
-
-    def _wait_for_standstill(self) -> None:
-        """Go on with the cycle until no drive has power, for as long as a stop may take."""
-        if not any(axis.powered for axis in self._axes):
-            return
-        self.quick_stop()
-        deadline = self._clock() + self._drives.stop_timeout
-        while any(axis.powered for axis in self._axes) and (now := self._clock()) < deadline:
+    def _wait_for_standstill(self, deadline: float) -> None:
+        while self._powered() and (now := self._clock()) < deadline:  # the cycle goes on, for it leads the ramp
             self.sync()
             while (left := now + self._period - self._clock()) > 0.0:
                 message = self._wire.bus.recv(left)

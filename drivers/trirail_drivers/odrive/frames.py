@@ -1,4 +1,4 @@
-"""ODrive's CANSimple messages as bytes: identifiers, layouts, states, errors, and how full they make the bus.
+"""ODrive's CANSimple messages as bytes: identifiers, layouts, states, errors, and what they put on the bus.
 
 Layouts are those of firmware 0.6, from ODrive's manual, chapter "CAN Protocol": little-endian, floats of 32 bits,
 positions in turns of the encoder that the axis loads.
@@ -12,7 +12,8 @@ from typing import Final
 
 import can
 
-from trirail_drivers.frames import frame_bits, message
+from trirail_drivers.frames import data_frame, frame_bits
+from trirail_drivers.load import Traffic
 
 # Commands: the lower five bits of an identifier, under the node id.
 GET_VERSION: Final = 0x00
@@ -137,7 +138,7 @@ def identifier(node: int, command: int) -> int:
 
 def command(node: int, number: int, data: bytes) -> can.Message:
     """A message to one node."""
-    return message(identifier(node, number), data)
+    return data_frame(identifier(node, number), data)
 
 
 def request(node: int, number: int) -> can.Message:
@@ -171,20 +172,17 @@ def error_names(errors: int) -> str:
     return ", ".join([*names, *([f"unknown error {unknown:08X}"] if unknown else [])])
 
 
-CYCLE_BITS: Final = 3 * (frame_bits(INPUT_POS.size) + frame_bits(0) + frame_bits(ESTIMATES.size))
-"""One cycle: three setpoints, three requests, three encoder estimates."""
-
-
-def bus_load(rate_hz: float, bitrate: int, heartbeat: float) -> float:
-    """Worst-case share of the bus that cycles, error requests and three heartbeats take; 1.0 is full."""
-    return (rate_hz * CYCLE_BITS + _background(heartbeat)) / bitrate
-
-
-def highest_rate(bitrate: int, heartbeat: float) -> float:
-    """The cycle rate [Hz] that fills the bus; not positive if it is too slow for the heartbeats alone."""
-    return (bitrate - _background(heartbeat)) / CYCLE_BITS
-
-
 def _background(heartbeat: float) -> float:
-    """Bits per second that do not depend on the cycle."""
+    """Bits per second of error requests, their answers, and three heartbeats of this period [s]."""
     return (frame_bits(0) + frame_bits(ERRORS.size)) / ERROR_PERIOD + 3 * frame_bits(BEAT.size) / heartbeat
+
+
+TRAFFIC: Final = Traffic(
+    cycle_bits=3 * (frame_bits(INPUT_POS.size) + frame_bits(0) + frame_bits(ESTIMATES.size)),
+    background=_background,
+    most_sent=13,
+)
+"""One cycle: three setpoints, three requests, three encoder estimates.
+
+Sent are at most those setpoints and requests, a mode and a state for each drive, and an error request.
+"""

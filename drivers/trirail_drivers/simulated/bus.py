@@ -10,18 +10,11 @@ from functools import partial
 
 import can
 
-from trirail_drivers import config
-from trirail_drivers.axis import MISSED_HEARTBEATS
 from trirail_drivers.simulated.devices import SimulatedDevice
-from trirail_drivers.simulated.drive import SimulatedDrive
 from trirail_drivers.simulated.faults import Faults
-from trirail_drivers.simulated.odrive import SimulatedOdrive
-from trirail_drivers.simulated.servo import Servo
 
 _STEP = 0.0005
 """How long a waiting receiver sleeps before it looks at the drives again [s]."""
-FRICTION = 2.0
-"""How an ODrive's slider slows down that coasts [m/s²]."""
 
 
 class SimulatedBus(can.BusABC):
@@ -30,12 +23,12 @@ class SimulatedBus(can.BusABC):
     def __init__(
         self,
         drives: Sequence[SimulatedDevice],
-        clock: Callable[[], float] = time.monotonic,
-        faults: Faults | None = None,
+        clock: Callable[[], float],
+        faults: Faults,
     ) -> None:
-        """`faults`, if there are to be any, are those of the same drives."""
+        """`faults` are those of the same drives."""
         self.drives = tuple(drives)
-        self.faults = faults or Faults(self.drives, [1.0] * len(self.drives))
+        self.faults = faults
         self.channel_info = "simulated drives"
         self._clock = clock
         self._arrived: deque[can.Message] = deque()
@@ -115,53 +108,3 @@ class SimulatedBus(can.BusABC):
                 return None, False
             time.sleep(min(remaining, _STEP))
         return self._arrived.popleft(), False
-
-
-def simulated_bus(can: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic) -> SimulatedBus:
-    """The three drives of a configuration on a bus of their own, at rest where `can.simulated.start` says.
-
-    A drive that is to be homed does not know where that is: it counts from 0 at power-on, and has its home switch
-    at the position that the configuration gives for zero counts.
-    """
-    make = {"cia402": _servo_drive, "odrive": _odrive}[drives.protocol]
-    starts = zip(drives.each, can.simulated.start, strict=True)
-    devices = [make(can.simulated, drives, drive, start) for drive, start in starts]
-    scales = [drive.direction * drive.counts_per_metre for drive in drives.each]
-    return SimulatedBus(devices, clock, Faults(devices, scales))
-
-
-def _servo_drive(
-    simulated: config.Simulated,
-    drives: config.Drives,  # noqa: ARG001  one signature for both
-    drive: config.Drive,
-    start: float,
-) -> SimulatedDevice:
-    counts = round(_counts(drive, start))
-    switch = None if drive.homing is None else -counts
-    servo = _servo(simulated, drive, counts if switch is None else 0)
-    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch)
-
-
-def _odrive(simulated: config.Simulated, drives: config.Drives, drive: config.Drive, start: float) -> SimulatedDevice:
-    return SimulatedOdrive(
-        drive.node,
-        _servo(simulated, drive, _counts(drive, start)),
-        heartbeat=drives.heartbeat,
-        friction=FRICTION * drive.counts_per_metre,
-        # As long as a CiA 402 drive waits for its master: CANSimple has no way to tell a drive.
-        watchdog=MISSED_HEARTBEATS * drives.heartbeat,
-    )
-
-
-def _counts(drive: config.Drive, position: float) -> float:
-    return drive.direction * (position - drive.offset) * drive.counts_per_metre
-
-
-def _servo(simulated: config.Simulated, drive: config.Drive, counts: float) -> Servo:
-    return Servo(
-        counts,
-        time_constant=simulated.time_constant,
-        feed_forward_gain=simulated.feed_forward_gain,
-        max_velocity=simulated.max_velocity * drive.counts_per_metre,
-        max_acceleration=simulated.max_acceleration * drive.counts_per_metre,
-    )

@@ -72,6 +72,11 @@ class Device:
         self.objects.on_write(0x1016, self._consumer_written)
         self.objects.on_write(0x1017, self._producer_written)
 
+    @property
+    def emergencies(self) -> Emergencies:
+        """The errors that it tells by EMCY."""
+        return self.errors
+
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
         """Put the device on a bus, that it sends to by `transmit(can_id, data)`, and switch it on."""
         self._transmit = transmit

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from trirail_drivers.interface import PowerState
+from trirail_drivers.simulated.emergency import Emergencies
 from trirail_drivers.simulated.servo import Servo
 
 
@@ -24,6 +25,10 @@ class SimulatedDevice(Protocol):
     @property
     def power(self) -> PowerState:
         """Its state as CiA 402 has it."""
+
+    @property
+    def emergencies(self) -> Emergencies | None:
+        """The errors that it tells by EMCY; None where its protocol has no such message."""
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
         """Put it on a bus, that it sends to by `transmit(can_id, data)`, and switch it on."""

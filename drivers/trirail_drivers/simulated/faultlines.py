@@ -13,10 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from trirail_drivers import frames
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
-from trirail_drivers.odrive import frames as odrive_frames
 
 HELP: Final = """\
 [at SECONDS] [when DRIVE CONDITION] [with CHANCE] [DRIVE] FAULT [VALUE] [FRAMES ...] [for SECONDS | for N frames]
@@ -91,33 +89,8 @@ class Fault:
     """How many frames it strikes; None for all."""
 
 
-_EITHER: Final = {"to": Frames(True, None), "from": Frames(False, None)}
-CANOPEN: Final = {
-    "nmt": Frames(True, frames.NMT),
-    "sync": Frames(True, frames.SYNC),
-    "rpdo1": Frames(True, frames.RPDO1, 1),
-    "rpdo2": Frames(True, frames.RPDO2, 1),
-    "sdo-request": Frames(True, frames.SDO_REQUEST, 1),
-    "emcy": Frames(False, frames.EMCY, 1),
-    "tpdo1": Frames(False, frames.TPDO1, 1),
-    "tpdo2": Frames(False, frames.TPDO2, 1),
-    "sdo-answer": Frames(False, frames.SDO_ANSWER, 1),
-    "heartbeat": Frames(False, frames.HEARTBEAT, 1),
-} | _EITHER
-"""Names of the frames of CANopen drives."""
-_NODE: Final = odrive_frames.identifier(1, 0)
-ODRIVE: Final = {
-    "set_axis_state": Frames(True, odrive_frames.SET_AXIS_STATE, _NODE),
-    "set_controller_mode": Frames(True, odrive_frames.SET_CONTROLLER_MODE, _NODE),
-    "set_input_pos": Frames(True, odrive_frames.SET_INPUT_POS, _NODE),
-    "clear_errors": Frames(True, odrive_frames.CLEAR_ERRORS, _NODE),
-    "position-request": Frames(True, odrive_frames.GET_ENCODER_ESTIMATES, _NODE),
-    "get_version": Frames(False, odrive_frames.GET_VERSION, _NODE),
-    "get_error": Frames(False, odrive_frames.GET_ERROR, _NODE),
-    "get_encoder_estimates": Frames(False, odrive_frames.GET_ENCODER_ESTIMATES, _NODE),
-    "heartbeat": Frames(False, odrive_frames.HEARTBEAT, _NODE),
-} | _EITHER
-"""Names of the frames of ODrives, as their manual has them."""
+EITHER: Final = {"to": Frames(True, None), "from": Frames(False, None)}
+"""Names of frames that drives of every protocol have."""
 CONDITIONS: Final = ("enabled", "moving", "stopping", "fault")
 _DRIVES: Final = {name: (index,) for index, name in enumerate(NAMES)} | {"all": tuple(range(len(NAMES)))}
 
@@ -203,7 +176,7 @@ class _Words:
             raise FaultSyntaxError(f"{after} {word}: after {after} comes {wants}, as in: {example}") from None
 
 
-def parse(line: str, known_frames: Mapping[str, Frames] = CANOPEN) -> Fault:
+def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
     """Read one line for drives whose frames have these names. Raises FaultSyntaxError, which says what is right."""
     words = _Words(line)
     delay, chance, condition = 0.0, 1.0, None
@@ -233,7 +206,7 @@ def parse(line: str, known_frames: Mapping[str, Frames] = CANOPEN) -> Fault:
         word = words.left.pop(0)
         if name not in _OF_FRAMES:
             raise FaultSyntaxError(f'"{word}" after {name}: only for can follow, as in: {who}{name} for 0.5')
-        chosen.append(_frames(word, known_frames))
+        chosen.append(_frames(word, {**known_frames, **EITHER}))
     duration, number = _lasting(words, name, kind.momentary)
     return Fault(line, name, drives, value, tuple(chosen), delay, condition, chance, duration, number)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -15,10 +15,8 @@ from trirail_drivers import canerrors, files
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES, PowerState
 from trirail_drivers.simulated.devices import SimulatedDevice
-from trirail_drivers.simulated.drive import SimulatedDrive
 from trirail_drivers.simulated.emergency import Emergencies
-from trirail_drivers.simulated.faultlines import CANOPEN, ODRIVE, Condition, Fault, FaultSyntaxError, Frames, parse
-from trirail_drivers.simulated.odrive import SimulatedOdrive
+from trirail_drivers.simulated.faultlines import Condition, Fault, FaultSyntaxError, Frames, parse
 
 MOVING: Final = 1e-3
 """A slider moves from this speed on [m/s]."""
@@ -64,13 +62,17 @@ class Faults:
         self,
         drives: Sequence[SimulatedDevice],
         counts_per_metre: Sequence[float],
+        frames: Mapping[str, Frames],
         seed: int = 0,
         tell: Callable[[str], None] = _to_nobody,
     ) -> None:
-        """`counts_per_metre`: negative where counts fall as the slider rises. `tell`: hears what begins and ends."""
+        """`counts_per_metre`: negative where counts fall as the slider rises. `frames`: those that lines can name.
+
+        `tell`: hears what begins and ends.
+        """
         self.tell = tell
         self._drives = drives
-        self._names = ODRIVE if any(isinstance(drive, SimulatedOdrive) for drive in drives) else CANOPEN
+        self._frames = frames
         self._scales = counts_per_metre
         self._random = random.Random(seed)
         self._active: list[_Active] = []
@@ -101,10 +103,10 @@ class Faults:
 
     def add(self, line: str) -> None:
         """Take up a line. Raises FaultSyntaxError."""
-        fault = parse(line, self._names)
+        fault = parse(line, self._frames)
         if fault.name == "emcy":
             for index in fault.drives:
-                if not isinstance(self._drives[index], SimulatedDrive):
+                if self._drives[index].emergencies is None:
                     raise FaultSyntaxError(f"{line}: drive {NAMES[index]} has no EMCY; as in: {NAMES[index]} fault 200")
         if self.idle:
             self._now = self._clock()
@@ -268,8 +270,8 @@ class Faults:
                 drive.servo.forced_velocity = 0.0
 
     def _emergencies(self, fault: Fault) -> list[Emergencies]:
-        struck = (self._drives[index] for index in fault.drives)
-        return [drive.errors for drive in struck if isinstance(drive, SimulatedDrive)]
+        struck = (self._drives[index].emergencies for index in fault.drives)
+        return [emergencies for emergencies in struck if emergencies is not None]
 
     def _fail(self, fault: Fault) -> None:
         for index in fault.drives:

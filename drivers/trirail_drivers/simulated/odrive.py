@@ -77,6 +77,11 @@ class SimulatedOdrive:
             return PowerState.OPERATION_ENABLED
         return PowerState.FAULT if self._told else PowerState.SWITCH_ON_DISABLED
 
+    @property
+    def emergencies(self) -> None:
+        """None: CANSimple has no EMCY."""
+        return None
+
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
         """Put the drive on a bus, that it sends to by `transmit(can_id, data)`, and switch it on."""
         self._transmit = transmit

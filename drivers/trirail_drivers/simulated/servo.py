@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from trirail_drivers import config
 from trirail_drivers.ramp import braked
 
 
@@ -48,6 +49,17 @@ class Servo:
         self._time_constant = time_constant
         self._max_velocity = max_velocity
         self._max_acceleration = max_acceleration
+
+    @classmethod
+    def configured(cls, simulated: config.Simulated, drive: config.Drive, counts: float) -> Servo:
+        """The servo that a configuration describes, at rest at a position [counts]."""
+        return cls(
+            counts,
+            time_constant=simulated.time_constant,
+            feed_forward_gain=simulated.feed_forward_gain,
+            max_velocity=simulated.max_velocity * drive.counts_per_metre,
+            max_acceleration=simulated.max_acceleration * drive.counts_per_metre,
+        )
 
     @property
     def following_error(self) -> float:

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from msgspec import Struct
-from trirail_drivers.load import HIGH, bus_load, highest_rate
+from trirail_drivers.load import HIGH
+from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.config import Config
 from trirail.processes.clock import Tick
@@ -17,8 +18,6 @@ RELIABLE_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_
 """Clock sources that are read without leaving the processor, or its virtual machine."""
 COARSE = 1e-6
 """A clock of a coarser resolution cannot wake anybody in time [s]."""
-FRAMES_A_CYCLE = 8
-"""That the service sends at most: SYNC, heartbeat, three setpoints, three controlwords."""
 LATE = 0.1
 """Share of the period by which one tick in a thousand may be late."""
 
@@ -131,10 +130,11 @@ def can_interface(config: Config, machine: Machine) -> list[Check]:
         return [Check("CAN", "warning", found, "look at it with its maker's tools; SocketCAN tells its state")]
     if not machine.af_can:
         return [Check("CAN", "failure", "this kernel has no SocketCAN", "modprobe can_raw")]
-    return [Check("CAN", "ok", "SocketCAN"), *_link(section.channel, section.bitrate, machine.link)]
+    return [Check("CAN", "ok", "SocketCAN"), *_link(config, machine.link)]
 
 
-def _link(name: str, bitrate: int, link: dict[str, Any] | None) -> list[Check]:
+def _link(config: Config, link: dict[str, Any] | None) -> list[Check]:
+    name, bitrate = config.can.channel, config.can.bitrate
     virtual = name.startswith("vcan")
     up = f"ip link set {name} up" + ("" if virtual else f" type can bitrate {bitrate}")
     if link is None:
@@ -146,7 +146,8 @@ def _link(name: str, bitrate: int, link: dict[str, Any] | None) -> list[Check]:
     if info.get("info_kind") == "vcan":
         return [Check(name, "ok", "up; virtual, without bitrate and error states")]
     data = info.get("info_data", {})
-    return [_bitrate(name, bitrate, data, up), _state(name, data, up), _queue(name, link.get("txqlen"))]
+    queue = _queue(name, link.get("txqlen"), PROTOCOLS[config.drives.protocol].traffic.most_sent)
+    return [_bitrate(name, bitrate, data, up), _state(name, data, up), queue]
 
 
 def _bitrate(name: str, bitrate: int, data: dict[str, Any], up: str) -> Check:
@@ -171,9 +172,9 @@ def _state(name: str, data: dict[str, Any], up: str) -> Check:
     return Check(f"{name} state", verdict, f"{state}{counted}", wiring)
 
 
-def _queue(name: str, length: int | None) -> Check:
+def _queue(name: str, length: int | None, most_sent: int) -> Check:
     """The kernel's queue must take two cycles' frames, for a late one and the next on time come together."""
-    wanted = 2 * FRAMES_A_CYCLE
+    wanted = 2 * most_sent
     if length is None or length >= wanted:
         return Check(f"{name} queue", "ok", f"{length or 'unknown number of'} frames")
     found = f"{length} frames; two cycles may come together and take {wanted}"
@@ -183,11 +184,12 @@ def _queue(name: str, length: int | None) -> Check:
 def load(config: Config) -> Check:
     """The share of the bus that the cycle takes at worst, as the driver counts it."""
     rate, bitrate, drives = config.loop.rate_hz, config.can.bitrate, config.drives
-    share = bus_load(rate, bitrate, drives)
+    traffic = PROTOCOLS[drives.protocol].traffic
+    share = traffic.bus_load(rate, bitrate, drives.heartbeat)
     found = f"{share:.0%} of {bitrate} bit/s at {rate} Hz"
     if share <= HIGH:
         return Check("bus load", "ok", found)
-    remedy = f"loop.rate_hz below {HIGH * highest_rate(bitrate, drives):.0f}, or a higher bitrate"
+    remedy = f"loop.rate_hz below {HIGH * traffic.highest_rate(bitrate, drives.heartbeat):.0f}, or a higher bitrate"
     return Check("bus load", "failure" if share > 1.0 else "warning", found, remedy)
 
 

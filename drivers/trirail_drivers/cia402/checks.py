@@ -1,0 +1,42 @@
+"""Refuses settings that no CiA 402 drive could carry out."""
+
+from __future__ import annotations
+
+from trirail_drivers.cia402 import settings
+from trirail_drivers.config import Drive, Drives
+from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import NAMES
+from trirail_drivers.requirements import Requirements, check_resolution
+from trirail_drivers.scaling import INT32_MAX, Scale, scale_of
+
+
+def check(drives: Drives, required: Requirements) -> None:
+    """Refuse what a drive cannot be told, take or resolve. Raises DriveError with the key."""
+    settings.check_nodes(drives)
+    for name, drive in zip(NAMES, drives.each, strict=True):
+        scale = scale_of(name, drive)
+        check_resolution(name, drive, drives, required, 1.0 / drive.counts_per_metre, _finer)
+        _check_counts(name, drive, scale, required)
+        settings.settings_of(name, drive, drives, scale, required.period)
+
+
+def _finer(widest: float) -> str:
+    return f"wanted counts_per_metre of at least {1.0 / widest:g}"
+
+
+def _check_counts(name: str, drive: Drive, scale: Scale, required: Requirements) -> None:
+    """Setpoints, positions and feed-forward are 32-bit integers."""
+    reach = max(abs(scale.exact(required.low)), abs(scale.exact(required.high)))
+    # A position may be a following error beyond the travel, and a velocity a little beyond its limit.
+    if reach + drive.counts_per_metre * required.following_error >= INT32_MAX:
+        raise DriveError(
+            f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}, offset = {drive.offset:g}: "
+            f"limits.slider.position = [{required.low:g}, {required.high:g}] is {reach:g} counts, and a drive takes "
+            f"{INT32_MAX}; wanted fewer counts, or an offset nearer to the travel"
+        )
+    if 2.0 * required.velocity * drive.counts_per_metre >= INT32_MAX:
+        raise DriveError(
+            f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}: limits.slider.velocity = "
+            f"{required.velocity:g} is {required.velocity * drive.counts_per_metre:g} counts/s, and twice that must be "
+            f"below {INT32_MAX}; wanted at most {INT32_MAX / (2.0 * required.velocity):.4g} counts_per_metre"
+        )

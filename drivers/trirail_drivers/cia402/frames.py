@@ -1,0 +1,126 @@
+"""CANopen frames as bytes: identifiers, layouts, CiA 402 states, and what they put on the bus."""
+
+from __future__ import annotations
+
+from struct import Struct
+from typing import Final, Literal
+
+import can
+
+from trirail_drivers.frames import data_frame, frame_bits
+from trirail_drivers.interface import PowerState
+from trirail_drivers.load import Traffic
+
+# Identifiers of the predefined connection set (CiA 301); all but the first two are bases for a node id.
+NMT: Final = 0x000
+SYNC: Final = 0x080
+EMCY: Final = 0x080
+TPDO1: Final = 0x180
+RPDO1: Final = 0x200
+TPDO2: Final = 0x280
+RPDO2: Final = 0x300
+SDO_ANSWER: Final = 0x580
+SDO_REQUEST: Final = 0x600
+HEARTBEAT: Final = 0x700
+
+NMT_COMMAND: Final = Struct("<BB")
+"""Command and node id."""
+SETPOINT: Final = Struct("<ii")
+"""RPDO2: target position 607Ah [counts] and velocity offset 60B1h [counts/s]."""
+POSITION: Final = Struct("<i")
+"""TPDO2: actual position 6064h [counts]."""
+CONTROLWORD: Final = Struct("<H")
+"""RPDO1: controlword 6040h."""
+STATUSWORD: Final = Struct("<H")
+"""TPDO1: statusword 6041h."""
+EMERGENCY: Final = Struct("<HB5s")
+"""Error code, error register 1001h, and what the manufacturer adds."""
+NMT_STATE: Final = Struct("<B")
+"""Heartbeat and boot-up: the sender's NMT state."""
+
+STATUSWORD_UPLOAD: Final = b"\x40\x41\x60\x00" + bytes(4)
+"""SDO request for the statusword 6041h."""
+STATUSWORD_UPLOADED: Final = b"\x4b\x41\x60\x00"
+"""How its answer begins; the two bytes of the statusword follow."""
+
+NMT_START: Final = 0x01
+NMT_PRE_OPERATIONAL: Final = 0x80
+
+BOOT_UP: Final = 0x00
+STOPPED: Final = 0x04
+OPERATIONAL: Final = 0x05
+PRE_OPERATIONAL: Final = 0x7F
+
+DISABLE_VOLTAGE: Final = 0x00
+QUICK_STOP: Final = 0x02
+SHUTDOWN: Final = 0x06
+SWITCH_ON: Final = 0x07
+ENABLE_OPERATION: Final = 0x0F
+FAULT_RESET: Final = 0x80
+HOMING_START: Final = 0x10
+"""Bit 4 in homing mode, beside ENABLE_OPERATION."""
+HALT: Final = 0x100
+"""Bit 8: stop and stand still, with power."""
+
+STATUS_PERIOD: Final = 0.1
+"""A drive repeats an unchanged statusword this often: event timer 1800h:05 [s]."""
+
+# CiA 402-2, statusword coding: mask 4Fh (bit 5 is free) for the first four states, 6Fh for the others.
+_STATES: Final = {
+    0x00: PowerState.NOT_READY_TO_SWITCH_ON,
+    0x20: PowerState.NOT_READY_TO_SWITCH_ON,
+    0x40: PowerState.SWITCH_ON_DISABLED,
+    0x60: PowerState.SWITCH_ON_DISABLED,
+    0x0F: PowerState.FAULT_REACTION_ACTIVE,
+    0x2F: PowerState.FAULT_REACTION_ACTIVE,
+    0x08: PowerState.FAULT,
+    0x28: PowerState.FAULT,
+    0x21: PowerState.READY_TO_SWITCH_ON,
+    0x23: PowerState.SWITCHED_ON,
+    0x27: PowerState.OPERATION_ENABLED,
+    0x07: PowerState.QUICK_STOP_ACTIVE,
+}
+
+# A quick stop under way is left to end by itself, in switch on disabled: 605Ah = 2.
+_TOWARDS_OPERATION: Final = {
+    PowerState.SWITCH_ON_DISABLED: SHUTDOWN,
+    PowerState.READY_TO_SWITCH_ON: SWITCH_ON,
+    PowerState.SWITCHED_ON: ENABLE_OPERATION,
+    PowerState.OPERATION_ENABLED: ENABLE_OPERATION,
+    PowerState.QUICK_STOP_ACTIVE: QUICK_STOP,
+}
+
+Wanted = Literal[PowerState.SWITCH_ON_DISABLED, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE]
+"""The states one can ask a drive for; the others are on the way, or its own doing."""
+
+
+def nmt(command: int, node: int) -> can.Message:
+    """An NMT command to one node."""
+    return data_frame(NMT, NMT_COMMAND.pack(command, node))
+
+
+def power_state(statusword: int) -> PowerState | None:
+    """Decode statusword 6041h; None if its bits are those of no CiA 402 state."""
+    return _STATES.get(statusword & 0x6F)
+
+
+def controlword(state: PowerState, wanted: Wanted) -> int:
+    """Controlword 6040h for the next transition from `state` towards `wanted`."""
+    if wanted is PowerState.OPERATION_ENABLED:
+        return _TOWARDS_OPERATION.get(state, DISABLE_VOLTAGE)
+    if wanted is PowerState.QUICK_STOP_ACTIVE:
+        return QUICK_STOP
+    return DISABLE_VOLTAGE
+
+
+def _background(heartbeat: float) -> float:
+    """Bits per second of repeated statuswords and of four heartbeats of this period [s]."""
+    return 3 * frame_bits(STATUSWORD.size) / STATUS_PERIOD + 4 * frame_bits(NMT_STATE.size) / heartbeat
+
+
+TRAFFIC: Final = Traffic(
+    cycle_bits=frame_bits(0) + 3 * frame_bits(SETPOINT.size) + 3 * frame_bits(POSITION.size),
+    background=_background,
+    most_sent=8,
+)
+"""One cycle: SYNC, three setpoints, three positions; sent are at most SYNC, heartbeat, setpoints, controlwords."""

@@ -1,0 +1,123 @@
+"""What three ODrives are to follow, and the ramp down which a quick stop leads it."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Sequence
+from typing import Final
+
+from trirail_drivers.interface import Triple
+from trirail_drivers.odrive import frames
+from trirail_drivers.odrive.axis import OdriveAxis
+from trirail_drivers.ramp import braked
+from trirail_drivers.wire import Wire
+
+SETTLING: Final = 0.05
+"""How long a drive holds at the end of a quick stop before its power is taken off, for its servo to catch up [s]."""
+
+
+class Setpoints:
+    """The setpoints [m], [m/s] that were written, those sent last, and the positions in force."""
+
+    def __init__(self, axes: Sequence[OdriveAxis], wire: Wire, deceleration: float) -> None:
+        """`deceleration` is that of the quick-stop ramp [m/s²]."""
+        self.period = 0.0
+        """Of the cycle [s]."""
+        self.sent: tuple[Triple, Triple] | None = None
+        """Setpoints sent last; None where no drive has been sent any since enabling."""
+        self._axes = axes
+        self._wire = wire
+        self._deceleration = deceleration
+        self._next: tuple[Triple, Triple] | None = None
+        """Setpoints to be sent at the next SYNC."""
+        self._in_force: list[float] = []
+        """Positions that the bus has taken last [m]."""
+        self._braking: float | None = None
+        """Time since a quick stop has brought the setpoints to a standstill [s]; None where none is under way."""
+
+    @property
+    def stopping(self) -> bool:
+        """Whether a quick stop is under way."""
+        return self._braking is not None
+
+    def begin(self) -> None:
+        """Forget what was sent before the drives are to get power."""
+        self._braking = self.sent = None
+        self._in_force = []
+
+    def take(self, position: Triple, velocity: Triple) -> OdriveAxis | None:
+        """Take what is to be sent at the next SYNC; the axis whose message cannot hold it, if there is one."""
+        for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
+            if not _is_sendable(axis, metres, rate):
+                return axis
+        self._next = position, velocity
+        return None
+
+    def step(self, enabled: bool) -> None:
+        """Send what is due at a SYNC."""
+        if self._braking is not None:
+            self._brake()
+        # Without power none is sent: a drive that has missed losing it is to stay where the ramp has ended.
+        if self._next is not None and (enabled or self.stopping):
+            self._send(*self._next)
+
+    def stop(self) -> None:
+        """Begin to lead the drives down the ramp, now; they must have been sent setpoints."""
+        if self.sent is None:
+            return
+        self._braking = 0.0
+        # The position in force stays; what the drives are to run on with is less from now on.
+        a, b, c = self._in_force
+        _, slower = self._braked(self.sent[1])
+        self._send((a, b, c), slower)
+        self._next = None
+
+    def abandon(self) -> None:
+        """Lead the drives down the ramp no longer."""
+        self._braking = None
+
+    def _send(self, position: Triple, velocity: Triple) -> None:
+        """Send setpoints; each is in force when it arrives."""
+        self.sent = sent = position, velocity
+        self._in_force = self._in_force or list(position)
+        for number, (axis, metres, rate) in enumerate(zip(self._axes, position, velocity, strict=True)):
+            data = frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
+            if self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
+                self._in_force[number] = metres
+            else:
+                axis.setpoints_lost += 1
+            if self.sent is not sent:
+                return  # what could not be sent has begun a quick stop, whose setpoints are newer
+
+    def _brake(self) -> None:
+        """One period further down the ramp; at its end, power off.
+
+        Where the bus takes no setpoint the time goes on, but the place does not: a drive that hears nothing stands
+        soon, and is not to catch up with the ramp when the bus is back.
+        """
+        if self.sent is None or self._braking is None:
+            return
+        _, velocity = self.sent
+        self._next = self._braked(velocity)
+        if any(velocity):
+            return
+        self._braking += self.period
+        if self._braking > SETTLING:
+            self._braking = None
+
+    def _braked(self, velocity: Triple) -> tuple[Triple, Triple]:
+        """Setpoints one period further down the ramp from those in force, of this velocity."""
+        (a, da), (b, db), (c, dc) = (
+            braked(place, rate, self._deceleration, self.period)
+            for place, rate in zip(self._in_force, velocity, strict=True)
+        )
+        return (a, b, c), (da, db, dc)
+
+
+def _is_sendable(axis: OdriveAxis, metres: float, rate: float) -> bool:
+    try:
+        frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
+    except (ValueError, OverflowError, struct.error):
+        return False
+    return math.isfinite(metres)  # a float that is not a number is packed like any other

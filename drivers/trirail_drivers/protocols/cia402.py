@@ -1,0 +1,44 @@
+"""CiA 402 drives on CANopen, as a protocol."""
+
+from __future__ import annotations
+
+from trirail_drivers import config
+from trirail_drivers.cia402 import checks, frames
+from trirail_drivers.cia402.drives import Cia402
+from trirail_drivers.protocols.protocol import Protocol
+from trirail_drivers.simulated import Frames, Servo, SimulatedDevice, SimulatedDrive
+
+
+def _simulated_drive(
+    simulated: config.Simulated,
+    drives: config.Drives,  # noqa: ARG001  one signature for all
+    drive: config.Drive,
+    start: float,
+) -> SimulatedDevice:
+    """A drive that is to be homed counts from 0 at power-on, and has its home switch at zero counts of [drives]."""
+    counts = round(drive.direction * (start - drive.offset) * drive.counts_per_metre)
+    switch = None if drive.homing is None else -counts
+    servo = Servo.configured(simulated, drive, counts if switch is None else 0)
+    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch)
+
+
+CIA402 = Protocol(
+    name="cia402",
+    driver=Cia402,
+    check=checks.check,
+    traffic=frames.TRAFFIC,
+    simulated_drive=_simulated_drive,
+    fault_frames={
+        "nmt": Frames(True, frames.NMT),
+        "sync": Frames(True, frames.SYNC),
+        "rpdo1": Frames(True, frames.RPDO1, 1),
+        "rpdo2": Frames(True, frames.RPDO2, 1),
+        "sdo-request": Frames(True, frames.SDO_REQUEST, 1),
+        "emcy": Frames(False, frames.EMCY, 1),
+        "tpdo1": Frames(False, frames.TPDO1, 1),
+        "tpdo2": Frames(False, frames.TPDO2, 1),
+        "sdo-answer": Frames(False, frames.SDO_ANSWER, 1),
+        "heartbeat": Frames(False, frames.HEARTBEAT, 1),
+    },
+)
+"""CiA 402 on CANopen, in cyclic synchronous position mode."""

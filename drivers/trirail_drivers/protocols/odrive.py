@@ -1,0 +1,52 @@
+"""ODrives on CANSimple, as a protocol."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from trirail_drivers import config
+from trirail_drivers.axis import MISSED_HEARTBEATS
+from trirail_drivers.odrive import checks, frames
+from trirail_drivers.odrive.drives import Odrive
+from trirail_drivers.protocols.protocol import Protocol
+from trirail_drivers.simulated import Frames, Servo, SimulatedDevice, SimulatedOdrive
+
+FRICTION: Final = 2.0
+"""How a simulated ODrive's slider slows down that coasts [m/s²]."""
+_NODE: Final = frames.identifier(1, 0)
+"""What each further node id adds to an identifier."""
+
+
+def _simulated_drive(
+    simulated: config.Simulated, drives: config.Drives, drive: config.Drive, start: float
+) -> SimulatedDevice:
+    turns = drive.direction * (start - drive.offset) * drive.counts_per_metre
+    return SimulatedOdrive(
+        drive.node,
+        Servo.configured(simulated, drive, turns),
+        heartbeat=drives.heartbeat,
+        friction=FRICTION * drive.counts_per_metre,
+        # As long as a CiA 402 drive waits for its master: CANSimple has no way to tell a drive.
+        watchdog=MISSED_HEARTBEATS * drives.heartbeat,
+    )
+
+
+ODRIVE = Protocol(
+    name="odrive",
+    driver=Odrive,
+    check=checks.check,
+    traffic=frames.TRAFFIC,
+    simulated_drive=_simulated_drive,
+    fault_frames={  # named as in the manual
+        "set_axis_state": Frames(True, frames.SET_AXIS_STATE, _NODE),
+        "set_controller_mode": Frames(True, frames.SET_CONTROLLER_MODE, _NODE),
+        "set_input_pos": Frames(True, frames.SET_INPUT_POS, _NODE),
+        "clear_errors": Frames(True, frames.CLEAR_ERRORS, _NODE),
+        "position-request": Frames(True, frames.GET_ENCODER_ESTIMATES, _NODE),
+        "get_version": Frames(False, frames.GET_VERSION, _NODE),
+        "get_error": Frames(False, frames.GET_ERROR, _NODE),
+        "get_encoder_estimates": Frames(False, frames.GET_ENCODER_ESTIMATES, _NODE),
+        "heartbeat": Frames(False, frames.HEARTBEAT, _NODE),
+    },
+)
+"""ODrive's CANSimple, in position control."""

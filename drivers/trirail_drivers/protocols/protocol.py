@@ -1,0 +1,34 @@
+"""What a protocol brings: its driver, the checks of its settings, its traffic, and its simulated drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import can
+
+from trirail_drivers import config
+from trirail_drivers.interface import Drives
+from trirail_drivers.load import Traffic
+from trirail_drivers.requirements import Requirements
+from trirail_drivers.simulated import Frames, SimulatedDevice
+
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """All that is known of a protocol outside its own modules."""
+
+    name: str
+    """As `drives.protocol` of the configuration names it."""
+    driver: Callable[[can.BusABC, int, config.Drives, Clock], Drives]
+    """Makes the driver of three drives, from the bus, its bitrate, section [drives] and the clock."""
+    check: Callable[[config.Drives, Requirements], None]
+    """Refuses with DriveError what the drives could not carry out."""
+    traffic: Traffic
+    """What drives and service put on the bus."""
+    simulated_drive: Callable[[config.Simulated, config.Drives, config.Drive, float], SimulatedDevice]
+    """Makes one simulated drive, its slider at rest at a position [m]."""
+    fault_frames: Mapping[str, Frames]
+    """The frames that faults on demand can name."""

@@ -1,0 +1,46 @@
+"""What a robot requires of its drives, and whether the steps of their positions are fine enough for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from trirail_drivers.config import Drive, Drives
+from trirail_drivers.errors import DriveError
+
+FINE_ENOUGH: Final = 10
+"""So many steps of a drive's position the following error must have, lest rounding alone be a fault."""
+
+
+class Requirements(NamedTuple):
+    """What the drives are to be able to do."""
+
+    period: float
+    """Of the cycle [s]."""
+    low: float
+    high: float
+    """Travel of the sliders [m]."""
+    velocity: float
+    """Of the sliders at most [m/s]."""
+    following_error: float
+    """Beyond which the service stops everything [m]."""
+
+
+def check_resolution(
+    name: str, drive: Drive, drives: Drives, required: Requirements, step: float, remedy: Callable[[float], str]
+) -> None:
+    """Refuse a `step` of the position [m] that no limit is several of wide: rounding alone is no fault, nor a jump.
+
+    `remedy` says what would be right, given the widest step [m] that would do. Raises DriveError.
+    """
+    limits = (
+        ("limits.slider.following_error", "m", required.following_error, FINE_ENOUGH),
+        ("drives.following_error", "m", drives.following_error, FINE_ENOUGH),
+        ("limits.slider.velocity", "m in a cycle", required.velocity * required.period, 1),
+    )
+    for key, unit, limit, steps in limits:
+        if step * steps > limit:
+            raise DriveError(
+                f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}, offset = {drive.offset:g}: the position "
+                f"goes in steps of {step:g} m, too coarse for {key}, {limit:g} {unit}; {remedy(limit / steps)}"
+            )
