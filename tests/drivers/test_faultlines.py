@@ -21,7 +21,7 @@ from trirail_drivers.simulated.faultlines import HELP, Condition, FaultSyntaxErr
 from trirail_drivers.simulated.faults import Faults
 from trirail_drivers.unixbus import UnixBus
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 WAIT = 20.0
 SCALE = 1e6
 

@@ -10,7 +10,7 @@ import pytest
 import trirail
 import trirail_drivers
 from conftest import Rig
-from test_odrive import odrives
+from drivers.test_odrive import odrives
 from trirail.config import SIM, load
 from trirail_drivers import config
 from trirail_drivers.protocols import PROTOCOLS

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 from conftest import CONFIG, Rig
+from control.test_control import PERIOD, assert_within_limits, refusal
 from hypothesis import given
 from hypothesis import strategies as st
-from test_control import PERIOD, assert_within_limits, refusal
 from trirail.wire.messages import PoseGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode

@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
-from test_service import Service, trirail, until
+from processes.test_service import Service, trirail, until
 from trirail.client.client import Robot
 from trirail.errors import RefusedError
 from trirail.wire import boundary

@@ -117,7 +117,7 @@ def test_a_file_that_was_never_closed_holds_all_that_was_written(tmp_path: Path)
 
 def test_a_killed_recorder_leaves_what_it_has_written(tmp_path: Path) -> None:
     script = (
-        "import os, signal, sys; from pathlib import Path; import made; from test_reading import written\n"
+        "import os, signal, sys; from pathlib import Path; import made; from telemetry.test_reading import written\n"
         "kept = written(Path(sys.argv[1]), made.records(0.8), close=False)\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )

@@ -14,7 +14,7 @@ import pytest
 from trirail_drivers.errors import BusError
 from trirail_drivers.unixbus import UnixBus
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 WAIT = 5.0
 """Longest wait for a frame that has to come [s]."""
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from trirail_drivers.frames import frame_bits
 from trirail_drivers.odrive import frames
 
-LOADED = cantools.database.load_file(Path(__file__).with_name("data") / "odrive-cansimple.dbc")
+LOADED = cantools.database.load_file(Path(__file__).parents[1] / "data" / "odrive-cansimple.dbc")
 assert isinstance(LOADED, Database)
 DBC = LOADED
 float32 = st.floats(width=32, allow_nan=False, allow_infinity=False)

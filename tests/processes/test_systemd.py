@@ -14,7 +14,7 @@ import pytest
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
 from trirail.processes.systemd import FEEDS, Watchdog, notify
 
-UNIT = Path(__file__).parents[1] / "configs" / "trirail.service"
+UNIT = Path(__file__).parents[2] / "configs" / "trirail.service"
 
 
 class Clock:

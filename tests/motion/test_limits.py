@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig, changed
+from control.test_control import GOAL, PERIOD, ROBOT, assert_within_limits, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from test_control import GOAL, PERIOD, ROBOT, assert_within_limits, refusal
 from trirail.control.feedback import Measured
 from trirail.kinematics.robot import inverse
 from trirail.motion.feasibility import PLATFORM_LAWS

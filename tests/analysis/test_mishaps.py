@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from test_loop import Shell, shell
+from processes.test_loop import Shell, shell
 from trirail.analysis.replay import again
 from trirail.telemetry.reading import Recording
 from trirail.wire.messages import PoseGoal

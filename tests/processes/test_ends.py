@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from test_service import (
+from processes.test_service import (
     END_WITHIN,
     UP_WITHIN,
     Service,

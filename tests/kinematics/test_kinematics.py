@@ -38,7 +38,7 @@ FIELDS = {
 
 
 def table(example: str) -> dict[str, Array]:
-    with (Path(__file__).parent / "data" / f"paper_{example}.csv").open(newline="") as file:
+    with (Path(__file__).parents[1] / "data" / f"paper_{example}.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     return {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
 

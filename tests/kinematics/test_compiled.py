@@ -29,7 +29,7 @@ def run(code: str, directory: Path) -> str:
 
 
 def test_a_second_start_compiles_nothing() -> None:
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     run(COUNT, root)  # the first start, if there was none before
     assert run(COUNT, root) == "0 0 0 0"
 

@@ -192,7 +192,7 @@ def test_a_full_disk_is_told_of_with_its_reason(tmp_path: Path, monkeypatch: pyt
 LIMITED = """
 import os, resource, sys
 from pathlib import Path
-import made, test_volumes as here
+import made, telemetry.test_rotation as here
 from trirail.telemetry.rotation import RETRY
 told, time = [], here.Time()
 config = here.configured()
@@ -213,7 +213,9 @@ os._exit(0)
 
 def test_after_a_disk_that_failed_the_recording_goes_on_in_another_file(tmp_path: Path) -> None:
     command = [sys.executable, "-c", LIMITED, str(tmp_path)]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        command, cwd=Path(__file__).parents[1], capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 0, done.stderr
     first, *others = parts(tmp_path)
     assert first.stat().st_size <= 1_000_000
@@ -224,14 +226,14 @@ def test_after_a_disk_that_failed_the_recording_goes_on_in_another_file(tmp_path
 
 def test_a_killed_recorder_leaves_all_that_was_saved(tmp_path: Path) -> None:
     script = (
-        "import os, signal, sys; from pathlib import Path; import made, test_volumes as here\n"
+        "import os, signal, sys; from pathlib import Path; import made, telemetry.test_rotation as here\n"
         "time = here.Time(); kept = here.recorder(Path(sys.argv[1]), time, here.configured())\n"
         "sent = made.records(1.98); here.feed(kept, sent[:1940], time); kept.save()\n"
         "here.feed(kept, sent[1940:], time)\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
     command = [sys.executable, "-c", script, str(tmp_path)]
-    assert subprocess.run(command, cwd=Path(__file__).parent, check=False).returncode == -9
+    assert subprocess.run(command, cwd=Path(__file__).parents[1], check=False).returncode == -9
     (path,) = parts(tmp_path)
     records = read(path).records
     assert records.tobytes() == made.records(1.98)[:1940].tobytes()

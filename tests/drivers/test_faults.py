@@ -12,7 +12,7 @@ import can
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig, changed
-from test_homing import incremental
+from drivers.test_homing import incremental
 from trirail.config import Config
 from trirail.wire.packets import CommandRequest, Confirmed, Refused
 from trirail.wire.vocabulary import Command, Mode

@@ -17,7 +17,7 @@ from trirail.config import Config
 from trirail.errors import TrirailError
 from trirail.wire.messages import Goal
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 GUIDES = sorted(
     {*ROOT.glob("*.md"), *(ROOT / name / "README.md" for name in ("service", "drivers", "configs", "tools"))}
 )

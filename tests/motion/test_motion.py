@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig
+from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal, slower
 from numpy.typing import NDArray
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
-from test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal, slower
 from trirail.config import Config
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import LEGS

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import can
 import numpy as np
 import pytest
-from test_faults import (
+from drivers.test_faults import (
     IN_MOTION,
     MODES,
     NOT_HOMING,
@@ -23,7 +23,7 @@ from test_faults import (
     assert_goes_on,
     assert_stops_until_reset,
 )
-from test_odrive import odrives
+from drivers.test_odrive import odrives
 from trirail.config import Config
 from trirail.wire.packets import Confirmed, Refused, Request
 from trirail.wire.vocabulary import Mode

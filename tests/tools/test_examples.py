@@ -15,7 +15,7 @@ from patience import patient
 from trirail import Robot
 from trirail.client import own_service
 
-EXAMPLES = Path(__file__).parents[1] / "tools/examples"
+EXAMPLES = Path(__file__).parents[2] / "tools/examples"
 WITHIN = 60.0
 
 

@@ -11,15 +11,15 @@ from struct import Struct
 from types import ModuleType
 
 import pytest
-import test_cia402
-import test_odrive
+from drivers.test_cia402 import PERIOD
 from rigs import Bus, DeviceRig
-from test_cia402 import PERIOD
 from trirail_drivers.cia402 import frames as canopen
 from trirail_drivers.cia402 import homing, sdo, settings
 from trirail_drivers.interface import PowerState
 from trirail_drivers.odrive import frames as cansimple
 from trirail_drivers.simulated import Servo, SimulatedDrive, SimulatedOdrive
+
+from drivers import test_cia402, test_odrive
 
 P = PowerState
 

@@ -553,7 +553,7 @@ def test_a_frozen_recorder_does_not_matter(service: Service) -> None:
 
 def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> None:
     bus = f"{tmp_path}/bus"
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     config = tmp_path / "drives.toml"
     config.write_text(
         SIM.read_text()
