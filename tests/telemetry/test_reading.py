@@ -121,7 +121,7 @@ def test_a_killed_recorder_leaves_what_it_has_written(tmp_path: Path) -> None:
         "kept = written(Path(sys.argv[1]), made.records(0.8), close=False)\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
-    path, tests = tmp_path / "a.rrd", Path(__file__).parent
+    path, tests = tmp_path / "a.rrd", Path(__file__).parents[1]
     assert subprocess.run([sys.executable, "-c", script, path], cwd=tests, check=False).returncode == -9
     assert read(path).records.tobytes() == made.records(0.8).tobytes()
 
