@@ -76,7 +76,7 @@ def test_shipped_configurations_load(path: Path) -> None:
         ("x = [-0.15, 0.15]", "x = [0.1]", "limits.platform.x = [0.1]: expected array of length 2"),
         ("phi = [-1.2, 0.85]", "phi = [-1.2, 1.0]", "singular angle 1.0472: keep below 0.8972"),
         ("phi = [-1.2, 0.85]", "phi = [-2.1, 0.8]", "singular angle -2.0944: keep above -1.9444"),
-        ("jerk = [40.0, 40.0, 240.0]", "jerk = [40.0, 0.0, 240.0]", "jerk[1] = 0.0: expected float >= 0.001"),
+        ("jerk = [40.0, 40.0, 300.0]", "jerk = [40.0, 0.0, 300.0]", "jerk[1] = 0.0: expected float >= 0.001"),
     ],
 )
 def test_wrong_ones_are_refused_in_one_line(right: str, wrong: str, said: str) -> None:

@@ -18,7 +18,7 @@ from trirail.config import Config
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import LEGS
 from trirail.kinematics.robot import forward, inverse
-from trirail.motion.goals import LEAD, Goals, Motion
+from trirail.motion.goals import LEAD, Goals, PlannedMotion
 from trirail.motion.planner import TOO_FAST_IN_MOTION
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.schedule import Schedule
@@ -392,7 +392,7 @@ def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
 PLAIN_SET_OUT = Goals._set_out
 
 
-def only_from_rest(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> Steps[Motion]:
+def only_from_rest(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> Steps[PlannedMotion]:
     """Plan from no motion, so that the robot stops first."""
     if not schedule.commanded.at_rest:
         raise TOO_FAST_IN_MOTION
@@ -413,7 +413,7 @@ def test_of_two_ways_the_sooner_is_taken(
     """From the same motion, with lower limits or after a stop: each where the other is not to be had, and then both."""
     plain_stop_first = Goals._stop_first
 
-    def no_stop(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> Steps[Motion]:
+    def no_stop(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> Steps[PlannedMotion]:
         raise TOO_FAST_IN_MOTION
         yield
 

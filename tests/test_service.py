@@ -370,6 +370,23 @@ def test_a_flood_of_goals_ends_one_by_one_and_a_stop_overtakes_it(service: Servi
     assert_stopped_smoothly(service.frames())
 
 
+@pytest.mark.parametrize("command", ["stop", "quick_stop", "disable", "override"])
+def test_goals_that_wait_at_override_zero_keep_no_command_waiting(service: Service, command: str) -> None:
+    with service.robot() as robot:
+        robot.enable()
+        robot.override(0)
+        goals = [robot.move_to(x=x, y=y, phi=0.0, blend=0.05) for x, y in ((0.01, 0.0), (0.02, 0.01), (0.03, 0.0))]
+        assert [goal.duration for goal in goals] == [None] * 3
+        if command == "override":
+            robot.override(100)
+            assert [goal.wait(timeout=10.0).outcome for goal in goals] == ["done"] * 3
+        else:
+            robot.command(command)
+            ended = {goal.wait(timeout=10.0).outcome for goal in goals}
+            assert ended == {"faulted" if command == "quick_stop" else "stopped"}
+    assert service.end() == 0
+
+
 def test_goals_wait_blend_and_are_cancelled(service: Service) -> None:
     with service.robot() as robot:
         robot.enable()

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.config import Config
 from trirail.control.modes import ModeEvent
-from trirail.motion.goals import Motion
+from trirail.motion.goals import PlannedMotion
 from trirail.motion.steps import Steps
 from trirail.wire.messages import PoseGoal, SlidersGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
@@ -98,7 +98,7 @@ def slow(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Rig:
     """A robot that is enabled, and thinks for 20 cycles about every goal."""
     plan = rig.control._goals.plan
 
-    def slowly(*arguments: Any) -> Steps[Motion]:
+    def slowly(*arguments: Any) -> Steps[PlannedMotion]:
         for _ in range(20):
             yield
         return (yield from plan(*arguments))

@@ -39,7 +39,7 @@ class Notice(NamedTuple):
     user: str | None = None
 
 
-class Goal(NamedTuple):
+class ActiveGoal(NamedTuple):
     """A goal that the robot is moving to, or that is to follow it."""
 
     id: str
@@ -61,7 +61,7 @@ class Ledger:
     """Keeps the goals and the commands under way; what it has to say waits in `answers` and `notices`."""
 
     def __init__(self) -> None:
-        self.goals: deque[Goal] = deque()
+        self.goals: deque[ActiveGoal] = deque()
         """The goal that the robot is moving to, and those to follow it."""
         self.answers: list[Answer] = []
         self.notices: list[Notice] = []
@@ -72,7 +72,7 @@ class Ledger:
     # ------------------------------------------------------------------ goals
 
     @property
-    def goal(self) -> Goal | None:
+    def goal(self) -> ActiveGoal | None:
         """The goal that the robot is moving to."""
         return self.goals[0] if self.goals else None
 
@@ -93,7 +93,7 @@ class Ledger:
         if self.renewed_by(request):
             self.goals[0] = self.goals[0]._replace(alive_until=until)
 
-    def release(self, cycle: int) -> Goal | None:
+    def release(self, cycle: int) -> ActiveGoal | None:
         """Return the jog under way if it has not been renewed in time, the first time that this is so."""
         goal = self.goal
         if goal is None or goal.released or cycle <= goal.alive_until:
@@ -113,7 +113,7 @@ class Ledger:
             self.end("preempted", f"preempted by goal {request.id}")
         blend = request.goal.blend if isinstance(request.goal, PoseGoal) else None
         is_jog = isinstance(request.goal, VelocityGoal)
-        self.goals.append(Goal(request.id, request.user, is_jog, blend, expires, alive_until, bound=taken.bound))
+        self.goals.append(ActiveGoal(request.id, request.user, is_jog, blend, expires, alive_until, bound=taken.bound))
 
     def pass_on(self) -> None:
         """The first goal is reached, and the one that waited for it has begun."""

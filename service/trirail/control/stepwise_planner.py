@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from trirail.errors import RefusedError
-from trirail.motion.goals import Extension, Goals, Motion
+from trirail.motion.goals import Extension, Goals, PlannedMotion
 from trirail.motion.runs import Run
 from trirail.motion.schedule import Schedule
 from trirail.motion.steps import Steps
@@ -43,7 +43,7 @@ class StepwisePlanner:
         self._period = period
         self._goal: Goal | None = None
         self._blend: float | None = None
-        self._steps: Steps[Motion] | Steps[tuple[Run, Extension]] | None = None
+        self._steps: Steps[PlannedMotion] | Steps[tuple[Run, Extension]] | None = None
         self._spent = 0
         self._change: Steps[None] | None = None
         self._tried = 0
@@ -99,7 +99,7 @@ class StepwisePlanner:
             raise
         return None
 
-    def _begin(self, goal: Goal) -> Steps[Motion] | Steps[tuple[Run, Extension]]:
+    def _begin(self, goal: Goal) -> Steps[PlannedMotion] | Steps[tuple[Run, Extension]]:
         if self._blend is not None and isinstance(goal, PoseGoal) and self._schedule.runs:
             return self._append(goal, self._blend)
         return self._goals.plan(goal, self._schedule, self.override)
@@ -108,11 +108,11 @@ class StepwisePlanner:
         run = self._schedule.runs[-1]
         return run, (yield from self._goals.append(goal, run, blend))
 
-    def _take(self, decided: Motion | tuple[Run, Extension]) -> AcceptedPlan | None:
+    def _take(self, decided: PlannedMotion | tuple[Run, Extension]) -> AcceptedPlan | None:
         """Carry out what has been decided."""
         schedule = self._schedule
         self._steps, self._tried = None, 0
-        if isinstance(decided, Motion):
+        if isinstance(decided, PlannedMotion):
             self._goal = self._change = None
             waiting = max(0, decided.turn - schedule.cycle) * self._period if decided.turn is not None else 0.0
             schedule.take(decided.runs, decided.turn)

@@ -46,7 +46,7 @@ class Look(NamedTuple):
     """Velocity, acceleration and jerk (4, 3) of the fastest slider, of x, y and phi, as shares of what plans use."""
     within_limits: bool
     """Whether sliders and platform can bear it, with what is kept for changes of rate."""
-    beyond: float
+    leaves_at: float
     """When it is out of reach [s]; not a number where it never is."""
 
     @property
@@ -57,7 +57,7 @@ class Look(NamedTuple):
     @property
     def fits(self) -> bool:
         """Whether a path can be planned so."""
-        return math.isnan(self.beyond) and self.excess <= 1.0
+        return math.isnan(self.leaves_at) and self.excess <= 1.0
 
 
 def excess(worst: Array) -> float:
@@ -98,9 +98,9 @@ class Checker:
             first = -self._period
         even = min(max(FEWEST, int((until - first) / GAP)), MOST)
         worst, start = np.zeros((4, 3)), np.array(pose, dtype=np.float64)
-        beyond = survey(self._legs, *path, *law[:2], first, until, even, self._period, start, self._box, worst)
+        leaves_at = survey(self._legs, *path, *law[:2], first, until, even, self._period, start, self._box, worst)
         worst /= self._planned
-        return Look(worst, math.isnan(beyond) and self.bears(worst), beyond)
+        return Look(worst, math.isnan(leaves_at) and self.bears(worst), leaves_at)
 
     def bears(self, worst: Array) -> bool:
         """Whether sliders and platform can bear a motion of such shares, with what is kept for changes of rate."""
@@ -114,8 +114,8 @@ class Checker:
             if first:
                 yield
             found = self.look(path, law, first, until, pose)
-            if not math.isnan(found.beyond):
-                raise self.refusal(path, found.beyond, pose)
+            if not math.isnan(found.leaves_at):
+                raise self.refusal(path, found.leaves_at, pose)
             np.maximum(worst, found.worst, out=worst)
         return worst
 

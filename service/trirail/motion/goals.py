@@ -34,7 +34,7 @@ SLOWED = 12
 """How often: 1.3 to the power of 12 is 23 times."""
 
 
-class Motion(NamedTuple):
+class PlannedMotion(NamedTuple):
     """How a goal is to be reached."""
 
     runs: deque[Run]
@@ -70,7 +70,7 @@ class Goals:
         self._planner = Planner(geometry, limits.platform, limits.slider, bounds, checker, period)
         self.time_scaling = TimeScaling(geometry, limits.platform, checker, period)
 
-    def plan(self, goal: Goal, schedule: Schedule, rate: float) -> Steps[Motion]:
+    def plan(self, goal: Goal, schedule: Schedule, rate: float) -> Steps[PlannedMotion]:
         """Return the motion to a goal, its time to run at `rate`, from the commanded state of the motion under way.
 
         It begins at once where one step is enough to plan it. Else it begins from where the robot will be when it
@@ -90,7 +90,7 @@ class Goals:
         still = not schedule.runs
         later = schedule if still else schedule.ahead(LEAD)
         yield
-        sooner: Motion | None = None
+        sooner: PlannedMotion | None = None
         try:
             sooner = yield from self._set_out(goal, later, rate)
         except RefusedError:
@@ -140,13 +140,13 @@ class Goals:
         elif isinstance(goal, SlidersGoal):
             self._planner.check_sliders(goal.position)
 
-    def _set_out(self, goal: Goal, schedule: Schedule, rate: float) -> Steps[Motion]:
+    def _set_out(self, goal: Goal, schedule: Schedule, rate: float) -> Steps[PlannedMotion]:
         """Plan from the commanded motion."""
         start = schedule.commanded
         if start.at_rest:
             plan = yield from self._plan(goal, start)
             run = yield from self.time_scaling.begin(plan.path, rate, start.pose)
-            return Motion(deque([run]), None, run.ends if rate else math.inf, plan.slowed, bound=plan.bound)
+            return PlannedMotion(deque([run]), None, run.ends if rate else math.inf, plan.slowed, bound=plan.bound)
         if schedule.runs[0].at.rate < SLOWEST:
             raise TOO_FAST_IN_MOTION
         for now in (schedule.runs[0].at.rate, 1.0):  # an override that the old path could take the new one may not
@@ -158,10 +158,10 @@ class Goals:
             if run.target >= now:
                 final = yield from self.time_scaling.possible(plan.path, 0.0, rate, start.pose)
                 duration = plan.path.duration / final if final else math.inf
-                return Motion(deque([run]), None, duration, plan.slowed, bound=plan.bound)
+                return PlannedMotion(deque([run]), None, duration, plan.slowed, bound=plan.bound)
         raise TOO_FAST_IN_MOTION
 
-    def _stop_first(self, goal: Goal, schedule: Schedule, rate: float) -> Steps[Motion]:
+    def _stop_first(self, goal: Goal, schedule: Schedule, rate: float) -> Steps[PlannedMotion]:
         """Plan from where the motion under way can be stopped."""
         stop = schedule.runs[0].copy()
         stop.seams.clear()
@@ -171,7 +171,7 @@ class Goals:
         plan = yield from self._plan(goal, rest(end))
         run = yield from self.time_scaling.begin(plan.path, rate, end)
         duration = stop.ends - stop.time + run.ends if rate else math.inf
-        return Motion(deque([stop, run]), None, duration, plan.slowed, stops_first=True, bound=plan.bound)
+        return PlannedMotion(deque([stop, run]), None, duration, plan.slowed, stops_first=True, bound=plan.bound)
 
     def _plan(self, goal: Goal, start: MotionState) -> Steps[Plan]:
         planner = self._planner

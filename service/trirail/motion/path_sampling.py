@@ -163,9 +163,9 @@ def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst:
         elif not _look(way, time, near, motion[1], sliders[1]):
             return last, time
         elif time > last + step and k > 0:
-            beyond = _turns(way, last, time, near, motion, sliders)
-            if not math.isnan(beyond):
-                return last, beyond
+            leaves_at = _turns(way, last, time, near, motion, sliders)
+            if not math.isnan(leaves_at):
+                return last, leaves_at
         last = time + step
         if not _look(way, last, near, motion[0], sliders[0]):
             return time, last
@@ -207,14 +207,14 @@ def survey(
     times = _moments(knots, law_knots, law_pieces, first, until, even, step)
     near = start.copy()
     worst[:] = 0.0
-    inside, beyond = _walk(way, times, until, step, near, worst)
-    if not math.isnan(beyond):
+    inside, leaves_at = _walk(way, times, until, step, near, worst)
+    if not math.isnan(leaves_at):
         motion, sliders = np.empty((3, 3)), np.empty((6, 3))
         inside = max(inside, first)
         for _ in range(HALVINGS // 3):
-            middle = (inside + beyond) / 2.0
+            middle = (inside + leaves_at) / 2.0
             if _look(way, middle, near, motion, sliders):
                 inside = middle
             else:
-                beyond = middle
-    return beyond
+                leaves_at = middle
+    return leaves_at

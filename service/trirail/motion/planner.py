@@ -161,13 +161,13 @@ class Planner:
             found = self._checker.look(path, constant(1.0), 0.0, path.duration, start.pose)
             if found.fits or (found.within_limits and not start.at_rest):
                 return Plan(path, 1.0 / share, bound)
-            if math.isnan(found.beyond):
+            if math.isnan(found.leaves_at):
                 share *= ROOM / found.excess
                 yield
                 continue
-            bound = self._checker.bound(path, found.beyond, start.pose)
+            bound = self._checker.bound(path, found.leaves_at, start.pose)
             if hold > 0.0:
-                hold = max(0.0, found.beyond - ramp - brake)  # to rest where it would have been out of reach
+                hold = max(0.0, found.leaves_at - ramp - brake)  # to rest where it would have been out of reach
             else:
                 share /= 2.0
             yield

@@ -80,7 +80,7 @@ class TimeScaling:
             return rate
         found = self._checker.look(path, constant(1.0, s), 0.0, path.duration - s, pose)
         yield
-        return min(rate, max(1.0, 1.0 / found.excess)) if math.isnan(found.beyond) and found.excess > 0.0 else 1.0
+        return min(rate, max(1.0, 1.0 / found.excess)) if math.isnan(found.leaves_at) and found.excess > 0.0 else 1.0
 
     def _ramp(self, run: Run, rate: float, share: float) -> Path | None:
         """Return the law from the present rate to another, at a share of the quickest change; None without one."""

@@ -16,7 +16,6 @@ import msgspec
 import zenoh
 from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_advanced_publisher
 
-from trirail import __version__
 from trirail.config import Config, geometry
 from trirail.errors import RefusedError
 from trirail.processes.heartbeats import BEAT_EVERY
@@ -24,7 +23,7 @@ from trirail.processes.inbox import Inbox, Incoming
 from trirail.processes.last_words import LastWords
 from trirail.processes.replies import Replies
 from trirail.processes.state import StateMaker
-from trirail.telemetry.provenance import versions
+from trirail.telemetry.provenance import software, versions
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.links import Closed, Link
 from trirail.wire.messages import CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
@@ -336,7 +335,7 @@ def _info(config: Config) -> Info:
         legs.append({"name": name} | {field: getattr(leg, field) for field in leg.__slots__})
     return Info(
         robot=config.robot.name,
-        version=__version__,
+        version=software().trirail,
         geometry=tuple(legs),
         limits=msgspec.to_builtins(config.limits),
         rate_hz=config.loop.rate_hz,

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import msgspec
 
-from trirail import __version__
 from trirail.config import Config, parse
 
 CONFIGURATION, SOFTWARE = "/configuration", "/software"
@@ -36,7 +35,7 @@ class Software(msgspec.Struct, frozen=True):
 @cache
 def software() -> Software:
     """Return what runs here."""
-    return Software(__version__, _fingerprint(), f"{platform.system()} {platform.machine()}", versions())
+    return Software(version("trirail"), _fingerprint(), f"{platform.system()} {platform.machine()}", versions())
 
 
 def versions() -> dict[str, str]:
