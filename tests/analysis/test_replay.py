@@ -176,7 +176,8 @@ def test_parts_are_put_together(recording: Recording) -> None:
 
 def test_every_goal_has_the_outcome_that_was_said(recording: Recording) -> None:
     summed = summary(recording)
-    said = {line.event.id: line.event.outcome for line in reversed(recording.events) if line.event and line.event.id}
+    events = [line.event for line in reversed(recording.events) if line.event is not None]
+    said = {event.id: event.outcome for event in events if event.outcome}
     assert {goal.id: goal.outcome for goal in summed.goals} == said
     assert all(goal.ended is not None and goal.ended >= goal.given for goal in summed.goals)
     assert {goal.kind for goal in summed.goals} >= {"pose", "sliders"}

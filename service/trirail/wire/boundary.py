@@ -82,7 +82,7 @@ def decode(payload: bytes, kind: Any, what: str, encoded: str = JSON) -> Any:
 
 
 def encode(content: msgspec.Struct, encoded: str = JSON) -> bytes:
-    """Write a message."""
+    """Write a message as JSON, or as msgpack where that is named."""
     return msgspec.msgpack.encode(content) if encoded == MSGPACK else msgspec.json.encode(content)
 
 

@@ -226,11 +226,17 @@ class Commanded(Struct, frozen=True):
     """What the robot was told: platform, then sliders."""
 
     pose: Triple
+    """x, y [m] of the platform's centre and its angle phi [rad], in the base frame."""
     pose_velocity: Triple
+    """[m/s, m/s, rad/s]."""
     pose_acceleration: Triple
+    """[m/s², m/s², rad/s²]."""
     position: Triple
+    """lambda_10 of the sliders A, B, C [m]."""
     velocity: Triple
+    """[m/s]."""
     acceleration: Triple
+    """[m/s²]."""
 
 
 class Traffic(Struct, frozen=True):
@@ -243,14 +249,18 @@ class Traffic(Struct, frozen=True):
 
 
 class Sliders(Struct, frozen=True):
-    """What the drives say."""
+    """What the drives say, of A, B, C."""
 
     position: Triple
+    """[m]."""
     velocity: Triple
+    """[m/s]."""
     following_error: Triple
+    """Setpoint less measured position [m]."""
     following_error_max: Triple
-    """Greatest since the service started, while enabled."""
+    """Greatest since the service started, while enabled [m]."""
     status: tuple[str, str, str]
+    """The power state of each, by its name in CiA 402."""
     traffic: tuple[Traffic, Traffic, Traffic]
 
 
@@ -259,7 +269,9 @@ class GoalState(Struct, frozen=True):
 
     id: str
     progress: float
+    """Share of its time that is over, 0 to 1."""
     remaining: float
+    """Time to its end [s]."""
     target: Triple | None = None
     """The pose that it leads to; None for a jog."""
 
@@ -293,16 +305,24 @@ class State(Struct, frozen=True):
     """The newest state, published at state_hz."""
 
     seq: int
+    """The cycle of its record."""
     t: float
+    """Nominal time since the loop's start [s]; the same as in records and events."""
     mode: str
+    """A trirail.wire.vocabulary.Mode."""
     pose: Triple
+    """Measured: x, y [m] and phi [rad] in the base frame, by the forward kinematics of the measured sliders."""
     velocity: Triple
+    """Measured, as a difference over a batch of records [m/s, m/s, rad/s]."""
     acceleration: Triple
+    """Measured, as a difference over a batch of records [m/s², m/s², rad/s²]."""
     commanded: Commanded
     sliders: Sliders
     goal: GoalState | None
     override: float
+    """The share of full speed at which motions are to run, 0 to 2."""
     faults: tuple[str, ...]
+    """Why the robot is in fault, one line each; empty otherwise."""
     loop: LoopState
 
 
