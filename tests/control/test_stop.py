@@ -124,7 +124,7 @@ def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: R
     pose = slow.control.commanded.pose
     slow.cycles(200)
     assert slow.control.commanded.pose == pytest.approx(pose, abs=1e-4)  # a disabled robot follows what is measured
-    assert slow.outcomes() == [("g1", "stopped"), ("running", "stopped")]
+    assert slow.outcomes() == [("running", "stopped"), ("g1", "stopped")]
 
 
 def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow: Rig) -> None:
@@ -139,7 +139,7 @@ def test_stop_of_the_running_goal_stops_the_robot_and_what_waits(slow: Rig) -> N
     planned(slow, FAR, "g1")
     slow.cycle(CommandRequest(99, "ann", Command.STOP, goal="running"))
     slow.until(slow.holds)
-    assert slow.outcomes() == [("g1", "stopped"), ("running", "stopped")]
+    assert slow.outcomes() == [("running", "stopped"), ("g1", "stopped")]
 
 
 @pytest.mark.parametrize("waiting", ["planned", "behind it"])

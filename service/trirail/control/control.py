@@ -158,12 +158,11 @@ class Control:
 
     def happen(self, event: ModeEvent, reason: str) -> None:
         """Let something happen that nobody asked for: the gateway is lost, ticks are late, the service ends."""
-        self._withdraw(event, reason)
         decided = step(self.state, event)
-        if isinstance(decided, Refusal) or decided.state == self.state:
-            return
-        self.ledger.tell("service", "warning", reason)
-        self._go(event, reason)
+        if not isinstance(decided, Refusal) and decided.state != self.state:
+            self.ledger.tell("service", "warning", reason)
+            self._go(event, reason)
+        self._withdraw(event, reason)
 
     def advance(self) -> None:
         """End a jog that nobody renews, plan one step further, and move the commanded state on by one period."""
@@ -233,8 +232,8 @@ class Control:
             return
         self.fault = reason
         self.ledger.tell("fault", "error", reason)
-        self._withdraw(ModeEvent.FAULT, reason)
         self._go(ModeEvent.FAULT, reason)
+        self._withdraw(ModeEvent.FAULT, reason)
 
     # ------------------------------------------------------------------ requests
 
@@ -248,7 +247,7 @@ class Control:
         return self.state.mode is Mode.MOVING
 
     def _withdraw(self, event: ModeEvent, reason: str) -> None:
-        """End what has been sent but not begun, where the robot is to stand."""
+        """End what has been sent but not begun, where the robot is to stand: after the goals before it."""
         if event not in _GO_ON:
             self.goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason)
 
@@ -277,8 +276,8 @@ class Control:
         if event is ModeEvent.QUICK_STOP:
             self.trip(reason)
         else:
-            self._withdraw(event, reason)
             self._go(event, reason)
+            self._withdraw(event, reason)
         self.ledger.undertake(request, self.cycles)
 
     def _take_override(self, request: CommandRequest) -> None:
