@@ -86,7 +86,7 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     """
     records = recording.records
     said = [(line.t, line.event) for line in recording.events if line.event is not None]
-    began = [t for t, event in said if event.kind == "mode" and event.id == goal]
+    began = [t for t, event in said if event.goal == goal]
     if len(began) != 1:
         raise ServiceError(f"the recording's log says {len(began)} times, not once, that goal {goal} began")
     first = int(np.searchsorted(recording.t, began[0] - period / 2.0))

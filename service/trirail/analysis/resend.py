@@ -99,8 +99,8 @@ class _Heard:
                 self._take(event)
 
     def _take(self, event: Event) -> None:
-        if event.kind == "mode" and event.id is not None:
-            self.began[event.id] = event.cycle
+        if event.goal is not None:
+            self.began[event.goal] = event.cycle
 
 
 def _check_start(recording: Recording, robot: Robot) -> None:
@@ -163,8 +163,8 @@ def _await(goals: Iterable[Goal]) -> None:
 
 def _beginnings(recording: Recording) -> list[tuple[str, int]]:
     """Return the goals with which motions began, each with its cycle."""
-    said = (line.event for line in recording.events if line.event is not None and line.event.kind == "mode")
-    return [(event.id, event.cycle) for event in said if event.id is not None]
+    said = (line.event for line in recording.events if line.event is not None)
+    return [(event.goal, event.cycle) for event in said if event.goal is not None]
 
 
 def _motion(records: NDArray[np.void], began: int | None) -> NDArray[np.float64]:

@@ -331,8 +331,8 @@ class Control:
             arrived = "released" if before.released else "arrived"
             self.ledger.end(outcome, arrived if outcome == "done" else reason)
         if self.state.mode is not before.mode:
-            whose, who = (goal.id, goal.user) if goal else (None, None)
-            self.ledger.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode, id=whose, user=who)
+            begun = goal.id if goal is not None else None
+            self.ledger.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode, goal=begun)
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
             self._schedule.take(deque())
             self._planner.stop_thinking()

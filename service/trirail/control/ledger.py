@@ -40,6 +40,7 @@ class Notice(NamedTuple):
     id: str | None = None
     outcome: Outcome | None = None
     reason: str | None = None
+    goal: str | None = None
     user: str | None = None
 
 
@@ -210,7 +211,8 @@ class Ledger:
         id: str | None = None,  # noqa: A002 - the field's name on the wire
         outcome: Outcome | None = None,
         reason: str | None = None,
+        goal: str | None = None,
         user: str | None = None,
     ) -> None:
         """Note something that everyone is to know."""
-        self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, user))
+        self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, goal, user))

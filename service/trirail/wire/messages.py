@@ -213,11 +213,13 @@ class Event(Struct, frozen=True, omit_defaults=True):
     mode: str | None = None
     """The mode entered, with kind mode."""
     id: str | None = None
-    """With kind goal, the goal that has ended; with kind mode, the goal with which the robot was set in motion."""
+    """The goal's id, with kind goal: what has this field is a goal's end."""
     outcome: Outcome | None = None
     """How the goal ended, with kind goal."""
     reason: str | None = None
     """Why it ended so, with kind goal; the message has it too."""
+    goal: str | None = None
+    """The id of the goal that set the robot in motion, with kind mode."""
     user: str | None = None
     """Who sent the goal, or what was refused."""
 

@@ -171,5 +171,5 @@ def told(event: Event) -> bytes:
         return packet
     words = f"{event.message[:1000]}… ({len(event.message)} characters)"
     reason = event.reason and f"{event.reason[:1000]}…"
-    name, user = (text and text[:100] for text in (event.id, event.user))
-    return message(Happened(structs.replace(event, message=words, id=name, reason=reason, user=user)))
+    name, goal, user = (text and text[:100] for text in (event.id, event.goal, event.user))
+    return message(Happened(structs.replace(event, message=words, id=name, reason=reason, goal=goal, user=user)))
