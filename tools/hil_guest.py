@@ -27,7 +27,10 @@ WITHIN = 300.0
 """How long anything may take in this slow machine [s]; the whole run has a time limit of its own, outside."""
 BUFFER = 8_000_000
 """Of candump's socket [bytes]: it shall see every frame, however busy the machine is."""
-PATIENT = f"from service import cli, supervisor; supervisor.START_WITHIN = {WITHIN}; cli.main()"
+PATIENT = (
+    "from trirail.cli import commands; from trirail.processes import supervisor; "
+    f"supervisor.START_WITHIN = {WITHIN}; commands.main()"
+)
 """`trirail`, with more patience: the interpreters alone take a minute to start here."""
 
 
