@@ -22,7 +22,6 @@ from trirail import Robot, inverse, Geometry, read
 from trirail.client import own_service
 
 config, locator = own_service.private(Path.cwd())
-config.write_text(config.read_text().replace("max_overruns = 100 ", "max_overruns = 1000 "))  # the machine may be busy
 recording = Path("moved.rrd")
 with own_service.service(config, recording), Robot("demo", locator) as robot:
     robot.enable()

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from patience import patient
 from trirail import Robot
 from trirail.client import own_service
 
@@ -31,7 +30,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     folder = tmp_path_factory.mktemp("ex")
     config, locator = own_service.private(folder)
     recording = folder / "examples.rrd"
-    with own_service.service(patient(config), recording):
+    with own_service.service(config, recording):
         yield Service(locator, recording)
 
 

@@ -158,7 +158,8 @@ def test_its_configuration_is_the_simulated_robots_out_of_reach_of_others(tmp_pa
     assert config.zenoh.listen == (locator,)
     assert locator == f"unixsock-stream/{tmp_path}/zenoh"
     assert config.telemetry.live_port == 0
-    replaced = {"zenoh": sim.zenoh, "telemetry": sim.telemetry}
+    assert config.watchdogs.max_overruns == 1000  # a machine that stalls for a second stops no simulated slider
+    replaced = {name: getattr(sim, name) for name in ("zenoh", "telemetry", "watchdogs", "can", "drives")}
     assert msgspec.structs.replace(config, **replaced) == sim
 
 

@@ -12,7 +12,6 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator, ValidationError
-from patience import patient
 from trirail.client import own_service
 from trirail.errors import RefusalCode
 from trirail.wire import messages, zenoh_session
@@ -135,7 +134,7 @@ def test_real_traffic_is_valid(tmp_path: Path) -> None:
         raise AssertionError(f"nobody answers on {key}")
 
     with (
-        own_service.service(patient(config), tmp_path / "r.rrd"),
+        own_service.service(config, tmp_path / "r.rrd"),
         zenoh_session.open_client(locator) as session,
         session.declare_subscriber("trirail/demo/state", keep),
         session.declare_subscriber("trirail/demo/event", keep),

@@ -19,6 +19,8 @@ from trirail.config import SIM
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.processes.interpreter import python
 
+PATIENT = {"max_overruns": "1000", "missed_syncs": "2000", "heartbeat": "1.0"}
+"""Keys of a configuration with which neither the loop nor the drives give up on a machine that stalls for a second."""
 START_WITHIN = 120.0
 """How long it may take to come up; the very first start compiles the kinematics [s]."""
 END_WITHIN = 20.0
@@ -81,11 +83,12 @@ def end(process: Process) -> int:
 def private(folder: Path, live_port: int = 0) -> tuple[Path, str]:
     """Write the configuration of the simulated robot for a service that nobody else can reach, nor see without a port.
 
-    Returns the file, in `folder`, and the locator to connect to.
+    It goes on where a busy machine stalls it for a second, since only simulated sliders move. Returns the file, in
+    `folder`, and the locator to connect to.
     """
     locator = f"unixsock-stream/{folder}/zenoh"
     text = SIM.read_text(encoding="utf-8")
-    for key, value in {"listen": f'["{locator}"]', "live_port": str(live_port)}.items():
+    for key, value in ({"listen": f'["{locator}"]', "live_port": str(live_port)} | PATIENT).items():
         text, found = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
         if found != 1:
             raise ServiceError(f"{SIM}: {key} was expected once, it is there {found} times")
