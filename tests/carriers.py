@@ -12,13 +12,16 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, ParamSpec
 
 import can
+import pytest
 from trirail_drivers.capture import Capture, CapturedBus
 from trirail_drivers.frame_io import FrameIO, PythonCanFrames, SocketFrames, frame_io
 from trirail_drivers.frames import CAN_FRAME
 from trirail_drivers.unixbus import UnixBus
+
+P = ParamSpec("P")
 
 NAME: Final = f"vcan{os.getpid() % 100_000}"
 """The virtual bus that tests make."""
@@ -47,6 +50,15 @@ def _lacking() -> str:
 
 LACKING: Final = _lacking()
 """Why there can be no virtual CAN bus here, empty where there can."""
+NEEDS_VCAN: Final = (pytest.mark.vcan, pytest.mark.skipif(bool(LACKING), reason=LACKING))
+"""The marks of what needs it."""
+
+
+def on_vcan(test: Callable[P, None]) -> Callable[P, None]:
+    """Mark a test that needs the virtual CAN bus."""
+    for mark in NEEDS_VCAN:
+        test = mark(test)
+    return test
 
 
 @contextmanager

@@ -94,7 +94,7 @@ for interface in can0 can1; do
 done
 set +e
 {sys.executable} tools/hil_guest.py {folder}
-{sys.executable} -m pytest -m vcan -rA --tb=short tests/drivers/test_socketcan.py 2>&1 | tee {folder}/vcan.log
+{sys.executable} -m pytest -m vcan -rA --tb=short tests/drivers/test_real_bus.py tests/drivers/test_frame_io.py 2>&1 | tee {folder}/vcan.log
 echo ${{PIPESTATUS[0]}} > {folder}/vcan.code
 """
 

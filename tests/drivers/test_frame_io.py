@@ -23,7 +23,7 @@ BUSES = [
     pytest.param(kind, way, id=f"{kind}, {way}", marks=marks)
     for kind, marks in (
         ("unix", ()),
-        ("vcan", (pytest.mark.vcan, pytest.mark.skipif(bool(carriers.LACKING), reason=carriers.LACKING))),
+        ("vcan", carriers.NEEDS_VCAN),
     )
     for way in carriers.WAYS
 ]
@@ -153,8 +153,7 @@ class Listener:
         raise AssertionError(text)
 
 
-@pytest.mark.vcan
-@pytest.mark.skipif(bool(carriers.LACKING), reason=carriers.LACKING)
+@carriers.on_vcan
 def test_the_kernel_keeps_out_what_nobody_listens_to_but_no_report_of_the_controller() -> None:
     def pour(far: FarEnd) -> None:
         for identifier in range(0x800):

@@ -298,7 +298,7 @@ class LoopState(Struct, frozen=True):
     bus_load: float
     """Worst-case share of the bus that the cycle takes, as computed at the start."""
     bus_load_measured: float
-    """Share of the bus that was in use in the last second, frames counted with worst-case stuffing."""
+    """Share of the bus that the frames sent and heard took in the last second, counted with worst-case stuffing."""
     lacking: tuple[str, ...]
     """What the loop runs without: real-time rights and the like, each with its remedy."""
 

@@ -1,0 +1,173 @@
+"""The driver on a bus between processes and on the kernel's virtual one, with the simulated drives behind it.
+
+Frames go both ways that they can: by python-can, and on the bus's own socket.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import can
+import carriers
+import pytest
+from carriers import NAME, ip, on_vcan
+from trirail_drivers import bus
+from trirail_drivers import wire as wires
+from trirail_drivers.bus import simulated_bus
+from trirail_drivers.cia402.drives import Cia402
+from trirail_drivers.config import Can, Drive, Drives, Simulated
+from trirail_drivers.errors import BusError
+from trirail_drivers.frames import Frame
+from trirail_drivers.interface import Feedback, PowerState
+from trirail_drivers.unixbus import UnixBus
+
+SIMULATED = Simulated(missed_syncs=1000)
+VCAN = Can(interface="socketcan", channel=NAME, simulated=SIMULATED)
+DRIVES = Drives(
+    protocol="cia402",
+    A=Drive(node=1, counts_per_metre=1e6),
+    B=Drive(node=2, counts_per_metre=1e6),
+    C=Drive(node=3, counts_per_metre=1e6),
+    heartbeat=2.0,  # a machine that is emulated, or busy, is no drive that is lost
+    sdo_timeout=10.0,
+)
+PERIOD = 0.02
+WITHIN = 60.0
+"""How long a slow machine may take for anything [s]."""
+
+# python-can leaves its socket to the garbage collector where there is no such interface.
+no_such_interface = pytest.mark.filterwarnings(
+    r"ignore:Exception ignored in. <socket\.socket.*family=29:pytest.PytestUnraisableExceptionWarning"
+)
+
+
+@pytest.fixture
+def interface() -> Iterator[str]:
+    """A virtual bus that is up."""
+    with carriers.vcan() as name:
+        yield name
+
+
+@pytest.fixture(params=["unix", pytest.param("vcan", marks=carriers.NEEDS_VCAN)])
+def section(request: pytest.FixtureRequest) -> Can:
+    """A bus that is there."""
+    if request.param == "vcan":
+        request.getfixturevalue("interface")
+        return VCAN
+    folder = request.getfixturevalue("tmp_path")
+    return Can(interface="unix", channel=str(folder / "can"), simulated=SIMULATED)
+
+
+@pytest.fixture
+def drives(section: Can) -> Iterator[None]:
+    """The simulated drives on it."""
+    over, running = socket.socketpair()
+    simulated = simulated_bus(section, DRIVES)
+    wire = UnixBus(section.channel, listen=True) if section.interface == "unix" else bus.open_bus(section, DRIVES)
+
+    def serve() -> None:
+        with selectors.DefaultSelector() as selector:
+            selector.register(wire, selectors.EVENT_READ)
+            selector.register(running, selectors.EVENT_READ)
+            while not any(key.fileobj is running for key, _ in selector.select(PERIOD / 5)):
+                with contextlib.suppress(can.CanError):  # the interface may be down
+                    while (frame := wire.recv(0)) is not None:
+                        simulated.send(frame)
+                while (answer := simulated.recv(0.0)) is not None:
+                    with contextlib.suppress(can.CanError):
+                        wire.send(answer)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    yield
+    over.send(b"!")
+    thread.join()
+    for part in (wire, simulated, over, running):
+        part.shutdown() if isinstance(part, can.BusABC) else part.close()
+
+
+@pytest.fixture(params=carriers.WAYS)
+def driver(
+    section: Can, drives: None, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Cia402]:
+    """The driver, whose frames go by python-can, and on the bus's own socket."""
+    monkeypatch.setattr(wires, "frame_io", carriers.WAYS[request.param])
+    connected = bus.connect(section, DRIVES)
+    assert isinstance(connected, Cia402)
+    yield connected
+    connected.close()
+
+
+def cycle(driver: Cia402, position: float = 0.0, *, heard: bool = True) -> Feedback:
+    """One cycle, as slow as the answers to its SYNC."""
+    driver.sync()
+    deadline = time.monotonic() + WITHIN
+    while True:
+        feedback = driver.read()
+        answered = feedback.age == (0, 0, 0)
+        if answered or not heard or feedback.fault or time.monotonic() > deadline:
+            driver.write((position,) * 3, (0.0,) * 3)
+            return feedback
+        os.sched_yield()
+
+
+def until(driver: Cia402, condition: Callable[[Feedback], bool], position: float = 0.0) -> Feedback:
+    deadline = time.monotonic() + WITHIN
+    while not condition(feedback := cycle(driver, position)):
+        assert feedback.fault is None, feedback.fault
+        assert time.monotonic() < deadline, feedback
+    return feedback
+
+
+@on_vcan
+def test_frames_pass_between_two_sockets(interface: str) -> None:
+    with bus.open_bus(VCAN, DRIVES) as one, bus.open_bus(VCAN, DRIVES) as other:
+        one.send(Frame(0x123, b"\x01\x02").message())
+        arrived = other.recv(WITHIN)
+        assert arrived is not None
+        assert (arrived.arbitration_id, bytes(arrived.data)) == (0x123, b"\x01\x02")
+        assert one.recv(0) is None, "a socket hears what it sent itself"
+
+
+@on_vcan
+@no_such_interface
+def test_an_interface_that_is_not_there_is_named_with_its_remedy() -> None:
+    with pytest.raises(BusError, match=f"ip link add {NAME} type vcan"):
+        bus.open_bus(VCAN, DRIVES)
+
+
+@on_vcan
+def test_an_interface_that_is_down_is_named_with_its_remedy(interface: str) -> None:
+    ip("link", "set", NAME, "down")
+    with pytest.raises(BusError, match="is down"):
+        bus.open_bus(VCAN, DRIVES)
+
+
+def test_drives_are_set_up_powered_moved_and_left_without_power(driver: Cia402) -> None:
+    driver.configure(PERIOD)
+    cycle(driver)
+    driver.enable()
+    until(driver, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
+    until(driver, lambda feedback: min(feedback.position) > 0.9e-4, position=1e-4)
+    driver.disable()
+    until(driver, lambda feedback: set(feedback.state) == {PowerState.SWITCH_ON_DISABLED}, position=1e-4)
+
+
+@pytest.mark.parametrize("section", [pytest.param("vcan", marks=carriers.NEEDS_VCAN)], indirect=True)
+def test_an_interface_that_goes_down_is_a_fault_of_the_bus(driver: Cia402) -> None:
+    driver.configure(PERIOD)
+    cycle(driver)
+    driver.enable()
+    until(driver, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
+    ip("link", "set", NAME, "down")
+    cycle(driver, heard=False)
+    fault = driver.read().fault
+    assert fault is not None
+    assert fault.cause == "bus"
+    assert "CAN bus" in fault.message
