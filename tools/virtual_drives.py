@@ -19,9 +19,10 @@ from pathlib import Path
 from types import FrameType
 
 import can
-from trirail.config import load
+import msgspec
+from trirail.config import Config, load
 from trirail.errors import TrirailError
-from trirail_drivers.bus import simulated_bus
+from trirail_drivers.bus import open_bus, simulated_bus
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES
 from trirail_drivers.simulated import SimulatedBus
@@ -133,7 +134,7 @@ def main() -> int:
     try:
         config = load(options.config)
         with (
-            open_bus(options.interface, options.channel, config.can.bitrate) as wire,
+            bus_to_be_on(options.interface, options.channel, config) as wire,
             simulated_bus(config.can, config.drives) as bus,
         ):
             bus.faults.tell = say
@@ -149,11 +150,12 @@ def main() -> int:
     return 0
 
 
-def open_bus(interface: str, channel: str, bitrate: int) -> can.BusABC:
-    """The bus to be on; over a unix socket the drives are the end that listens."""
+def bus_to_be_on(interface: str, channel: str, config: Config) -> can.BusABC:
+    """The bus of the drives, with the file's bitrate and options; of a unix socket they are the end that listens."""
     if interface == "unix":
         return UnixBus(channel, listen=True)
-    return can.Bus(channel=channel, interface=interface, bitrate=bitrate)
+    section = msgspec.structs.replace(config.can, interface=interface, channel=channel)
+    return open_bus(section, config.drives)
 
 
 def say(text: str) -> None:
