@@ -13,12 +13,11 @@ from pathlib import Path
 import msgspec
 import trirail_drivers
 
-import trirail
 from trirail.config import Config, parse
 
 CONFIGURATION, SOFTWARE = "/configuration", "/software"
 LIBRARIES = ("eclipse-zenoh", "ruckig", "rerun-sdk", "python-can", "canopen", "numpy", "numba")
-_PACKAGES = tuple(Path(package.__path__[0]) for package in (trirail, trirail_drivers))
+_PACKAGES = (Path(__file__).parents[1], Path(trirail_drivers.__path__[0]))
 
 
 class Software(msgspec.Struct, frozen=True):
