@@ -97,6 +97,8 @@ class _Heard:
         while not self._over.is_set():
             for event in self._robot.events(timeout=0.5):
                 self._take(event)
+                if self._over.is_set():
+                    return
 
     def _take(self, event: Event) -> None:
         if event.goal is not None:

@@ -376,19 +376,23 @@ class Robot:
     def events(self, history: bool = False, timeout: float | None = None) -> Iterator[Event]:
         """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
         received: queue.Queue[Event] = queue.Queue()
+        last = 0, 0.0
+
+        def keep_new(event: Event) -> None:
+            # A gateway that was started again tells the past once more; a service that was, counts from one.
+            nonlocal last
+            if event.seq > last[0] or event.time > last[1]:
+                last = event.seq, event.time
+                received.put(event)
+
         with declare_advanced_subscriber(
             self._session,
             self._key("event"),
-            self._listener.messages(Event, received.put),
+            self._listener.messages(Event, keep_new),
             history=HistoryConfig(detect_late_publishers=True) if history else None,
             recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
         ):
-            last = 0, 0.0
-            for event in _until_silent(received, timeout):
-                # A gateway that was started again tells the past once more; a service that was, counts from one.
-                if event.seq > last[0] or event.time > last[1]:
-                    last = event.seq, event.time
-                    yield event
+            yield from _until_silent(received, timeout)
 
     def records(self, take: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
         """Have every batch of records taken as it comes, until the context ends; wire.records.unpack reads them.
@@ -448,6 +452,7 @@ class Robot:
 
 
 def _until_silent(received: queue.Queue[T], timeout: float | None) -> Iterator[T]:
+    """Yield what is received, until nothing is for `timeout` seconds: only what is to be yielded may be put there."""
     while True:
         try:
             yield received.get(timeout=timeout)
