@@ -191,7 +191,7 @@ def load(path: Path) -> Config:
     try:
         text = files.text(path)
     except FileError as error:
-        raise ConfigError(f"{error}; configs/sim.toml is one to start from") from error
+        raise ConfigError(f"{error}; `trirail config copy sim` gives one to start from") from error
     try:
         return _beside(path, parse(text))
     except ConfigError as error:

@@ -11,17 +11,18 @@ from typing import Any
 
 import made
 import numpy as np
+import pyarrow as pa
 import pytest
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from trirail.config import SIM, load
 from trirail.errors import EmptyRecordingError, ServiceError
-from trirail.telemetry import reading
-from trirail.telemetry.columns import Column, Timelines, chunks, structs
+from trirail.telemetry import journal, reading
+from trirail.telemetry.columns import FIELDS, RECORD, Column, Timelines, chunks, structs
 from trirail.telemetry.reading import read
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.scene import FIELDS, Scene
+from trirail.telemetry.scene import Scene
 from trirail.telemetry.shown_robot import Subject
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
@@ -212,9 +213,24 @@ def test_records_of_another_version_are_refused_by_field(tmp_path: Path, layout:
     path, other = tmp_path / "a.rrd", np.zeros(10, layout)
     stream = rr.RecordingStream("trirail")
     stream.save(path)
-    stream.send_chunks(chunks(Timelines(1000, 0).of(other), [Column("/record", FIELDS, structs(other))]))
+    stream.send_chunks(chunks(Timelines(1000, 0).of(other), [Column(RECORD, FIELDS, structs(other))]))
     stream.disconnect()
     with pytest.raises(ServiceError, match=rf"a\.rrd: written by another version: its records differ in {differs}$"):
+        read(path)
+
+
+@pytest.mark.parametrize("log", ["events", "requests"])
+def test_events_and_requests_of_another_version_are_refused(tmp_path: Path, log: str) -> None:
+    path, sent = tmp_path / "a.rrd", made.records(0.1)
+    stream = rr.RecordingStream("trirail")
+    stream.save(path)
+    columns = [Column(RECORD, FIELDS, structs(sent))]
+    stream.send_chunks(chunks(Timelines(1000, 0).of(sent), columns))
+    said = [Column(f"/{log}", kind, pa.array([["?"]])) for kind in (journal.TEXT, journal.LEVEL)]
+    said.append(Column(f"/{log}", journal.JSON, pa.array([['{"seq": 1, "omen": "dark"}']])))
+    stream.send_chunks(chunks(Timelines(1000, 0).of(sent[:1]), said))
+    stream.disconnect()
+    with pytest.raises(ServiceError, match=rf"a\.rrd: written by another version: its {log} cannot be read: "):
         read(path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket
 import threading
@@ -25,6 +26,7 @@ from trirail.telemetry.streams import Show
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
 from trirail_drivers.capture import FRAME, REMOTE
+from trirail_drivers.errors import FileError
 
 WALL_NS = 1_795_245_300_000_000_000
 
@@ -131,6 +133,20 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     blocked.write_text("")
     with pytest.raises(ServiceError, match=r"cannot write a recording to .*file/x: .*telemetry\.directory"):
         recorder(blocked / "x")
+
+
+@pytest.mark.parametrize("kind", ["FIFO", "device", "folder"])
+@pytest.mark.timeout(20)
+def test_what_is_no_file_is_not_recorded_to(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.rrd"
+    if kind == "FIFO":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/null")
+    else:
+        path.mkdir()
+    with pytest.raises(FileError, match=rf"a\.rrd: a {kind}; wanted a regular file"):
+        Recorder(load(SIM), tmp_path, path=path, live=False)
 
 
 def test_a_live_port_in_use_is_refused(tmp_path: Path) -> None:

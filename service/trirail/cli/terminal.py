@@ -15,6 +15,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
+from trirail_drivers import load
 from trirail_drivers.errors import shortened
 
 from trirail.client.client import Goal, Jog, Result, Robot
@@ -67,8 +68,8 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
         out.print(f"    live view  trirail view  ({recorder['live']})", soft_wrap=True)
     out.print(f"    recording  {plain(recorder['recording'])}", soft_wrap=True)
     out.print(f"    bus load   {loop['bus_load']:.0%}")
-    if loop["bus_load"] > 0.8:
-        out.print("    [yellow]warning[/]: above 80 % there is little left for repeated frames; lower loop.rate_hz")
+    if warning := load.warning(config.loop.rate_hz, loop["bus_load"]):
+        out.print(f"    [yellow]warning[/] {warning}", soft_wrap=True)
     for lack in loop["lacking"]:
         out.print(f"    [yellow]without[/] {plain(lack)}", soft_wrap=True)
 

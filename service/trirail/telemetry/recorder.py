@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from datetime import datetime
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from trirail_drivers import files
 
 from trirail.config import Config
 from trirail.errors import ServiceError
@@ -42,7 +44,7 @@ class Recorder:
     box, given its `name` and not a path, is one file, which takes what room there is.
 
     `warn` is told what is missing; else that stands in the log alone. Raises ServiceError if the file cannot be
-    written or the live port is taken.
+    written or the live port is taken, FileError if `path` is no regular file.
     """
 
     def __init__(
@@ -226,7 +228,9 @@ class Recorder:
 
 
 def _overwrite(path: Path) -> Path:
-    """Create an empty file, or empty it."""
+    """Create an empty file, or empty it. Raises FileError for what is no file: a FIFO would wait for a reader."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileNotFoundError):
+        files.check(path)
     path.open("wb").close()
     return path

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from trirail.telemetry import columns, curves, drawing, palette
-from trirail.telemetry.columns import Column
+from trirail.telemetry.columns import FIELDS, RECORD, Column
 from trirail.telemetry.shown_robot import Subject
 from trirail.wire.vocabulary import MODES
 from trirail.workspace.mechanism import Mechanism
@@ -27,7 +27,6 @@ DRAWN_HZ = 100
 OUTLINES_HZ = 10
 """Outlines of the workspace a second, at most."""
 
-FIELDS = rr.ComponentDescriptor("fields")
 SCALARS = rr.Scalars.descriptor_scalars()
 STATE = rr.StateChange.descriptor_state()
 
@@ -66,7 +65,7 @@ class Scene:
 
     def complete(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return records as they are."""
-        return columns.chunks(self._timelines.of(records), [Column("/record", FIELDS, columns.structs(records))])
+        return columns.chunks(self._timelines.of(records), [Column(RECORD, FIELDS, columns.structs(records))])
 
     def drawn(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return records as people see them: one at least, in order."""
