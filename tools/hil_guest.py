@@ -20,7 +20,7 @@ from typing import Any
 from trirail.client.client import Result, Robot
 from trirail.config import Config, load
 from trirail.errors import RefusedError, TrirailError
-from trirail.wire.messages import State
+from trirail.wire.state import State
 
 ROOT = Path(__file__).parents[1]
 WITHIN = 300.0
