@@ -334,6 +334,7 @@ def _check(config: Config) -> None:
     places = (*slider.position, *(config.can.simulated.start if config.can.interface == "simulated" else ()))
     required = Requirements(config.period, min(places), max(places), slider.velocity, slider.following_error)
     try:
+        config_checks.check_bus(config.can)
         config_checks.check(config.drives, required)
     except DriveError as error:
         raise ConfigError(str(error)) from error

@@ -17,7 +17,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from trirail.config import SIM, load
-from trirail.errors import ServiceError
+from trirail.errors import EmptyRecordingError, ServiceError
 from trirail.telemetry import journal, reading
 from trirail.telemetry.columns import FIELDS, RECORD, Column, Timelines, chunks, structs
 from trirail.telemetry.reading import read
@@ -186,8 +186,16 @@ def test_what_is_no_recording_is_refused_with_its_path(tmp_path: Path) -> None:
         assert "\n" not in str(raised.value)
 
 
-def test_a_recording_without_records_is_refused(tmp_path: Path) -> None:
+def test_a_recording_without_records_is_told_as_what_it_is(tmp_path: Path) -> None:
     written(tmp_path / "a.rrd", made.records(0.1)[:0])
+    with pytest.raises(EmptyRecordingError, match=r"a\.rrd: nothing was recorded: its service ended before"):
+        read(tmp_path / "a.rrd")
+
+
+def test_a_recording_of_others_is_refused(tmp_path: Path) -> None:
+    with rr.RecordingStream("another") as stream:
+        stream.save(tmp_path / "a.rrd")
+        stream.log("here", rr.Scalars(1.0))
     with pytest.raises(ServiceError, match=r"a\.rrd: holds no records of cycles"):
         read(tmp_path / "a.rrd")
 

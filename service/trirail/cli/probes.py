@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from msgspec import structs
+from trirail_drivers import adapters
 
 from trirail.cli.doctor import Machine
 from trirail.config import Config, LoopTable
@@ -41,6 +42,7 @@ def machine(config: Config) -> Machine:
         isolated=processors(_text(SYSTEM / "devices/system/cpu/isolated") or ""),
         link=link(config.can.channel) if config.can.interface == "socketcan" else None,
         ticks=ticks(config.period),
+        adapter=adapters.lacking(config.can.interface),
     )
 
 

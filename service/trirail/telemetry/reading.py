@@ -28,9 +28,10 @@ from rerun.error_utils import RerunWarning
 from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
-from trirail.errors import ServiceError
+from trirail.errors import EmptyRecordingError, ServiceError
 from trirail.telemetry.columns import FIELDS, RECORD, SECOND, structs
 from trirail.telemetry.journal import EVENTS, JSON, REQUESTS
+from trirail.telemetry.provenance import SOFTWARE
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE
@@ -89,7 +90,8 @@ def read(path: Path) -> Recording:
 
     Rerun's own format (.rrd); the file is not changed. Fields, units and frames of the records are those of
     trirail.wire.records.FIELDS: SI units and radians, sliders in the order A, B, C, poses in the base frame.
-    Raises ServiceError if the file cannot be read, is not a recording, holds no records, or is of another version.
+    Raises ServiceError if the file cannot be read, is not a recording, or is of another version, and of its kinds
+    EmptyRecordingError if it holds no records.
     """
     size = path.stat().st_size if path.is_file() else 0
     try:
@@ -100,14 +102,18 @@ def read(path: Path) -> Recording:
             raise
         with _whole(path, growing=True) as whole:  # it was being written while Rerun read it
             chunks = _chunks(whole, path)
-    records, t, wall = _records([chunk for chunk in chunks if chunk.entity_path == RECORD], path)
+    texts = _static(chunks, _DOCUMENT)
+    kept = [chunk for chunk in chunks if chunk.entity_path == RECORD]
+    if SOFTWARE in texts and not kept:
+        raise EmptyRecordingError(f"{path}: nothing was recorded: its service ended before the first cycle reached it")
+    records, t, wall = _records(kept, path)
     return Recording(
         name=next(iter(_static(chunks, "RecordingInfo:name").values()), ""),
         records=records,
         t=t,
         wall=wall,
         events=_events([chunk for chunk in chunks if chunk.entity_path == EVENTS], path),
-        texts=_static(chunks, _DOCUMENT),
+        texts=texts,
         requests=_requests([chunk for chunk in chunks if chunk.entity_path == REQUESTS], path),
     )
 
