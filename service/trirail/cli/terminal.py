@@ -18,10 +18,11 @@ from rich.table import Table
 from trirail_drivers import load
 from trirail_drivers.errors import shortened
 
-from trirail.client.client import Goal, Jog, Result, Robot
+from trirail.client.client import GoalHandle, Jog, Result, Robot
 from trirail.errors import ServiceError
 from trirail.telemetry import palette
-from trirail.wire.messages import Event, GoalReply, Percentiles, State
+from trirail.wire.messages import Event, GoalReply
+from trirail.wire.state import Percentiles, State
 from trirail.wire.text import json_printable, printable
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def notes(reply: GoalReply) -> str:
     return f" ({', '.join(said)})" if said else ""
 
 
-def follow(robot: Robot, goal: Goal, title: str, *, show: bool = True) -> Result:
+def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> Result:
     """Wait for a goal's end and show its progress."""
     columns = (
         TextColumn("{task.description}"),
