@@ -6,22 +6,23 @@ import contextlib
 import os
 import selectors
 import socket
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
 
 import can
+import carriers
 import pytest
+from carriers import NAME, ip
 from trirail_drivers import bus
+from trirail_drivers import wire as wires
 from trirail_drivers.bus import simulated_bus
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Can, Drive, Drives, Simulated
 from trirail_drivers.errors import BusError
-from trirail_drivers.frames import data_frame
+from trirail_drivers.frames import Frame
 from trirail_drivers.interface import Feedback, PowerState
 
-NAME = f"vcan{os.getpid() % 100_000}"
 SECTION = Can(interface="socketcan", channel=NAME, simulated=Simulated(missed_syncs=1000))
 DRIVES = Drives(
     protocol="cia402",
@@ -36,29 +37,9 @@ WITHIN = 60.0
 """How long a slow machine may take for anything [s]."""
 
 
-def lacking() -> str:
-    """Why there can be no virtual CAN bus here, empty where there can."""
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except OSError:
-        return "this kernel has no SocketCAN (modprobe can_raw): make hil runs these in a machine that has"
-    try:
-        ip("link", "add", NAME, "type", "vcan")
-    except (OSError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", None) or str(error)
-        return f"no virtual CAN bus can be made here (root, modprobe vcan): {said.strip()}"
-    ip("link", "delete", NAME)
-    return ""
-
-
-def ip(*arguments: str) -> None:
-    subprocess.run(("ip", *arguments), capture_output=True, text=True, check=True)
-
-
-LACKING = lacking()
 pytestmark = [
     pytest.mark.vcan,
-    pytest.mark.skipif(bool(LACKING), reason=LACKING),
+    pytest.mark.skipif(bool(carriers.LACKING), reason=carriers.LACKING),
     # python-can leaves its socket to the garbage collector where there is no such interface.
     pytest.mark.filterwarnings(
         r"ignore:Exception ignored in. <socket\.socket.*family=29:pytest.PytestUnraisableExceptionWarning"
@@ -69,10 +50,8 @@ pytestmark = [
 @pytest.fixture
 def interface() -> Iterator[str]:
     """A virtual bus that is up."""
-    ip("link", "add", NAME, "type", "vcan")
-    ip("link", "set", NAME, "up")
-    yield NAME
-    ip("link", "delete", NAME)
+    with carriers.vcan() as name:
+        yield name
 
 
 @pytest.fixture
@@ -103,8 +82,10 @@ def drives(interface: str) -> Iterator[None]:
         part.shutdown() if isinstance(part, can.BusABC) else part.close()
 
 
-@pytest.fixture
-def driver(drives: None) -> Iterator[Cia402]:
+@pytest.fixture(params=carriers.WAYS)
+def driver(drives: None, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cia402]:
+    """The driver, whose frames go by python-can, and on the bus's own socket."""
+    monkeypatch.setattr(wires, "frame_io", carriers.WAYS[request.param])
     connected = bus.connect(SECTION, DRIVES)
     assert isinstance(connected, Cia402)
     yield connected
@@ -134,7 +115,7 @@ def until(driver: Cia402, condition: Callable[[Feedback], bool], position: float
 
 def test_frames_pass_between_two_sockets(interface: str) -> None:
     with bus.open_bus(SECTION, DRIVES) as one, bus.open_bus(SECTION, DRIVES) as other:
-        one.send(data_frame(0x123, b"\x01\x02"))
+        one.send(Frame(0x123, b"\x01\x02").message())
         arrived = other.recv(WITHIN)
         assert arrived is not None
         assert (arrived.arbitration_id, bytes(arrived.data)) == (0x123, b"\x01\x02")

@@ -19,7 +19,7 @@ from trirail.wire.vocabulary import Command
 from trirail.wire.zenoh_session import DEFAULT_LOCATOR
 
 if TYPE_CHECKING:
-    from trirail.client.client import Goal, Robot
+    from trirail.client.client import GoalHandle, Robot
 
 app = App(
     name="trirail",
@@ -335,7 +335,7 @@ for each in Command:
         app.command(_tells(each), name=each.replace("_", "-"), help=each.help)
 
 
-def _follow(service: Service, robot: Robot, goal: Goal, wait: bool, title: str) -> int:
+def _follow(service: Service, robot: Robot, goal: GoalHandle, wait: bool, title: str) -> int:
     """Say that a goal is accepted, or follow it to its end."""
     if not wait:
         words = f"goal {goal.id}: {goal.expected}{terminal.notes(goal.reply)}"

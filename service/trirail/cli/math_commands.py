@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from trirail.kinematics.algebra import Array
     from trirail.kinematics.geometry import Geometry
     from trirail.motion.limits import Violation
-    from trirail.workspace.workspace import Survey
+    from trirail.workspace.workspace import Extent
 
 Flag = Parameter(negative="")
 
@@ -156,13 +156,13 @@ def workspace(
     deg
         The angles are in degrees.
     """
-    from trirail.workspace.workspace import area, permitted, reachable, survey
+    from trirail.workspace.workspace import area, extent, permitted, reachable
 
     config, robot = _load(offline)
     if not all(map(math.isfinite, phi)):
         raise KinematicsError("phi: every angle must be finite")
     limits = config.limits
-    service, reach = survey(robot, limits, permitted), survey(robot, limits, reachable)
+    service, reach = extent(robot, limits, permitted), extent(robot, limits, reachable)
     angles = [math.radians(angle) if deg else angle for angle in phi] or _round_angles(*service.phi)
     slices = [(angle, permitted(robot, limits, angle), reachable(robot, limits, angle)) for angle in angles]
     at_zero = area(permitted(robot, limits, 0.0)), area(reachable(robot, limits, 0.0))
@@ -185,7 +185,7 @@ def workspace(
             }
         )
         return 0
-    _print_surveys(service, reach, at_zero)
+    _print_extents(service, reach, at_zero)
     terminal.say("")
     _print_slices([(angle, area(inside), area(whole)) for angle, inside, whole in slices])
     if plot:
@@ -225,7 +225,7 @@ def _round_angles(low: float, high: float) -> list[float]:
     return [math.radians(step * k) for k in range(first, last + 1)]
 
 
-def _draw(file: Path, config: Config, robot: Geometry, angles: list[float], reach: Survey, service: Survey) -> None:
+def _draw(file: Path, config: Config, robot: Geometry, angles: list[float], reach: Extent, service: Extent) -> None:
     try:
         from trirail.workspace import plots
     except ImportError as error:
@@ -236,14 +236,14 @@ def _draw(file: Path, config: Config, robot: Geometry, angles: list[float], reac
         raise TrirailError(f"cannot draw to {file}: {error}") from error
 
 
-def _measures(survey: Survey, area_at_zero: float) -> dict[str, object]:
+def _measures(extent: Extent, area_at_zero: float) -> dict[str, object]:
     return {
-        "x": survey.x,
-        "y": survey.y,
-        "phi": survey.phi,
+        "x": extent.x,
+        "y": extent.y,
+        "phi": extent.phi,
         "area_at_zero": area_at_zero,
-        "best": {"phi": survey.best_phi, "area": survey.best_area},
-        "volume": survey.volume,
+        "best": {"phi": extent.best_phi, "area": extent.best_area},
+        "volume": extent.volume,
     }
 
 
@@ -270,7 +270,7 @@ def _print_joints(solved: dict[str, list[float]], sensitivities: Array) -> None:
     terminal.out.print(table)
 
 
-def _print_surveys(service: Survey, reach: Survey, at_zero: tuple[float, float]) -> None:
+def _print_extents(service: Extent, reach: Extent, at_zero: tuple[float, float]) -> None:
     table = _table("", "the service permits", "the robot reaches", "")
     both = service, reach
     table.add_row("x", *(_range(each.x, 1e3) for each in both), "mm")

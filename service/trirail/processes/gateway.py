@@ -25,8 +25,8 @@ from trirail.processes.replies import Replies
 from trirail.processes.state import StateMaker
 from trirail.telemetry.provenance import software, versions
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.links import Closed, Link
-from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
+from trirail.wire.links import Closed, PacketLink
+from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Goal, GoalReply, NoContent, Override, Stop
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -44,6 +44,7 @@ from trirail.wire.packets import (
 )
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_UNREAD
+from trirail.wire.state import Info
 from trirail.wire.text import is_name, quoted
 from trirail.wire.vocabulary import Command, Mode
 
@@ -76,7 +77,7 @@ class _Waiting(NamedTuple):
 class Gateway:
     """Takes requests from Zenoh, passes them to the loop, and answers and publishes what the loop says."""
 
-    def __init__(self, config: Config, link: Link, beat: Callable[[], None], opened: zenoh.Session) -> None:
+    def __init__(self, config: Config, link: PacketLink, beat: Callable[[], None], opened: zenoh.Session) -> None:
         self._robot = config.robot.name
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
         self._home_within = REPLY_WITHIN + sum(homing)
@@ -342,7 +343,7 @@ def _info(config: Config) -> Info:
     )
 
 
-def main(config: Config, link: Link, beat: Callable[[], None], ready: Callable[[object], None]) -> int:
+def main(config: Config, link: PacketLink, beat: Callable[[], None], ready: Callable[[object], None]) -> int:
     """Run the gateway's process; `ready` is called once it can be reached."""
     with zenoh_session.open_service(config.zenoh.listen) as opened:
         gateway = Gateway(config, link, beat, opened)
