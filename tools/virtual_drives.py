@@ -14,6 +14,7 @@ import os
 import select
 import signal
 import sys
+import time
 from pathlib import Path
 from types import FrameType
 
@@ -95,7 +96,12 @@ def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report, console: Cons
     """Carry frames between a bus and the simulated drives, until interrupted; look at their timers each `poll` [s]."""
     while True:
         console.poll()
-        frame = wire.recv(poll)
+        try:
+            frame = wire.recv(poll)
+        except can.CanOperationError as error:  # a bus that is down: their watchdogs run, and it may come back
+            report.once(f"cannot receive: {error}")
+            frame = None
+            time.sleep(poll)
         if frame is not None:
             with contextlib.suppress(can.CanOperationError):  # bus-off: nobody hears it
                 drives.send(frame)
