@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from trirail.kinematics.algebra import Array, Matrix, Vector, add, cross, dot, scale, subtract
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import PARALLEL
@@ -186,7 +184,7 @@ def loop_equation(legs: Array, sliders: Array) -> Vector:
 
 
 @compiled()
-def _forward(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
+def _forward(legs: Array, sliders: Array | Vector, near: Array, pose: Array) -> int:
     for i in range(3):
         if not math.isfinite(sliders[i]):
             return 1 + i
