@@ -16,6 +16,7 @@ import pytest
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from trirail.config import SIM, Config, load, parse
+from trirail.processes import loop
 from trirail.processes.loop import BATCHES_PER_SECOND
 from trirail.processes.recording import GATHER
 from trirail.telemetry import blackbox, provenance, retention
@@ -25,6 +26,7 @@ from trirail.telemetry.recorder import Recorder
 from trirail.wire.messages import Event, PoseGoal
 from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.vocabulary import Mode
+from trirail_drivers import interface
 
 WALL_NS = 1_795_245_300_000_000_000
 BATCH = 20
@@ -85,6 +87,15 @@ def test_a_configuration_with_measured_legs_is_too() -> None:
     text = text.replace("l0 = 0.3", "\n".join(f"[[geometry.leg]]\n{leg}" for leg in turned))
     config = msgspec.toml.decode(text, type=Config)  # no robot could be built like this: only the form is at stake
     assert msgspec.toml.decode(provenance.toml(config), type=Config) == config
+
+
+def test_the_fingerprint_is_that_of_the_source_of_both_packages() -> None:
+    assert {Path(str(module.__file__)) for module in (loop, interface)} <= set(provenance.sources())
+
+
+def test_software_of_another_version_is_unknown_software() -> None:
+    assert provenance.recorded_by({provenance.SOFTWARE: '{"trirail": "9.0", "build": 7}'}) is None
+    assert provenance.recorded_by({provenance.SOFTWARE: "no JSON"}) is None
 
 
 # ---------------------------------------------------------------------- rotation
