@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 from trirail.config import SIM, LegTable, load
 from trirail.kinematics.geometry import Geometry, Leg
-from trirail.processes.gateway import _info
+from trirail.processes.info import info
 from trirail.telemetry.scene import Scene
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.records import DTYPE
@@ -206,7 +206,7 @@ def test_limits_of_the_following_error_come_into_view_with_it(scene: Scene) -> N
 
 
 def test_a_robot_is_the_same_by_its_configuration_and_by_its_services_words() -> None:
-    info = msgspec.json.decode(msgspec.json.encode(_info(CONFIG)), type=Info)
-    told, configured = ShownRobot.told(info), ShownRobot.configured(CONFIG)
+    answered = msgspec.json.decode(msgspec.json.encode(info(CONFIG)), type=Info)
+    told, configured = ShownRobot.told(answered), ShownRobot.configured(CONFIG)
     assert (told.name, told.limits, told.rate_hz) == (configured.name, configured.limits, configured.rate_hz)
     assert told.geometry.legs == configured.geometry.legs

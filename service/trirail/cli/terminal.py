@@ -188,3 +188,17 @@ def _coloured(mode: str) -> str:
 def percentiles(values: Percentiles) -> str:
     """Write percentiles on a line."""
     return f"p50 {values.p50:.0f}  p99 {values.p99:.0f}  p99.9 {values.p999:.0f}  max {values.max:.0f} µs"
+
+
+def table(first: str, *others: str) -> Table:
+    """Return an empty table with these headings, numbers to the right; a column without one holds units."""
+    made = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="bold")
+    made.add_column(first)
+    for name in others:
+        made.add_column(name, justify="right" if name else "left")
+    return made
+
+
+def number(value: float, digits: int) -> str:
+    """Write a number without the sign of a rounded zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
