@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 from conftest import Rig
+from trirail.motion.planning import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
-from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop
+from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop, Ports
 from trirail.wire import links
 from trirail.wire.links import Link, Port
 from trirail.wire.messages import PoseGoal
@@ -28,6 +29,7 @@ from trirail.wire.packets import (
     decode_answer,
     message,
 )
+from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.vocabulary import Command, Mode
 
@@ -37,11 +39,16 @@ class Shell:
 
     def __init__(self, rig: Rig, folder: Path) -> None:
         self.rig = rig
-        self.ports = Port(links.listen(folder / "gateway")), Port(links.listen(folder / "recorder"))
+        names = ("gateway", "recorder", "planner")
+        self.ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))
         self.gateway: Link = links.connect(folder / "gateway")
         self.recorder: Link = links.connect(folder / "recorder")
+        self.planner: Link = links.connect(folder / "planner", MAX_PLANNING)
+        self.motion_planner = MotionPlanner(rig.config)
+        self.serves = True
+        """Whether the planner answers what it is asked before the next cycle."""
         self.heartbeats = Heartbeats.create()
-        self.loop = Loop(rig.config, rig.driver, *self.ports, self.heartbeats)
+        self.loop = Loop(rig.config, rig.driver, self.ports, self.heartbeats)
         self.loop.control.start(rig.control.measured.feedback)
 
     def cycles(self, number: int, missed: int = 0) -> None:
@@ -49,6 +56,8 @@ class Shell:
             self.rig.now += self.rig.config.period
             self.rig.sent.clear()
             self.loop.cycle(Tick(round(self.rig.now * 1e9), 0, missed))
+            while self.serves and (packet := self.planner.receive()) is not None:
+                self.planner.send(encode(self.motion_planner.plan(decode_plan_request(packet))))
 
     def enabled(self) -> None:
         self.cycles(self.rig.config.loop.rate_hz // BATCHES_PER_SECOND)  # by then the gateway is accepted
@@ -72,6 +81,7 @@ def shell(rig: Rig, tmp_path: Path) -> Iterator[Shell]:
     yield made
     made.gateway.close()
     made.recorder.close()
+    made.planner.close()
     for port in made.ports:
         port.close()
 
