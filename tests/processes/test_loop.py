@@ -12,7 +12,7 @@ from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop, Ports
 from trirail.wire import links
-from trirail.wire.links import Link, Port
+from trirail.wire.links import PacketLink, Port
 from trirail.wire.messages import PoseGoal
 from trirail.wire.packets import (
     CommandRequest,
@@ -41,9 +41,9 @@ class Shell:
         self.rig = rig
         names = ("gateway", "recorder", "planner")
         self.ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))
-        self.gateway: Link = links.connect(folder / "gateway")
-        self.recorder: Link = links.connect(folder / "recorder")
-        self.planner: Link = links.connect(folder / "planner", MAX_PLANNING)
+        self.gateway: PacketLink = links.connect(folder / "gateway")
+        self.recorder: PacketLink = links.connect(folder / "recorder")
+        self.planner: PacketLink = links.connect(folder / "planner", MAX_PLANNING)
         self.motion_planner = MotionPlanner(rig.config)
         self.serves = True
         """Whether the planner answers what it is asked before the next cycle."""
@@ -68,7 +68,7 @@ class Shell:
     def mode(self) -> Mode:
         return self.loop.control.state.mode
 
-    def received(self, by: Link | None = None) -> list[bytes]:
+    def received(self, by: PacketLink | None = None) -> list[bytes]:
         packets = []
         while (packet := (by or self.gateway).receive()) is not None:
             packets.append(packet)

@@ -24,7 +24,7 @@ class TooLarge(Exception):
     """A packet that the other side would get cut."""
 
 
-class Link:
+class PacketLink:
     """One side of a connection; neither sending nor receiving ever waits."""
 
     def __init__(self, connected: socket.socket, largest: int = MAX_PACKET) -> None:
@@ -71,7 +71,7 @@ class Link:
         self._socket.close()
 
 
-def connect(path: Path, largest: int = MAX_PACKET) -> Link:
+def connect(path: Path, largest: int = MAX_PACKET) -> PacketLink:
     """Connect to a port of the loop, for packets of so many bytes at most. Raises OSError where nobody listens."""
     connecting = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
@@ -79,7 +79,7 @@ def connect(path: Path, largest: int = MAX_PACKET) -> Link:
     except OSError:
         connecting.close()
         raise
-    return Link(connecting, largest)
+    return PacketLink(connecting, largest)
 
 
 def listen(path: Path) -> socket.socket:
@@ -97,7 +97,7 @@ class Port:
         self._listening = listening
         self._largest = largest
         self._listening.setblocking(False)
-        self._link: Link | None = None
+        self._link: PacketLink | None = None
         self._lost = False
         self.dropped = 0
         """Packets that the peer was too slow for, or that are too large."""
@@ -115,7 +115,7 @@ class Port:
             connected, _ = self._listening.accept()
         except BlockingIOError:
             return False
-        self._link = Link(connected, self._largest)
+        self._link = PacketLink(connected, self._largest)
         return True
 
     def await_peer(self, seconds: float) -> bool:
