@@ -403,7 +403,7 @@ def test_an_answer_to_what_was_asked_before_is_not_the_last(shell: Shell) -> Non
     shell.cycles(20)
     target = shell.loop.control.target
     assert target is not None
-    assert target == pytest.approx((0.0, 0.05, 0.0))
+    assert target == pytest.approx((0.0, 0.05, 0.0), abs=1e-6)
 
 
 def test_the_recorder_has_every_answer_with_the_cycle_in_which_it_was_taken(shell: Shell) -> None:
