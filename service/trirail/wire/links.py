@@ -34,6 +34,8 @@ class PacketLink:
             with contextlib.suppress(PermissionError):
                 connected.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
         self._socket = connected
+        self._arrivals = select.poll()
+        self._arrivals.register(connected, select.POLLIN)
 
     def fileno(self) -> int:
         """For select and its like."""
@@ -56,6 +58,8 @@ class PacketLink:
 
     def receive(self) -> bytes | None:
         """Take the next packet, None if there is none. Raises Closed when the peer has gone."""
+        if not self._arrivals.poll(0):  # a third of what it takes to fail at receiving: most of the loop's cycles
+            return None
         try:
             packet = self._socket.recv(self._largest)
         except BlockingIOError:
