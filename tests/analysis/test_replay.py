@@ -197,7 +197,8 @@ def test_parts_are_put_together(recording: Recording) -> None:
         records=recording.records[half - 10 :], t=recording.t[half - 10 :], wall=recording.wall[half - 10 :]
     )
     whole = join([second, first])
-    assert whole.records.tobytes() == recording.records.tobytes()
+    names = recording.records.dtype.names or ()  # not the bytes: what is between fields means nothing
+    assert all(whole.records[name].tobytes() == recording.records[name].tobytes() for name in names)
     assert np.array_equal(whole.t, recording.t)
     assert (whole.requests, whole.events) == (recording.requests, recording.events)
     with pytest.raises(ServiceError, match="is not of the same session as"):
