@@ -23,7 +23,7 @@ from trirail.errors import EmptyRecordingError, ServiceError, TrirailError
 from trirail.processes.interpreter import child
 from trirail.telemetry.reading import Recording, read
 from trirail.telemetry.sinks import HOST, free_port
-from trirail.wire.messages import State
+from trirail.wire.state import State
 from trirail_drivers.cia402 import frames
 from trirail_drivers.unixbus import UnixBus
 

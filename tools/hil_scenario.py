@@ -11,7 +11,7 @@ from hil_programs import WITHIN, Failed, Machine, run, until
 from trirail.client.client import Result, Robot
 from trirail.config import Config
 from trirail.errors import RefusedError
-from trirail.wire.messages import State
+from trirail.wire.state import State
 
 Held = Callable[[str, str], None]
 """Takes what held, and how."""

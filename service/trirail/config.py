@@ -34,7 +34,7 @@ Point = tuple[Coordinate, Coordinate]
 Range = tuple[Coordinate, Coordinate]
 
 
-class Robot(Struct, frozen=True, forbid_unknown_fields=True):
+class RobotTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [robot]."""
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
@@ -114,7 +114,7 @@ class MotionTable(Struct, frozen=True, forbid_unknown_fields=True):
     """How many goals may wait for the one under way, where that has a `blend`."""
 
 
-class Loop(Struct, frozen=True, forbid_unknown_fields=True):
+class LoopTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [loop]."""
 
     rate_hz: Annotated[int, Meta(ge=1, le=4000)]
@@ -169,10 +169,10 @@ class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """A whole configuration file."""
 
-    robot: Robot
+    robot: RobotTable
     geometry: GeometryTable
     limits: Limits
-    loop: Loop
+    loop: LoopTable
     can: Can
     drives: Drives
     zenoh: Zenoh

@@ -15,7 +15,7 @@ from conftest import Rig
 from made import records
 from trirail.analysis.resend import _beginnings, _Heard, _send
 from trirail.analysis.summary import _goals
-from trirail.client.client import Goal, Result, Robot
+from trirail.client.client import GoalHandle, Result, Robot
 from trirail.telemetry.reading import Line, Recording
 from trirail.wire.messages import Event, PoseGoal
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Request
@@ -28,7 +28,7 @@ class Heard:
     def __init__(self) -> None:
         self.log: list[str] = []
 
-    def send(self, make: Any, name: str) -> Goal:
+    def send(self, make: Any, name: str) -> GoalHandle:
         self.log.append(f"send {name[:-7]}")
         return Ending(name, cast("Robot", self))
 
@@ -37,7 +37,7 @@ class Heard:
         self.log.append(name)
 
 
-class Ending(Goal):
+class Ending(GoalHandle):
     """A goal that ends as soon as it is waited for."""
 
     def wait(self, timeout: float | None = None) -> Result:

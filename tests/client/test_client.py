@@ -11,7 +11,7 @@ import msgspec
 import pytest
 import zenoh
 from trirail.client import client
-from trirail.client.client import Goal, Robot
+from trirail.client.client import GoalHandle, Robot
 from trirail.errors import ServiceError
 from trirail.wire.messages import Event
 from trirail.wire.zenoh_session import open_service
@@ -58,7 +58,7 @@ def noisy(tmp_path: Path) -> Iterator[Robot]:
         (lambda robot: list(robot.events(history=True, timeout=TIMEOUT)), None),
         (lambda robot: list(robot.states(timeout=TIMEOUT)), None),
         (lambda robot: robot.state(timeout=TIMEOUT), ServiceError),
-        (lambda robot: Goal("mine", robot).wait(timeout=TIMEOUT), TimeoutError),
+        (lambda robot: GoalHandle("mine", robot).wait(timeout=TIMEOUT), TimeoutError),
         (lambda robot: robot.stop(), ServiceError),
         (lambda robot: robot.home(), ServiceError),
     ],

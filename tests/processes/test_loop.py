@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
-from conftest import Rig
+from conftest import Followers, Rig, what_memory_takes
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop
 from trirail.wire import links
-from trirail.wire.links import Link, Port
+from trirail.wire.links import PacketLink, Port
 from trirail.wire.messages import PoseGoal
 from trirail.wire.packets import (
     CommandRequest,
@@ -30,6 +31,7 @@ from trirail.wire.packets import (
 )
 from trirail.wire.records import unpack
 from trirail.wire.vocabulary import Command, Mode
+from trirail_drivers.interface import Drives
 
 
 class Shell:
@@ -38,8 +40,8 @@ class Shell:
     def __init__(self, rig: Rig, folder: Path) -> None:
         self.rig = rig
         self.ports = Port(links.listen(folder / "gateway")), Port(links.listen(folder / "recorder"))
-        self.gateway: Link = links.connect(folder / "gateway")
-        self.recorder: Link = links.connect(folder / "recorder")
+        self.gateway: PacketLink = links.connect(folder / "gateway")
+        self.recorder: PacketLink = links.connect(folder / "recorder")
         self.heartbeats = Heartbeats.create()
         self.loop = Loop(rig.config, rig.driver, *self.ports, self.heartbeats)
         self.loop.control.start(rig.control.measured.feedback)
@@ -59,7 +61,7 @@ class Shell:
     def mode(self) -> Mode:
         return self.loop.control.state.mode
 
-    def received(self, by: Link | None = None) -> list[bytes]:
+    def received(self, by: PacketLink | None = None) -> list[bytes]:
         packets = []
         while (packet := (by or self.gateway).receive()) is not None:
             packets.append(packet)
@@ -107,6 +109,28 @@ def test_the_bus_load_is_measured(shell: Shell) -> None:
     said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
     measured = [answer.bus_load for answer in said if isinstance(answer, Status)][-1]
     assert measured == pytest.approx(shell.rig.driver.bus_load, rel=0.05)
+
+
+@pytest.mark.parametrize("in_motion", [False, True])
+def test_a_cycle_that_changes_nothing_takes_no_memory(shell: Shell, in_motion: bool) -> None:
+    """With a gateway that gives signs of life, and records that go to it and to the recorder."""
+    shell.enabled()
+    if in_motion:
+        now = round(shell.rig.now * 1e9)
+        shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.1, 0.02, 0.1, speed=0.02), now)))
+        beating(shell, 50)
+    drives = Followers(shell.loop.control.measured.feedback)
+    shell.loop._drives = shell.loop.control._drives = cast(Drives, drives)
+    heart, tick = shell.heartbeats.of("gateway"), Tick(round(shell.rig.now * 1e9), 0, 0)
+
+    def cycle() -> None:
+        heart.beat()
+        shell.loop.cycle(tick)
+
+    grown, in_use = what_memory_takes(cycle, 500)
+    assert shell.mode() is (Mode.MOVING if in_motion else Mode.HOLDING)
+    assert grown <= 256
+    assert in_use <= 4096
 
 
 def test_missed_ticks_are_counted(shell: Shell) -> None:

@@ -23,7 +23,7 @@ from trirail.telemetry.columns import FIELDS, RECORD, Column, Timelines, chunks,
 from trirail.telemetry.reading import read
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.scene import Scene
-from trirail.telemetry.shown_robot import Subject
+from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
 
@@ -97,7 +97,7 @@ def test_texts_that_hold_for_the_whole_session_come_by_entity(tmp_path: Path) ->
     stream.save(path)
     stream.log("config", rr.TextDocument("[robot]\nname = 'x'"), static=True)
     stream.log("passing", rr.TextDocument("not for the whole session"))
-    stream.send_chunks(Scene(Subject.configured(load(SIM)), 0).complete(made.records(0.1)))
+    stream.send_chunks(Scene(ShownRobot.configured(load(SIM)), 0).complete(made.records(0.1)))
     stream.disconnect()
     recording = read(path)
     assert recording.texts == {"/config": "[robot]\nname = 'x'"}

@@ -17,7 +17,7 @@ from trirail_drivers.cia402 import frames, setup
 from trirail_drivers.cia402.axis import Axis
 from trirail_drivers.cia402.homing import Homing
 from trirail_drivers.driver import Clock, Driver
-from trirail_drivers.frames import data_frame
+from trirail_drivers.frames import Frame
 from trirail_drivers.interface import Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3
@@ -36,8 +36,9 @@ class Cia402(Driver[Axis]):
             self._wire.listen(frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
             self._wire.listen(frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
         self._homing = Homing(self._axes, drives, self._wire.send)
-        self._sync = data_frame(frames.SYNC, b"")
-        self._heartbeat = data_frame(frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL))
+        self._sync = Frame(frames.SYNC)
+        self._heartbeat = Frame(frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL))
+        self._setpoints = tuple(Frame(frames.RPDO2 + axis.node, bytes(frames.SETPOINT.size)) for axis in self._axes)
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
@@ -87,7 +88,7 @@ class Cia402(Driver[Axis]):
             axis.answers.read_over()
             if axis.mute:
                 axis.mute = False
-                self._wire.send(data_frame(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
+                self._wire.send(Frame(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
             fault = axis.fault(now, self._wanted) if self._wire.fault is None else None
             if fault is not None:
                 self._wire.fail(fault)
@@ -119,19 +120,17 @@ class Cia402(Driver[Axis]):
         late = self._clock() - self._synced > self._period
         if self._wanted is not PowerState.OPERATION_ENABLED:
             self._command()  # where frames have to wait, those that stop go before setpoints
-        messages = []
-        for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
+        for axis, frame, metres, rate in zip(self._axes, self._setpoints, position, velocity, strict=True):
             try:
                 if axis.held is None:
-                    data = frames.SETPOINT.pack(axis.scale.counts(metres), axis.scale.counts_per_second(rate))
+                    frame.fill(frames.SETPOINT, axis.scale.counts(metres), axis.scale.counts_per_second(rate))
                 else:
-                    data = frames.SETPOINT.pack(axis.held, 0)
+                    frame.fill(frames.SETPOINT, axis.held, 0)
             except (ValueError, OverflowError, struct.error):
                 self._refuse_setpoint(axis, metres, rate)
                 return
-            messages.append(data_frame(frames.RPDO2 + axis.node, data))
-        for axis, message in zip(self._axes, messages, strict=True):
-            if not self._wire.send(message):
+        for axis, frame in zip(self._axes, self._setpoints, strict=True):
+            if not self._wire.send(frame):
                 axis.setpoints_lost += 1
             elif late:
                 axis.setpoints_late += 1
@@ -192,9 +191,9 @@ class Cia402(Driver[Axis]):
     def _leave(self) -> None:
         off = frames.CONTROLWORD.pack(frames.DISABLE_VOLTAGE)
         for axis in self._axes:
-            self._wire.send(data_frame(frames.RPDO1 + axis.node, off))
+            self._wire.send(Frame(frames.RPDO1 + axis.node, off))
             # PDOs are heard in NMT operational only, SDOs in pre-operational too: two bytes for object 6040h.
-            self._wire.send(data_frame(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00"))
+            self._wire.send(Frame(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00"))
         for axis in self._axes:
             self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
 
@@ -205,7 +204,7 @@ class Cia402(Driver[Axis]):
             word = axis.word(now, self._next)
             repeat = axis.command_age >= REPEAT_AFTER and axis.is_not_followed(word, self._next)
             if (word != axis.controlword or repeat) and self._wire.send(
-                data_frame(frames.RPDO1 + axis.node, frames.CONTROLWORD.pack(word))
+                Frame(frames.RPDO1 + axis.node, frames.CONTROLWORD.pack(word))
             ):
                 axis.controlword = word
                 axis.command_age = 0
@@ -229,10 +228,7 @@ class Cia402(Driver[Axis]):
 
     def _wait_for_standstill(self, deadline: float) -> None:
         while self._powered() and (left := deadline - self._clock()) > 0:
-            message = self._wire.bus.recv(left)
-            if message is None:
-                return
-            self._wire.take(message, self._clock())
+            self._wire.wait(left, self._clock)
 
     def _powered(self) -> bool:
         return any(axis.state in setup.HAS_POWER for axis in self._axes)

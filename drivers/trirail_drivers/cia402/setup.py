@@ -13,6 +13,7 @@ from trirail_drivers.cia402.sdo import Client, Clock, Remote
 from trirail_drivers.cia402.settings import Setting, check_nodes, settings_of
 from trirail_drivers.config import Drives
 from trirail_drivers.errors import BusError, DriveError
+from trirail_drivers.frames import Frame
 from trirail_drivers.interface import NAMES, PowerState
 from trirail_drivers.scaling import Scale
 
@@ -65,9 +66,9 @@ def configure(
     return tuple(_start(remote) for remote in remotes)
 
 
-def _send(bus: can.BusABC, message: can.Message) -> None:
+def _send(bus: can.BusABC, frame: Frame) -> None:
     try:
-        bus.send(message)
+        bus.send(frame.message())
     except (can.CanError, OSError) as error:
         raise BusError(f"cannot send on {bus.channel_info}: {error}; is the interface up?") from error
 

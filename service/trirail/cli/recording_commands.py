@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from rich.text import Text
 
 from trirail.cli import terminal
-from trirail.cli.math_commands import Flag
+from trirail.cli.options import Flag
 from trirail.errors import ServiceError, TrirailError
 from trirail.telemetry import palette
 

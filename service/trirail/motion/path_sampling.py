@@ -130,7 +130,7 @@ def _turns(way: Way, last: float, time: float, near: Array, motion: Array, slide
 
 
 @compiled()
-def _measure_bus_load(now: Array, then: Array, i: int, step: float, whole: bool, worst: Array) -> None:
+def _measure_rates(now: Array, then: Array, i: int, step: float, whole: bool, worst: Array) -> None:
     """Raise `worst` (3,) to the velocity, acceleration and jerk of column i of rows (position, velocity, acceleration).
 
     `then` are the rows a step later. `whole` tells whether the motion goes on for the whole step.
@@ -167,8 +167,8 @@ def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst:
             return time, last
         whole = time >= 0.0 and last <= until  # else it is the step from or to a standstill, in which nothing else is
         for i in range(3):
-            _measure_bus_load(sliders[1], sliders[0], i, step, whole, worst[0])
-            _measure_bus_load(motion[1], motion[0], i, step, whole, worst[1 + i])
+            _measure_rates(sliders[1], sliders[0], i, step, whole, worst[0])
+            _measure_rates(motion[1], motion[0], i, step, whole, worst[1 + i])
     return last, math.nan
 
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections import deque
 
+import numpy as np
+
 from trirail.motion.runs import MotionState, Run
 
 
 class Schedule:
-    """Runs, one after the other; each cycle is `advance`."""
+    """Runs, one after the other. Each cycle is `advance`, or `begin_cycle` and `end_cycle` around the motion itself."""
 
     def __init__(self, commanded: MotionState, period: float) -> None:
+        self.motion = np.zeros((2, 3, 3))
+        """The motion commanded now, and in the cycle before: rows pose, velocity, acceleration."""
         self.commanded = commanded
         self.runs: deque[Run] = deque()
         """The motion under way, and those to follow at its end."""
@@ -18,6 +22,15 @@ class Schedule:
         self._period = period
         self._later: deque[Run] = deque()
         self._turn: int | None = None
+
+    @property
+    def commanded(self) -> MotionState:
+        """The motion commanded now."""
+        return MotionState(*self.motion[0].tolist())
+
+    @commanded.setter
+    def commanded(self, motion: MotionState) -> None:
+        self.motion[0] = motion
 
     @property
     def turning(self) -> bool:
@@ -38,6 +51,19 @@ class Schedule:
             return waiting + sum(run.ends for run in self._later)
         return sum(run.ends - run.time for run in self.runs)
 
+    @property
+    def single(self) -> bool:
+        """Whether it is one motion to one goal at most: then its run alone tells how far it has come."""
+        return len(self.runs) <= 1 and self._turn is None and not (self.runs and self.runs[0].seams)
+
+    @property
+    def progress(self) -> tuple[float, float]:
+        """Share of the time of the goal under way that is over, and what remains of it [s]."""
+        if not self.runs or self.turning:
+            return 0.0, self.remaining
+        *stops, run = self.runs
+        return run.progress, run.remaining + sum(stop.ends - stop.time for stop in stops)
+
     def take(self, runs: deque[Run], turn: int | None = None) -> None:
         """Go on with other runs, at once or from the cycle `turn` on; they begin with the motion commanded then."""
         if turn is None or turn <= self.cycle or not self.runs:
@@ -57,14 +83,25 @@ class Schedule:
 
     def advance(self) -> int:
         """Move the commanded state on by one period; return how many goals have ended where the next one begins."""
+        run = self.begin_cycle()
+        if run is None:
+            return 0
+        self.commanded = run.state(0.0, self.commanded.pose)
+        return self.end_cycle(run)
+
+    def begin_cycle(self) -> Run | None:
+        """Go on to the next cycle; return the run under way in it, whose time is one period on."""
         if self._turn == self.cycle:
             self.take(self._later)
         self.cycle += 1
         if not self.runs:
-            return 0
+            return None
         run = self.runs[0]
-        self.commanded = run.state(self._period, self.commanded.pose)
         run.time += self._period
+        return run
+
+    def end_cycle(self, run: Run) -> int:
+        """Let what has ended in this cycle go; return how many goals have where the next one begins."""
         passed = run.pass_seams()
         if run.stands and len(self.runs) > 1:
             self.runs.popleft()

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 import msgspec
+import numpy as np
 from trirail_drivers.bus import connect
 from trirail_drivers.capture import Capture
 from trirail_drivers.interface import DriveFault, Drives
@@ -37,7 +38,7 @@ from trirail.wire.packets import (
     message,
     told,
 )
-from trirail.wire.records import LAYOUT, Part, Record, pack_into
+from trirail.wire.records import HEAD, SIZE, Part
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import MODES, Mode
 
@@ -47,8 +48,6 @@ REQUESTS_A_CYCLE = 4
 ANSWERS_A_CYCLE = 8
 EVENTS_KEPT = 1000
 """Events kept for a gateway that comes anew: the one before may have died with some that it had not published."""
-OLDEST = 255
-"""No feedback is recorded as older [SYNCs]."""
 LEAST_PATIENCE = 3
 """Cycles for which the gateway may be silent, however few there are a second."""
 SHUTDOWN = 3.0
@@ -102,7 +101,9 @@ class Loop:
         self._given: list[ControlInput] = []
         self._fault: DriveFault | None = None
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
-        self._batch = bytearray(1 + self._batch_size * LAYOUT.size)
+        self._made = self.control.measured.record.view(np.uint8).data
+        """The cycle's record, as the control makes it."""
+        self._batch = memoryview(bytearray(1 + self._batch_size * SIZE))
         self._batch[0] = Kind.RECORDS
         self._batched = 0
         self._marked_ns = 0
@@ -201,36 +202,10 @@ class Loop:
     def _record(self, tick: Tick) -> None:
         """Append this cycle's record; pass batch, answers and events on."""
         control = self.control
-        feedback, measured, commanded = control.measured.feedback, control.measured, control.commanded
-        rows = control.setpoints.rows
-        progress, remaining = control.progress
-        record = Record(
-            cycle=control.cycles,
-            deadline_ns=tick.deadline_ns,
-            lateness_ns=tick.lateness_ns,
-            parts_ns=self._parts_ns,
-            overruns=self._overruns,
-            mode=MODES.index(control.state.mode),
-            drive_state=feedback.state,
-            age=[min(age, OLDEST) for age in feedback.age],
-            follows=feedback.follows,
-            homed=feedback.homed,
-            homing=feedback.homing,
-            pose=measured.pose,
-            commanded_pose=commanded.pose,
-            commanded_pose_velocity=commanded.velocity,
-            commanded_pose_acceleration=commanded.acceleration,
-            position=feedback.position,
-            velocity=measured.velocity,
-            commanded_position=rows[0],
-            commanded_velocity=rows[1],
-            commanded_acceleration=rows[2],
-            passive_position=rows[3],
-            following_error=measured.following_error,
-            progress=progress,
-            remaining=remaining,
-        )
-        pack_into(self._batch, 1 + self._batched * LAYOUT.size, record)
+        ticks = control.cycles, tick.deadline_ns, tick.lateness_ns, self._overruns
+        HEAD.pack_into(self._made, 0, *ticks, *self._parts_ns, MODES.index(control.state.mode))
+        begin = 1 + self._batched * SIZE
+        self._batch[begin : begin + SIZE] = self._made
         self._batched += 1
         if self._batched == self._batch_size:
             self._flush()
@@ -243,7 +218,7 @@ class Loop:
         """Give a sign of life; send the batch, take new peers, and what was kept for them; listen to the recorder."""
         self._heart.beat()
         if self._batched:
-            batch = bytes(self._batch[: 1 + self._batched * LAYOUT.size])
+            batch = self._batch[: 1 + self._batched * SIZE]
             self._batched = 0
             self._gateway.send(batch)
             self._recorder.send(batch)
