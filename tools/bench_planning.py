@@ -7,6 +7,7 @@ import random
 import time
 from collections.abc import Callable
 
+import bench_time_optimal
 import numpy as np
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from trirail.config import SIM, geometry, load
@@ -50,8 +51,9 @@ def main(json: bool) -> None:
             "most_steps": max(counts),
         }
     bare = _bare(config.period)
+    weak = bench_time_optimal.measure()
     if json:
-        print(json_format.dumps({"goals": results, "ruckig_alone_us": bare, "aim_us": AIM}))
+        print(json_format.dumps({"goals": results, "ruckig_alone_us": bare, "aim_us": AIM, "weak_sliders": weak}))
         return
     print(f"a step of planning, processor time [µs]; the aim is {AIM:g}, and one step a cycle")
     for kind, found in results.items():
@@ -61,6 +63,7 @@ def main(json: bool) -> None:
             f"{found['in_one_step']:.0%} of the goals in one step, none in more than {found['most_steps']}"
         )
     print(f"Ruckig alone, for one pose from rest: {bare:.1f} µs; the rest is the look along the path")
+    bench_time_optimal.report(weak)
 
 
 def _pose(rnd: random.Random) -> tuple[float, float, float]:
