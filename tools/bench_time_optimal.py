@@ -17,9 +17,8 @@ from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
-from trirail.motion.planner import Plan, Planner
+from trirail.motion.planner import Planner
 from trirail.motion.runs import rest
-from trirail.motion.steps import Steps
 
 GOALS, SEED = 300, 13
 WEAK = {"velocity": 0.3, "acceleration": 3.0, "jerk": 50.0}
@@ -110,21 +109,12 @@ def _pose(rnd: random.Random, limits: Limits) -> Triple:
 
 def _times(planner: Planner, robot: Geometry, limits: Limits, start: Triple, target: Triple) -> Times:
     with patch("trirail.motion.planner.time_optimal", return_value=None):
-        uniform = _decided(planner.to_pose(rest(start), target))
+        uniform = planner.to_pose(rest(start), target)
     began = time.thread_time()
-    planned = _decided(planner.to_pose(rest(start), target))
+    planned = planner.to_pose(rest(start), target)
     thinking = time.thread_time() - began
     bound = topp_ra(robot, limits, start, target)
     return Times(uniform.path.duration / uniform.slowed, uniform.path.duration, planned.path.duration, bound, thinking)
-
-
-def _decided(steps: Steps[Plan]) -> Plan:
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            plan: Plan = end.value
-            return plan
 
 
 def topp_ra(robot: Geometry, limits: Limits, start: Triple, target: Triple) -> float:

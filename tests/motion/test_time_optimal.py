@@ -24,7 +24,6 @@ from trirail.motion.limits import Bounds
 from trirail.motion.paths import Path, value
 from trirail.motion.planner import Kinodynamic, Plan, Planner
 from trirail.motion.runs import MotionState, rest
-from trirail.motion.steps import Steps
 
 ROBOT = geometry(CONFIG.geometry)
 PLATFORM = CONFIG.limits.platform
@@ -62,29 +61,20 @@ def planner_of(sliders: Sequence[float]) -> Planner:
     return Planner(ROBOT, limits.platform, limits.slider, bounds, checker, CONFIG.period)
 
 
-def decided(steps: Steps[Plan]) -> Plan:
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            plan: Plan = end.value
-            return plan
-
-
 def to_pose(
     sliders: Sequence[float], start: Triple, target: Triple, speed: float = 1.0, own: Kinodynamic | None = None
 ) -> Pair:
     planner = planner_of(sliders)
-    plan = decided(planner.to_pose(rest(start), target, speed, own))
+    plan = planner.to_pose(rest(start), target, speed, own)
     with patch("trirail.motion.planner.time_optimal", return_value=None):
-        return Pair(plan, decided(planner.to_pose(rest(start), target, speed, own)))
+        return Pair(plan, planner.to_pose(rest(start), target, speed, own))
 
 
 def to_sliders(sliders: Sequence[float], start: Triple, target: Triple) -> Pair:
     planner = planner_of(sliders)
-    plan = decided(planner.to_sliders(rest(start), target))
+    plan = planner.to_sliders(rest(start), target)
     with patch("trirail.motion.planner.time_optimal", return_value=None):
-        return Pair(plan, decided(planner.to_sliders(rest(start), target)))
+        return Pair(plan, planner.to_sliders(rest(start), target))
 
 
 def positions(path: Path) -> NDArray[np.float64]:
@@ -199,7 +189,7 @@ def test_what_fits_stays_ruckigs() -> None:
     """To the last bit, whatever the way by which others are made sooner."""
     start, end = (0.0, 0.0, 0.0), (0.03, -0.02, 0.1)
     with patch("trirail.motion.planner.time_optimal", side_effect=AssertionError):
-        plan = decided(planner_of((1.0, 15.0, 400.0)).to_pose(rest(start), end))
+        plan = planner_of((1.0, 15.0, 400.0).to_pose(rest(start), end))
     assert plan.slowed == 1.0
 
 
@@ -230,12 +220,12 @@ def test_a_goals_own_limits_are_kept(share: float) -> None:
 def test_another_goal_on_the_way(start: Triple, end: Triple, then: Triple, share: float) -> None:
     """What begins in motion begins with that motion, or is refused: then the robot stops first."""
     planner = planner_of(WEAK)
-    path = decided(planner.to_pose(rest(start), end)).path
+    path = planner.to_pose(rest(start), end).path
     out = np.zeros((3, 3))
     value(path.knots, path.pieces, share * path.duration, out)
     state = MotionState(*out.tolist())
     try:
-        plan = decided(planner.to_pose(state, then))
+        plan = planner.to_pose(state, then)
     except RefusedError:
         return
     value(plan.path.knots, plan.path.pieces, 0.0, out)
