@@ -189,7 +189,7 @@ def test_what_fits_stays_ruckigs() -> None:
     """To the last bit, whatever the way by which others are made sooner."""
     start, end = (0.0, 0.0, 0.0), (0.03, -0.02, 0.1)
     with patch("trirail.motion.planner.time_optimal", side_effect=AssertionError):
-        plan = planner_of((1.0, 15.0, 400.0).to_pose(rest(start), end))
+        plan = planner_of((1.0, 15.0, 400.0)).to_pose(rest(start), end)
     assert plan.slowed == 1.0
 
 
