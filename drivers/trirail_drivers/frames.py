@@ -10,6 +10,11 @@ def data_frame(identifier: int, data: bytes) -> can.Message:
     return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
 
 
+def remote_frame(identifier: int, length: int) -> can.Message:
+    """A request for the data frame of an 11-bit identifier."""
+    return can.Message(arbitration_id=identifier, is_remote_frame=True, dlc=length, is_extended_id=False)
+
+
 def frame_bits(n: int) -> int:
     """Bits that a classical frame of `n` data bytes and an 11-bit identifier takes at most.
 
