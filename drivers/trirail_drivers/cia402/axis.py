@@ -121,9 +121,9 @@ class Axis(axis.Axis):
     def on_position(self, data: bytes | bytearray, now: float) -> None:
         """TPDO2: the position sampled at a SYNC, and the statusword where the drive's way has it here."""
         counts, statusword = self.way.feedback.unpack(data)
+        self._came += not self._came or counts != self.actual  # the same again is one frame that came twice
         self.take_position(counts)
         self.answers.come()
-        self._came += 1
         if statusword is not None:
             self.status_heard = now
             self.take_status(statusword)
