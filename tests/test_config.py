@@ -156,6 +156,33 @@ def test_what_odrives_do_not_have_is_refused(table: str, said: str) -> None:
         parse(text)
 
 
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ("index = 0", 'can.options.index: "simulated" has no options'),
+        ('"tty baudrate" = 1', "can.options"),
+        ("timing = [1, 2]", "can.options"),
+    ],
+)
+def test_options_of_the_bus_that_are_refused(table: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        parse(f"{TEXT}\n[can.options]\n{table}\n")
+
+
+@pytest.mark.parametrize("name", ["channel", "interface", "bitrate"])
+def test_what_stands_in_can_is_no_option(name: str) -> None:
+    text = TEXT.replace('interface = "simulated"', 'interface = "gs_usb"')
+    with pytest.raises(ConfigError, match=rf"can.options.{name}: interface, channel and bitrate stand in \[can\]"):
+        parse(f'{text}\n[can.options]\n{name} = "x"\n')
+
+
+def test_options_of_the_bus_keep_their_types() -> None:
+    text = TEXT.replace('interface = "simulated"', 'interface = "socketcand"')
+    options = parse(f'{text}\n[can.options]\nhost = "a"\nport = 1\ntcp_tune = true\nwait = 0.5\n').can.options
+    assert options == {"host": "a", "port": 1, "tcp_tune": True, "wait": 0.5}
+    assert [type(value) for value in options.values()] == [str, int, bool, float]
+
+
 def test_an_eds_lies_beside_the_configuration(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(TEXT.replace("[drives.B]\n", '[drives.B]\neds = "makes/b.eds"\n'))

@@ -24,7 +24,7 @@ def loaded_by(statement: str) -> set[str]:
         ("from trirail import TrirailError, RefusedError, ServiceError, ConfigError, KinematicsError", set()),
         ("from trirail import Robot", {"numpy", "zenoh"}),
         ("from trirail import Geometry, Leg, inverse, forward, jacobians", {"numba", "numpy"}),
-        ("from trirail import read", {"numba", "numpy", "rerun"}),
+        ("from trirail import read", {"numpy", "rerun"}),
     ],
 )
 def test_each_name_loads_what_it_needs_and_no_more(statement: str, loaded: set[str]) -> None:

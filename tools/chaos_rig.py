@@ -19,11 +19,11 @@ import numpy as np
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.config import SIM, load
-from trirail.errors import ServiceError, TrirailError
+from trirail.errors import EmptyRecordingError, ServiceError, TrirailError
 from trirail.processes.interpreter import child
 from trirail.telemetry.reading import Recording, read
 from trirail.telemetry.sinks import HOST, free_port
-from trirail.wire.messages import State
+from trirail.wire.state import State
 from trirail_drivers.cia402 import frames
 from trirail_drivers.unixbus import UnixBus
 
@@ -172,11 +172,17 @@ class Rig:
 
     def recordings(self) -> list[Recording]:
         """All that the service has recorded; Failed where a file cannot be read."""
-        files = sorted((self.folder / "recordings").glob("*.rrd"))
-        try:
-            return [read(file) for file in files if not file.name.startswith("fault-")]
-        except ServiceError as error:
-            raise Failed(str(error)) from error
+        found = []
+        for file in sorted((self.folder / "recordings").glob("*.rrd")):
+            if file.name.startswith("fault-"):
+                continue
+            try:
+                found.append(read(file))
+            except EmptyRecordingError:  # a recorder that took a dead one's place, just before the service ended
+                continue
+            except ServiceError as error:
+                raise Failed(str(error)) from error
+        return found
 
     def warnings(self) -> str:
         """What the service has warned of, for people who look for the cause of a failure."""

@@ -50,7 +50,7 @@ BOUNDS = (
           "it is killed; a gateway is started again, with the loop the service ends"),
     Bound("Controlled stop when the service ends", ("trirail.processes.loop:SHUTDOWN s",), "the drives' quick stop"),
     Bound("Goals that wait for the one under way", ("motion.queue",), "refused, `queue_full`"),
-    Bound("Wait of a goal for those before it", ("trirail.processes.gateway:PATIENCE s",),
+    Bound("Wait of a goal for those before it", ("trirail.processes.backlog:PATIENCE s",),
           "refused, `stopped`; a goal may have its own, `valid_for`: `expired`"),
     Bound("Renewal of a jog", (), "the robot brakes, `jog_over`"),
     Bound("A command, as the service waits for it", ("trirail.processes.gateway:REPLY_WITHIN s",),

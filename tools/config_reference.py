@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import config_limits
 import docstrings
+import msgspec
 from msgspec import inspect as mi
 from trirail.cli.config_commands import shipped_files
 from trirail.config import Config
@@ -78,7 +79,7 @@ def keys(kind: type) -> Iterator[tuple[str, str, str, str]]:
     said = docstrings.fields(kind)
     for field in _fields(kind):
         if _table(field.type)[0] is None:
-            default = "" if field.required else "none" if field.default is None else f"`{json.dumps(field.default)}`"
+            default = "" if field.required else "none" if field.default is None else f"`{json.dumps(_default(field))}`"
             yield field.encode_name, allowed(field.type), default, said.get(field.encode_name, "")
 
 
@@ -107,6 +108,8 @@ def allowed(kind: mi.Type) -> str:
             return "`true`, `false`"
         case mi.TupleType(item_types=items):
             return f"{len(items)} × {allowed(items[0])}"
+        case mi.DictType(value_type=value):
+            return f"table of {allowed(value)}"
         case mi.VarTupleType(item_type=item):
             return f"list of {allowed(item)}"
     raise TypeError(f"no words for {kind}: add them here")
@@ -131,6 +134,10 @@ def _fields(kind: type) -> tuple[mi.Field, ...]:
     if not isinstance(found, mi.StructType):
         raise TypeError(f"{kind} is no table")
     return found.fields
+
+
+def _default(field: mi.Field) -> object:
+    return field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
 
 
 def _table(kind: mi.Type) -> tuple[type | None, bool]:

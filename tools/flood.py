@@ -45,6 +45,8 @@ PENDING = 200
 """Queries of one sender that may be without an answer."""
 GREATEST_MB = 900.0
 """What no process of the service may be beyond [1e6 bytes]."""
+SAMPLES = 10
+"""How often the memory is looked at meanwhile."""
 LOG_BYTES = 100_000
 STOP_WITHIN = 5.0
 """How long a stop may take to be answered on a machine that the flood keeps busy [s]."""
@@ -194,6 +196,26 @@ def memory(pids: dict[str, int]) -> dict[str, float]:
 
 
 @contextlib.contextmanager
+def sampled(pids: dict[str, int], every: float) -> Iterator[list[dict[str, float]]]:
+    """Look at the memory that processes hold so often [s]; give the samples."""
+    samples: list[dict[str, float]] = []
+    over = threading.Event()
+
+    def sample() -> None:
+        while not over.wait(every):
+            with contextlib.suppress(OSError):  # one that has ended is told of elsewhere
+                samples.append(memory(pids))
+
+    thread = threading.Thread(target=sample, daemon=True)
+    thread.start()
+    try:
+        yield samples
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextlib.contextmanager
 def private_service(folder: Path) -> Iterator[tuple[own_service.Process, str, tuple[int, int]]]:
     """Run a service on TCP ports of its own; give its process, its locator and the ports."""
     zenoh_port, live_port = free_port(), free_port()
@@ -240,7 +262,8 @@ def run(seconds: float, rate: float) -> list[str]:
             ]
             for one in floods:
                 one.start()
-            taken, stops = use(locator, seconds)
+            with sampled(pids, seconds / SAMPLES) as samples:
+                taken, stops = use(locator, seconds)
             sent, answered = max((heard.recv() for _ in floods), key=lambda told: sum(told[0].values()))
             for one in floods:
                 one.join()
@@ -248,7 +271,8 @@ def run(seconds: float, rate: float) -> list[str]:
             print(f"{sum(sent.values())} messages of {len(sent)} kinds in {seconds:g} s, {answered} answers")
             print(f"{taken} goals taken, {len(stops)} stops, the slowest answered in {max(stops):.2f} s")
             for process in pids:
-                print(f"{process:12}{before[process]:7.0f} MB before, {after[process]:7.0f} MB after")
+                meanwhile = " ".join(f"{sample[process]:.0f}" for sample in samples)
+                print(f"{process:12}{before[process]:5.0f} MB before, {meanwhile}, {after[process]:.0f} after")
             return list(_failures(robot, service.pid, pids, after, stops))
 
 

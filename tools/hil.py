@@ -21,6 +21,7 @@ from types import FrameType
 from typing import Any
 
 import bus_log
+import hil_dissector
 from hil_machine import ROOT, heard, machine, pack, prepare
 from hil_needs import Failed, install, last, requirements
 from trirail.config import Config, load
@@ -36,6 +37,22 @@ CHANGES = {
     "live_port = 9876": "live_port = 0",
 }
 """What the machine's configuration has that differs from configs/socketcan.toml."""
+HOMING = {
+    "rate_hz = 20 ": "rate_hz = 10 ",
+    "following_error = 0.03 ": "following_error = 0.06 ",
+    "following_error = 0.04": "following_error = 0.08",
+}
+"""What the second configuration has that differs from the first, besides homing: another rate."""
+LOGS = ("service", "drives", "homing-service", "homing-drives")
+"""What is shown of a run that failed."""
+INCREMENTAL = """
+[drives.{}.homing]
+method = 19
+speed_switch = 0.02
+speed_zero = 0.005
+acceleration = 0.5
+timeout = 120.0
+"""
 
 
 def main() -> int:
@@ -105,19 +122,19 @@ def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict
     result = _result(folder)
     report["checks"] |= result["checks"]
     if result["failure"]:
-        raise Failed(f"{result['failure']}{_logs(folder, 'service', 'drives')}")
+        raise Failed(f"{result['failure']}{_logs(folder, *LOGS)}")
     code = (folder / "vcan.code").read_text().strip() if (folder / "vcan.code").exists() else "none"
     summary = last((folder / "vcan.log").read_text(), 1) if (folder / "vcan.log").exists() else ""
     if code != "0" or "passed" not in summary:
         raise Failed(f"the tests marked vcan: exit code {code}{_logs(folder, 'vcan')}")
     say(f"tests marked vcan: {summary.strip()}")
     report["checks"]["vcan"] = summary.strip()
-    report["loop"] = result["loop"]
+    report["loops"] = result["loops"]
     check_frames(folder, config, result, say, report)
 
 
 def configure(folder: Path) -> Config:
-    """Write the machine's configuration: configs/socketcan.toml with CHANGES."""
+    """Write two configurations: configs/socketcan.toml with CHANGES, which is returned, and then with HOMING."""
     text = (ROOT / "configs/socketcan.toml").read_text()
     memory = "/dev/shm"
     changes = CHANGES | {
@@ -126,34 +143,45 @@ def configure(folder: Path) -> Config:
         # A stalled host stalls the drives with the loop: that is no loss of SYNC.
         "[drives]\n": "[can.simulated]\nmissed_syncs = 40\n\n[drives]\nsdo_timeout = 10.0\n",
     }
+    text = _changed(text, changes)
+    (folder / "robot.toml").write_text(text)
+    (folder / "homing.toml").write_text(_changed(text, HOMING) + "".join(map(INCREMENTAL.format, "ABC")))
+    load(folder / "homing.toml")
+    return load(folder / "robot.toml")
+
+
+def _changed(text: str, changes: dict[str, str]) -> str:
     for before, after in changes.items():
         if text.count(before) != 1:
             raise Failed(f"configs/socketcan.toml: {before!r} is not there once; CHANGES of tools/hil.py needs it")
         text = text.replace(before, after)
-    (folder / "robot.toml").write_text(text)
-    return load(folder / "robot.toml")
+    return text
 
 
 def _result(folder: Path) -> dict[str, Any]:
     try:
         return json.loads((folder / "result.json").read_text())  # type: ignore[no-any-return]
     except FileNotFoundError:
-        raise Failed(f"the machine ended without a result{_logs(folder, 'service', 'drives')}") from None
+        raise Failed(f"the machine ended without a result{_logs(folder, *LOGS)}") from None
 
 
 def check_frames(folder: Path, config: Config, result: dict[str, Any], say: Progress, report: dict[str, Any]) -> None:
     """Check the frames that candump saw on can1, and those that the service says it sent and heard."""
     frames = bus_log.read(folder / "bus.log")
     own = bus_log.read(folder / "service-frames.log")
-    until, missed = result["cut"], result["loop"]["overruns"]
+    until, missed = result["cut"], result["loops"][f"{config.loop.rate_hz} Hz"]["overruns"]
+    dissected = hil_dissector.dissect(folder / "bus.log")
     problems = bus_log.problems(frames, config, missed, until) + bus_log.differences(own, frames, until)
+    problems += hil_dissector.problems(dissected, until)
     if problems:
         raise Failed("the frames on the bus are wrong:\n  " + "\n  ".join(problems[:10]) + f"\nsee {folder}/bus.log")
     report["frames"] = bus_log.statistics(frames, config, until)
-    for name, words in bus_log.HELD.items():
+    report["dissected"] = hil_dissector.statistics(dissected)
+    for name, words in (bus_log.HELD | {"dissector": hil_dissector.HELD}).items():
         report["checks"][name] = words
         say(f"frames: {words}")
     say(f"frames: {json.dumps(report['frames'])}")
+    say(f"frames, as Wireshark sees them: {json.dumps(report['dissected'])}")
 
 
 def _logs(folder: Path, *names: str) -> str:

@@ -18,6 +18,7 @@ CARD = "kernel/drivers/net/can/sja1000/kvaser_pci.ko"
 
 PROGRAMS = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-static", "modprobe": "kmod", "udevadm": "udev"}
 PROGRAMS |= {"ip": "iproute2", "candump": "can-utils", "chrt": "util-linux", "mksquashfs": "squashfs-tools"}
+PROGRAMS |= {"tshark": "tshark"}
 """Each program that is needed, and the package of Debian and Ubuntu that has it."""
 KERNELS = {"debian": "linux-image-amd64", "ubuntu": "linux-image-generic"}
 """The package of a kernel with CAN and its drivers."""

@@ -1,6 +1,6 @@
 """JSON Schemas of the messages, for clients in other languages: python tools/message_schemas.py [--check].
 
-They are made from the types of trirail.wire.messages and shipped in service/trirail/wire/schemas, one file for each
+They are made from the types of trirail.wire and shipped in service/trirail/wire/schemas, one file for each
 kind of message. With --check nothing is written; exit 1 if a file is not what the types say.
 """
 
@@ -15,7 +15,7 @@ from typing import Any, get_args
 import docstrings
 import msgspec
 from trirail.errors import RefusalCode
-from trirail.wire import messages
+from trirail.wire import messages, state
 
 FOLDER = Path(messages.__file__).parent / "schemas"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -30,9 +30,9 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "command": (messages.NoContent, "The content, if any, of the other commands."),
     "command-reply": (messages.CommandReply, "The reply to a command that has been carried out."),
     "error-reply": (messages.ErrorReply, "The error reply to a goal or command that is refused, or that fails."),
-    "state": (messages.State, "What is published on state."),
+    "state": (state.State, "What is published on state."),
     "event": (messages.Event, "What is published on event."),
-    "info": (messages.Info, "The reply to a query on info."),
+    "info": (state.Info, "The reply to a query on info."),
 }
 """By file: the type, and where the message is met."""
 
@@ -51,7 +51,7 @@ def schemas() -> dict[str, str]:
                     {"const": code, "description": f"{code.meaning}; {code.remedy}"} for code in RefusalCode
                 ]
                 continue
-            for field, text in docstrings.fields(getattr(messages, struct)).items():
+            for field, text in docstrings.fields(getattr(messages, struct, None) or getattr(state, struct)).items():
                 definition["properties"][field]["description"] = text
         whole = {"$schema": DIALECT, "title": f"trirail: {name}", "description": where, **schema, "$defs": definitions}
         made[f"{name}.json"] = json.dumps(whole, indent=2, ensure_ascii=False) + "\n"

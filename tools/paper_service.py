@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from paper_motions import DURATION, EXAMPLES, Curves, Example, platform
 from trirail.client import own_service
-from trirail.client.client import Goal, Robot
+from trirail.client.client import GoalHandle, Robot
 from trirail.config import SIM, load
 from trirail.errors import RefusedError, ServiceError
 from trirail.kinematics.algebra import Array
@@ -109,14 +109,14 @@ def _name(example: Example) -> str:
     return f"paper-{example.name}"
 
 
-def _send(robot: Robot, example: Example) -> Goal:
+def _send(robot: Robot, example: Example) -> GoalHandle:
     try:
         return robot.follow(points(example), id=_name(example))
     except RefusedError as error:
         raise RefusedError(error.code, f"the service refused {example.name}: {error}") from error
 
 
-def _finish(goal: Goal, name: str) -> None:
+def _finish(goal: GoalHandle, name: str) -> None:
     try:
         result = goal.wait(WITHIN)
     except TimeoutError as error:

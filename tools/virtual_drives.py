@@ -14,13 +14,15 @@ import os
 import select
 import signal
 import sys
+import time
 from pathlib import Path
 from types import FrameType
 
 import can
-from trirail.config import load
+import msgspec
+from trirail.config import Config, load
 from trirail.errors import TrirailError
-from trirail_drivers.bus import simulated_bus
+from trirail_drivers.bus import open_bus, simulated_bus
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES
 from trirail_drivers.simulated import SimulatedBus
@@ -94,7 +96,12 @@ def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report, console: Cons
     """Carry frames between a bus and the simulated drives, until interrupted; look at their timers each `poll` [s]."""
     while True:
         console.poll()
-        frame = wire.recv(poll)
+        try:
+            frame = wire.recv(poll)
+        except can.CanOperationError as error:  # a bus that is down: their watchdogs run, and it may come back
+            report.once(f"cannot receive: {error}")
+            frame = None
+            time.sleep(poll)
         if frame is not None:
             with contextlib.suppress(can.CanOperationError):  # bus-off: nobody hears it
                 drives.send(frame)
@@ -127,7 +134,7 @@ def main() -> int:
     try:
         config = load(options.config)
         with (
-            open_bus(options.interface, options.channel, config.can.bitrate) as wire,
+            bus_to_be_on(options.interface, options.channel, config) as wire,
             simulated_bus(config.can, config.drives) as bus,
         ):
             bus.faults.tell = say
@@ -143,11 +150,12 @@ def main() -> int:
     return 0
 
 
-def open_bus(interface: str, channel: str, bitrate: int) -> can.BusABC:
-    """The bus to be on; over a unix socket the drives are the end that listens."""
+def bus_to_be_on(interface: str, channel: str, config: Config) -> can.BusABC:
+    """The bus of the drives, with the file's bitrate and options; of a unix socket they are the end that listens."""
     if interface == "unix":
         return UnixBus(channel, listen=True)
-    return can.Bus(channel=channel, interface=interface, bitrate=bitrate)
+    section = msgspec.structs.replace(config.can, interface=interface, channel=channel)
+    return open_bus(section, config.drives)
 
 
 def say(text: str) -> None:

@@ -7,10 +7,11 @@ import logging
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import can
 
-from trirail_drivers import canerrors, config
+from trirail_drivers import adapters, canerrors, config
 from trirail_drivers.capture import Capture, CapturedBus
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import Drives
@@ -39,6 +40,7 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Callable[[], flo
     if section.interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted({"simulated", "unix", *can.VALID_INTERFACES}))
         raise BusError(f'can.interface "{section.interface}" is unknown; known are {known}')
+    options: dict[str, Any] = dict(section.options)
     try:
         # Our configuration alone decides: none of python-can's own files and environment variables.
         bus = can.Bus(
@@ -46,8 +48,9 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Callable[[], flo
             channel=section.channel,
             bitrate=section.bitrate,
             ignore_config=True,
+            **options,
         )
-    except (can.CanError, OSError, ImportError, TypeError, ValueError) as error:
+    except Exception as error:  # makers' libraries raise what they like: Kvaser's, where it is missing, NameError
         raise BusError(_explained(section, error)) from error
     if section.interface == "socketcan" and _is_down(section.channel):
         bus.shutdown()
@@ -90,6 +93,8 @@ def _explained(section: config.Can, error: Exception) -> str:
         return "this kernel has no SocketCAN (address family AF_CAN); load it with: modprobe can_raw"
     if section.interface == "socketcan" and number == errno.ENODEV:
         return f'there is no CAN interface "{section.channel}"; {_bring_up(section)}'
+    if lacking := adapters.lacking(section.interface):
+        return f"CAN interface {section.interface} needs {lacking}"
     reason = " ".join(str(error).split())
     return f'cannot open CAN interface {section.interface}, channel "{section.channel}": {reason}'
 

@@ -104,9 +104,8 @@ class Report(NamedTuple):
     text: str
 
 
-def report(frame: can.Message) -> Report:
-    """Read an error frame; one that is not SocketCAN's is a warning that says so."""
-    kind, data = frame.arbitration_id, frame.data
+def report(kind: int, data: bytes | bytearray) -> Report:
+    """Read an error frame's identifier and data; one that is not SocketCAN's is a warning that says so."""
     if len(data) != _LENGTH:
         return Report(Gravity.WARNING, f"error frame {kind:X} in the interface's own coding")
     parts = [words for bit, words in _CLASSES.items() if kind & bit]
@@ -146,6 +145,8 @@ def cannot_send(error: Exception) -> str:
             return f"{reason}: the interface is down; bring it up: ip link set DEV up"
         case errno.ENODEV | errno.ENXIO:
             return f"{reason}: the interface is gone; is the adapter still plugged in?"
+        case errno.EPIPE | errno.ECONNRESET:
+            return f"{reason}: the end of the bus that listens is gone"
     return reason
 
 

@@ -8,9 +8,10 @@ from collections.abc import Iterator
 
 import can
 
-FRAME = struct.Struct("<dHB8s")
-"""A captured frame: seconds since 1970, identifier, length, data. The length of a remote frame has REMOTE added."""
-REMOTE = 0x80
+from trirail_drivers.frames import CAN_FRAME, packed
+
+FRAME = struct.Struct(f"<d{CAN_FRAME.size}s")
+"""A captured frame: seconds since 1970, `struct can_frame`."""
 CHUNK = 1024
 """Frames handed over at a time."""
 KEPT = 100_000
@@ -23,11 +24,10 @@ class Capture:
     def __init__(self) -> None:
         self._frames = bytearray()
 
-    def note(self, frame: can.Message) -> None:
-        """Note a frame, now."""
+    def note(self, frame: bytes | bytearray, t: float) -> None:
+        """Note a `struct can_frame` and its time, in seconds since 1970."""
         if len(self._frames) < KEPT * FRAME.size:
-            length = frame.dlc | REMOTE * frame.is_remote_frame
-            self._frames += FRAME.pack(time.time(), frame.arbitration_id, length, bytes(frame.data))
+            self._frames += FRAME.pack(t, frame)
 
     def take(self) -> Iterator[bytes]:
         """Hand over what has been noted, in chunks of at most CHUNK frames."""
@@ -40,28 +40,30 @@ class CapturedBus(can.BusABC):
     """A bus whose frames are noted on their way."""
 
     def __init__(self, bus: can.BusABC, capture: Capture) -> None:
-        self._bus = bus
-        self._capture = capture
+        self.inner = bus
+        """The bus underneath."""
+        self.capture = capture
+        """Where its frames are noted."""
         self.channel_info = f"{bus.channel_info}, captured"
         super().__init__(channel=self.channel_info)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send and note a frame."""
-        self._capture.note(msg)
-        self._bus.send(msg, timeout)
+        self.inner.send(msg, timeout)
+        self.capture.note(packed(msg), time.time())
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Receive and note a frame."""
-        frame = self._bus.recv(timeout)
+        frame = self.inner.recv(timeout)
         if frame is not None:
-            self._capture.note(frame)
+            self.capture.note(packed(frame), time.time())
         return frame
 
     def fileno(self) -> int:
         """As the bus underneath."""
-        return self._bus.fileno()
+        return self.inner.fileno()
 
     def shutdown(self) -> None:
         """Close the bus underneath."""
         super().shutdown()
-        self._bus.shutdown()
+        self.inner.shutdown()

@@ -44,6 +44,11 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
     """Slider positions at power-on [m]."""
 
 
+OptionNumber = Annotated[int, Meta(ge=-(10**12), le=10**12)] | Annotated[float, Meta(ge=-1e12, le=1e12)]
+OptionName = Annotated[str, Meta(max_length=64, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+"""A keyword argument of a python-can bus."""
+
+
 class Can(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [can]: any python-can interface, or "simulated" (three drives inside the process)."""
 
@@ -53,6 +58,8 @@ class Can(Struct, frozen=True, forbid_unknown_fields=True):
     """The interface's channel, as `can0`."""
     bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
     """Bits per second: for the bus load, and for interfaces that set it themselves."""
+    options: dict[OptionName, bool | OptionNumber | Name] = {}
+    """Handed to python-can as they are: `index` of gs_usb, `host` and `port` of socketcand, `tty_baudrate` of slcan."""
     simulated: Simulated = Simulated()
 
 

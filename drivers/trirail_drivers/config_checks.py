@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
-from trirail_drivers.config import Drives
+from trirail_drivers.config import Can, Drives
 from trirail_drivers.errors import DriveError
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.requirements import Requirements
+
+_OWN = ("simulated", "unix")
+"""Interfaces that are not python-can's."""
+_ELSEWHERE = ("interface", "channel", "bitrate", "ignore_config", "config_context")
+"""What `can.Bus` is given from elsewhere, or not at all."""
+
+
+def check_bus(section: Can) -> None:
+    """Refuse options that python-can cannot be given. Raises DriveError with the key."""
+    for name in section.options:
+        if section.interface in _OWN:
+            raise DriveError(f'can.options.{name}: "{section.interface}" has no options, python-can\'s interfaces have')
+        if name in _ELSEWHERE:
+            raise DriveError(f"can.options.{name}: interface, channel and bitrate stand in [can]; the rest is fixed")
 
 
 def check(drives: Drives, required: Requirements) -> None:

@@ -55,7 +55,7 @@ class Driver(ABC, Generic[AnyAxis]):
 
     @property
     def traffic(self) -> int:
-        """Bits of all frames on the bus since the start, each with worst-case stuffing."""
+        """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
         return self._wire.traffic
 
     def close(self) -> None:

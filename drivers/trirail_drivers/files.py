@@ -1,4 +1,4 @@
-"""Files that people name, read without waiting: regular ones of a bounded size, no FIFOs, devices or folders."""
+"""Files that people name, read and written without waiting: regular ones, no FIFOs, devices or folders."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def opened(path: Path) -> BinaryIO:
     """Open a regular file to be read. Raises FileError, where there is none or where reading might never end."""
     try:
         # Opening a device may do something, and a FIFO without O_NONBLOCK waits for somebody to write to it.
-        _check(path, os.stat(path).st_mode)
+        check(path)
         file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
     except OSError as error:
         raise FileError(f"{path}: {error.strerror}") from error
     except ValueError as error:  # a null character in the name
         raise FileError(f"{str(path)!r}: {error}") from error
     try:
-        _check(path, os.fstat(file.fileno()).st_mode)
+        _check(path, os.fstat(file.fileno()))
     except FileError:
         file.close()
         raise
@@ -54,6 +54,11 @@ def text(path: Path) -> str:
         raise FileError(f"{path}: not text in UTF-8: {error.reason} at byte {error.start}") from error
 
 
-def _check(path: Path, mode: int) -> None:
-    if not stat.S_ISREG(mode):
-        raise FileError(f"{path}: {_KINDS.get(stat.S_IFMT(mode), 'no file')}; wanted a regular file")
+def check(path: Path) -> None:
+    """Raise FileError for what is there but is no regular file, OSError where nothing is there."""
+    _check(path, os.stat(path))
+
+
+def _check(path: Path, found: os.stat_result) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        raise FileError(f"{path}: {_KINDS.get(stat.S_IFMT(found.st_mode), 'no file')}; wanted a regular file")

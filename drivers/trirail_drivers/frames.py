@@ -1,18 +1,24 @@
-"""Classical CAN frames, whatever the drives speak."""
+"""Classical CAN frames, whatever the drives speak, as Linux lays them out: struct can_frame of linux/can.h."""
 
 from __future__ import annotations
 
+from struct import Struct
+from typing import Final
+
 import can
 
-
-def data_frame(identifier: int, data: bytes) -> can.Message:
-    """A data frame with an 11-bit identifier."""
-    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
-
-
-def remote_frame(identifier: int, length: int) -> can.Message:
-    """A request for the data frame of an 11-bit identifier."""
-    return can.Message(arbitration_id=identifier, is_remote_frame=True, dlc=length, is_extended_id=False)
+CAN_FRAME: Final = Struct("=IB3x8s")
+"""`struct can_frame`: identifier with flags, length, data."""
+HEAD: Final = Struct("=IB")
+"""Its beginning: identifier with flags, length."""
+DATA_AT: Final = 8
+"""Where its data begins."""
+EXTENDED: Final = 1 << 31
+REMOTE: Final = 1 << 30
+ERROR: Final = 1 << 29
+"""Flags beside the identifier: one of 29 bits, a remote frame, a report of the controller."""
+STANDARD_BITS: Final = 0x7FF
+EXTENDED_BITS: Final = 0x1FFF_FFFF
 
 
 def frame_bits(n: int) -> int:
@@ -22,3 +28,52 @@ def frame_bits(n: int) -> int:
     bit after the first five and then one after every four (ISO 11898-1).
     """
     return 8 * n + 47 + (34 + 8 * n - 1) // 4
+
+
+BITS: Final = tuple(frame_bits(n) for n in range(9))
+"""`frame_bits` of each length."""
+
+
+class Frame:
+    """A frame to be sent, with an 11-bit identifier; one that is sent in every cycle is filled in anew each time."""
+
+    __slots__ = ("bits", "packed")
+
+    def __init__(self, identifier: int, data: bytes = b"", *, remote: bool = False) -> None:
+        self.bits = BITS[len(data)]
+        """What it takes of the bus at most."""
+        self.packed = bytearray(CAN_FRAME.pack(identifier | REMOTE * remote, len(data), data))
+        """`struct can_frame`."""
+
+    def fill(self, layout: Struct, *values: int) -> None:
+        """Give it other data, of the same length; struct.error where the layout cannot hold a value."""
+        layout.pack_into(self.packed, DATA_AT, *values)
+
+    def message(self) -> can.Message:
+        """The frame as python-can has it."""
+        return unpacked(bytes(self.packed))
+
+
+def can_id(message: can.Message) -> int:
+    """Identifier and flags of a python-can message, as `struct can_frame` has them."""
+    flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame | ERROR * message.is_error_frame
+    return message.arbitration_id | flags
+
+
+def packed(message: can.Message) -> bytes:
+    """A python-can message as `struct can_frame`."""
+    return CAN_FRAME.pack(can_id(message), message.dlc, bytes(message.data))
+
+
+def unpacked(packed: bytes, timestamp: float = 0.0) -> can.Message:
+    """A `struct can_frame` as python-can has it; its time in seconds since 1970."""
+    identifier, length, data = CAN_FRAME.unpack(packed)
+    return can.Message(
+        timestamp=timestamp,
+        arbitration_id=identifier & (EXTENDED_BITS if identifier & EXTENDED else STANDARD_BITS),
+        is_extended_id=bool(identifier & EXTENDED),
+        is_remote_frame=bool(identifier & REMOTE),
+        is_error_frame=bool(identifier & ERROR),
+        dlc=length,
+        data=None if identifier & REMOTE else data[:length],
+    )

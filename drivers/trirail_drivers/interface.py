@@ -87,7 +87,7 @@ class Drives(Protocol):
 
     @property
     def traffic(self) -> int:
-        """Bits of all frames on the bus since the start, each with worst-case stuffing."""
+        """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
 
     def configure(self, period: float) -> None:
         """Set the drives up for a cycle of `period` seconds, check what can be read back, start them without power."""

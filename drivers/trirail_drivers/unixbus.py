@@ -8,16 +8,11 @@ import socket
 import time
 from collections import deque
 from pathlib import Path
-from struct import Struct
-from typing import Final
 
 import can
 
 from trirail_drivers.errors import BusError
-
-_FRAME: Final = Struct("=IB3x8s")
-"""Linux `struct can_frame`: CAN-ID with flags, length, data; one a packet."""
-_EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
+from trirail_drivers.frames import CAN_FRAME, packed, unpacked
 
 
 class UnixBus(can.BusABC):
@@ -25,6 +20,7 @@ class UnixBus(can.BusABC):
 
     The end that listens makes the bus: whenever it receives, it relays each frame to all its peers but the
     sender. Any number of others connect. A peer that does not read loses frames, like a full CAN controller.
+    Each packet is a `struct can_frame`.
     """
 
     def __init__(self, channel: str, listen: bool = False, **kwargs: object) -> None:
@@ -49,9 +45,7 @@ class UnixBus(can.BusABC):
         """Send to the peers; raises can.CanOperationError where the listening end is gone or too slow."""
         if msg.is_fd:
             raise can.CanOperationError(f"{self.channel_info}: classical CAN frames only, not CAN FD")
-        can_id = msg.arbitration_id
-        can_id |= _EXTENDED * msg.is_extended_id | _REMOTE * msg.is_remote_frame | _ERROR * msg.is_error_frame
-        packet = _FRAME.pack(can_id, msg.dlc, bytes(msg.data))
+        packet = packed(msg)
         if self._listener is None:
             try:
                 next(iter(self._peers.values())).send(packet)
@@ -59,6 +53,11 @@ class UnixBus(can.BusABC):
                 raise can.CanOperationError(f"{self.channel_info}: cannot send, {error!r}") from error
         else:
             self._relay(packet)
+
+    @property
+    def carrier(self) -> socket.socket | None:
+        """The socket on which a connected end sends and receives; None of the end that listens, or that was left."""
+        return next(iter(self._peers.values()), None) if self._listener is None else None
 
     def fileno(self) -> int:
         """Readable when a frame or a new peer may be there."""
@@ -109,10 +108,10 @@ class UnixBus(can.BusABC):
     def _take(self, peer: socket.socket) -> None:
         """Read one frame, or the end, of a peer."""
         try:
-            packet = peer.recv(_FRAME.size)
+            packet = peer.recv(CAN_FRAME.size)
         except ConnectionError:
             packet = b""
-        if len(packet) != _FRAME.size:
+        if len(packet) != CAN_FRAME.size:
             self._epoll.unregister(peer)
             del self._peers[peer.fileno()]
             peer.close()
@@ -120,17 +119,7 @@ class UnixBus(can.BusABC):
                 raise can.CanOperationError(f"{self.channel_info}: the listening end is gone")
             return
         self._relay(packet, peer)
-        can_id, length, data = _FRAME.unpack(packet)
-        message = can.Message(
-            timestamp=time.time(),
-            arbitration_id=can_id & (0x1FFFFFFF if can_id & _EXTENDED else 0x7FF),
-            is_extended_id=bool(can_id & _EXTENDED),
-            is_remote_frame=bool(can_id & _REMOTE),
-            is_error_frame=bool(can_id & _ERROR),
-            dlc=length,
-            data=None if can_id & _REMOTE else data[:length],
-        )
-        self._arrived.append(message)
+        self._arrived.append(unpacked(packet, time.time()))
 
     def _relay(self, packet: bytes, sender: socket.socket | None = None) -> None:
         if self._listener is None:

@@ -9,15 +9,14 @@ from typing import Protocol
 import can
 
 from trirail_drivers import canerrors
-from trirail_drivers.frames import frame_bits
+from trirail_drivers.frame_io import frame_io
+from trirail_drivers.frames import BITS, ERROR, EXTENDED_BITS, Frame
 from trirail_drivers.interface import DriveFault
 
 MOST_FRAMES = 1000
 """Frames taken in by one `receive` at most, so that a chattering bus cannot hold it."""
 UNSENT_CYCLES = 3
 """So many cycles in a row with a full transmit queue are a fault."""
-
-_BITS = tuple(frame_bits(n) for n in range(9))
 
 Handler = Callable[[bytearray, float], None]
 """Takes a frame's data and the time; struct.error if the length is wrong."""
@@ -38,8 +37,10 @@ class Wire:
 
     def __init__(self, bus: can.BusABC, stop: Callable[[], None]) -> None:
         self.bus = bus
+        """For what is no part of the cycle: setting drives up, leaving."""
         self.traffic = 0
         """Bits of all frames sent and received so far, each with worst-case stuffing."""
+        self._frames = frame_io(bus)
         self.fault: DriveFault | None = None
         self._stop = stop
         self._handlers: dict[int, tuple[Listener, Handler]] = {}
@@ -51,6 +52,7 @@ class Wire:
     def listen(self, can_id: int, listener: Listener, handler: Handler) -> None:
         """Let a handler have the data frames of an 11-bit identifier."""
         self._handlers[can_id] = listener, handler
+        self._frames.hear(self._handlers)
 
     def begin(self) -> None:
         """Note that a cycle begins."""
@@ -80,14 +82,13 @@ class Wire:
         self.fault = None
         self._warned.clear()
 
-    def send(self, message: can.Message) -> bool:
+    def send(self, frame: Frame) -> bool:
         """Send a frame at once; return whether the bus took it.
 
         One that a full queue does not take is left out and, for a few cycles, no fault.
         """
         try:
-            self.bus.send(message, timeout=0)
-            self.traffic += _BITS[min(len(message.data), 8)]
+            self._frames.send(frame)
         except (can.CanError, OSError) as error:
             text = f"CAN bus: cannot send: {canerrors.cannot_send(error)}"
             self._unsent = True
@@ -96,32 +97,40 @@ class Wire:
             else:
                 self.fail(DriveFault("", "bus", 0, text))
             return False
+        self.traffic += frame.bits
         return True
 
     def receive(self, now: float) -> None:
         """Take in every frame that has arrived."""
         try:
             for _ in range(MOST_FRAMES):
-                message = self.bus.recv(0)
-                if message is None:
+                received = self._frames.receive()
+                if received is None:
                     return
-                self.traffic += _BITS[min(len(message.data), 8)]
-                self.take(message, now)
+                self._take(*received, now)
         except (can.CanError, OSError) as error:
             self.fail(DriveFault("", "bus", 0, f"CAN bus: cannot receive: {error}"))
 
-    def take(self, message: can.Message, now: float) -> None:
+    def wait(self, seconds: float, clock: Callable[[], float]) -> None:
+        """Wait for a frame, at most so long [s], and take it in; not for the cycle. Raises can.CanError, OSError."""
+        received = self._frames.receive(seconds)
+        if received is not None:
+            self._take(*received, clock())
+
+    def _take(self, identifier: int, data: bytearray, now: float) -> None:
         """Give one frame to who listens to it."""
-        if message.is_error_frame:
-            self._take_error(canerrors.report(message))
+        if identifier & ERROR:
+            self._take_error(canerrors.report(identifier & EXTENDED_BITS, data))
             return
-        if message.is_extended_id or message.is_remote_frame or message.arbitration_id not in self._handlers:
+        self.traffic += BITS[min(len(data), 8)]
+        heard = self._handlers.get(identifier)  # identifiers of 29 bits and remote frames have flags, and so no handler
+        if heard is None:
             return
-        listener, handler = self._handlers[message.arbitration_id]
+        listener, handler = heard
         try:
-            handler(message.data, now)
+            handler(data, now)
         except struct.error:
-            listener.tell("frame", 0, f"frame {message.arbitration_id:03X} has wrong length {len(message.data)}")
+            listener.tell("frame", 0, f"frame {identifier:03X} has wrong length {len(data)}")
 
     def _take_error(self, report: canerrors.Report) -> None:
         if report.gravity is canerrors.Gravity.FAULT:

@@ -34,7 +34,7 @@ Point = tuple[Coordinate, Coordinate]
 Range = tuple[Coordinate, Coordinate]
 
 
-class Robot(Struct, frozen=True, forbid_unknown_fields=True):
+class RobotTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [robot]."""
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
@@ -114,7 +114,7 @@ class MotionTable(Struct, frozen=True, forbid_unknown_fields=True):
     """How many goals may wait for the one under way, where that has a `blend`."""
 
 
-class Loop(Struct, frozen=True, forbid_unknown_fields=True):
+class LoopTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [loop]."""
 
     rate_hz: Annotated[int, Meta(ge=1, le=4000)]
@@ -169,10 +169,10 @@ class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """A whole configuration file."""
 
-    robot: Robot
+    robot: RobotTable
     geometry: GeometryTable
     limits: Limits
-    loop: Loop
+    loop: LoopTable
     can: Can
     drives: Drives
     zenoh: Zenoh
@@ -191,7 +191,7 @@ def load(path: Path) -> Config:
     try:
         text = files.text(path)
     except FileError as error:
-        raise ConfigError(f"{error}; configs/sim.toml is one to start from") from error
+        raise ConfigError(f"{error}; `trirail config copy sim` gives one to start from") from error
     try:
         return _beside(path, parse(text))
     except ConfigError as error:
@@ -334,6 +334,7 @@ def _check(config: Config) -> None:
     places = (*slider.position, *(config.can.simulated.start if config.can.interface == "simulated" else ()))
     required = Requirements(config.period, min(places), max(places), slider.velocity, slider.following_error)
     try:
+        config_checks.check_bus(config.can)
         config_checks.check(config.drives, required)
     except DriveError as error:
         raise ConfigError(str(error)) from error

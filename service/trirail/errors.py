@@ -7,7 +7,15 @@ from typing import Self
 
 from trirail_drivers.errors import TrirailError
 
-__all__ = ["ConfigError", "KinematicsError", "RefusalCode", "RefusedError", "ServiceError", "TrirailError"]
+__all__ = [
+    "ConfigError",
+    "EmptyRecordingError",
+    "KinematicsError",
+    "RefusalCode",
+    "RefusedError",
+    "ServiceError",
+    "TrirailError",
+]
 
 
 class ConfigError(TrirailError):
@@ -16,6 +24,10 @@ class ConfigError(TrirailError):
 
 class ServiceError(TrirailError):
     """The service cannot start, or cannot be reached."""
+
+
+class EmptyRecordingError(ServiceError):
+    """A recording in which nothing has been recorded: its service ended before the first cycle reached it."""
 
 
 class KinematicsError(TrirailError, ValueError):

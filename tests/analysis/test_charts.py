@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import made
 import numpy as np
 import pytest
 from rich.style import Style
 from trirail.analysis import charts
+from trirail.analysis.summary import UNKNOWN
 from trirail.cli import recording_commands, terminal
 from trirail.config import SIM, load
 from trirail.telemetry import palette
 from trirail.telemetry.recorder import Recorder
+from trirail.wire.messages import Outcome
 from trirail.wire.vocabulary import MODES, Mode
 
 
@@ -22,6 +25,11 @@ def test_every_mode_has_a_colour_of_its_own_wherever_it_is_shown() -> None:
         assert [*shown] == [*MODES]
         assert len(set(shown.values())) == len(MODES)
     assert all(Style.parse(style).color is not None for style in terminal.COLOURS.values())
+
+
+def test_every_outcome_has_one_colour_wherever_it_is_shown() -> None:
+    assert set(palette.OUTCOMES) == {*get_args(Outcome), UNKNOWN}
+    assert all(Style.parse(palette.code(colour)).color is not None for colour in palette.OUTCOMES.values())
 
 
 @pytest.mark.parametrize("picture", ["session.png", "session.svg"])

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import threading
+import time
+from collections.abc import Iterator
 from typing import Any, cast
 
 import numpy as np
@@ -10,7 +15,7 @@ from conftest import Rig
 from made import records
 from trirail.analysis.resend import _beginnings, _Heard, _send
 from trirail.analysis.summary import _goals
-from trirail.client.client import Goal, Result, Robot
+from trirail.client.client import GoalHandle, Result, Robot
 from trirail.telemetry.reading import Line, Recording
 from trirail.wire.messages import Event, PoseGoal
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Request
@@ -23,7 +28,7 @@ class Heard:
     def __init__(self) -> None:
         self.log: list[str] = []
 
-    def send(self, make: Any, name: str) -> Goal:
+    def send(self, make: Any, name: str) -> GoalHandle:
         self.log.append(f"send {name[:-7]}")
         return Ending(name, cast("Robot", self))
 
@@ -32,7 +37,7 @@ class Heard:
         self.log.append(name)
 
 
-class Ending(Goal):
+class Ending(GoalHandle):
     """A goal that ends as soon as it is waited for."""
 
     def wait(self, timeout: float | None = None) -> Result:
@@ -47,6 +52,36 @@ def goal(seq: int, cycle: int, name: str) -> ControlInput:
 def ended(cycle: int, name: str, outcome: Any) -> Line:
     event = Event(cycle, cycle * 1e-3, cycle, 0.0, "goal", "info", "", id=name, outcome=outcome)
     return Line(event.t, np.datetime64(0, "ns"), "INFO", "", event)
+
+
+class Talking:
+    """A robot's client to whom something happens for ever."""
+
+    def __init__(self) -> None:
+        self.told = threading.Event()
+
+    def events(self, timeout: float) -> Iterator[Event]:
+        for seq in itertools.count(1):
+            yield Event(seq, 0.0, seq, 0.0, "service", "info", "", goal=f"{timeout}")
+            self.told.set()
+            time.sleep(0)  # the other thread's turn
+
+    @contextlib.contextmanager
+    def records(self, _: Any) -> Iterator[None]:
+        yield
+
+
+def test_listening_ends_with_its_context_though_something_happens_all_the_time() -> None:
+    talking = Talking()
+    ended = threading.Event()
+
+    def listen() -> None:
+        with _Heard(cast("Robot", talking)).listening():
+            assert talking.told.wait(10.0)
+        ended.set()
+
+    threading.Thread(target=listen, daemon=True).start()
+    assert ended.wait(10.0)
 
 
 ODD = ["g", "my goal", "goal of ann", "moving: goal x of", "done: ", "ü: ∅"]

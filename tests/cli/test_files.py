@@ -71,6 +71,10 @@ def test_what_is_no_regular_file_is_refused(kind: str, command: list[str], tmp_p
     assert f"{path}: {said.get(kind, f'a {kind};')}" in refused(given)
 
 
+def test_who_names_no_configuration_is_told_how_to_get_one(tmp_path: Path, refused: Say) -> None:
+    assert "`trirail config copy sim` gives one to start from" in refused(["run", str(tmp_path / "x.toml")])
+
+
 def test_a_fifo_that_nobody_writes_to_is_refused_by_the_program(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "x.rrd")
     command = [sys.executable, "-m", "trirail", "report", str(tmp_path / "x.rrd")]

@@ -12,7 +12,7 @@ import pytest
 import trirail
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.client.client import _refusal
+from trirail.client import connection
 from trirail.control.ledger import Withdrawal
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.messages import ErrorReply
@@ -50,14 +50,14 @@ def test_every_code_is_used_but_the_one_for_those_that_are_not_known() -> None:
 def test_a_code_goes_over_the_wire_as_its_word_and_comes_out_as_itself(code: RefusalCode) -> None:
     sent = msgspec.json.encode(ErrorReply(code, "no"))
     assert sent == b'{"code":"%s","message":"no"}' % code.encode()
-    refusal = _refusal(sent)
+    refusal = connection.refusal(sent)
     assert isinstance(refusal, RefusedError)
     assert refusal.code is code
 
 
 @given(st.text())
 def test_a_code_of_a_newer_service_is_a_refusal_too(code: str) -> None:
-    refusal = _refusal(msgspec.json.encode({"code": code, "message": "no"}))
+    refusal = connection.refusal(msgspec.json.encode({"code": code, "message": "no"}))
     assert isinstance(refusal, RefusedError)
     assert refusal.code in (code, RefusalCode.OTHER)
     assert str(refusal) == "no"

@@ -59,6 +59,17 @@ def test_a_fault_reset_has_the_time_of_two_statuswords() -> None:
     assert axis.fault(T + 0.26, OFF) == ("B", "fault", 0, "drive B: fault")
 
 
+@pytest.mark.parametrize("wanted", [OFF, WANTED, P.QUICK_STOP_ACTIVE])
+def test_a_fault_from_before_the_start_is_told_and_left_alone_until_it_is_to_be_reset(wanted: frames.Wanted) -> None:
+    axis = Axis("B", 2, Scale(1e6, 0.0), heartbeat=100.0)
+    axis.on_heartbeat(OPERATIONAL, T)
+    axis.on_status(FAULT, T)
+    assert axis.fault(T, wanted) == ("B", "fault", 0, "drive B: fault")
+    assert not axis.word(T, wanted) & frames.FAULT_RESET
+    axis.forgive(T)
+    assert axis.word(T, wanted) == frames.FAULT_RESET
+
+
 def test_a_fault_has_the_code_of_its_emergency_until_it_is_over() -> None:
     axis = made()
     axis.on_emergency(ERROR, T)
@@ -104,8 +115,14 @@ def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -
     assert state_of(axis) is P.NOT_READY_TO_SWITCH_ON
     assert axis.mute
     assert axis.left_operational
+    axis.on_heartbeat(OPERATIONAL, T)
+    assert not axis.mute  # somebody else has started it: its statuswords come by themselves
+    axis.on_heartbeat(PRE_OPERATIONAL, T)
     axis.forgive(T + 5.0)
     assert not axis.left_operational  # it is started once
+    axis.on_heartbeat(PRE_OPERATIONAL, T + 5.0)  # sent before it was
+    assert not axis.left_operational
+    assert not axis.mute
     assert axis.fault(T + 5.299, OFF) is None  # its statuswords have time anew
     axis.on_heartbeat(OPERATIONAL, T + 5.0)
     assert not axis.mute

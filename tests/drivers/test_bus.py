@@ -142,5 +142,5 @@ def test_can_interface_that_is_down(up: bool, tmp_path: Path, monkeypatch: pytes
 
 def test_other_failures_keep_python_cans_reason_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     failing_with(can.CanInitializationError("no such\nadapter"), monkeypatch)
-    text = refusal(Can(interface="pcan", channel="PCAN_USBBUS1"))
-    assert text == 'cannot open CAN interface pcan, channel "PCAN_USBBUS1": no such adapter'
+    text = refusal(Can(interface="vector", channel="1"))
+    assert text == 'cannot open CAN interface vector, channel "1": no such adapter'

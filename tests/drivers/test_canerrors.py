@@ -10,12 +10,6 @@ import pytest
 from trirail_drivers.canerrors import Gravity, cannot_send, error_number, queue_is_full, report
 
 
-def frame(kind: int, *data: int, length: int = 8) -> can.Message:
-    return can.Message(
-        arbitration_id=kind, is_extended_id=False, is_error_frame=True, data=bytes(data).ljust(length, b"\0")
-    )
-
-
 @pytest.mark.parametrize(
     ("kind", "data", "gravity", "said"),
     [
@@ -37,14 +31,14 @@ def frame(kind: int, *data: int, length: int = 8) -> can.Message:
     ],
 )
 def test_error_frames_in_words(kind: int, data: tuple[int, ...], gravity: Gravity, said: str) -> None:
-    told = report(frame(kind, *data))
+    told = report(kind, bytes(data).ljust(8, b"\0"))
     assert told.gravity is gravity
     assert "\n" not in told.text
     assert re.search(said, told.text)
 
 
 def test_an_error_frame_of_another_interface_is_not_read_as_socketcans() -> None:
-    told = report(frame(0x040, length=4))
+    told = report(0x040, bytes(4))
     assert told.gravity is Gravity.WARNING
     assert "own coding" in told.text
 
@@ -68,7 +62,8 @@ def caused(number: int) -> can.CanOperationError:
         (OSError(errno.ENOBUFS, "No buffer space available"), True, "txqueuelen"),
         (refused(errno.ENETDOWN), False, "is down; bring it up: ip link set DEV up"),
         (refused(errno.ENODEV), False, "is gone; is the adapter"),
-        (caused(errno.EPIPE), False, "^cannot send$"),
+        (caused(errno.EPIPE), False, "the end of the bus that listens is gone"),
+        (caused(errno.EIO), False, "^cannot send$"),
     ],
 )
 def test_why_a_frame_could_not_be_sent(error: Exception, full: bool, remedy: str) -> None:

@@ -277,7 +277,7 @@ def test_bus_off_lets_nothing_through_and_is_told_by_error_frames(rig: Rig) -> N
     assert frame is not None
     assert (frame.is_error_frame, frame.arbitration_id) == (True, 0x040)
     with pytest.raises(can.CanOperationError, match="No buffer space"):
-        rig.bus.send(frames.nmt(frames.NMT_START, 1))
+        rig.bus.send(frames.nmt(frames.NMT_START, 1).message())
     assert rig.heartbeats(0.09) == [0, 0, 0]
     rig.wait(0.02)
     assert rig.upload(1)

@@ -229,5 +229,5 @@ def test_a_unit_that_cannot_be_set_and_that_nobody_says_is_refused(rigs: list[Ri
     refuses = {(0x60A9, 0): lambda value: value & 0xFFFFFF != 0xB44700}
     rig = Rig("maxon_epos4_compact50_5", Habits(refuses=refuses), revolutions_per_metre=None)
     rigs.append(rig)
-    with pytest.raises(DriveError, match=r"object 60A9 is rev/min and cannot be set .*say drives.A.revolutions_per_metre"):
+    with pytest.raises(DriveError, match=r"object 60A9 is rev/min and cannot be set .*say drives.A.rev"):
         rig.ready()

@@ -207,6 +207,19 @@ def test_the_frames_of_one_drive(rig: Rig) -> None:
     assert said == ["mode 6", "controlword 001F", "controlword 000F", "mode 8"]
 
 
+def test_the_sdo_requests_of_one_drive(rig: Rig) -> None:
+    """CiA 301, initiate download and upload: e = s = 1 and n = 3 unused bytes; unused bits and bytes are zero."""
+    rig.enable()
+    begin(rig)
+    said: list[str] = []
+    while not rig.control.measured.feedback.homed[0]:
+        rig.cycle()
+        asked = [message.data.hex() for message in rig.sent if message.arbitration_id == 0x601]
+        said += [request for request in asked if said[-1:] != [request]]
+    to_6, to_8, display, status = "2f60600006000000", "2f60600008000000", "4061600000000000", "4041600000000000"
+    assert said == [to_6, display, status, to_8, display]
+
+
 @pytest.mark.parametrize("word", [0x1F, 0x0F, 0x10F])
 def test_a_controlword_that_gets_lost_is_sent_again(rig: Rig, monkeypatch: pytest.MonkeyPatch, word: int) -> None:
     rig.enable()

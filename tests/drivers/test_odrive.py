@@ -625,12 +625,12 @@ class TestFaultsOnDemand:
         device = enabled.devices[0]
         device.disarm_reason = Error.SPINOUT_DETECTED
         before = device.axis_state, device.modes, device._input, device.disarm_reason
-        enabled.bus.send(frames.command(0, getattr(frames, name.upper()), bytes(3)))
+        enabled.bus.send(frames.command(0, getattr(frames, name.upper()), bytes(3)).message())
         assert (device.axis_state, device.modes, device._input, device.disarm_reason) == before
 
     def test_a_setpoint_that_is_no_number_disarms_a_drive(self, enabled: Rig) -> None:
         data = frames.INPUT_POS.pack(math.nan, 0, 0)
-        enabled.bus.send(frames.command(0, frames.SET_INPUT_POS, data))
+        enabled.bus.send(frames.command(0, frames.SET_INPUT_POS, data).message())
         assert enabled.devices[0].disarm_reason is Error.MISSING_INPUT
 
     def test_a_slider_that_runs_away_rolls_out_without_power(self, enabled: Rig) -> None:

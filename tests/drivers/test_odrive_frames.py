@@ -62,9 +62,9 @@ def test_bytes_as_they_are_on_the_bus() -> None:
     assert frames.input_pos(-1.5, 2.0).hex() == "0000c0bfd0070000"
     assert frames.AXIS_STATE.pack(frames.AxisState.CLOSED_LOOP_CONTROL).hex() == "0800000000000000"
     assert frames.CONTROLLER_MODE.pack(frames.POSITION_CONTROL, frames.PASSTHROUGH).hex() == "0300000001000000"
-    request = frames.request(3, frames.GET_ENCODER_ESTIMATES)
+    request = frames.request(3, frames.GET_ENCODER_ESTIMATES).message()
     assert (request.arbitration_id, request.is_remote_frame, request.dlc) == (0x069, True, 0)
-    command = frames.command(3, frames.CLEAR_ERRORS, frames.CLEAR.pack(0))
+    command = frames.command(3, frames.CLEAR_ERRORS, frames.CLEAR.pack(0)).message()
     assert command.equals(can.Message(arbitration_id=0x078, data=[0], is_extended_id=False), timestamp_delta=None)
 
 

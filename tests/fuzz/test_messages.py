@@ -21,11 +21,12 @@ from trirail.processes.gateway import Gateway
 from trirail.processes.inbox import Incoming, Kind
 from trirail.wire import boundary, links, packets, text, zenoh_session
 from trirail.wire.links import Port, TooLarge
-from trirail.wire.messages import CommandReply, Event, Goal, Info, Override, PoseGoal, State, Stop, TrajectoryGoal
+from trirail.wire.messages import CommandReply, Event, Goal, Override, PoseGoal, Stop, TrajectoryGoal
 from trirail.wire.messages import TrajectoryPoint as Point
 from trirail.wire.packets import Accepted, GoalRequest, Happened, RefusedRequest
 from trirail.wire.records import DTYPE, LAYOUT
 from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_PACKET, MAX_POINTS
+from trirail.wire.state import Info, State
 from trirail.wire.vocabulary import Mode
 
 KINDS: tuple[Any, ...] = (Goal, Stop | None, Override, State, Event, Info, CommandReply)

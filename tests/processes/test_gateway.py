@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 from conftest import CONFIG
-from trirail.processes.gateway import PATIENCE, UNDER_WAY, Gateway
+from trirail.processes.backlog import PATIENCE
+from trirail.processes.gateway import UNDER_WAY, Gateway
 from trirail.processes.inbox import Incoming
 from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, RefusedRequest, Request

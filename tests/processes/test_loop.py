@@ -11,7 +11,7 @@ from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop
 from trirail.wire import links
-from trirail.wire.links import Link, Port
+from trirail.wire.links import PacketLink, Port
 from trirail.wire.messages import PoseGoal
 from trirail.wire.packets import (
     CommandRequest,
@@ -38,8 +38,8 @@ class Shell:
     def __init__(self, rig: Rig, folder: Path) -> None:
         self.rig = rig
         self.ports = Port(links.listen(folder / "gateway")), Port(links.listen(folder / "recorder"))
-        self.gateway: Link = links.connect(folder / "gateway")
-        self.recorder: Link = links.connect(folder / "recorder")
+        self.gateway: PacketLink = links.connect(folder / "gateway")
+        self.recorder: PacketLink = links.connect(folder / "recorder")
         self.heartbeats = Heartbeats.create()
         self.loop = Loop(rig.config, rig.driver, *self.ports, self.heartbeats)
         self.loop.control.start(rig.control.measured.feedback)
@@ -59,7 +59,7 @@ class Shell:
     def mode(self) -> Mode:
         return self.loop.control.state.mode
 
-    def received(self, by: Link | None = None) -> list[bytes]:
+    def received(self, by: PacketLink | None = None) -> list[bytes]:
         packets = []
         while (packet := (by or self.gateway).receive()) is not None:
             packets.append(packet)

@@ -32,7 +32,8 @@ from trirail.errors import RefusedError, ServiceError
 from trirail.processes.interpreter import child, python
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import read
-from trirail.wire.messages import Event, GoalReply, OwnLimits, State
+from trirail.wire.messages import Event, GoalReply, OwnLimits
+from trirail.wire.state import State
 from trirail.wire.vocabulary import MODES, Mode
 from trirail.wire.zenoh_session import open_client
 from trirail_drivers.cia402 import frames
@@ -412,10 +413,10 @@ def test_a_view_is_drawn_from_what_the_service_publishes(shared: tuple[Service, 
     with RemoteView(robot.info(), service.locator) as view:
         host = socket.create_connection(("127.0.0.1", urlsplit(view.url).port or 0), timeout=5.0)
         host.close()
-        began = view._show.t
+        began = view._streams.t
         goal = robot.move_to(x=0.01, y=0.0, phi=0.0)
         assert goal.wait(timeout=10.0).outcome == "done"
-        until(robot, lambda _: view._show.t > began + 0.2)
+        until(robot, lambda _: view._streams.t > began + 0.2)
     assert (view._lost, view._relay.skipped) == (0, 0)
     assert view._bus_load == pytest.approx(0.75, abs=0.001)
     assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"

@@ -11,18 +11,19 @@ from typing import Any
 
 import made
 import numpy as np
+import pyarrow as pa
 import pytest
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from trirail.config import SIM, load
-from trirail.errors import ServiceError
-from trirail.telemetry import reading
-from trirail.telemetry.columns import Column, Timelines, chunks, structs
+from trirail.errors import EmptyRecordingError, ServiceError
+from trirail.telemetry import journal, reading
+from trirail.telemetry.columns import FIELDS, RECORD, Column, Timelines, chunks, structs
 from trirail.telemetry.reading import read
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.scene import FIELDS, Scene
-from trirail.telemetry.shown_robot import Subject
+from trirail.telemetry.scene import Scene
+from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
 
@@ -96,7 +97,7 @@ def test_texts_that_hold_for_the_whole_session_come_by_entity(tmp_path: Path) ->
     stream.save(path)
     stream.log("config", rr.TextDocument("[robot]\nname = 'x'"), static=True)
     stream.log("passing", rr.TextDocument("not for the whole session"))
-    stream.send_chunks(Scene(Subject.configured(load(SIM)), 0).complete(made.records(0.1)))
+    stream.send_chunks(Scene(ShownRobot.configured(load(SIM)), 0).complete(made.records(0.1)))
     stream.disconnect()
     recording = read(path)
     assert recording.texts == {"/config": "[robot]\nname = 'x'"}
@@ -185,8 +186,16 @@ def test_what_is_no_recording_is_refused_with_its_path(tmp_path: Path) -> None:
         assert "\n" not in str(raised.value)
 
 
-def test_a_recording_without_records_is_refused(tmp_path: Path) -> None:
+def test_a_recording_without_records_is_told_as_what_it_is(tmp_path: Path) -> None:
     written(tmp_path / "a.rrd", made.records(0.1)[:0])
+    with pytest.raises(EmptyRecordingError, match=r"a\.rrd: nothing was recorded: its service ended before"):
+        read(tmp_path / "a.rrd")
+
+
+def test_a_recording_of_others_is_refused(tmp_path: Path) -> None:
+    with rr.RecordingStream("another") as stream:
+        stream.save(tmp_path / "a.rrd")
+        stream.log("here", rr.Scalars(1.0))
     with pytest.raises(ServiceError, match=r"a\.rrd: holds no records of cycles"):
         read(tmp_path / "a.rrd")
 
@@ -204,9 +213,24 @@ def test_records_of_another_version_are_refused_by_field(tmp_path: Path, layout:
     path, other = tmp_path / "a.rrd", np.zeros(10, layout)
     stream = rr.RecordingStream("trirail")
     stream.save(path)
-    stream.send_chunks(chunks(Timelines(1000, 0).of(other), [Column("/record", FIELDS, structs(other))]))
+    stream.send_chunks(chunks(Timelines(1000, 0).of(other), [Column(RECORD, FIELDS, structs(other))]))
     stream.disconnect()
     with pytest.raises(ServiceError, match=rf"a\.rrd: written by another version: its records differ in {differs}$"):
+        read(path)
+
+
+@pytest.mark.parametrize("log", ["events", "requests"])
+def test_events_and_requests_of_another_version_are_refused(tmp_path: Path, log: str) -> None:
+    path, sent = tmp_path / "a.rrd", made.records(0.1)
+    stream = rr.RecordingStream("trirail")
+    stream.save(path)
+    columns = [Column(RECORD, FIELDS, structs(sent))]
+    stream.send_chunks(chunks(Timelines(1000, 0).of(sent), columns))
+    said = [Column(f"/{log}", kind, pa.array([["?"]])) for kind in (journal.TEXT, journal.LEVEL)]
+    said.append(Column(f"/{log}", journal.JSON, pa.array([['{"seq": 1, "omen": "dark"}']])))
+    stream.send_chunks(chunks(Timelines(1000, 0).of(sent[:1]), said))
+    stream.disconnect()
+    with pytest.raises(ServiceError, match=rf"a\.rrd: written by another version: its {log} cannot be read: "):
         read(path)
 
 

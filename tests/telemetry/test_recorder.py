@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket
 import threading
@@ -19,12 +20,14 @@ from rerun.chunk import Chunk, RrdReader
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.shown_robot import Subject
+from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import BACKLOG, Archive, Relay, free_port
-from trirail.telemetry.streams import Show
+from trirail.telemetry.streams import Streams
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
-from trirail_drivers.capture import FRAME, REMOTE
+from trirail_drivers.capture import FRAME
+from trirail_drivers.errors import FileError
+from trirail_drivers.frames import Frame, packed
 
 WALL_NS = 1_795_245_300_000_000_000
 
@@ -131,6 +134,20 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     blocked.write_text("")
     with pytest.raises(ServiceError, match=r"cannot write a recording to .*file/x: .*telemetry\.directory"):
         recorder(blocked / "x")
+
+
+@pytest.mark.parametrize("kind", ["FIFO", "device", "folder"])
+@pytest.mark.timeout(20)
+def test_what_is_no_file_is_not_recorded_to(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.rrd"
+    if kind == "FIFO":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/null")
+    else:
+        path.mkdir()
+    with pytest.raises(FileError, match=rf"a\.rrd: a {kind}; wanted a regular file"):
+        Recorder(load(SIM), tmp_path, path=path, live=False)
 
 
 def test_a_live_port_in_use_is_refused(tmp_path: Path) -> None:
@@ -258,20 +275,20 @@ PLATFORM = "/robot/platform"
 
 
 def test_sinks_of_one_pace_share_their_drawings_and_a_change_of_pace_loses_none() -> None:
-    show = Show(Subject.configured(configured()), "shown", 0)
+    streams = Streams(ShownRobot.configured(configured()), "shown", 0)
     file, live = Kept(), Kept()
-    show.attach(file, 1)
+    streams.attach(file, 1)
     records = made.records(6.0)
 
     def pass_by(begin: int, end: int) -> tuple[list[list[Chunk]], list[list[Chunk]]]:
         file.drawn, live.drawn = [], []
         for start in range(begin, end, 20):
-            show.records(records[start : start + 20].tobytes())
+            streams.records(records[start : start + 20].tobytes())
         return file.drawn, live.drawn
 
     everything: list[int] = []
     for begin, end, pace in ((0, 1500, 1), (1500, 3300, 5), (3300, 6000, 1)):
-        show.attach(live, pace)
+        streams.attach(live, pace)
         everything += live.cycles() if begin else []  # what the change of pace has flushed
         to_file, to_live = pass_by(begin, end)
         if pace == 1:
@@ -281,7 +298,7 @@ def test_sinks_of_one_pace_share_their_drawings_and_a_change_of_pace_loses_none(
             assert (len(to_file), len(to_live)) == (1, 9)
         everything += live.cycles()
         live.drawn = []
-    show.flush()
+    streams.flush()
     everything += live.cycles()
     assert everything == sorted(set(everything))
     assert set(everything) >= set(range(9, 6000, 10))
@@ -291,13 +308,13 @@ def test_a_live_view_is_drawn_for_only_while_somebody_watches(tmp_path: Path, mo
     port = free_port()
     recording = recorder(tmp_path, configured(live_port=port), live=True)
     drawn: list[int] = []
-    draw = recording._show.scene.drawn
+    draw = recording._streams.scene.drawn
 
     def counted(records: NDArray[np.void]) -> list[Chunk]:
         drawn.append(len(records))
         return draw(records)
 
-    monkeypatch.setattr(recording._show.scene, "drawn", counted)
+    monkeypatch.setattr(recording._streams.scene, "drawn", counted)
     records = made.records(10.0)
     feed(recording, records[:5000])
     assert sum(drawn) <= 5000
@@ -310,21 +327,31 @@ def test_a_live_view_is_drawn_for_only_while_somebody_watches(tmp_path: Path, mo
 
 def test_captured_frames_are_a_log_that_python_can_reads(tmp_path: Path) -> None:
     recording = recorder(tmp_path, configured(capture_can=True))
-    recording.frames(FRAME.pack(1_795_245_300.25, 0x201, 6, bytes([1, 2, 3, 4, 5, 255, 0, 0])))
-    recording.frames(FRAME.pack(1_795_245_300.5, 0x080, 0, bytes(8)))
-    recording.frames(FRAME.pack(1_795_245_300.75, 0x029, REMOTE, bytes(8)))
+    foreign = can.Message(arbitration_id=0x1ABCDEF0, data=b"\x07", is_extended_id=True)
+    passive = can.Message(arbitration_id=0x204, data=b"\0\x30" + bytes(6), is_extended_id=False, is_error_frame=True)
+    seen = [
+        Frame(0x201, bytes([1, 2, 3, 4, 5, 255])).packed,
+        Frame(0x080).packed,
+        Frame(0x029, remote=True).packed,
+        packed(foreign),
+        packed(passive),
+    ]
+    for number, frame in enumerate(seen):
+        recording.frames(FRAME.pack(1_795_245_300.25 + number, frame))
     recording.close()
     with can.CanutilsLogReader(recording.path.with_suffix(".log")) as log:
-        first, second, third = log
+        first, second, third, fourth, fifth = log
     assert (first.arbitration_id, bytes(first.data)) == (0x201, bytes([1, 2, 3, 4, 5, 255]))
     assert first.timestamp == pytest.approx(1_795_245_300.25)
     assert first.channel == "simulated"
     assert (second.arbitration_id, second.dlc) == (0x080, 0)
     assert (third.arbitration_id, third.is_remote_frame, second.is_remote_frame) == (0x029, True, False)
+    assert (fourth.arbitration_id, fourth.is_extended_id, bytes(fourth.data)) == (0x1ABCDEF0, True, b"\x07")
+    assert (fifth.is_error_frame, first.is_error_frame) == (True, False)
 
 
 def test_frames_are_not_kept_unless_asked_for(tmp_path: Path) -> None:
     recording = recorder(tmp_path)
-    recording.frames(FRAME.pack(1.0, 0x201, 0, bytes(8)))
+    recording.frames(FRAME.pack(1.0, Frame(0x201).packed))
     recording.close()
     assert [path.suffix for path in tmp_path.iterdir()] == [".rrd"]

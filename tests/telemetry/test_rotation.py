@@ -16,15 +16,17 @@ import pytest
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from trirail.config import SIM, Config, load, parse
+from trirail.processes import loop
 from trirail.processes.loop import BATCHES_PER_SECOND
 from trirail.processes.recording import GATHER
-from trirail.telemetry import provenance, retention
+from trirail.telemetry import blackbox, provenance, retention
 from trirail.telemetry.blackbox import AFTER, BEFORE, BlackBox
 from trirail.telemetry.reading import Recording, join, read
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.messages import Event, PoseGoal
 from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.vocabulary import Mode
+from trirail_drivers import interface
 
 WALL_NS = 1_795_245_300_000_000_000
 BATCH = 20
@@ -85,6 +87,15 @@ def test_a_configuration_with_measured_legs_is_too() -> None:
     text = text.replace("l0 = 0.3", "\n".join(f"[[geometry.leg]]\n{leg}" for leg in turned))
     config = msgspec.toml.decode(text, type=Config)  # no robot could be built like this: only the form is at stake
     assert msgspec.toml.decode(provenance.toml(config), type=Config) == config
+
+
+def test_the_fingerprint_is_that_of_the_source_of_both_packages() -> None:
+    assert {Path(str(module.__file__)) for module in (loop, interface)} <= set(provenance.sources())
+
+
+def test_software_of_another_version_is_unknown_software() -> None:
+    assert provenance.recorded_by({provenance.SOFTWARE: '{"trirail": "9.0", "build": 7}'}) is None
+    assert provenance.recorded_by({provenance.SOFTWARE: "no JSON"}) is None
 
 
 # ---------------------------------------------------------------------- rotation
@@ -289,6 +300,27 @@ def test_a_fault_keeps_the_minute_before_and_the_stop(tmp_path: Path) -> None:
     assert provenance.configuration(box.texts) == configured(rotate_mb=1.0, capture_can=True)
     assert provenance.recorded_by(box.texts) == provenance.software()
     assert told == []
+
+
+def test_a_flood_of_messages_before_a_fault_leaves_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blackbox, "SAID_MB", 0.05)
+    time, told = Time(), list[str]()
+    box = BlackBox(1000, lambda name: recorder(tmp_path, time, configured(), name=name), told.append)
+    box.stands("target", (0.01, 0.02, 0.1))
+    sent = made.records(3.0)
+    for number in range(100):
+        feed(box, sent[20 * number :][:20], time)
+        for _ in range(5):
+            box.event(Event(number, number / 50, 20 * number, WALL_NS * 1e-9, "refused", "info", f"{number:04}" * 50))
+    box.event(Event(100, 2.0, 2000, WALL_NS * 1e-9, "fault", "error", "drive B: emergency 4310"))
+    box.close()
+    (path,) = parts(tmp_path)
+    *flood, fault = (line.text for line in read(path).events)
+    assert fault == "drive B: emergency 4310"
+    assert flood == [f"{number:04}" * 50 for number in range(100) for _ in range(5)][-len(flood) :]
+    assert 25_000 < sum(map(len, flood)) < 50_000
+    assert len(read(path).records) == 2000
+    assert "too much was said for the black box" in told[0]
 
 
 def test_a_service_that_ends_right_after_a_fault_keeps_it_too(tmp_path: Path) -> None:

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 from trirail.config import SIM, LegTable, load
 from trirail.kinematics.geometry import Geometry, Leg
-from trirail.processes.gateway import _info
+from trirail.processes.info import info
 from trirail.telemetry.scene import Scene
-from trirail.telemetry.shown_robot import Subject
-from trirail.wire.messages import Info
+from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.records import DTYPE
+from trirail.wire.state import Info
 from trirail.wire.vocabulary import MODES, Mode
 from trirail.workspace.mechanism import Mechanism, sliders
-from trirail.workspace.reach import Outlook
+from trirail.workspace.reach import Reach
 from trirail.workspace.singularity import distance_to_singularity
 
 CONFIG = load(SIM)
@@ -36,7 +36,7 @@ GENERAL = Geometry(
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return Scene(Subject.configured(CONFIG), WALL_OFFSET_NS)
+    return Scene(ShownRobot.configured(CONFIG), WALL_OFFSET_NS)
 
 
 def by_entity(chunks: list[Chunk]) -> dict[str, Chunk]:
@@ -71,7 +71,7 @@ def test_sliders_are_drawn_on_their_rail_and_on_their_edge(geometry: Geometry) -
     records["pose"], records["position"] = records["commanded_pose"], records["commanded_position"]
     parts = Mechanism.of(geometry, CONFIG.limits.slider)
     config = _with_geometry(geometry)
-    drawn = by_entity(Scene(Subject.configured(config), 0).drawn(records))
+    drawn = by_entity(Scene(ShownRobot.configured(config), 0).drawn(records))
 
     points = values(drawn["/robot/sliders"], "Points2D:positions")
     centre = values(drawn["/robot/platform"], "Transform3D:translation")[:, 0, :2]
@@ -192,7 +192,7 @@ def test_the_goal_is_drawn_where_it_leads_and_not_without_one(scene: Scene) -> N
 def test_the_distance_to_singularity_is_that_of_the_mathematics() -> None:
     for geometry, tolerance in ((Geometry.symmetric(0.3), 1e-9), (GENERAL, math.radians(1.5))):
         poses = made.records(5.0)["commanded_pose"][::10]
-        found = Outlook(geometry, CONFIG.limits).distance(poses)
+        found = Reach(geometry, CONFIG.limits).distance(poses)
         assert found == pytest.approx(np.abs(distance_to_singularity(geometry, poses)), abs=tolerance)
 
 
@@ -206,7 +206,7 @@ def test_limits_of_the_following_error_come_into_view_with_it(scene: Scene) -> N
 
 
 def test_a_robot_is_the_same_by_its_configuration_and_by_its_services_words() -> None:
-    info = msgspec.json.decode(msgspec.json.encode(_info(CONFIG)), type=Info)
-    told, configured = Subject.told(info), Subject.configured(CONFIG)
+    answered = msgspec.json.decode(msgspec.json.encode(info(CONFIG)), type=Info)
+    told, configured = ShownRobot.told(answered), ShownRobot.configured(CONFIG)
     assert (told.name, told.limits, told.rate_hz) == (configured.name, configured.limits, configured.rate_hz)
     assert told.geometry.legs == configured.geometry.legs

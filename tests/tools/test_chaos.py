@@ -13,7 +13,7 @@ from chaos_rig import NODES, PROCESSES, Failed, Rig
 from trirail.config import SIM, load
 from trirail.wire import vocabulary
 from trirail_drivers.cia402 import frames
-from trirail_drivers.frames import data_frame
+from trirail_drivers.frames import Frame
 
 
 def test_it_has_every_mode_process_and_harm() -> None:
@@ -29,7 +29,7 @@ def heard(setpoints: list[float], told: int = frames.ENABLE_OPERATION) -> Rig:
     rig._lock = threading.Lock()
     rig._heard = []
     for node in NODES:
-        rig._heard.append(data_frame(frames.RPDO1 + node, frames.CONTROLWORD.pack(told)))
+        rig._heard.append(Frame(frames.RPDO1 + node, frames.CONTROLWORD.pack(told)).message())
         for position in setpoints:
             content = frames.SETPOINT.pack(round(position * 1e7), 0)
             rig._heard.append(can.Message(arbitration_id=frames.RPDO2 + node, data=content, is_extended_id=False))

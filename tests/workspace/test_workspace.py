@@ -22,7 +22,7 @@ from trirail.workspace.singularity import (
     range_of_j1,
     sensitivity,
 )
-from trirail.workspace.workspace import area, permitted, reachable, survey, violations
+from trirail.workspace.workspace import area, extent, permitted, reachable, violations
 
 Array = NDArray[np.float64]
 
@@ -346,7 +346,7 @@ def test_a_pose_in_the_slice_violates_nothing(robot: Geometry, limits: Limits, s
 
 def test_extents_by_hand() -> None:
     """The slice at zero is the widest; a platform at the origin turns until all three sliders meet an end."""
-    found = survey(PAPER, LIMITS, reachable)
+    found = extent(PAPER, LIMITS, reachable)
     assert_allclose(found.x, [-0.255, 0.255], atol=1e-9)
     assert_allclose(found.y[1], 0.17 * math.sqrt(3), atol=1e-9)
     sliders = 3 * -0.17
@@ -360,7 +360,7 @@ def test_extents_by_hand() -> None:
 @pytest.mark.parametrize("robot", [PAPER, as_built(1, 0.01)])
 def test_the_volume_by_chance(robot: Geometry) -> None:
     """Poses drawn at random in a box around the window, against the joints' limits."""
-    found = survey(robot, LIMITS, permitted)
+    found = extent(robot, LIMITS, permitted)
     window = LIMITS.platform
     low, high = np.array([window.x, window.y, window.phi]).T
     poses = np.random.default_rng(0).uniform(low, high, (10_000, 3))
@@ -375,4 +375,4 @@ def test_the_volume_by_chance(robot: Geometry) -> None:
 
 def test_limits_that_leave_nothing_are_refused() -> None:
     with pytest.raises(KinematicsError, match="no pose is within the limits"):
-        survey(PAPER, limited((0.2, 0.3), (-0.3, -0.2)), reachable)
+        extent(PAPER, limited((0.2, 0.3), (-0.3, -0.2)), reachable)

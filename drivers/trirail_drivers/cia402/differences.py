@@ -79,7 +79,7 @@ class Differences:
         self.found.append(
             Difference(
                 f"{key[0]:04X}:{key[1]:02X}",
-                named[1].name if named else "",
+                named[1].name if named else self.remote.name_of(key),
                 "" if found is None else shown(*key, found),
                 shown(*key, wanted),
                 why or (named[1].purpose if named else ""),

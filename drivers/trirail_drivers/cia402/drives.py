@@ -18,7 +18,7 @@ from trirail_drivers.cia402.axis import Axis
 from trirail_drivers.cia402.homing import Homing
 from trirail_drivers.cia402.strangers import Strangers
 from trirail_drivers.driver import Clock, Driver
-from trirail_drivers.frames import data_frame, remote_frame
+from trirail_drivers.frames import Frame
 from trirail_drivers.interface import Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3
@@ -34,8 +34,9 @@ class Cia402(Driver[Axis]):
         for axis in self._axes:
             self._listen(axis)
         self._homing = Homing(self._axes, drives, self._wire.send)
-        self._sync = data_frame(frames.SYNC, b"")
-        self._heartbeat = data_frame(frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL))
+        self._sync = Frame(frames.SYNC)
+        self._heartbeat = Frame(frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL))
+        self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
@@ -56,6 +57,7 @@ class Cia402(Driver[Axis]):
             axis.take_position(start.counts)
             axis.error_code = start.error_code
             axis.take_status(start.statusword)
+        self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
         for line in setup.told(made for made, _ in done):
             self._wire.warn(line)
 
@@ -90,7 +92,7 @@ class Cia402(Driver[Axis]):
             self._wire.send(self._heartbeat)
             for axis in self._axes:
                 if axis.way.guarded:
-                    self._wire.send(remote_frame(frames.HEARTBEAT + axis.node, 1))
+                    self._wire.send(Frame(frames.HEARTBEAT + axis.node, b"\0", remote=True))
         for axis in self._axes:
             axis.answers.sync_sent()
             axis.command_age += 1
@@ -136,22 +138,20 @@ class Cia402(Driver[Axis]):
         late = self._clock() - self._synced > self._period
         if self._wanted is not PowerState.OPERATION_ENABLED:
             self._command()  # where frames have to wait, those that stop go before setpoints
-        messages = []
-        for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
+        for axis, frame, metres, rate in zip(self._axes, self._setpoints, position, velocity, strict=True):
             try:
                 if axis.held is not None:
                     setpoint = axis.held, 0
                 else:
                     offset = axis.units.velocity(rate) if axis.way.setpoints.has_velocity else 0
                     setpoint = axis.scale.counts(metres), offset
-                data = axis.way.setpoints.pack(*setpoint, axis.controlword)
+                axis.way.setpoints.fill(frame, *setpoint, axis.controlword)
             except (ValueError, OverflowError, struct.error):
                 self._refuse_setpoint(axis, metres, rate)
                 return
             axis.setpoint = setpoint
-            messages.append(data_frame(axis.way.setpoints.identifier, data))
-        for axis, message in zip(self._axes, messages, strict=True):
-            if not self._wire.send(message):
+        for axis, frame in zip(self._axes, self._setpoints, strict=True):
+            if not self._wire.send(frame):
                 axis.setpoints_lost += 1
             elif late:
                 axis.setpoints_late += 1
@@ -209,7 +209,7 @@ class Cia402(Driver[Axis]):
             axis.forgive(now)
             if axis.register_wanted:
                 axis.register_wanted = False
-                self._wire.send(data_frame(frames.SDO_REQUEST + axis.node, frames.ERROR_REGISTER_UPLOAD))
+                self._wire.send(Frame(frames.SDO_REQUEST + axis.node, frames.ERROR_REGISTER_UPLOAD))
         self._command()
 
     def _leave(self) -> None:
@@ -226,17 +226,18 @@ class Cia402(Driver[Axis]):
         if axis.mute or (axis.way.polled and now >= axis.poll_due):
             axis.mute = False
             axis.poll_due = now + frames.POLL_PERIOD
-            self._wire.send(data_frame(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
+            self._wire.send(Frame(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
 
     def _command(self) -> None:
         """Send the controlwords that are due: one transition per drive at a time."""
         now = self._clock()
         for axis in self._axes:
             word = axis.word(now, self._next)
-            repeat = axis.command_age >= REPEAT_AFTER and axis.is_not_followed(word, self._next)
+            deaf = axis.may_be_deaf and self._wanted is not PowerState.OPERATION_ENABLED
+            repeat = axis.command_age >= REPEAT_AFTER and (deaf or axis.is_not_followed(word, self._next))
             if not (word != axis.controlword or repeat):
                 continue
-            if axis.may_be_deaf and self._wanted is not PowerState.OPERATION_ENABLED:
+            if deaf:
                 # PDOs are heard in NMT operational only (CiA 301): what stops it goes both ways.
                 self._send_word_by_sdo(axis, word)
             if self._send_word(axis, word):
@@ -246,16 +247,17 @@ class Cia402(Driver[Axis]):
     def _send_word(self, axis: Axis, word: int) -> bool:
         """Send a controlword by PDO; where it goes with the setpoint, with the last one or with where the drive is."""
         if axis.way.controlword is not None:
-            return self._wire.send(data_frame(axis.way.controlword, frames.CONTROLWORD.pack(word)))
-        data = axis.way.setpoints.pack(*(axis.setpoint or (axis.actual, 0)), word)
-        return self._wire.send(data_frame(axis.way.setpoints.identifier, data))
+            return self._wire.send(Frame(axis.way.controlword, frames.CONTROLWORD.pack(word)))
+        frame = axis.way.setpoints.frame()
+        axis.way.setpoints.fill(frame, *(axis.setpoint or (axis.actual, 0)), word)
+        return self._wire.send(frame)
 
     def _send_word_by_sdo(self, axis: Axis, word: int) -> None:
         """Send a controlword by SDO, which is heard in pre-operational too; a stopped node is first brought there."""
         if axis.stopped:
             self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
         data = frames.CONTROLWORD_DOWNLOAD + frames.CONTROLWORD.pack(word) + bytes(2)
-        self._wire.send(data_frame(frames.SDO_REQUEST + axis.node, data))
+        self._wire.send(Frame(frames.SDO_REQUEST + axis.node, data))
 
     @property
     def _next(self) -> frames.Wanted:
@@ -276,10 +278,7 @@ class Cia402(Driver[Axis]):
 
     def _wait_for_standstill(self, deadline: float) -> None:
         while self._powered() and (left := deadline - self._clock()) > 0:
-            message = self._wire.bus.recv(left)
-            if message is None:
-                return
-            self._wire.take(message, self._clock())
+            self._wire.wait(left, self._clock)
 
     def _powered(self) -> bool:
         return any(axis.state in setup.HAS_POWER for axis in self._axes)

@@ -5,9 +5,7 @@ from __future__ import annotations
 from struct import Struct
 from typing import Final, Literal
 
-import can
-
-from trirail_drivers.frames import data_frame, frame_bits
+from trirail_drivers.frames import Frame, frame_bits
 from trirail_drivers.interface import PowerState
 from trirail_drivers.load import Traffic
 
@@ -109,9 +107,9 @@ Wanted = Literal[PowerState.SWITCH_ON_DISABLED, PowerState.OPERATION_ENABLED, Po
 """The states one can ask a drive for; the others are on the way, or its own doing."""
 
 
-def nmt(command: int, node: int) -> can.Message:
+def nmt(command: int, node: int) -> Frame:
     """An NMT command to one node."""
-    return data_frame(NMT, NMT_COMMAND.pack(command, node))
+    return Frame(NMT, NMT_COMMAND.pack(command, node))
 
 
 def power_state(statusword: int) -> PowerState | None:

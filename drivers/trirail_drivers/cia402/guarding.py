@@ -9,7 +9,7 @@ import can
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.config import Drives
-from trirail_drivers.frames import remote_frame
+from trirail_drivers.frames import Frame
 
 MISSED: Final = 3
 """So many heartbeats, or guardings, in a row that do not come are a loss."""
@@ -60,7 +60,7 @@ def _answers(drive: Differences, node: int) -> bool:
     """Whether the drive answers a remote request for its state."""
     client = drive.remote.client
     try:
-        client.bus.send(remote_frame(frames.HEARTBEAT + node, 1))
+        client.bus.send(Frame(frames.HEARTBEAT + node, b"\0", remote=True).message())
     except (can.CanError, OSError, NotImplementedError):
         return False
     deadline = client.clock() + client.timeout

@@ -15,12 +15,10 @@ from collections.abc import Callable, Generator
 from struct import Struct
 from typing import Final
 
-import can
-
 from trirail_drivers import config
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.axis import Axis
-from trirail_drivers.frames import data_frame
+from trirail_drivers.frames import Frame
 from trirail_drivers.interface import DriveFault
 
 HOMING = 6
@@ -54,7 +52,7 @@ class HomingFailedError(Exception):
 class Homing:
     """Homes the drives that have a homing method, one step at each `step`."""
 
-    def __init__(self, axes: tuple[Axis, ...], drives: config.Drives, send: Callable[[can.Message], object]) -> None:
+    def __init__(self, axes: tuple[Axis, ...], drives: config.Drives, send: Callable[[Frame], object]) -> None:
         self._plan = [
             (axis, drive.homing.timeout)
             for axis, drive in zip(axes, drives.each, strict=True)
@@ -184,7 +182,7 @@ class Homing:
     def _ask(self, axis: Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
         """One SDO, without waiting: the cycle goes on, and a later one has the answer."""
         axis.sdo_answer, axis.sdo_asked = None, index.to_bytes(2, "little")
-        self._send(data_frame(frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value]))))
+        self._send(Frame(frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value]))))
         deadline = self._now + self._sdo_timeout
         while (answer := axis.sdo_answer) is None:
             if self._now >= deadline:

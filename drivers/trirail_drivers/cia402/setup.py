@@ -27,6 +27,7 @@ from trirail_drivers.cia402.units import Units
 from trirail_drivers.cia402.ways import Way
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import BusError, DriveError
+from trirail_drivers.frames import Frame
 from trirail_drivers.interface import NAMES, PowerState
 from trirail_drivers.scaling import Scale
 
@@ -171,9 +172,9 @@ def _bring(
     return made, differences
 
 
-def _send(bus: can.BusABC, message: can.Message) -> None:
+def _send(bus: can.BusABC, frame: Frame) -> None:
     try:
-        bus.send(message)
+        bus.send(frame.message())
     except (can.CanError, OSError) as error:
         raise BusError(f"cannot send on {bus.channel_info}: {error}; is the interface up?") from error
 

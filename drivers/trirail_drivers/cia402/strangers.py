@@ -18,6 +18,7 @@ _COMMANDS: Final = {
     0x82: "reset communication",
 }
 _STARTS: Final = 0x01
+_STOPS: Final = 0x02
 
 
 class Strangers:
@@ -56,6 +57,7 @@ class Strangers:
         if command != _STARTS:
             for axis in meant:
                 axis.leave_operational()
+                axis.stopped = command == _STOPS
         name = _COMMANDS.get(command, f"{command:02X}h")
         whom = "all nodes" if node == 0 else f"drive {meant[0].name}"
         self._told(f'commands {whom} by NMT "{name}"')

@@ -8,7 +8,7 @@ from struct import Struct
 from typing import Final
 
 from trirail_drivers.cia402 import frames
-from trirail_drivers.frames import frame_bits
+from trirail_drivers.frames import Frame, frame_bits
 from trirail_drivers.load import Traffic
 
 INTERPOLATED_POSITION: Final = 7
@@ -46,10 +46,14 @@ class Setpoints:
         self._layout = Struct("<" + "".join(fields[entry][1] for entry in entries))
         self.size = self._layout.size
 
-    def pack(self, counts: int, velocity: int, controlword: int) -> bytes:
-        """The frame's bytes; struct.error where a number is too large."""
+    def frame(self) -> Frame:
+        """A frame to be filled in each cycle."""
+        return Frame(self.identifier, bytes(self.size))
+
+    def fill(self, frame: Frame, counts: int, velocity: int, controlword: int) -> None:
+        """Fill in a frame; struct.error where a number is too large."""
         given = counts, velocity, controlword
-        return self._layout.pack(*[given[field] for field in self._order])
+        frame.fill(self._layout, *[given[field] for field in self._order])
 
     @property
     def has_velocity(self) -> bool:

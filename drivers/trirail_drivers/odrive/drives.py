@@ -241,6 +241,4 @@ class Odrive(Driver[OdriveAxis]):
         while self._powered() and (now := self._clock()) < deadline:  # the cycle goes on, for it leads the ramp
             self.sync()
             while (left := now + self._period - self._clock()) > 0.0:
-                message = self._wire.bus.recv(left)
-                if message is not None:
-                    self._wire.take(message, self._clock())
+                self._wire.wait(left, self._clock)

@@ -10,9 +10,7 @@ from enum import IntEnum, IntFlag
 from struct import Struct
 from typing import Final
 
-import can
-
-from trirail_drivers.frames import data_frame, frame_bits
+from trirail_drivers.frames import Frame, frame_bits
 from trirail_drivers.load import Traffic
 
 # Commands: the lower five bits of an identifier, under the node id.
@@ -136,18 +134,18 @@ def identifier(node: int, command: int) -> int:
     return node << 5 | command
 
 
-def command(node: int, number: int, data: bytes) -> can.Message:
+def command(node: int, number: int, data: bytes) -> Frame:
     """A message to one node."""
-    return data_frame(identifier(node, number), data)
+    return Frame(identifier(node, number), data)
 
 
-def request(node: int, number: int) -> can.Message:
+def request(node: int, number: int) -> Frame:
     """A remote frame, on which the node sends the message of that number.
 
     ODrives take an empty data frame for a request as well. But that would collide, bit by bit, with a message that
     the drive sends by itself at this moment; a remote frame lets that one go first (ISO 11898-1).
     """
-    return can.Message(arbitration_id=identifier(node, number), is_extended_id=False, is_remote_frame=True, check=False)
+    return Frame(identifier(node, number), remote=True)
 
 
 def input_pos(position: float, velocity: float) -> bytes:

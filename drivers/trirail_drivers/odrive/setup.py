@@ -20,6 +20,7 @@ import can
 from trirail_drivers.axis import MISSED_HEARTBEATS
 from trirail_drivers.config import Drives
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout
+from trirail_drivers.frames import Frame
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
@@ -94,16 +95,14 @@ def _late(
     deadline = clock() + seconds
     while (late := [axis for axis in axes if lacks(axis)]) and (left := deadline - clock()) > 0.0:
         try:
-            message = wire.bus.recv(left)
+            wire.wait(left, clock)
         except (can.CanError, OSError) as error:
             raise BusError(f"cannot receive on {wire.bus.channel_info}: {error}") from error
-        if message is not None:
-            wire.take(message, clock())
     return late
 
 
-def _send(wire: Wire, message: can.Message) -> None:
+def _send(wire: Wire, frame: Frame) -> None:
     try:
-        wire.bus.send(message)
+        wire.bus.send(frame.message())
     except (can.CanError, OSError) as error:
         raise BusError(f"cannot send on {wire.bus.channel_info}: {error}; is the interface up?") from error

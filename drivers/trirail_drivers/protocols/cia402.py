@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from trirail_drivers import config
 from trirail_drivers.cia402 import checks, frames
 from trirail_drivers.cia402.drives import Cia402
+from trirail_drivers.cia402.inspection import inspect
 from trirail_drivers.protocols.protocol import Protocol
-from trirail_drivers.simulated import Frames, Servo, SimulatedDevice, SimulatedDrive
+from trirail_drivers.simulated import EDS, Frames, Machine, Servo, SimulatedDevice, SimulatedDrive
 
 
 def _simulated_drive(
@@ -19,7 +22,9 @@ def _simulated_drive(
     counts = round(drive.direction * (start - drive.offset) * drive.counts_per_metre)
     switch = None if drive.homing is None else -counts
     servo = Servo.configured(simulated, drive, counts if switch is None else 0)
-    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch)
+    eds = Path(drive.eds) if drive.eds is not None else EDS
+    machine = Machine(counts_per_metre=drive.counts_per_metre)
+    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, machine)
 
 
 CIA402 = Protocol(
@@ -28,6 +33,7 @@ CIA402 = Protocol(
     check=checks.check,
     traffic=frames.TRAFFIC,
     simulated_drive=_simulated_drive,
+    inspect=inspect,
     fault_frames={
         "nmt": Frames(True, frames.NMT),
         "sync": Frames(True, frames.SYNC),

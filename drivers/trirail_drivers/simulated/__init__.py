@@ -2,9 +2,10 @@
 
 from trirail_drivers.simulated.bus import SimulatedBus
 from trirail_drivers.simulated.devices import SimulatedDevice
-from trirail_drivers.simulated.drive import SimulatedDrive
+from trirail_drivers.simulated.drive import EDS, SimulatedDrive
 from trirail_drivers.simulated.faultlines import Frames
 from trirail_drivers.simulated.odrive import SimulatedOdrive
 from trirail_drivers.simulated.servo import Servo
+from trirail_drivers.simulated.units import Machine
 
-__all__ = ["Frames", "Servo", "SimulatedBus", "SimulatedDevice", "SimulatedDrive", "SimulatedOdrive"]
+__all__ = ["EDS", "Frames", "Machine", "Servo", "SimulatedBus", "SimulatedDevice", "SimulatedDrive", "SimulatedOdrive"]

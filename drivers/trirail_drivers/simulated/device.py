@@ -11,6 +11,7 @@ from typing import Final
 
 from trirail_drivers.simulated.dictionary import Dictionary, Entry
 from trirail_drivers.simulated.emergency import Emergencies
+from trirail_drivers.simulated.errorcontrol import ErrorControl
 from trirail_drivers.simulated.pdo import ReceivePdo, TransmitPdo
 from trirail_drivers.simulated.sdo import SdoServer
 
@@ -21,6 +22,9 @@ PDO_TOO_LONG = 0x8220
 SYNC_LENGTH = 0x8240
 
 _SYNC = 0x080
+_CAN_ID = 0x7FF
+_NOT_VALID = 1 << 31
+_MOST_PDOS = 512
 _COMMUNICATION = range(0x1000, 0x2000)
 _ALL = range(0x10000)
 
@@ -56,21 +60,26 @@ class Device:
         self._now = 0.0
         self._transmit: Callable[[int, bytes], None] = _discard
         self._handlers: dict[int, Callable[[bytes], None]] = {}
-        self.errors = Emergencies(self.objects, partial(self._send, 0x80 + node))
+        self._emergency_id = self.objects.internal(0x1014, 0, 0x80 + node)
+        self.errors = Emergencies(self.objects, self._send_emergency)
         self._sdo = SdoServer(self.objects, partial(self._send, 0x580 + node))
-        self._rpdos = [ReceivePdo(self.objects, 0x1400 + n, 0x1600 + n, self._route) for n in range(2)]
-        self._tpdos = [TransmitPdo(self.objects, 0x1800 + n, 0x1A00 + n, self._route) for n in range(2)]
+        self._rpdos = [ReceivePdo(self.objects, 0x1400 + n, 0x1600 + n, self._route) for n in self._pdos(0x1400)]
+        self._tpdos = [TransmitPdo(self.objects, 0x1800 + n, 0x1A00 + n, self._route) for n in self._pdos(0x1800)]
         self._sync_rpdos: list[ReceivePdo] = []
         self._sync_tpdos: list[TransmitPdo] = []
         self._event_tpdos: list[TransmitPdo] = []
-        self._heartbeat_due = self._consumer_due = self._sync_due = math.inf
+        self._error_control = ErrorControl(self.objects, self._master_lost, self._route)
+        self._sync_due = math.inf
         self._last_sync = -math.inf
-        self._sync_period = self.objects[0x1006, 0]
-        self._sync_window = self.objects[0x1007, 0]
-        self._consumer = self.objects[0x1016, 1]
-        self._producer = self.objects[0x1017, 0]
-        self.objects.on_write(0x1016, self._consumer_written)
-        self.objects.on_write(0x1017, self._producer_written)
+        self._sync_id = self.objects.internal(0x1005, 0, _SYNC)
+        self._sync_period = self.objects.internal(0x1006, 0)
+        self._sync_window = self.objects.internal(0x1007, 0)
+        self._on_error = self.objects.internal(0x1029, 1)
+        self.objects.on_write(0x1005, self._sync_written)
+
+    def _pdos(self, communication: int) -> list[int]:
+        """Which PDOs the EDS describes, counted from 0."""
+        return [n for n in range(_MOST_PDOS) if (communication + n, 1) in self.objects]
 
     @property
     def emergencies(self) -> Emergencies:
@@ -104,6 +113,11 @@ class Device:
         if self.silent:
             return
         self.poll(now)
+        if can_id == 0x700 + self.node:
+            answer = self._error_control.guarded(self.nmt, now)
+            if answer is not None:
+                self._send(can_id, answer)
+                self._master_back()
         for pdo in self._tpdos:
             if self.nmt is Nmt.OPERATIONAL and pdo.valid and pdo.remote and pdo.can_id == can_id:
                 self._send(can_id, pdo.pack())
@@ -114,11 +128,8 @@ class Device:
         if now >= self._sync_due:
             due, self._sync_due = self._sync_due, math.inf
             self.sync_lost(due)
-        if now >= self._consumer_due:
-            self._consumer_due = math.inf
-            self._heartbeat_lost()
-        if now >= self._heartbeat_due:
-            self._send_heartbeat()
+        if self._error_control.poll(now):
+            self._send(0x700 + self.node, bytes([self.nmt]))
         self.time_passed(now)
         if self._event_tpdos:
             self._send_events()
@@ -156,9 +167,9 @@ class Device:
             self._sync_due = math.inf
             self.restarted()
         self.errors.forget(but=self.fault)
-        self._heartbeat_due = self._consumer_due = math.inf
+        self._error_control.restart(self._now)
         for pdo in (*self._rpdos, *self._tpdos):
-            pdo.refresh()
+            pdo.power_on()
         self._send(0x700 + self.node, bytes([Nmt.INITIALISING]))
         self._enter(Nmt.PRE_OPERATIONAL)
 
@@ -192,48 +203,42 @@ class Device:
     def _route(self) -> None:
         """Decide which frames are heard: CiA 301, NMT states and communication object relation."""
         operational = self.nmt is Nmt.OPERATIONAL
-        rpdos = [pdo for pdo in self._rpdos if operational and pdo.valid]
-        tpdos = [pdo for pdo in self._tpdos if operational and pdo.valid]
+        rpdos = [pdo for pdo in self._rpdos if operational and pdo.valid and pdo.entries]
+        tpdos = [pdo for pdo in self._tpdos if operational and pdo.valid and pdo.entries]
         handlers: dict[int, Callable[[bytes], None]] = {pdo.can_id: partial(self._receive_pdo, pdo) for pdo in rpdos}
         handlers[0x000] = self._nmt_command
-        node, milliseconds = divmod(self._consumer.value, 1 << 16)
-        if node and milliseconds:
-            handlers[0x700 + node] = self._heartbeat
+        if self._error_control.watched is not None:
+            handlers[0x700 + self._error_control.watched] = self._heartbeat
         if self.nmt is not Nmt.STOPPED:
             handlers[0x600 + self.node] = self._sdo.request
-            handlers[_SYNC] = self._sync
+            handlers[self._sync_id.value & _CAN_ID] = self._sync
         self._sync_rpdos = [pdo for pdo in rpdos if pdo.synchronous]
         self._sync_tpdos = [pdo for pdo in tpdos if pdo.synchronous]
         self._event_tpdos = [pdo for pdo in tpdos if not pdo.synchronous]
         self._handlers = handlers
 
-    def _producer_written(self, entry: Entry, _old: int) -> None:
-        self._heartbeat_due = self._now if entry.value else math.inf
-
-    def _send_heartbeat(self) -> None:
-        self._send(0x700 + self.node, bytes([self.nmt]))
-        period = self._producer.value * 1e-3
-        self._heartbeat_due += period
-        if self._heartbeat_due <= self._now:  # too late for that one as well: leave it out
-            self._heartbeat_due = self._now + period
-
-    def _consumer_written(self, _entry: Entry, _old: int) -> None:
-        self._consumer_due = math.inf
-        self._route()
-
     def _heartbeat(self, _data: bytes) -> None:
-        """CiA 301: watching begins with the first heartbeat, and after a loss with the next one."""
-        self._consumer_due = self._now + (self._consumer.value & 0xFFFF) * 1e-3
+        self._error_control.heard(self._now)
+        self._master_back()
+
+    def _master_back(self) -> None:
         if self.fault != HEARTBEAT_LOST:
             self.errors.clear(HEARTBEAT_LOST)
 
-    def _heartbeat_lost(self) -> None:
+    def _master_lost(self) -> None:
         self.errors.report(HEARTBEAT_LOST)
         self.connection_lost(HEARTBEAT_LOST)
         if self.nmt is Nmt.OPERATIONAL:
-            self._enter(_ON_ERROR.get(self.objects[0x1029, 1].value, self.nmt))
+            self._enter(_ON_ERROR.get(self._on_error.value, self.nmt))
+
+    def _send_emergency(self, data: bytes) -> None:
+        if not self._emergency_id.value & _NOT_VALID:
+            self._send(self._emergency_id.value & _CAN_ID, data)
 
     # SYNC and PDO.
+
+    def _sync_written(self, _entry: Entry, _old: int) -> None:
+        self._route()
 
     def _sync(self, data: bytes) -> None:
         if data:

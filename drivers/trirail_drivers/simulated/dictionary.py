@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from struct import Struct
 
-import canopen
 from canopen.objectdictionary import ODVariable
+
+from trirail_drivers.simulated.edsfile import compact_arrays, read
 
 WRITE_ONLY = 0x06010001
 READ_ONLY = 0x06010002
@@ -25,6 +25,18 @@ VALUE_TOO_LOW = 0x06090032
 WRONG_STATE = 0x08000022
 NO_DATA = 0x08000024
 
+LONGEST = 1 << 16
+"""A text or domain takes so much at most [bytes]."""
+
+_UNSIGNED = {0x01: 1, 0x05: 1, 0x06: 2, 0x16: 3, 0x07: 4, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8}
+_SIGNED = {0x02: 1, 0x03: 2, 0x10: 3, 0x04: 4, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8}
+_OCTETS = {0x08: 4, 0x11: 8, 0x0C: 6, 0x0D: 6}
+"""CiA 301 data types and their bytes: BOOLEAN and UNSIGNED8 to 64; INTEGER8 to 64; REAL32, REAL64, TIME_OF_DAY and
+TIME_DIFFERENCE, which no code here reckons with. What is in none of them is text or a domain, of any length."""
+_BOOLEAN = 0x01
+_FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h", (4, False): "I", (4, True): "i",
+            (8, False): "Q", (8, True): "q"}  # fmt: skip
+
 
 class SdoAbort(Exception):
     """A request is refused, with an abort code of CiA 301 (SDO abort transfer)."""
@@ -35,18 +47,25 @@ class SdoAbort(Exception):
 
 
 class Entry:
-    """One object or sub-object. `value` is the integer it holds; the device's own code sets it directly."""
+    """One object or sub-object, which holds an integer or, of other data types, its bytes.
+
+    `value` is the integer it holds; the device's own code sets it directly.
+    """
 
     __slots__ = (
+        "_default_content",
         "_limits",
+        "_signed",
+        "content",
         "default",
         "index",
-        "layout",
+        "integer",
         "mappable",
         "on_write",
         "readable",
+        "size",
         "subindex",
-        "text",
+        "unset",
         "value",
     )
 
@@ -56,16 +75,22 @@ class Entry:
         self.readable: bool = variable.readable
         self.mappable: bool = variable.pdo_mappable
         self.on_write: Callable[[Entry, int], None] | None = None
-        self.default = self.value = 0
-        self.text = b""
-        self.layout: Struct | None = None
-        if isinstance(variable.default, str):
-            self.text = variable.default.encode("ascii")
-        else:
-            self.layout = Struct(_LAYOUTS[variable.data_type or 0])
-            self.default = self.value = variable.default or 0
-        writable: bool = variable.writable
-        self._limits = (variable.min, variable.max) if writable else None
+        kind = variable.data_type or 0
+        self.integer = kind in _UNSIGNED or kind in _SIGNED
+        self._signed = kind in _SIGNED
+        self.size: int | None = (_UNSIGNED | _SIGNED | _OCTETS).get(kind)
+        """Bytes; None where the length is not fixed."""
+        given = variable.value if variable.value is not None else variable.default
+        self.unset = given is None
+        """Whether the EDS gives no power-on value."""
+        self.default = self.value = self._wrapped(given) if self.integer and isinstance(given, int) else 0
+        self._default_content = self.content = b"" if self.integer else _octets(variable, given, self.size)
+        low, high = variable.min, variable.max
+        if low is not None and high is not None and low > high:  # as some files have it: no limit was meant
+            low = high = None
+        if kind == _BOOLEAN:
+            low, high = 0, 1
+        self._limits = (low, high) if variable.writable else None
 
     @property
     def writable(self) -> bool:
@@ -73,25 +98,35 @@ class Entry:
         return self._limits is not None
 
     @property
-    def size(self) -> int:
-        """Length in bytes."""
-        return self.layout.size if self.layout else len(self.text)
+    def format(self) -> str:
+        """How a struct packs it, if it is of a fixed size."""
+        return _FORMATS.get((self.size or 0, self._signed), f"{self.size}s") if self.integer else f"{self.size}s"
+
+    @property
+    def plain(self) -> bool:
+        """Whether a struct packs its `value`; else it packs `encode`."""
+        return not self.format.endswith("s")
 
     def encode(self) -> bytes:
         """The value as it travels, little-endian."""
-        return self.layout.pack(self.value) if self.layout else self.text
+        return self.value.to_bytes(self.size or 0, "little", signed=self._signed) if self.integer else self.content
 
-    def decode(self, data: bytes) -> int:
-        """The integer in `data`; its length must be the object's."""
-        if self.layout is None or len(data) > self.layout.size:
+    def load(self, data: bytes) -> None:
+        """Take its bytes from the bus; refused, it raises SdoAbort and leaves the old ones."""
+        if self._limits is None:
+            raise SdoAbort(READ_ONLY)
+        longest = self.size or LONGEST
+        if len(data) > longest:
             raise SdoAbort(TOO_LONG)
-        if len(data) < self.layout.size:
+        if self.size is not None and len(data) < self.size:
             raise SdoAbort(TOO_SHORT)
-        value: int = self.layout.unpack(data)[0]
-        return value
+        if self.integer:
+            self.write(int.from_bytes(data, "little", signed=self._signed))
+        else:
+            self.content = data
 
     def write(self, value: int) -> None:
-        """Take `value` from the bus, by SDO or PDO; refused, it raises SdoAbort and leaves the old one."""
+        """Take an integer from the bus, by SDO or PDO; refused, it raises SdoAbort and leaves the old one."""
         if self._limits is None:
             raise SdoAbort(READ_ONLY)
         low, high = self._limits
@@ -107,9 +142,32 @@ class Entry:
                 self.value = old
                 raise
 
+    def store(self, number: float) -> None:
+        """Hold the nearest integer that the data type has; the device's own code does that."""
+        bits = 8 * (self.size or 0) - self._signed
+        self.value = max(-(1 << bits) if self._signed else 0, min(round(number), (1 << bits) - 1))
 
-_LAYOUTS = {2: "<b", 3: "<h", 4: "<i", 5: "<B", 6: "<H", 7: "<I"}
-"""CiA 301 data types (INTEGER8 … UNSIGNED32) as struct formats."""
+    def _wrapped(self, given: int) -> int:
+        """What an EDS gives, which may write a negative number as its two's complement."""
+        bits = 8 * (self.size or 0)
+        value = given % (1 << bits)
+        return value - (1 << bits) if self._signed and value >> (bits - 1) else value
+
+    def restore(self) -> None:
+        """Hold the power-on value."""
+        self.value, self.content = self.default, self._default_content
+
+
+def _octets(variable: ODVariable, given: object, size: int | None) -> bytes:
+    """What the EDS gives for an object that is no integer, as it travels."""
+    if isinstance(given, int) and size is not None:  # times are written as integers
+        return (given % (1 << 8 * size)).to_bytes(size, "little")
+    if isinstance(given, str | float):
+        try:
+            return bytes(variable.encode_raw(given))
+        except (ValueError, TypeError):  # text that ASCII has not
+            return str(given).encode("utf-8")
+    return bytes(given) if isinstance(given, bytes) else bytes(size or 0)
 
 
 class Dictionary:
@@ -118,10 +176,18 @@ class Dictionary:
     def __init__(self, eds: Path, node: int) -> None:
         self._entries: dict[tuple[int, int], Entry] = {}
         self._indices: set[int] = set()
-        for index, item in canopen.import_od(str(eds), node).items():
+        self._hidden: dict[tuple[int, int], Entry] = {}
+        objects = read(eds, node)
+        compact = compact_arrays(eds)
+        for index, item in objects.items():
             self._indices.add(index)
-            for variable in [item] if isinstance(item, ODVariable) else item.subindices.values():
+            variables = [item] if isinstance(item, ODVariable) else list(item.subindices.values())
+            for variable in variables:
                 self._entries[index, variable.subindex] = Entry(variable)
+            for subindex in range(1, compact.get(index, 0) + 1):
+                self._entries.setdefault((index, subindex), Entry(item[subindex]))
+            if compact.get(index):
+                self._entries[index, 0].default = self._entries[index, 0].value = compact[index]
 
     def __getitem__(self, key: tuple[int, int]) -> Entry:
         """The entry at (index, subindex); raises SdoAbort where there is none."""
@@ -129,6 +195,25 @@ class Dictionary:
             return self._entries[key]
         except KeyError:
             raise SdoAbort(NO_SUBINDEX if key[0] in self._indices else NO_OBJECT) from None
+
+    def __contains__(self, key: tuple[int, int]) -> bool:
+        """Whether the device has the object."""
+        return key in self._entries
+
+    def internal(self, index: int, subindex: int, initial: int = 0) -> Entry:
+        """The entry at (index, subindex); where the device has none, one that the bus does not see.
+
+        `initial` is its power-on value where the EDS gives none.
+        """
+        entry = self._entries.get((index, subindex)) or self._hidden.get((index, subindex))
+        if entry is None:
+            variable = ODVariable("", index, subindex)
+            variable.data_type, variable.access_type = 0x15, ""
+            entry = self._hidden[index, subindex] = Entry(variable)
+        if entry.unset:
+            entry.unset = False
+            entry.default = entry.value = initial
+        return entry
 
     def on_write(self, index: int, action: Callable[[Entry, int], None]) -> None:
         """Call `action(entry, old value)` after each write to `index`; it may refuse by raising SdoAbort."""
@@ -138,6 +223,6 @@ class Dictionary:
 
     def restore(self, indices: range) -> None:
         """Give the objects in `indices` their power-on values."""
-        for entry in self._entries.values():
+        for entry in (*self._entries.values(), *self._hidden.values()):
             if entry.index in indices:
-                entry.value = entry.default
+                entry.restore()

@@ -1,4 +1,4 @@
-"""A servo drive as CiA 402 has it, in cyclic synchronous position and homing mode, on a simulated axis."""
+"""A servo drive as CiA 402 has it, on a simulated axis: cyclic synchronous position, interpolated position, homing."""
 
 from __future__ import annotations
 
@@ -8,32 +8,24 @@ from typing import Final
 
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated.device import Device, Nmt
-from trirail_drivers.simulated.dictionary import INVALID_VALUE, Entry, SdoAbort
-from trirail_drivers.simulated.homing import EDGES, STANDING, Homing
+from trirail_drivers.simulated.dictionary import Entry
+from trirail_drivers.simulated.homing import Homing
 from trirail_drivers.simulated.power import FAULT_RESET, STATUS, commanded
+from trirail_drivers.simulated.profile import HOMING, Profile
 from trirail_drivers.simulated.servo import Servo
+from trirail_drivers.simulated.units import Machine
 
+MACHINE: Final = Machine()
 EDS: Final = Path(__file__).parents[1] / "cia402" / "servo.eds"
 
 FOLLOWING_ERROR = 0x8611
 SYNC_LOST = 0x8700
 
-NO_MODE = 0
-HOMING = 6
-CYCLIC_SYNCHRONOUS_POSITION = 8
-_MODES = (NO_MODE, HOMING, CYCLIC_SYNCHRONOUS_POSITION)
-"""What 6060h takes; 6502h tells the same."""
-
-_STOP_AND_DISABLE, _STOP_AND_STAY = 2, 6
-"""605Ah: by the quick-stop ramp into SWITCH ON DISABLED, or staying in QUICK STOP ACTIVE."""
-
-_WINDOW_OFF = 0xFFFFFFFF
-
 # Controlword bits beside the command's (CiA 402-2, 6040h; bit 4 as mode 6 defines it).
 _HOMING_START = 1 << 4
 _HALT = 1 << 8
 
-# Statusword bits beside the state's (CiA 402-2, 6041h; bits 12 and 13 as modes 8 and 6 define them).
+# Statusword bits beside the state's (CiA 402-2, 6041h; bits 12 and 13 as modes 6 to 8 define them).
 _VOLTAGE_ENABLED = 1 << 4
 _REMOTE = 1 << 9
 _INTERNAL_LIMIT = 1 << 11
@@ -56,38 +48,31 @@ class SimulatedDrive(Device):
     the time; until the SYNC is found lost, it keeps its velocity. Without power it is held by its brake.
     """
 
-    def __init__(self, node: int, servo: Servo, missed_syncs: int = 3, home_switch: float | None = None) -> None:
-        super().__init__(node, EDS)
+    def __init__(
+        self,
+        node: int,
+        servo: Servo,
+        missed_syncs: int = 3,
+        home_switch: float | None = None,
+        eds: Path = EDS,
+        machine: Machine = MACHINE,
+    ) -> None:
+        """`eds` says which objects it has and in which units; it does without the others."""
+        super().__init__(node, eds)
         self._missed_syncs = missed_syncs
         self.servo = servo
         self.homing = Homing(servo, home_switch)
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self._synchronised = False
         self._moved_at = 0.0
-        self._period = 0.0
+        self._heard_period = 0.0
+        """Between the last two SYNCs [s]."""
         self._setpoint_given = False
         self._beyond_window: float | None = None
-        o = self.objects
-        self._error_code = o[0x603F, 0]
-        self._controlword = o[0x6040, 0]
-        self._statusword = o[0x6041, 0]
-        self._quick_stop_option = o[0x605A, 0]
-        self._mode = o[0x6060, 0]
-        self._mode_display = o[0x6061, 0]
-        self._position = o[0x6064, 0]
-        self._window = o[0x6065, 0]
-        self._window_time = o[0x6066, 0]
-        self._velocity = o[0x606C, 0]
-        self._target = o[0x607A, 0]
-        self._quick_stop_deceleration = o[0x6085, 0]
-        self._velocity_offset = o[0x60B1, 0]
-        self._following_error = o[0x60F4, 0]
-        o.on_write(0x6040, self._control)
-        o.on_write(0x605A, self._quick_stop_option_written)
-        o.on_write(0x6060, self._mode_written)
-        o.on_write(0x607A, self._target_written)
-        o.on_write(0x6098, self._method_written)
-        o.on_write(0x60C2, self._period_written)
+        self._profile = Profile(self.objects, machine, self._mode_changed)
+        self.objects.on_write(0x6040, self._control)
+        self.objects.on_write(0x607A, self._setpoint_written)
+        self.objects.on_write(0x60C1, self._setpoint_written)
 
     @property
     def power(self) -> PowerState:
@@ -98,7 +83,7 @@ class SimulatedDrive(Device):
         """Break down with EMCY and 603Fh error `code`: transitions 13 and, at standstill, 14."""
         if self.state in _FAULTY:
             return
-        self.fault = self._error_code.value = code
+        self.fault = self._profile.error_code.value = code
         self.errors.report(code)
         self._change(PowerState.FAULT_REACTION_ACTIVE)
 
@@ -109,14 +94,16 @@ class SimulatedDrive(Device):
         self.fault = 0
         self._synchronised = self._setpoint_given = False
         self._moved_at = self._now
+        self._heard_period = 0.0
         self.homing.forget()
-        self._update_period()
+        self._profile.restarted()
         self._change(PowerState.SWITCH_ON_DISABLED)
 
     def before_sync(self) -> None:
-        """Move for one interpolation period; at the first SYNC the axis has already moved with the time."""
+        """Move from one setpoint to the next; at the first SYNC the axis has already moved with the time."""
         if self._synchronised:
-            self._move(self._period, self._velocity_offset.value)
+            self._heard_period = self._now - self._moved_at
+            self._move(self._step, self._profile.feed_forward)
         self._synchronised = True
         self._moved_at = self._now
 
@@ -127,8 +114,13 @@ class SimulatedDrive(Device):
             self._moved_at = now
 
     def sync_timeout(self) -> float:
-        """So many periods: of SYNC (1006h) where it is set, else of interpolation."""
-        return self._missed_syncs * (self._sync_period.value * 1e-6 or self._period)
+        """So many periods: of SYNC (1006h) where it is set, else of interpolation; inf before the second SYNC."""
+        return self._missed_syncs * (self._sync_period.value * 1e-6 or self._step) or math.inf
+
+    @property
+    def _step(self) -> float:
+        """The time from one setpoint to the next [s]: 60C2h or 1006h where one is set, else what SYNC has."""
+        return self._profile.interpolation_period or self._sync_period.value * 1e-6 or self._heard_period
 
     def sync_lost(self, at: float) -> None:
         """Go by the time from now on; while enabled and told to expect SYNC (1006h), break down."""
@@ -143,7 +135,7 @@ class SimulatedDrive(Device):
         """CiA 402-2, 6007h, abort connection option code."""
         if self.state is not PowerState.OPERATION_ENABLED:
             return
-        match self.objects[0x6007, 0].value:
+        match self._profile.abort_option.value:
             case 1:
                 self.fail(code)
             case 2:
@@ -160,15 +152,11 @@ class SimulatedDrive(Device):
                 self._change(PowerState.SWITCH_ON_DISABLED)
                 self.errors.clear(fault)
             return
-        state = commanded(self.state, entry.value, self._stays_stopped)
+        state = commanded(self.state, entry.value, self._profile.stays_stopped)
         if state is not self.state:
             self._change(state)
         elif self._homes:
             self._home(entry.value, old)
-
-    @property
-    def _stays_stopped(self) -> bool:
-        return self._quick_stop_option.value == _STOP_AND_STAY
 
     def _change(self, state: PowerState) -> None:
         if self.state is PowerState.OPERATION_ENABLED:
@@ -180,7 +168,7 @@ class SimulatedDrive(Device):
         if state is PowerState.OPERATION_ENABLED:
             self._beyond_window = None
             if not self._setpoint_given:
-                self._target.value = self._position.value
+                self._profile.hold()
         self._publish()
 
     # Motion.
@@ -189,30 +177,28 @@ class SimulatedDrive(Device):
         if self.state not in _POWERED:
             return
         if self._follows_command:
-            self.servo.follow(self._target.value, feed_forward, step)
+            self.servo.follow(self._profile.setpoint, feed_forward, step)
             self._watch_following_error(step)
         elif self._homes and self.homing.under_way:
-            self.homing.move(step, bool(self._controlword.value & _HALT))
+            self.homing.move(step, bool(self._profile.controlword.value & _HALT))
         else:
-            self.servo.brake(self._quick_stop_deceleration.value, step)
+            self.servo.brake(self._profile.quick_stop_deceleration or self.servo.max_acceleration, step)
             if self.servo.velocity == 0.0:
                 self._standstill()
         self._publish()
 
     @property
     def _follows_command(self) -> bool:
-        return self.state is PowerState.OPERATION_ENABLED and self._mode.value == CYCLIC_SYNCHRONOUS_POSITION
+        return self.state is PowerState.OPERATION_ENABLED and self._profile.follows_setpoints
 
     @property
     def _homes(self) -> bool:
-        return self.state is PowerState.OPERATION_ENABLED and self._mode.value == HOMING
+        return self.state is PowerState.OPERATION_ENABLED and self._profile.mode.value == HOMING
 
     def _home(self, word: int, old: int) -> None:
         """CiA 402-2, homing mode: bit 4 of the controlword starts when it rises and interrupts when it falls."""
         if word & ~old & _HOMING_START:
-            o = self.objects
-            method, offset = o[0x6098, 0].value, o[0x607C, 0].value
-            self.homing.start(method, o[0x6099, 1].value, o[0x6099, 2].value, o[0x609A, 0].value, offset)
+            self.homing.start(*self._profile.homing)
         elif old & ~word & _HOMING_START:
             self.homing.interrupt()
         self._publish()
@@ -221,40 +207,37 @@ class SimulatedDrive(Device):
         """Transition 14, or 12 where the quick stop does not stay active."""
         if self.state is PowerState.FAULT_REACTION_ACTIVE:
             self._change(PowerState.FAULT)
-        elif self.state is PowerState.QUICK_STOP_ACTIVE and not self._stays_stopped:
+        elif self.state is PowerState.QUICK_STOP_ACTIVE and not self._profile.stays_stopped:
             self._change(PowerState.SWITCH_ON_DISABLED)
 
     def _watch_following_error(self, step: float) -> None:
         """CiA 402-2, 6065h and 6066h: too far off for too long is a fault."""
-        window = self._window.value
-        if window == _WINDOW_OFF or abs(self.servo.following_error) <= window:
+        window, time = self._profile.window
+        if abs(self.servo.following_error) <= window:
             self._beyond_window = None
             return
         self._beyond_window = 0.0 if self._beyond_window is None else self._beyond_window + step
-        if self._beyond_window >= self._window_time.value * 1e-3:
+        if self._beyond_window >= time:
             self.fail(FOLLOWING_ERROR)
 
     def _publish(self) -> None:
         """Bring the actual values and the statusword up to date."""
-        servo = self.servo
-        self._position.value = _int32(servo.position)
-        self._velocity.value = _int32(servo.velocity)
-        self._following_error.value = _int32(servo.following_error)
+        self._profile.tell(self.servo)
         status = STATUS[self.state] | _VOLTAGE_ENABLED | _REMOTE
         if self._follows_command:
             status |= _FOLLOWS_COMMAND
-            if servo.limited:
+            if self.servo.limited:
                 status |= _INTERNAL_LIMIT
-        if self._mode.value == HOMING:
+        if self._profile.mode.value == HOMING:
             status |= self._homing_bits()
         if self.fault == FOLLOWING_ERROR:
             status |= _FOLLOWING_ERROR_BIT
-        self._statusword.value = status
+        self._profile.statusword.value = status
 
     def _homing_bits(self) -> int:
         """CiA 402-2, homing mode: error, attained and target reached, of which the last says that the axis stands."""
         homing = self.homing
-        meant_to_stand = not homing.under_way or bool(self._controlword.value & _HALT)
+        meant_to_stand = not homing.under_way or bool(self._profile.controlword.value & _HALT)
         return (
             _TARGET_REACHED * (meant_to_stand and self.servo.velocity == 0.0)
             | _HOMING_ATTAINED * homing.attained
@@ -263,31 +246,9 @@ class SimulatedDrive(Device):
 
     # Writes.
 
-    def _quick_stop_option_written(self, entry: Entry, _old: int) -> None:
-        if entry.value not in (_STOP_AND_DISABLE, _STOP_AND_STAY):
-            raise SdoAbort(INVALID_VALUE)
-
-    def _mode_written(self, entry: Entry, old: int) -> None:
-        if entry.value not in _MODES:
-            raise SdoAbort(INVALID_VALUE)
-        if entry.value != old:
-            self.homing.forget()
-        self._mode_display.value = entry.value
+    def _mode_changed(self) -> None:
+        self.homing.forget()
         self._publish()
 
-    def _method_written(self, entry: Entry, _old: int) -> None:
-        if entry.value not in (NO_MODE, *EDGES, *STANDING):
-            raise SdoAbort(INVALID_VALUE)
-
-    def _target_written(self, _entry: Entry, _old: int) -> None:
+    def _setpoint_written(self, _entry: Entry, _old: int) -> None:
         self._setpoint_given = True
-
-    def _period_written(self, _entry: Entry, _old: int) -> None:
-        self._update_period()
-
-    def _update_period(self) -> None:
-        self._period = self.objects[0x60C2, 1].value * math.pow(10.0, self.objects[0x60C2, 2].value)
-
-
-def _int32(value: float) -> int:
-    return max(-(2**31), min(round(value), 2**31 - 1))

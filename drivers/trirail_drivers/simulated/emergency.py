@@ -9,7 +9,6 @@ from typing import Final
 from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, Entry, SdoAbort
 
 _EMERGENCY: Final = Struct("<HBH3x")
-_HISTORY = 8
 
 _GENERIC, _COMMUNICATION, _PROFILE = 0x01, 0x10, 0x20
 _REGISTER_BITS: Final = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x7: _PROFILE, 0x8: _COMMUNICATION, 0xF: 0x80}
@@ -21,9 +20,9 @@ class Emergencies:
 
     def __init__(self, objects: Dictionary, send: Callable[[bytes], None]) -> None:
         self._send = send
-        self._register = objects[0x1001, 0]
-        self._count = objects[0x1003, 0]
-        self._history = [objects[0x1003, n] for n in range(1, _HISTORY + 1)]
+        self._register = objects.internal(0x1001, 0)
+        self._count = objects.internal(0x1003, 0)
+        self._history = [objects[0x1003, n] for n in range(1, 255) if (0x1003, n) in objects]
         self._active: set[tuple[int, int]] = set()
         self._muted = False
         self._held_back: bytes | None = None
@@ -39,11 +38,17 @@ class Emergencies:
             return
         self._active.add((code, detail))
         self._update_register()
-        self._count.value = min(self._count.value + 1, _HISTORY)
+        self._remember(detail << 16 | code)
+        self._tell(code, detail)
+
+    def _remember(self, error: int) -> None:
+        """The newest error stands first; a device without 1003h forgets it."""
+        if not self._history:
+            return
+        self._count.value = min(self._count.value + 1, len(self._history))
         for older, newer in zip(self._history[:0:-1], self._history[-2::-1], strict=True):
             older.value = newer.value
-        self._history[0].value = detail << 16 | code
-        self._tell(code, detail)
+        self._history[0].value = error
 
     def clear(self, code: int, detail: int = 0) -> None:
         """An error is over; with the last one goes "error reset" (code 0)."""

@@ -30,8 +30,9 @@ _RESTRICTED = (
     range(0x6E0, 0x800),
 )
 """CAN-IDs that no PDO may have (CiA 301, restricted CAN-IDs)."""
-_MOST_MAPPED = 8
 _MOST_BYTES = 8
+_ON_EVENT = 255
+"""Transmission type: as the device profile has it."""
 
 
 class Pdo(ABC):
@@ -41,14 +42,21 @@ class Pdo(ABC):
         self.number = communication % 0x200 + 1
         self._objects = objects
         self._mapping = mapping
-        self._cob_id = objects[communication, 1]
-        self._type = objects[communication, 2]
+        self._cob_id = objects.internal(communication, 1, _NOT_VALID)
+        self._type = objects.internal(communication, 2, _ON_EVENT)
+        self._most = 0
+        """Objects that its mapping has room for."""
+        while (mapping, self._most + 1) in objects:
+            self._most += 1
+        given = [objects.internal(mapping, n).default for n in range(1, self._most + 1)]
+        self._count = objects.internal(mapping, 0, (*given, 0).index(0))
         self._changed = changed
         self.entries: tuple[Entry, ...] = ()
         self.layout = Struct("<")
+        self._plain = True
         objects.on_write(communication, self._communication_written)
         objects.on_write(mapping, self._mapping_written)
-        self.refresh()
+        self.power_on()
 
     @property
     def valid(self) -> bool:
@@ -72,10 +80,16 @@ class Pdo(ABC):
 
     def refresh(self) -> None:
         """Work out the packing from the mapping, so that the cycle has only to use it."""
-        count = self._objects[self._mapping, 0].value
-        values = [self._objects[self._mapping, n].value for n in range(1, count + 1)]
-        self.entries = tuple(self._mapped(value) for value in values)
-        self.layout = Struct("<" + "".join(entry.layout.format[1:] for entry in self.entries if entry.layout))
+        self.entries = tuple(self._mapped(value) for value in self._values())
+        self.layout = Struct("<" + "".join(entry.format for entry in self.entries))
+        self._plain = all(entry.plain for entry in self.entries)
+
+    def power_on(self) -> None:
+        """Take up the mapping that the EDS gives; where that is none that could be written, nothing is mapped."""
+        try:
+            self.refresh()
+        except SdoAbort:
+            self.entries, self.layout, self._plain = (), Struct("<"), True
 
     @abstractmethod
     def permits(self, entry: Entry) -> bool:
@@ -85,29 +99,34 @@ class Pdo(ABC):
     def reset(self) -> None:
         """Forget what was received or sent."""
 
+    def _values(self) -> list[int]:
+        """The mapping as far as it is counted; the counts that some drives have at power-on go beyond it."""
+        values = [self._objects[self._mapping, n].value for n in range(1, min(self._count.value, self._most) + 1)]
+        return values[: (*values, 0).index(0)]
+
     def _mapped(self, value: int) -> Entry:
         """The entry that a mapping parameter names: index, subindex, length in bits."""
         index, subindex, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
         if not value:
             raise SdoAbort(NO_OBJECT)
         entry = self._objects[index, subindex]
-        if not (entry.mappable and self.permits(entry) and bits == 8 * entry.size):
+        if not (entry.mappable and self.permits(entry) and entry.size and bits == 8 * entry.size):
             raise SdoAbort(NOT_MAPPABLE)
         return entry
 
     def _mapping_written(self, entry: Entry, old: int) -> None:
         """CiA 301, 1600h and 1A00h: first no PDO, then no entries, then the entries, then how many."""
-        count = old if entry.subindex == 0 else self._objects[self._mapping, 0].value
+        count = old if entry.subindex == 0 else self._count.value
         if self.valid or (entry.subindex and count):
             raise SdoAbort(UNSUPPORTED_ACCESS)
         if entry.subindex:
             if entry.value:
                 self._mapped(entry.value)
             return
-        if entry.value > _MOST_MAPPED:
+        if entry.value > self._most:
             raise SdoAbort(PDO_TOO_LONG)
         mapped = [self._mapped(self._objects[self._mapping, n].value) for n in range(1, entry.value + 1)]
-        if sum(item.size for item in mapped) > _MOST_BYTES:
+        if sum(item.size or 0 for item in mapped) > _MOST_BYTES:
             raise SdoAbort(PDO_TOO_LONG)
         self.refresh()
 
@@ -132,7 +151,7 @@ class Pdo(ABC):
 class ReceivePdo(Pdo):
     """An RPDO: taken up at the SYNC after it arrived (types 0 to 240) or at once (254, 255)."""
 
-    _latched: tuple[int, ...] | None = None
+    _latched: tuple[int | bytes, ...] | None = None
 
     def permits(self, entry: Entry) -> bool:
         """Only what the bus may write."""
@@ -155,7 +174,10 @@ class ReceivePdo(Pdo):
             return
         for entry, value in zip(self.entries, values, strict=True):
             try:
-                entry.write(value)
+                if isinstance(value, int):
+                    entry.write(value)
+                else:
+                    entry.load(value)
             except SdoAbort:
                 continue
 
@@ -165,8 +187,8 @@ class TransmitPdo(Pdo):
 
     def __init__(self, objects: Dictionary, communication: int, mapping: int, changed: Callable[[], None]) -> None:
         super().__init__(objects, communication, mapping, changed)
-        self._inhibit = objects[communication, 3]
-        self._event_timer = objects[communication, 5]
+        self._inhibit = objects.internal(communication, 3)
+        self._event_timer = objects.internal(communication, 5)
         self.reset()
 
     def permits(self, entry: Entry) -> bool:
@@ -181,7 +203,9 @@ class TransmitPdo(Pdo):
 
     def pack(self) -> bytes:
         """The mapped values as they are now."""
-        return self.layout.pack(*[entry.value for entry in self.entries])
+        if self._plain:
+            return self.layout.pack(*[entry.value for entry in self.entries])
+        return b"".join([entry.encode() for entry in self.entries])
 
     def at_sync(self) -> bytes | None:
         """The data to send on this SYNC, if any."""

@@ -50,6 +50,11 @@ class Servo:
         self._max_velocity = max_velocity
         self._max_acceleration = max_acceleration
 
+    @property
+    def max_acceleration(self) -> float:
+        """What the motor can do at most [counts/s²]."""
+        return self._max_acceleration
+
     @classmethod
     def configured(cls, simulated: config.Simulated, drive: config.Drive, counts: float) -> Servo:
         """The servo that a configuration describes, at rest at a position [counts]."""

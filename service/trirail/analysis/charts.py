@@ -19,12 +19,10 @@ from trirail.wire.vocabulary import MODES, Mode
 
 __all__ = ["draw"]
 
-INK, GREY, PALE, RED, AMBER = "#1f2933", "#7b8794", "#d3d9e0", "#c0392b", "#e0a100"
+INK, GREY, PALE, RED = "#1f2933", "#7b8794", "#d3d9e0", "#c0392b"
 SLIDERS = ("#d1495b", "#2e8b57", "#2f6fb3")
 MODE_COLOURS = {mode: palette.code(palette.pale(colour)) for mode, colour in palette.MODES.items()}
-OUTCOMES = {"done": "#2f6fb3", "rejected": AMBER, "expired": AMBER, "faulted": RED, "unknown": GREY}
-OTHER = "#8c6bb1"
-"""Goals that were preempted or stopped."""
+OUTCOME_COLOURS = {outcome: palette.code(colour) for outcome, colour in palette.OUTCOMES.items()}
 BINS = 1500
 """So many points of a curve are drawn: of each bin the least and the greatest value."""
 HEIGHTS = (0.9, 2.2, 1.6, 1.6, 1.6)
@@ -81,7 +79,7 @@ def _modes(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], summe
         _goal(panel, goal, 1.1 + 0.5 * (number % 2), float(t[-1]))
     panel.set(ylim=(-0.1, 2.2), yticks=[0.45, 1.55], yticklabels=["mode", "goals"])
     shown = [Patch(color=MODE_COLOURS[Mode(name)], label=name) for name in summed.modes]
-    kinds = {goal.outcome: OUTCOMES.get(goal.outcome, OTHER) for goal in summed.goals}
+    kinds = {goal.outcome: OUTCOME_COLOURS[goal.outcome] for goal in summed.goals}
     shown += [Patch(color=colour, label=f"goal {outcome}") for outcome, colour in kinds.items()]
     panel.legend(
         handles=shown, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=12, frameon=False, fontsize=8, labelcolor=INK
@@ -90,7 +88,7 @@ def _modes(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], summe
 
 def _goal(panel: Axes, goal: GoalSummary, y: float, end: float) -> None:
     ended = end if goal.ended is None else goal.ended
-    colour = OUTCOMES.get(goal.outcome, OTHER)
+    colour = OUTCOME_COLOURS[goal.outcome]
     panel.add_patch(Rectangle((goal.given, y), ended - goal.given, 0.4, facecolor=colour, linewidth=0))
     if goal.outcome in ("rejected", "expired"):
         panel.plot([goal.given], [y + 0.2], "x", color=colour, markersize=6, markeredgewidth=2)

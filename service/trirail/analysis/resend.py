@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from trirail_drivers.interface import Triple
 
-from trirail.client.client import Goal, Robot
+from trirail.client.client import GoalHandle, Robot
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry.reading import Recording
-from trirail.wire.messages import Event, Override, Stop
-from trirail.wire.messages import Goal as Message
+from trirail.wire.messages import Event, Goal, Override, Stop
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.records import unpack
 from trirail.wire.vocabulary import MODES, Mode
@@ -37,7 +36,7 @@ HEARD_WITHIN = 2.0
 _MOVING = MODES.index(Mode.MOVING)
 
 
-class Motion(NamedTuple):
+class ComparedMotion(NamedTuple):
     """One motion, as recorded and as it was now."""
 
     id: str
@@ -52,7 +51,7 @@ class Motion(NamedTuple):
     """Greatest difference of a setpoint, of each slider [m]."""
 
 
-def resend(recording: Recording, robot: Robot, say: Callable[[str], None]) -> list[Motion]:
+def resend(recording: Recording, robot: Robot, say: Callable[[str], None]) -> list[ComparedMotion]:
     """Send a session again and compare. Raises ServiceError where the robot does not stand where it began."""
     _check_start(recording, robot)
     heard = _Heard(robot)
@@ -97,6 +96,8 @@ class _Heard:
         while not self._over.is_set():
             for event in self._robot.events(timeout=0.5):
                 self._take(event)
+                if self._over.is_set():
+                    return
 
     def _take(self, event: Event) -> None:
         if event.goal is not None:
@@ -110,7 +111,9 @@ def _check_start(recording: Recording, robot: Robot) -> None:
         raise ServiceError(f"the session began with the sliders at {began} mm, they are at {now} mm: go there first")
 
 
-def _send(recording: Recording, robot: Robot, say: Callable[[str], None]) -> tuple[dict[str, str], dict[str, Goal]]:
+def _send(
+    recording: Recording, robot: Robot, say: Callable[[str], None]
+) -> tuple[dict[str, str], dict[str, GoalHandle]]:
     """Send the requests in their time; return the goals' new names, and those that were taken.
 
     None goes before the goals have ended that had ended before it: a service that misses ticks takes longer for them.
@@ -119,7 +122,7 @@ def _send(recording: Recording, robot: Robot, say: Callable[[str], None]) -> tup
     period = float(t[-1] - t[0]) / float(cycles[-1] - cycles[0])
     suffix, begins = uuid.uuid4().hex[:6], time.monotonic()
     renamed: dict[str, str] = {}
-    goals: dict[str, Goal] = {}
+    goals: dict[str, GoalHandle] = {}
     said = [line.event for line in recording.events if line.event is not None and line.event.outcome]
     ends = {event.id: event.cycle for event in said}
     first = recording.requests[0].cycle if recording.requests else 0
@@ -143,7 +146,7 @@ def _send(recording: Recording, robot: Robot, say: Callable[[str], None]) -> tup
     return renamed, goals
 
 
-def _given(goal: Message) -> Callable[[str], Message]:
+def _given(goal: Goal) -> Callable[[str], Goal]:
     return lambda _: goal
 
 
@@ -153,7 +156,7 @@ def _content(request: CommandRequest, renamed: dict[str, str]) -> bytes | None:
     return msgspec.json.encode(Stop(renamed.get(request.goal, request.goal))) if request.goal is not None else None
 
 
-def _await(goals: Iterable[Goal]) -> None:
+def _await(goals: Iterable[GoalHandle]) -> None:
     """Wait for goals to end, but not for ever."""
     deadline = time.monotonic() + END_WITHIN
     for goal in goals:
@@ -178,8 +181,10 @@ def _motion(records: NDArray[np.void], began: int | None) -> NDArray[np.float64]
     return setpoints
 
 
-def _compared(name: str, goal: Goal | None, then: NDArray[np.float64], now: NDArray[np.float64]) -> Motion:
+def _compared(
+    name: str, goal: GoalHandle | None, then: NDArray[np.float64], now: NDArray[np.float64]
+) -> ComparedMotion:
     length = min(len(then), len(now))
     a, b, c = np.abs(then[:length] - now[:length]).max(axis=0, initial=0.0).tolist()
     outcome = "refused" if goal is None else goal.result.outcome if goal.result else "unknown"
-    return Motion(name, outcome, length, abs(len(then) - len(now)), (a, b, c))
+    return ComparedMotion(name, outcome, length, abs(len(then) - len(now)), (a, b, c))

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import Line, Recording
-from trirail.wire.messages import Event, Percentiles
+from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, GoalRequest
+from trirail.wire.state import Percentiles
 from trirail.wire.vocabulary import MODES, Mode
 
 ENABLED_MODES = tuple(MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING))

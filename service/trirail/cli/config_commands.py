@@ -12,7 +12,7 @@ import msgspec
 from cyclopts import App
 
 from trirail.cli import terminal
-from trirail.cli.math_commands import Flag
+from trirail.cli.options import Flag
 from trirail.config import SIM, load
 from trirail.errors import ConfigError
 

@@ -17,12 +17,12 @@ from trirail.client import own_service
 from trirail.client.client import Result, Robot
 from trirail.config import SIM, load
 from trirail.errors import RefusedError
-from trirail.wire.messages import State
+from trirail.wire.state import State
 
 GOAL_WITHIN = 15.0
 
 
-class Leg(NamedTuple):
+class Stage(NamedTuple):
     """One goal of the tour: a name, x, y [m], phi [rad] and the speed."""
 
     name: str
@@ -34,23 +34,23 @@ class Leg(NamedTuple):
 
 CENTRE = (0.0, 0.0, 0.0)
 TOUR = (
-    Leg("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.18),
-    Leg("back to the centre", *CENTRE),
-    Leg("paper: 50 mm along x", 0.05, 0.0, 0.0, 0.13),
-    Leg("back to the centre", *CENTRE),
-    Leg("paper: 50 mm along y", 0.0, 0.05, 0.0, 0.13),
-    Leg("back to the centre", *CENTRE),
-    Leg("tour: right, turned left", 0.06, 0.02, 0.35),
-    Leg("tour: top", 0.0, 0.07, -0.4),
-    Leg("tour: left, turned right", -0.06, 0.02, -0.7),
-    Leg("tour: bottom left", -0.04, -0.05, 0.2),
-    Leg("tour: bottom right, slowly", 0.04, -0.05, -0.2, 0.5),
-    Leg("tour: home", *CENTRE),
+    Stage("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.18),
+    Stage("back to the centre", *CENTRE),
+    Stage("paper: 50 mm along x", 0.05, 0.0, 0.0, 0.13),
+    Stage("back to the centre", *CENTRE),
+    Stage("paper: 50 mm along y", 0.0, 0.05, 0.0, 0.13),
+    Stage("back to the centre", *CENTRE),
+    Stage("tour: right, turned left", 0.06, 0.02, 0.35),
+    Stage("tour: top", 0.0, 0.07, -0.4),
+    Stage("tour: left, turned right", -0.06, 0.02, -0.7),
+    Stage("tour: bottom left", -0.04, -0.05, 0.2),
+    Stage("tour: bottom right, slowly", 0.04, -0.05, -0.2, 0.5),
+    Stage("tour: home", *CENTRE),
 )
 
 
 class _Row(NamedTuple):
-    leg: Leg
+    stage: Stage
     result: Result
     seconds: float
 
@@ -92,17 +92,17 @@ def _tour(robot: Robot) -> Iterator[_Row]:
     )
     with Progress(*columns, console=out) as progress:
         task = progress.add_task("the tour", total=len(TOUR), note="")
-        for number, leg in enumerate(TOUR, 1):
+        for number, stage in enumerate(TOUR, 1):
             began = time.monotonic()
             try:
-                goal = robot.move_to(x=leg.x, y=leg.y, phi=leg.phi, speed=leg.speed, id=f"tour-{number}")
+                goal = robot.move_to(x=stage.x, y=stage.y, phi=stage.phi, speed=stage.speed, id=f"tour-{number}")
             except RefusedError as error:
                 result = Result("", "rejected", str(error))
             else:
                 for state in robot.states(2.0):
                     x, y, phi = state.pose
                     pose = f"x {x * 1e3:6.1f} mm  y {y * 1e3:6.1f} mm  φ {math.degrees(phi):6.1f}°"
-                    progress.update(task, description=leg.name, note=pose)
+                    progress.update(task, description=stage.name, note=pose)
                     if goal.result or time.monotonic() - began > GOAL_WITHIN:
                         break
                 result = goal.result or Result(goal.id, "unknown", f"no end within {GOAL_WITHIN:g} s")
@@ -110,10 +110,10 @@ def _tour(robot: Robot) -> Iterator[_Row]:
             seconds = time.monotonic() - began
             colour = "green" if result.outcome == "done" else "red"
             progress.console.print(
-                f"  [{colour}]{result.outcome:9}[/] {leg.name:28} {seconds:5.2f} s"
+                f"  [{colour}]{result.outcome:9}[/] {stage.name:28} {seconds:5.2f} s"
                 + ("" if result.outcome == "done" else f"  {plain(result.message)}")
             )
-            yield _Row(leg, result, seconds)
+            yield _Row(stage, result, seconds)
 
 
 def _report(rows: list[_Row], state: State, recording: Path) -> None:

@@ -49,6 +49,8 @@ class Machine(Struct, frozen=True):
     link: dict[str, Any] | None
     """The CAN interface as `ip -details -json link` has it."""
     ticks: tuple[Tick, ...]
+    adapter: str = ""
+    """What python-can's interface would lack, with the remedy; "" for nothing."""
 
 
 def examine(config: Config, machine: Machine) -> list[Check]:
@@ -126,6 +128,8 @@ def can_interface(config: Config, machine: Machine) -> list[Check]:
     if section.interface in {"simulated", "unix"}:
         return [Check("CAN", "ok", f"{section.interface}: no hardware is used")]
     if section.interface != "socketcan":
+        if machine.adapter:
+            return [Check("CAN", "failure", f"{section.interface} needs {machine.adapter}")]
         found = f"{section.interface}, channel {section.channel or 'by default'}: its state cannot be read"
         return [Check("CAN", "warning", found, "look at it with its maker's tools; SocketCAN tells its state")]
     if not machine.af_can:

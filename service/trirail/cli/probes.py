@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from msgspec import structs
+from trirail_drivers import adapters
 
 from trirail.cli.doctor import Machine
-from trirail.config import Config, Loop
+from trirail.config import Config, LoopTable
 from trirail.errors import ServiceError
 from trirail.processes import realtime
 from trirail.processes.clock import Tick, Ticker
@@ -41,6 +42,7 @@ def machine(config: Config) -> Machine:
         isolated=processors(_text(SYSTEM / "devices/system/cpu/isolated") or ""),
         link=link(config.can.channel) if config.can.interface == "socketcan" else None,
         ticks=ticks(config.period),
+        adapter=adapters.lacking(config.can.interface),
     )
 
 
@@ -77,7 +79,7 @@ def ticks(period: float) -> tuple[Tick, ...]:
     return tuple(ticker.wait() for _ in range(number))
 
 
-def _wished(loop: Loop) -> Any:
+def _wished(loop: LoopTable) -> Any:
     # What is missing is for the doctor to say; the loop would refuse to run.
     return "off" if loop.realtime == "off" else "prefer"
 

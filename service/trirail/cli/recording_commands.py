@@ -10,8 +10,9 @@ from cyclopts import Parameter
 from rich.text import Text
 
 from trirail.cli import terminal
-from trirail.cli.math_commands import Flag
+from trirail.cli.options import Flag
 from trirail.errors import ServiceError, TrirailError
+from trirail.telemetry import palette
 
 if TYPE_CHECKING:
     from trirail.analysis.replay import Comparison
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from trirail.telemetry.reading import Recording
 
 Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")]
-
-OUTCOMES = {"done": "green", "rejected": "yellow", "expired": "yellow", "faulted": "bold red", "unknown": "dim"}
 
 
 def replay(
@@ -193,7 +192,7 @@ def _print_goals(goals: list[GoalSummary]) -> None:
     longest = max(len(goal.id) for goal in goals)
     for goal in goals:
         took = "" if goal.ended is None else f"{goal.ended - goal.given:.3f} s"
-        colour = OUTCOMES.get(goal.outcome, "cyan")
+        colour = palette.code(palette.OUTCOMES[goal.outcome])
         name = terminal.plain(f"{goal.id:{longest}}")
         words = "" if goal.outcome == "done" else f": {terminal.plain(goal.message)}"
         line = f"  {goal.given:9.3f} s  {took:>9}  [{colour}]{goal.outcome:9}[/]  {name}  {goal.kind} of "

@@ -9,14 +9,15 @@ from types import TracebackType
 
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
-from trirail.client.listener import Listener
+from trirail.client.samples import SampleReader
 from trirail.errors import ServiceError
-from trirail.telemetry.shown_robot import Subject
+from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import free_port, live_relay, live_server
-from trirail.telemetry.streams import LIVE_HZ, Shortfall, Show
+from trirail.telemetry.streams import LIVE_HZ, Shortfall, Streams
 from trirail.wire import zenoh_session
-from trirail.wire.messages import Event, Info, State
+from trirail.wire.messages import Event
 from trirail.wire.records import unpack
+from trirail.wire.state import Info, State
 
 HISTORY_MB = 256.0
 """Memory for what viewers that connect late are shown of the past; nothing else runs in this process [1e6 bytes]."""
@@ -37,21 +38,21 @@ class RemoteView:
         self._cycle: int | None = None
         self._bus_load: float | None = None
         self._session = zenoh_session.open_client(connect)
-        self._listener = Listener()
+        self._reader = SampleReader()
         try:
             self._subscribe(info.robot)
             first = self._first(info)
             offset_ns = time.time_ns() - int(unpack(first)[-1]["deadline_ns"])
-            self._show = Show(Subject.told(info), f"{info.robot} from {connect}", offset_ns)
+            self._streams = Streams(ShownRobot.told(info), f"{info.robot} from {connect}", offset_ns)
             server = live_server(free_port(), HISTORY_MB)
         except BaseException:
             self._session.close()  # type: ignore[no-untyped-call]
             raise
         self.url = server.uri
         """Where viewers on this machine connect."""
-        self._relay = live_relay(self._show.open(server))
-        self._show.attach(self._relay, LIVE_HZ)
-        self._missing = Shortfall(self._show, MISSING, lambda: (self._lost, self._relay.skipped))
+        self._relay = live_relay(self._streams.open(server))
+        self._streams.attach(self._relay, LIVE_HZ)
+        self._missing = Shortfall(self._streams, MISSING, lambda: (self._lost, self._relay.skipped))
         self._records(first)
         self._thread = threading.Thread(target=self._run, name="records", daemon=True)
         self._thread.start()
@@ -69,7 +70,7 @@ class RemoteView:
         self._relay.close()
 
     def _subscribe(self, robot: str) -> None:
-        heard, declare = self._listener, self._session.declare_subscriber
+        heard, declare = self._reader, self._session.declare_subscriber
         self._declared = [
             declare(zenoh_session.key(robot, "records"), heard.batches(self._queue.put)),
             declare(zenoh_session.key(robot, "state"), heard.messages(State, self._queue.put)),
@@ -106,7 +107,7 @@ class RemoteView:
             if isinstance(item, bytes):
                 self._records(item)
             elif isinstance(item, Event):
-                self._show.event(item)
+                self._streams.event(item)
             else:
                 self._state(item)
 
@@ -115,12 +116,12 @@ class RemoteView:
         if self._cycle is not None and cycles[0] > self._cycle:
             self._lost += int(cycles[0]) - self._cycle - 1
         self._cycle = int(cycles[-1])
-        self._show.records(batch)
+        self._streams.records(batch)
         self._missing.check()
-        self._show.save()  # those of the past come in one go: each alone would be a batch to skip
+        self._streams.save()  # those of the past come in one go: each alone would be a batch to skip
 
     def _state(self, state: State) -> None:
-        self._show.target(state.goal.target if state.goal else None)
+        self._streams.target(state.goal.target if state.goal else None)
         if state.loop.bus_load != self._bus_load:
             self._bus_load = state.loop.bus_load
-            self._show.bus_load(state.loop.bus_load)
+            self._streams.bus_load(state.loop.bus_load)

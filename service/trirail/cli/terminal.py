@@ -15,12 +15,14 @@ from rich.live import Live
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
+from trirail_drivers import load
 from trirail_drivers.errors import shortened
 
-from trirail.client.client import Goal, Jog, Result, Robot
+from trirail.client.client import GoalHandle, Jog, Result, Robot
 from trirail.errors import ServiceError
 from trirail.telemetry import palette
-from trirail.wire.messages import Event, GoalReply, Percentiles, State
+from trirail.wire.messages import Event, GoalReply
+from trirail.wire.state import Percentiles, State
 from trirail.wire.text import json_printable, printable
 
 if TYPE_CHECKING:
@@ -67,8 +69,8 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
         out.print(f"    live view  trirail view  ({recorder['live']})", soft_wrap=True)
     out.print(f"    recording  {plain(recorder['recording'])}", soft_wrap=True)
     out.print(f"    bus load   {loop['bus_load']:.0%}")
-    if loop["bus_load"] > 0.8:
-        out.print("    [yellow]warning[/]: above 80 % there is little left for repeated frames; lower loop.rate_hz")
+    if warning := load.warning(config.loop.rate_hz, loop["bus_load"]):
+        out.print(f"    [yellow]warning[/] {warning}", soft_wrap=True)
     for lack in loop["lacking"]:
         out.print(f"    [yellow]without[/] {plain(lack)}", soft_wrap=True)
 
@@ -85,7 +87,7 @@ def notes(reply: GoalReply) -> str:
     return f" ({', '.join(said)})" if said else ""
 
 
-def follow(robot: Robot, goal: Goal, title: str, *, show: bool = True) -> Result:
+def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> Result:
     """Wait for a goal's end and show its progress."""
     columns = (
         TextColumn("{task.description}"),
@@ -186,3 +188,17 @@ def _coloured(mode: str) -> str:
 def percentiles(values: Percentiles) -> str:
     """Write percentiles on a line."""
     return f"p50 {values.p50:.0f}  p99 {values.p99:.0f}  p99.9 {values.p999:.0f}  max {values.max:.0f} µs"
+
+
+def table(first: str, *others: str) -> Table:
+    """Return an empty table with these headings, numbers to the right; a column without one holds units."""
+    made = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="bold")
+    made.add_column(first)
+    for name in others:
+        made.add_column(name, justify="right" if name else "left")
+    return made
+
+
+def number(value: float, digits: int) -> str:
+    """Write a number without the sign of a rounded zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"

@@ -48,9 +48,8 @@ _GO_ON = (
     ModeEvent.STANDSTILL,
     ModeEvent.ARRIVED,
     ModeEvent.POWERED,
-    ModeEvent.RESUME,
-    ModeEvent.ENABLE,
-    ModeEvent.RESET,
+    # Homing moves the sliders: what was sent before would not begin from where it was meant to.
+    *(ModeEvent[name.name] for name in Command if not name.stops and name not in (Command.OVERRIDE, Command.HOME)),
 )
 """Events that leave alone what has been sent but not begun."""
 

@@ -8,12 +8,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
-from trirail.kinematics.algebra import Array, Vector, add, cross, dot, scale, subtract
+from trirail.kinematics.algebra import Array, Matrix, Vector, add, cross, dot, scale, subtract
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import PARALLEL
-from trirail.kinematics.recursion import BASE, joint_motion, link, platform_centre
+from trirail.kinematics.recursion import BASE, ZERO, joint_motion, link, platform_centre
 
 __all__ = [
     "J2_SINGULAR",
@@ -60,6 +58,26 @@ def _close(leg: Array, pose: Vector) -> ClosedLeg:
     return ClosedLeg(lambda_10, lambda_32, delta, edge, subtract(centre, pin))
 
 
+class MovingLeg(NamedTuple):
+    """A closed leg whose platform moves."""
+
+    closed: ClosedLeg
+    rates: Vector  # of its three joints
+    accelerations: Vector
+    regular: bool  # else the leg is singular, or a number is not finite
+
+
+@compiled()
+def _move(leg: Array, pose: Vector, velocity: Vector, acceleration: Vector) -> MovingLeg:
+    """Solve a leg for the motion of its platform."""
+    closed = _close(leg, pose)
+    variables = closed.lambda_10, pose[2], closed.lambda_32
+    rates, accelerations = joint_motion(leg, variables, velocity, acceleration)
+    sliders = closed.lambda_10 + rates[0] + accelerations[0]
+    total = sliders + closed.lambda_32 + rates[2] + accelerations[2]
+    return MovingLeg(closed, rates, accelerations, abs(closed.delta) > PARALLEL and math.isfinite(total))
+
+
 @compiled()
 def inverse_motion(legs: Array, motion: Array, out: Array) -> int:
     """Do inverse_into, from compiled code."""
@@ -67,13 +85,10 @@ def inverse_motion(legs: Array, motion: Array, out: Array) -> int:
     velocity = motion[1, 0], motion[1, 1], motion[1, 2]
     acceleration = motion[2, 0], motion[2, 1], motion[2, 2]
     for i in range(3):
-        closed = _close(legs[i], pose)
-        variables = closed.lambda_10, pose[2], closed.lambda_32
-        rates, accelerations = joint_motion(legs[i], variables, velocity, acceleration)
-        out[0, i], out[1, i], out[2, i] = closed.lambda_10, rates[0], accelerations[0]
-        out[3, i], out[4, i], out[5, i] = closed.lambda_32, rates[2], accelerations[2]
-        total = out[0, i] + out[1, i] + out[2, i] + out[3, i] + out[4, i] + out[5, i]
-        if not (abs(closed.delta) > PARALLEL and math.isfinite(total)):
+        leg = _move(legs[i], pose, velocity, acceleration)
+        out[0, i], out[1, i], out[2, i] = leg.closed.lambda_10, leg.rates[0], leg.accelerations[0]
+        out[3, i], out[4, i], out[5, i] = leg.closed.lambda_32, leg.rates[2], leg.accelerations[2]
+        if not leg.regular:
             return 1 + i
     return 0
 
@@ -169,7 +184,7 @@ def loop_equation(legs: Array, sliders: Array) -> Vector:
 
 
 @compiled()
-def _forward(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
+def _forward(legs: Array, sliders: Array | Vector, near: Array, pose: Array) -> int:
     for i in range(3):
         if not math.isfinite(sliders[i]):
             return 1 + i
@@ -234,8 +249,8 @@ def _solve(rows: tuple[Vector, Vector, Vector], right: Vector) -> Vector:
 
 
 @compiled()
-def forward_motion(legs: Array, sliders: Array, near: Array, motion: Array) -> int:
-    """Write the platform's pose, velocity and acceleration (3, 3) for those of the sliders, (3, 3).
+def forward_motion(legs: Array, sliders: Matrix, near: Array, motion: Array) -> int:
+    """Write the platform's pose, velocity and acceleration (3, 3) for those of the sliders, three rows.
 
     From (16): J2 times the platform's velocity is J1 times the sliders'. Their accelerations are linear in the
     platform's, with the same matrices: what they are without it is subtracted. Codes of forward_into.
@@ -246,17 +261,13 @@ def forward_motion(legs: Array, sliders: Array, near: Array, motion: Array) -> i
     pose = motion[0, 0], motion[0, 1], motion[0, 2]
     a, b, c = _close(legs[0], pose), _close(legs[1], pose), _close(legs[2], pose)
     j2 = _beta(a), _beta(b), _beta(c)
-    rates = a.delta * sliders[1, 0], b.delta * sliders[1, 1], c.delta * sliders[1, 2]
-    motion[1, 0], motion[1, 1], motion[1, 2] = _solve(j2, rates)
-    motion[2, 0] = motion[2, 1] = motion[2, 2] = 0.0
-    without = np.empty((6, 3))
-    code = inverse_motion(legs, motion, without)
-    if code != 0:
-        return code
-    left = (
-        a.delta * (sliders[2, 0] - without[2, 0]),
-        b.delta * (sliders[2, 1] - without[2, 1]),
-        c.delta * (sliders[2, 2] - without[2, 2]),
-    )
-    motion[2, 0], motion[2, 1], motion[2, 2] = _solve(j2, left)
+    rates = a.delta * sliders[1][0], b.delta * sliders[1][1], c.delta * sliders[1][2]
+    velocity = _solve(j2, rates)
+    motion[1, 0], motion[1, 1], motion[1, 2] = velocity
+    for i in range(3):
+        leg = _move(legs[i], pose, velocity, ZERO)
+        if not leg.regular:
+            return 1 + i
+        motion[2, i] = leg.closed.delta * (sliders[2][i] - leg.accelerations[0])
+    motion[2, 0], motion[2, 1], motion[2, 2] = _solve(j2, (motion[2, 0], motion[2, 1], motion[2, 2]))
     return 0

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from trirail.kinematics.algebra import Array
-from trirail.kinematics.closure import LEGS_TYPE, forward_motion, inverse_motion
+from trirail.kinematics.closure import LEGS_TYPE, inverse_motion
 from trirail.kinematics.compiled import compiled
-from trirail.motion.paths import HALVINGS, ROUNDING, motion_at, reached, value_at
+from trirail.motion.paths import HALVINGS, ROUNDING, law_at, platform_at, reached
 
 __all__ = ["survey"]
 
@@ -42,11 +42,8 @@ def _moments(
     for k in range(even):
         times[k] = first + (until - first) * k / (even - 1)
     n = even
-    law = np.empty((3, 1))
-    value_at(law_knots, law_pieces, first, law)
-    begin = law[0, 0]
-    value_at(law_knots, law_pieces, until, law)
-    end = law[0, 0]
+    begin = law_at(law_knots, law_pieces, first)[0]
+    end = law_at(law_knots, law_pieces, until)[0]
     for k in range(len(knots)):
         for part in range(WITHIN if k < len(knots) - 1 else 1):
             s = knots[k]
@@ -88,11 +85,10 @@ class Way(NamedTuple):
 @compiled()
 def _look(way: Way, time: float, near: Array, motion: Array, sliders: Array) -> bool:
     """Write platform and sliders at a time of the law; whether they are within reach."""
-    motion_at(way.knots, way.pieces, way.law_knots, way.law_pieces, time, motion)
+    law = law_at(way.law_knots, way.law_pieces, time)
+    if platform_at(way.legs, way.knots, way.pieces, way.in_sliders, law, near, motion) != 0:
+        return False
     if way.in_sliders:
-        targets = motion.copy()
-        if forward_motion(way.legs, targets, near, motion) != 0:
-            return False
         near[:] = motion[0]
     if inverse_motion(way.legs, motion, sliders) != 0:
         return False
@@ -134,7 +130,7 @@ def _turns(way: Way, last: float, time: float, near: Array, motion: Array, slide
 
 
 @compiled()
-def _measure_bus_load(now: Array, then: Array, i: int, step: float, whole: bool, worst: Array) -> None:
+def _measure_rates(now: Array, then: Array, i: int, step: float, whole: bool, worst: Array) -> None:
     """Raise `worst` (3,) to the velocity, acceleration and jerk of column i of rows (position, velocity, acceleration).
 
     `then` are the rows a step later. `whole` tells whether the motion goes on for the whole step.
@@ -171,8 +167,8 @@ def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst:
             return time, last
         whole = time >= 0.0 and last <= until  # else it is the step from or to a standstill, in which nothing else is
         for i in range(3):
-            _measure_bus_load(sliders[1], sliders[0], i, step, whole, worst[0])
-            _measure_bus_load(motion[1], motion[0], i, step, whole, worst[1 + i])
+            _measure_rates(sliders[1], sliders[0], i, step, whole, worst[0])
+            _measure_rates(motion[1], motion[0], i, step, whole, worst[1 + i])
     return last, math.nan
 
 

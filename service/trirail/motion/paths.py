@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.algebra import Array, Vector
 from trirail.kinematics.closure import LEGS_TYPE, forward_motion
 from trirail.kinematics.compiled import compiled
 
-__all__ = ["Path", "advance", "constant", "motion_at", "reached", "value", "value_at"]
+__all__ = ["Path", "advance", "constant", "law_at", "platform_at", "reached", "value"]
 
 FOR_EVER = 1e9
 """How long the last piece of a law lasts [s]."""
@@ -50,21 +50,46 @@ def _piece(knots: Array, time: float) -> int:
     return low
 
 
+class Moment(NamedTuple):
+    """A time along a path: in which piece, how long after its knot, and whether the motion goes on there."""
+
+    piece: int
+    time: float
+    inside: bool
+
+
 @compiled()
-def value_at(knots: Array, pieces: Array, time: float, out: Array) -> None:
-    """Do value, from compiled code; before the start and after the end nothing moves."""
-    inside = knots[0] <= time <= knots[-1]
+def _moment(knots: Array, time: float) -> Moment:
     at = min(max(time, knots[0]), knots[-1])
     k = _piece(knots, at)
-    t = at - knots[k]
+    return Moment(k, at - knots[k], knots[0] <= time <= knots[-1])
+
+
+@compiled()
+def _coordinate(p: Array, at: Moment) -> Vector:
+    """Return a polynomial's value and first two derivatives; before the start and after the end nothing moves."""
+    t = at.time
+    position = p[0] + t * (p[1] + t * (p[2] + t * (p[3] + t * (p[4] + t * p[5]))))
+    if not at.inside:
+        return position, 0.0, 0.0
+    velocity = p[1] + t * (2.0 * p[2] + t * (3.0 * p[3] + t * (4.0 * p[4] + t * 5.0 * p[5])))
+    acceleration = 2.0 * p[2] + t * (6.0 * p[3] + t * (12.0 * p[4] + t * 20.0 * p[5]))
+    return position, velocity, acceleration
+
+
+@compiled()
+def value_at(knots: Array, pieces: Array, time: float, out: Array) -> None:
+    """Do value, from compiled code."""
+    at = _moment(knots, time)
     for i in range(pieces.shape[1]):
-        p = pieces[k, i]
-        out[0, i] = p[0] + t * (p[1] + t * (p[2] + t * (p[3] + t * (p[4] + t * p[5]))))
-        if inside:
-            out[1, i] = p[1] + t * (2.0 * p[2] + t * (3.0 * p[3] + t * (4.0 * p[4] + t * 5.0 * p[5])))
-            out[2, i] = 2.0 * p[2] + t * (6.0 * p[3] + t * (12.0 * p[4] + t * 20.0 * p[5]))
-        else:
-            out[1, i] = out[2, i] = 0.0
+        out[0, i], out[1, i], out[2, i] = _coordinate(pieces[at.piece, i], at)
+
+
+@compiled()
+def law_at(knots: Array, pieces: Array, time: float) -> Vector:
+    """Return where a law is: time along the path [s], its rate, and the rate's change [1/s]."""
+    at = _moment(knots, time)
+    return _coordinate(pieces[at.piece, 0], at)
 
 
 @compiled("void(f8[::1], f8[:, :, ::1], f8, f8[:, ::1])")
@@ -74,16 +99,33 @@ def value(knots: Array, pieces: Array, time: float, out: Array) -> None:
 
 
 @compiled()
-def motion_at(knots: Array, pieces: Array, law_knots: Array, law_pieces: Array, time: float, out: Array) -> None:
-    """Write where a path is, by a law, at a time of the law: value and two derivatives, (3, d)."""
-    law = np.empty((3, 1))
-    value_at(law_knots, law_pieces, time, law)
-    s: float = law[0, 0]
-    rate, change = law[1, 0], law[2, 0]
+def motion_at(knots: Array, pieces: Array, law: Vector, out: Array) -> None:
+    """Write where a path is, where its law is: value and two derivatives, (3, d)."""
+    s, rate, change = law
     value_at(knots, pieces, s, out)
     for i in range(3):
         out[2, i] = out[2, i] * rate * rate + out[1, i] * change
         out[1, i] *= rate
+
+
+@compiled()
+def platform_at(
+    legs: Array, knots: Array, pieces: Array, in_sliders: bool, law: Vector, near: Array, out: Array
+) -> int:
+    """Write where the platform is, where a path's law is: pose, velocity and acceleration (3, 3).
+
+    A path in slider space is turned into the platform's motion on the branch of the pose `near`. Returns 0, or a
+    code of forward_into.
+    """
+    motion_at(knots, pieces, law, out)
+    if not in_sliders:
+        return 0
+    sliders = (
+        (out[0, 0], out[0, 1], out[0, 2]),
+        (out[1, 0], out[1, 1], out[1, 2]),
+        (out[2, 0], out[2, 1], out[2, 2]),
+    )
+    return forward_motion(legs, sliders, near, out)
 
 
 @compiled(f"i8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], f8, f8[::1], f8[:, ::1])")
@@ -98,26 +140,17 @@ def advance(
     near: Array,
     out: Array,
 ) -> int:
-    """Write the platform's pose, velocity and acceleration (3, 3) at a time of the law [s].
-
-    A path in slider space is turned into the platform's motion on the branch of the pose `near`. Returns 0, or a
-    code of forward_into.
-    """
-    motion_at(knots, pieces, law_knots, law_pieces, time, out)
-    if in_sliders:
-        sliders = out.copy()
-        return forward_motion(legs, sliders, near, out)
-    return 0
+    """Write the platform's pose, velocity and acceleration (3, 3) at a time of the law [s]; see platform_at."""
+    return platform_at(legs, knots, pieces, in_sliders, law_at(law_knots, law_pieces, time), near, out)
 
 
 @compiled("f8(f8[::1], f8[:, :, ::1], f8, f8)")
 def reached(law_knots: Array, law_pieces: Array, s: float, last: float) -> float:
     """Return when a law passes a time along the path [s], by halving: between its start and `last`."""
-    low, high, out = law_knots[0], last, np.empty((3, 1))
+    low, high = law_knots[0], last
     for _ in range(HALVINGS):
         middle = (low + high) / 2.0
-        value_at(law_knots, law_pieces, middle, out)
-        if out[0, 0] < s:
+        if law_at(law_knots, law_pieces, middle)[0] < s:
             low = middle
         else:
             high = middle

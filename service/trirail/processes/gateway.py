@@ -7,26 +7,25 @@ import select
 import signal
 import time
 import uuid
-from collections import deque
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import zenoh
-from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_advanced_publisher
 
-from trirail.config import Config, geometry
+from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.backlog import Backlog
 from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox, Incoming
+from trirail.processes.info import info
 from trirail.processes.last_words import LastWords
+from trirail.processes.publications import Publications
 from trirail.processes.replies import Replies
 from trirail.processes.state import StateMaker
-from trirail.telemetry.provenance import software, versions
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.links import Closed, Link
-from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Goal, GoalReply, Info, NoContent, Override, Stop
+from trirail.wire.links import Closed, PacketLink
+from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Goal, GoalReply, NoContent, Override, Stop
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -43,27 +42,18 @@ from trirail.wire.packets import (
     message,
 )
 from trirail.wire.records import unpack
-from trirail.wire.sizes import MAX_UNREAD
 from trirail.wire.text import is_name, quoted
 from trirail.wire.vocabulary import Command, Mode
 
 AT_ONCE = 256
 """Messages from Zenoh that are read before the loop is listened to again."""
-BACKLOG = 5_000
-"""Goals that may wait for those before them; beyond that they are refused."""
-PATIENCE = 8.0
-"""A goal that has waited longer for those before it does not begin any more: its sender gives up soon [s]."""
 AHEAD = 2
 """Goals that the loop has at once, so that it has the next one when it is done with the last. The others wait here:
 a command overtakes them, and what waits when the robot is told to stop does not begin any more."""
 UNDER_WAY = 32
 """Commands that the loop has at once; beyond that they are refused, but for those that stop the robot."""
-EVENTS_KEPT = 1000
 REPLY_WITHIN = 15.0
 """A command that the loop has not carried out by then is answered with an error [s]."""
-_PAST = RepliesConfig(
-    priority=zenoh.Priority.BACKGROUND, congestion_control=zenoh.CongestionControl.BLOCK, express=False
-)
 REFUSALS_PER_SECOND = 10
 """Unreadable goals that are told to everyone; the others only get their error reply."""
 
@@ -76,22 +66,20 @@ class _Waiting(NamedTuple):
 class Gateway:
     """Takes requests from Zenoh, passes them to the loop, and answers and publishes what the loop says."""
 
-    def __init__(self, config: Config, link: Link, beat: Callable[[], None], opened: zenoh.Session) -> None:
+    def __init__(self, config: Config, link: PacketLink, beat: Callable[[], None], opened: zenoh.Session) -> None:
         self._robot = config.robot.name
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
         self._home_within = REPLY_WITHIN + sum(homing)
         self._link = link
         self._beat = beat
         self._last_words = LastWords(config.period)
-        self._session = opened
-        self._info = _info(config)
+        self._info = info(config)
         self._states = StateMaker(config)
         self._state_every = 1.0 / config.telemetry.state_hz
         self._state_due = 0.0
         self._replies = Replies(self._robot)
         self._inbox = Inbox(opened, self._robot, self._too_much)
-        self._backlog: deque[tuple[Incoming, GoalRequest]] = deque()
-        self._backlog_bytes = 0
+        self._backlog = Backlog()
         self._ahead: set[int] = set()
         self._commands: set[int] = set()
         self._waiting: dict[int, _Waiting] = {}
@@ -99,27 +87,7 @@ class Gateway:
         self._refusals = 0
         self._refusals_since = 0.0
         self._ending = False
-        self._state = opened.declare_publisher(
-            self._key("state"),
-            encoding=boundary.JSON,
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.DATA_HIGH,
-        )
-        self._records = opened.declare_publisher(
-            self._key("records"),
-            encoding=boundary.BINARY,
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.DATA_LOW,
-        )
-        self._event = declare_advanced_publisher(
-            opened,
-            self._key("event"),
-            encoding=boundary.JSON,
-            # The past goes out in one burst, whole, in a queue of its own: who is slow to take it delays nothing else.
-            cache=CacheConfig(max_samples=EVENTS_KEPT, replies_config=_PAST),
-            sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
-            publisher_detection=True,
-        )
+        self._publications = Publications(opened, self._robot)
 
     def serve(self, ready: Callable[[], None]) -> None:
         """Serve until told to end or the loop has gone; `ready` is called once the loop has said welcome."""
@@ -143,7 +111,7 @@ class Gateway:
         finally:
             for incoming in [
                 *(waiting.incoming for waiting in self._waiting.values()),
-                *(goal[0] for goal in self._backlog),
+                *(goal.incoming for goal in self._backlog),
             ]:
                 self._replies.send(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
             self._replies.close()
@@ -175,26 +143,19 @@ class Gateway:
     def _goal(self, incoming: Incoming) -> None:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
         goal: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
-        if len(self._backlog) >= BACKLOG or self._backlog_bytes + incoming.size > MAX_UNREAD:
-            raise RefusedError(RefusalCode.BUSY, f"{len(self._backlog)} goals are waiting already: send fewer")
+        self._backlog.check_room(incoming.size)
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
-        request = GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns())
-        self._backlog.append((incoming._replace(payload=b""), request))
-        self._backlog_bytes += incoming.size
+        self._backlog.add(incoming, GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns()))
         self._send_goals()
 
     def _send_goals(self) -> None:
         """Pass on as many goals as the loop is to have."""
-        while self._backlog and len(self._ahead) < AHEAD:
-            incoming, request = self._backlog[0]
-            if time.monotonic_ns() - request.received_ns > PATIENCE * 1e9 and request.withdrawn is None:
-                reason = f"too many goals before it: it has waited longer than {PATIENCE:g} s"
-                request = msgspec.structs.replace(request, withdrawn=reason)
+        while len(self._ahead) < AHEAD and (first := self._backlog.first()) is not None:
+            incoming, request = first
             if not self._link.send(message(request)):
                 return
-            self._backlog.popleft()
-            self._backlog_bytes -= incoming.size
+            self._backlog.take()
             self._ahead.add(request.ticket)
             self._last_words.take(request)
             self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
@@ -211,7 +172,8 @@ class Gateway:
         share = content.percent / 100.0 if isinstance(content, Override) else None
         goal = content.goal if isinstance(content, Stop) else None
         reason = f"{name} by {user}"
-        if goal is not None and self._withdraw(incoming, goal, reason):
+        if goal is not None and self._backlog.withdraw(goal, reason):  # before the loop has it
+            self._replies.send(incoming, CommandReply(Command.STOP, self._states.newest().mode))
             return
         if len(self._commands) >= UNDER_WAY and not name.stops:
             raise RefusedError(RefusalCode.BUSY, f"{len(self._commands)} commands are under way already: send fewer")
@@ -222,17 +184,7 @@ class Gateway:
         within = self._home_within if name is Command.HOME else REPLY_WITHIN
         self._waiting[self._tickets] = _Waiting(incoming, time.monotonic() + within)
         if name.stops and goal is None:
-            replace = msgspec.structs.replace
-            self._backlog = deque((waiting, replace(request, withdrawn=reason)) for waiting, request in self._backlog)
-
-    def _withdraw(self, incoming: Incoming, goal_id: str, reason: str) -> bool:
-        """Stop a goal that waits here, before the loop has it; whether there is one."""
-        for number, (waiting, request) in enumerate(self._backlog):
-            if request.id == goal_id:
-                self._backlog[number] = waiting, msgspec.structs.replace(request, withdrawn=reason)
-                self._replies.send(incoming, CommandReply(Command.STOP, self._states.newest().mode))
-                return True
-        return False
+            self._backlog.withdraw_all(reason)
 
     def _too_much(self, incoming: Incoming) -> None:
         """Answer what there is no room for; called by Zenoh's threads."""
@@ -278,7 +230,7 @@ class Gateway:
         self._last_words.take(answer)
         match answer:
             case Happened(event):
-                self._event.put(msgspec.json.encode(event))
+                self._publications.event(event)
             case Status() | Welcome():
                 self._states.update(answer)
             case Accepted(ticket, goal_id, duration, slowed, stops_first, queued):
@@ -291,20 +243,20 @@ class Gateway:
 
     def _publish(self, batch: memoryview) -> None:
         """Take in a batch of records and pass it on; publish the newest state when it is time."""
-        self._records.put(bytes(batch))
+        self._publications.records(bytes(batch))
         self._states.records(unpack(batch))
         now = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
-            self._state.put(msgspec.json.encode(self._states.newest()))
+            self._publications.state(self._states.newest())
 
     def _tell_of_its_end(self) -> None:
         """The loop has gone: where it has died, tell everyone in its place."""
         for event in self._last_words.events(self._states.cycle):
-            self._event.put(msgspec.json.encode(event))
+            self._publications.event(event)
         if (reason := self._last_words.reason) and self._states.cycle:
             state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason,))
-            self._state.put(msgspec.json.encode(state))
+            self._publications.state(state)
 
     def _answer(self, ticket: int, content: msgspec.Struct) -> None:
         waiting = self._waiting.pop(ticket, None)
@@ -324,25 +276,7 @@ class Gateway:
         return zenoh_session.key(self._robot, *parts)
 
 
-def _info(config: Config) -> Info:
-    live = config.telemetry.live_port
-    legs: list[dict[str, Any]] = []
-    for name, leg in zip("ABC", geometry(config.geometry).legs, strict=True):
-        legs.append({"name": name} | {field: getattr(leg, field) for field in leg.__slots__})
-    return Info(
-        robot=config.robot.name,
-        version=software().trirail,
-        geometry=tuple(legs),
-        limits=msgspec.to_builtins(config.limits),
-        rate_hz=config.loop.rate_hz,
-        state_hz=config.telemetry.state_hz,
-        recordings=str(Path(config.telemetry.directory).resolve()),
-        live=f"rerun+http://127.0.0.1:{live}/proxy" if live else "",
-        versions=versions(),
-    )
-
-
-def main(config: Config, link: Link, beat: Callable[[], None], ready: Callable[[object], None]) -> int:
+def main(config: Config, link: PacketLink, beat: Callable[[], None], ready: Callable[[object], None]) -> int:
     """Run the gateway's process; `ready` is called once it can be reached."""
     with zenoh_session.open_service(config.zenoh.listen) as opened:
         gateway = Gateway(config, link, beat, opened)

@@ -8,7 +8,7 @@ import os
 import struct
 from collections.abc import Callable
 
-from trirail.config import Loop
+from trirail.config import LoopTable
 from trirail.errors import ServiceError
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
@@ -28,25 +28,25 @@ def die_with_parent(signal_number: int) -> None:
     _call("prctl", _PR_SET_PDEATHSIG, signal_number)
 
 
-def _fifo(loop: Loop) -> None:
+def _fifo(loop: LoopTable) -> None:
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(loop.priority))
 
 
-def _lock_memory(_: Loop) -> None:
+def _lock_memory(_: LoopTable) -> None:
     _call("mlockall", _MCL_CURRENT | _MCL_FUTURE)
 
 
-def _pin(loop: Loop) -> None:
+def _pin(loop: LoopTable) -> None:
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0)) if loop.cpu is None else loop.cpu})
 
 
-def _stay_awake(_: Loop) -> None:
+def _stay_awake(_: LoopTable) -> None:
     # Documentation/power/pm_qos_interface: the request holds for as long as the file stays open.
     handle = os.open("/dev/cpu_dma_latency", os.O_WRONLY | os.O_CLOEXEC)
     os.write(handle, struct.pack("i", 0))
 
 
-_MEASURES: tuple[tuple[str, Callable[[Loop], None], str], ...] = (
+_MEASURES: tuple[tuple[str, Callable[[LoopTable], None], str], ...] = (
     ("SCHED_FIFO", _fifo, "run as root, or allow it: systemd LimitRTPRIO=99, or rtprio in limits.conf"),
     (
         "locked memory",
@@ -57,7 +57,7 @@ _MEASURES: tuple[tuple[str, Callable[[Loop], None], str], ...] = (
 )
 
 
-def acquire(loop: Loop) -> tuple[str, ...]:
+def acquire(loop: LoopTable) -> tuple[str, ...]:
     """Take every measure that the configuration asks for; return those that failed, each with its remedy.
 
     Raises ServiceError with `realtime = "enforce"` where one of them is missing.

@@ -14,7 +14,7 @@ from trirail.config import Config
 from trirail.processes.last_words import LastWords
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.recorder import Recorder
-from trirail.wire.links import Closed, Link
+from trirail.wire.links import Closed, PacketLink
 from trirail.wire.messages import Level
 from trirail.wire.packets import Answer, ControlInput, Happened, Kind, Remark, Status, Welcome, decode_answer, message
 from trirail.wire.records import last_cycle
@@ -29,7 +29,7 @@ A killed recorder loses what it has not written: that much, and the batch that t
 class Intake:
     """Takes the loop's packets to the recorder and the black box, and tells the loop what it should know."""
 
-    def __init__(self, config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> None:
+    def __init__(self, config: Config, record: str | None, link: PacketLink, ready: Callable[[object], None]) -> None:
         self._link = link
         self._ready = ready
         self._cycle = 0
@@ -94,7 +94,7 @@ class Intake:
             self._link.send(message(Remark(level, words)))
 
 
-def main(config: Config, record: str | None, link: Link, ready: Callable[[object], None]) -> int:
+def main(config: Config, record: str | None, link: PacketLink, ready: Callable[[object], None]) -> int:
     """Record until the loop has gone or the process is told to end."""
     intake = Intake(config, record, link, ready)
     ending = False

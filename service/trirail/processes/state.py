@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from trirail_drivers.interface import PowerState, Triple
 
 from trirail.config import Config
-from trirail.wire.messages import Commanded, GoalState, LoopState, Percentiles, Sliders, State, Traffic
 from trirail.wire.packets import Status, Welcome
+from trirail.wire.state import Commanded, FrameCounts, GoalState, LoopState, Percentiles, Sliders, State
 from trirail.wire.vocabulary import MODES, Mode
 
 WINDOW = 60.0
@@ -94,7 +94,7 @@ class StateMaker:
                 following_error=_triple(row["following_error"]),
                 following_error_max=_triple(self._error_max),
                 status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
-                traffic=(Traffic(*a), Traffic(*b), Traffic(*c)),
+                traffic=(FrameCounts(*a), FrameCounts(*b), FrameCounts(*c)),
             ),
             goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._status.target)
             if goal

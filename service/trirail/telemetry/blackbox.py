@@ -6,17 +6,21 @@ the log, the drawing, the configuration and the software. It also has the second
 
 from __future__ import annotations
 
+import heapq
+import itertools
+import math
 import threading
 from collections import deque
 from collections.abc import Callable
 from datetime import datetime
 from operator import methodcaller
+from typing import NamedTuple
 
 from trirail.errors import ServiceError
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.retention import BLACK_BOX
 from trirail.wire.messages import Event
-from trirail.wire.packets import ControlInput
+from trirail.wire.packets import ControlInput, Happened, decode_answer, encode
 from trirail.wire.records import last_cycle
 
 BEFORE = 60.0
@@ -26,7 +30,23 @@ AFTER = 2.0
 SPARE = 1.0
 """Kept beyond both, for batches that begin or end in between [s]."""
 
+SAID_MB = 32.0
+"""How much is kept of what was said and asked, packed [1e6 bytes]: a flood of messages may say more in a minute."""
+
 Fill = Callable[[Recorder], None]
+
+
+class Kept(NamedTuple):
+    """What is to be given to a recorder again."""
+
+    order: int
+    t: float
+    """When it came [s]."""
+    fill: Fill
+    lasting: str = ""
+    """By which name it holds until it is said anew; empty for what is over at once."""
+    size: int = 0
+    """How much it counts for in what is kept of all that is said [bytes]."""
 
 
 class BlackBox:
@@ -36,7 +56,11 @@ class BlackBox:
         self._rate_hz = rate_hz
         self._begin = begin
         self._say = say
-        self._kept: deque[tuple[float, str, Fill]] = deque()
+        self._order = itertools.count()
+        self._records: deque[Kept] = deque()
+        self._said: deque[Kept] = deque()
+        self._said_bytes = 0
+        self._left_out_at = -math.inf
         self._standing: dict[str, Fill] = {}
         self._t = 0.0
         self._faults: deque[Event] = deque()
@@ -45,27 +69,28 @@ class BlackBox:
     def records(self, batch: bytes) -> None:
         """Take packed records; write the file when those after a fault are there."""
         self._t = last_cycle(batch) / self._rate_hz
-        self._keep(methodcaller("records", batch))
-        while self._kept and self._kept[0][0] < self._t - BEFORE - AFTER - SPARE:
-            _, lasting, fill = self._kept.popleft()
-            if lasting:
-                self._standing[lasting] = fill
+        self._records.append(Kept(next(self._order), self._t, methodcaller("records", batch)))
+        oldest = self._t - BEFORE - AFTER - SPARE
+        while self._records[0].t < oldest:
+            self._records.popleft()
+        while self._said and self._said[0].t < oldest:
+            self._forget()
         while self._faults and self._t >= self._faults[0].t + AFTER:
             self._write(self._faults.popleft())
 
     def event(self, event: Event) -> None:
         """Take an event."""
-        self._keep(methodcaller("event", event))
+        self._keep_packed(Happened(event))
         if event.kind == "fault":
             self._faults.append(event)
 
     def given(self, what: ControlInput) -> None:
         """Take what the control was given."""
-        self._keep(methodcaller("given", what))
+        self._keep_packed(what)
 
     def stands(self, name: str, *values: object) -> None:
         """Take what holds until it is said anew: by the name of the recorder's method."""
-        self._keep(methodcaller(name, *values), name)
+        self._keep(methodcaller(name, *values), lasting=name)
 
     def close(self) -> None:
         """Write the files of faults that have just been; wait until they are complete."""
@@ -74,11 +99,29 @@ class BlackBox:
         for thread in self._writing:
             thread.join()
 
-    def _keep(self, fill: Fill, lasting: str = "") -> None:
-        self._kept.append((self._t, lasting, fill))
+    def _keep_packed(self, said: Happened | ControlInput) -> None:
+        """Keep a message as it came: packed it is many times smaller."""
+        packed = encode(said)
+        self._keep(lambda recorder: _say(recorder, packed), size=len(packed))
+
+    def _keep(self, fill: Fill, *, lasting: str = "", size: int = 0) -> None:
+        self._said.append(Kept(next(self._order), self._t, fill, lasting, size))
+        self._said_bytes += size
+        while self._said_bytes > SAID_MB * 1e6:
+            self._left_out_at = self._said[0].t
+            self._forget()
+
+    def _forget(self) -> None:
+        """Let the oldest of what was said go, but for what still holds."""
+        old = self._said.popleft()
+        self._said_bytes -= old.size
+        if old.lasting:
+            self._standing[old.lasting] = old.fill
 
     def _write(self, fault: Event) -> None:
-        fills = [*self._standing.values(), *(fill for _, _, fill in self._kept)]
+        if self._left_out_at >= self._t - BEFORE - AFTER - SPARE:
+            self._say(f"too much was said for the black box: what was until t = {self._left_out_at:.1f} s is left out")
+        fills = [*self._standing.values(), *(kept.fill for kept in heapq.merge(self._records, self._said))]
         # In a thread: it takes a second or two, in which the recording goes on.
         thread = threading.Thread(target=self._fill, args=(fault, fills), name="black box")
         self._writing = [writing for writing in self._writing if writing.is_alive()] + [thread]
@@ -95,3 +138,12 @@ class BlackBox:
         recorder.close()
         if recorder.lost:
             self._say(f"the last minute before the fault is not whole in {recorder.path}: {recorder.cause}")
+
+
+def _say(recorder: Recorder, packed: bytes) -> None:
+    """Give a recorder a message of the loop's."""
+    match decode_answer(packed):
+        case Happened(event):
+            recorder.event(event)
+        case ControlInput() as what:
+            recorder.given(what)

@@ -7,7 +7,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from trirail.telemetry import curves
-from trirail.telemetry.shown_robot import Subject
+from trirail.telemetry.shown_robot import ShownRobot
 from trirail.workspace.mechanism import Points
 
 WINDOW = 8.0
@@ -16,10 +16,10 @@ MARGIN = 0.09
 """Room around the robot, as a share of its size."""
 
 
-def layout(subject: Subject, bounds: Points) -> rrb.Blueprint:
+def layout(robot: ShownRobot, bounds: Points) -> rrb.Blueprint:
     """Return the layout for a robot that lies within `bounds`, (2, 2): lowest and highest x and y [m]."""
     window = rrb.TimeAxis(view_range=_last(WINDOW))
-    error_mm = subject.limits.slider.following_error * 1e3
+    error_mm = robot.limits.slider.following_error * 1e3
     sliders = rrb.Vertical(
         _plot("Slider position λ  [mm]", curves.POSITION, window),
         _plot("Slider velocity  [mm/s]", curves.VELOCITY, window),
@@ -42,7 +42,7 @@ def layout(subject: Subject, bounds: Points) -> rrb.Blueprint:
         ),
     )
     left = rrb.Vertical(
-        _robot(subject, bounds),
+        _robot(robot, bounds),
         rrb.StateTimelineView(name="Mode", origin="/mode", time_view=window),
         events,
         row_shares=[66, 10, 24],
@@ -55,11 +55,11 @@ def layout(subject: Subject, bounds: Points) -> rrb.Blueprint:
     )
 
 
-def _robot(subject: Subject, bounds: Points) -> rrb.Spatial2DView:
+def _robot(robot: ShownRobot, bounds: Points) -> rrb.Spatial2DView:
     low, high = bounds + MARGIN * np.ptp(bounds) * np.array([[-1.0], [1.0]])
     trace = rrb.VisibleTimeRanges(timeline="t", range=_last(WINDOW))
     return rrb.Spatial2DView(
-        name=f"{subject.name}: 3-PRP planar robot",
+        name=f"{robot.name}: 3-PRP planar robot",
         origin="/",
         contents="/robot/**",
         visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),

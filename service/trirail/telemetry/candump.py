@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trirail_drivers.capture import FRAME, REMOTE
+from trirail_drivers.capture import FRAME
+from trirail_drivers.frames import CAN_FRAME, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
 
 
 class CandumpLog:
@@ -18,10 +19,7 @@ class CandumpLog:
 
     def write(self, batch: bytes) -> None:
         """Append a batch of captured frames."""
-        lines = "".join(
-            f"({t:.6f}) {self._channel} {identifier:03X}#{'R' if length & REMOTE else data[:length].hex().upper()}\n"
-            for t, identifier, length, data in FRAME.iter_unpack(batch)
-        )
+        lines = "".join(f"({t:.6f}) {self._channel} {_written(frame)}\n" for t, frame in FRAME.iter_unpack(batch))
         try:
             self._file.write(lines.encode())
         except OSError:
@@ -30,3 +28,15 @@ class CandumpLog:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _written(frame: bytes) -> str:
+    """A `struct can_frame` in candump's words: 3 digits of an 11-bit identifier, 8 of others and of error frames."""
+    identifier, length, data = CAN_FRAME.unpack(frame)
+    if identifier & ERROR:
+        name = f"{identifier & (ERROR | EXTENDED_BITS):08X}"
+    elif identifier & EXTENDED:
+        name = f"{identifier & EXTENDED_BITS:08X}"
+    else:
+        name = f"{identifier & STANDARD_BITS:03X}"
+    return f"{name}#{'R' if identifier & REMOTE else data[:length].hex().upper()}"

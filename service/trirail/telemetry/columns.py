@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 SECOND = 1_000_000_000  # [ns]
+RECORD, FIELDS = "/record", rr.ComponentDescriptor("fields")
+"""Where every cycle's record stands in a recording, whole: entity path and component."""
 
 
 class Column(NamedTuple):

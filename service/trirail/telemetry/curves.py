@@ -11,7 +11,7 @@ from trirail.config import Range
 from trirail.kinematics.geometry import LEGS
 from trirail.telemetry import palette
 from trirail.telemetry.palette import Colour
-from trirail.telemetry.shown_robot import Subject
+from trirail.telemetry.shown_robot import ShownRobot
 
 POSITION, VELOCITY, ACCELERATION = "/sliders/position", "/sliders/velocity", "/sliders/acceleration"
 ERROR = "/sliders/following_error"
@@ -22,7 +22,7 @@ NEAR = 0.1
 """The limits of the following error are drawn where it reaches this share of them: else they would flatten it."""
 
 
-class Line(NamedTuple):
+class Curve(NamedTuple):
     """A line that moves."""
 
     name: str
@@ -40,26 +40,26 @@ class Limit(NamedTuple):
 class Lines(NamedTuple):
     """The lines of one plot."""
 
-    moving: tuple[Line, ...]
+    moving: tuple[Curve, ...]
     still: tuple[Limit, ...] = ()
     near: float = 0.0
     """Limits are drawn only where a value reaches this share of one."""
 
 
-def plots(subject: Subject) -> dict[str, Lines]:
+def plots(robot: ShownRobot) -> dict[str, Lines]:
     """Return what is plotted, by entity, in the units of the curves."""
-    slider, platform = subject.limits.slider, subject.limits.platform
+    slider, platform = robot.limits.slider, robot.limits.platform
     error = slider.following_error * 1e6
-    margin = float(np.degrees(subject.limits.singularity_margin))
+    margin = float(np.degrees(robot.limits.singularity_margin))
     return {
         POSITION: _sliders(*(limit * 1e3 for limit in slider.position)),
         VELOCITY: _sliders(-slider.velocity * 1e3, slider.velocity * 1e3),
         ACCELERATION: _sliders(-slider.acceleration, slider.acceleration),
         ERROR: _sliders(-error, error)._replace(near=NEAR),
-        CENTRE: Lines((Line("x", palette.X), Line("y", palette.Y)), _window(platform.x, platform.y)),
-        PHI: Lines((Line("φ", palette.PHI),)),
-        SINGULARITY: Lines((Line("distance", palette.SINGULARITY),), (Limit("margin", margin),)),
-        TIMING: timing(subject.rate_hz, float("nan")),
+        CENTRE: Lines((Curve("x", palette.X), Curve("y", palette.Y)), _window(platform.x, platform.y)),
+        PHI: Lines((Curve("φ", palette.PHI),)),
+        SINGULARITY: Lines((Curve("distance", palette.SINGULARITY),), (Limit("margin", margin),)),
+        TIMING: timing(robot.rate_hz, float("nan")),
     }
 
 
@@ -67,7 +67,7 @@ def timing(rate_hz: int, bus_load: float) -> Lines:
     """Return the lines of the loop's timing; the bus is shown as the time that its frames take, as a share of 1."""
     period = 1e6 / rate_hz
     return Lines(
-        (Line("cycle", palette.CYCLE), Line("lateness", palette.LATENESS)),
+        (Curve("cycle", palette.CYCLE), Curve("lateness", palette.LATENESS)),
         (Limit(f"bus {bus_load:.0%}", bus_load * period, palette.BUS), Limit("period", period, palette.BUDGET)),
     )
 
@@ -118,5 +118,5 @@ def _window(x: Range, y: Range) -> tuple[Limit, ...]:
 
 
 def _sliders(low: float, high: float) -> Lines:
-    lines = tuple(Line(leg, colour) for leg, colour in zip(LEGS, palette.SLIDERS, strict=True))
+    lines = tuple(Curve(leg, colour) for leg, colour in zip(LEGS, palette.SLIDERS, strict=True))
     return Lines(lines, (Limit("min", low), Limit("max", high)))

@@ -44,6 +44,18 @@ MODES: dict[Mode, Colour] = {
 """Every mode's colour: in the live view as it is, on paper in its pale shade, in terminals as rich's style."""
 
 
+OUTCOMES: dict[str, Colour] = {
+    "done": (47, 150, 84),
+    "rejected": (224, 161, 0),
+    "expired": (224, 161, 0),
+    "preempted": (140, 107, 177),
+    "stopped": (140, 107, 177),
+    "faulted": (200, 56, 56),
+    "unknown": (123, 135, 148),
+}
+"""How goals end: the colour of each outcome, on paper and in terminals; unknown is one that was not recorded."""
+
+
 def pale(colour: Colour) -> Colour:
     """Return the colour as it fills areas on white: halfway to it."""
     red, green, blue = colour[:3]

@@ -11,12 +11,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 import msgspec
+import trirail_drivers
 
 from trirail.config import Config, parse
 
 CONFIGURATION, SOFTWARE = "/configuration", "/software"
 LIBRARIES = ("eclipse-zenoh", "ruckig", "rerun-sdk", "python-can", "canopen", "numpy", "numba")
-_HERE = Path(__file__).parents[1]
+_PACKAGES = (Path(__file__).parents[1], Path(trirail_drivers.__path__[0]))
 
 
 class Software(msgspec.Struct, frozen=True):
@@ -56,9 +57,11 @@ def configuration(found: Mapping[str, str]) -> Config | None:
 
 
 def recorded_by(found: Mapping[str, str]) -> Software | None:
-    """Return the software among a recording's texts, None where there is none."""
-    text = found.get(SOFTWARE)
-    return msgspec.json.decode(text, type=Software) if text is not None else None
+    """Return the software among a recording's texts, None where there is none, or it is written as no version here."""
+    try:
+        return msgspec.json.decode(found.get(SOFTWARE, ""), type=Software)
+    except msgspec.DecodeError:
+        return None
 
 
 def toml(config: Config) -> str:
@@ -87,10 +90,15 @@ def _value(value: object) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
+def sources() -> Iterator[Path]:
+    """Yield the source files of both packages, in order."""
+    for package in _PACKAGES:
+        yield from sorted(package.rglob("*.py"))
+
+
 def _fingerprint() -> str:
-    """Return a digest of the source of both packages, in its order."""
     digest = hashlib.sha256()
-    for package in (_HERE, _HERE.parent / "drivers"):
-        for path in sorted(package.rglob("*.py")):
-            digest.update(path.relative_to(package.parent).as_posix().encode() + b"\0" + path.read_bytes())
+    for path in sources():
+        package = next(package for package in _PACKAGES if path.is_relative_to(package))
+        digest.update(path.relative_to(package.parent).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:12]

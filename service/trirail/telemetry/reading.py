@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -28,10 +28,10 @@ from rerun.error_utils import RerunWarning
 from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
-from trirail.errors import ServiceError
-from trirail.telemetry.columns import SECOND, structs
+from trirail.errors import EmptyRecordingError, ServiceError
+from trirail.telemetry.columns import FIELDS, RECORD, SECOND, structs
 from trirail.telemetry.journal import EVENTS, JSON, REQUESTS
-from trirail.telemetry.scene import FIELDS
+from trirail.telemetry.provenance import SOFTWARE
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE
@@ -47,7 +47,8 @@ _END = 0
 
 _TEXT, _LEVEL = rr.TextLog.descriptor_text().component, rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
-_KEPT = ("/record", EVENTS, REQUESTS)
+_KEPT = (RECORD, EVENTS, REQUESTS)
+T = TypeVar("T", bound=msgspec.Struct)
 _LAYOUT = structs(np.zeros(1, DTYPE)).type.value_type
 """The records' fields, as they are in a file."""
 
@@ -89,7 +90,8 @@ def read(path: Path) -> Recording:
 
     Rerun's own format (.rrd); the file is not changed. Fields, units and frames of the records are those of
     trirail.wire.records.FIELDS: SI units and radians, sliders in the order A, B, C, poses in the base frame.
-    Raises ServiceError if the file cannot be read, is not a recording, holds no records, or is of another version.
+    Raises ServiceError if the file cannot be read, is not a recording, or is of another version, and of its kinds
+    EmptyRecordingError if it holds no records.
     """
     size = path.stat().st_size if path.is_file() else 0
     try:
@@ -100,14 +102,18 @@ def read(path: Path) -> Recording:
             raise
         with _whole(path, growing=True) as whole:  # it was being written while Rerun read it
             chunks = _chunks(whole, path)
-    records, t, wall = _records([chunk for chunk in chunks if chunk.entity_path == "/record"], path)
+    texts = _static(chunks, _DOCUMENT)
+    kept = [chunk for chunk in chunks if chunk.entity_path == RECORD]
+    if SOFTWARE in texts and not kept:
+        raise EmptyRecordingError(f"{path}: nothing was recorded: its service ended before the first cycle reached it")
+    records, t, wall = _records(kept, path)
     return Recording(
         name=next(iter(_static(chunks, "RecordingInfo:name").values()), ""),
         records=records,
         t=t,
         wall=wall,
-        events=_events([chunk for chunk in chunks if chunk.entity_path == EVENTS]),
-        texts=_static(chunks, _DOCUMENT),
+        events=_events([chunk for chunk in chunks if chunk.entity_path == EVENTS], path),
+        texts=texts,
         requests=_requests([chunk for chunk in chunks if chunk.entity_path == REQUESTS], path),
     )
 
@@ -187,7 +193,7 @@ def _chunks(whole: Path, path: Path) -> list[Chunk]:
 def _records(chunks: list[Chunk], path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], NDArray[np.datetime64]]:
     batches = [chunk.to_record_batch() for chunk in chunks]
     if not any(batch.num_rows for batch in batches):
-        raise ServiceError(f"{path}: holds no records of cycles (entity /record): was it made by trirail?")
+        raise ServiceError(f"{path}: holds no records of cycles (entity {RECORD}): was it made by trirail?")
     rows = pa.concat_arrays([batch.column(FIELDS.component).flatten() for batch in batches])
     if odd := set(rows.type) ^ set(_LAYOUT):
         names = ", ".join(sorted({field.name for field in odd}))
@@ -203,25 +209,29 @@ def _records(chunks: list[Chunk], path: Path) -> tuple[NDArray[np.void], NDArray
     return records[order], t[order], wall[order]
 
 
-def _events(chunks: list[Chunk]) -> list[Line]:
+def _events(chunks: list[Chunk], path: Path) -> list[Line]:
     lines: list[Line] = []
     for batch in (chunk.to_record_batch() for chunk in chunks):
         t = batch.column("t").to_numpy().astype(np.int64) / SECOND
         wall = batch.column("wall").to_numpy()
         levels, texts = (batch.column(name).flatten().to_pylist() for name in (_LEVEL, _TEXT))
         spoken = batch.column(JSON.component).to_pylist() if JSON.component in batch.schema.names else [None] * len(t)
-        events = [msgspec.json.decode(content[0], type=Event) if content else None for content in spoken]
+        events = [_decoded(content[0], Event, path, "events") if content else None for content in spoken]
         lines += map(Line, t.tolist(), wall, levels, texts, events)
     return sorted(lines, key=lambda line: line.t)
 
 
 def _requests(chunks: list[Chunk], path: Path) -> tuple[ControlInput, ...]:
     rows = [text for chunk in chunks for text in chunk.to_record_batch().column(JSON.component).flatten().to_pylist()]
-    try:
-        found = [msgspec.json.decode(row, type=ControlInput) for row in rows]
-    except msgspec.DecodeError as error:
-        raise ServiceError(f"{path}: written by another version: its requests cannot be read: {error}") from error
+    found = (_decoded(row, ControlInput, path, "requests") for row in rows)
     return tuple(sorted(found, key=lambda given: given.seq))
+
+
+def _decoded(row: str, kind: type[T], path: Path, what: str) -> T:
+    try:
+        return msgspec.json.decode(row, type=kind)
+    except msgspec.DecodeError as error:
+        raise ServiceError(f"{path}: written by another version: its {what} cannot be read: {error}") from error
 
 
 def _static(chunks: list[Chunk], component: str) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from datetime import datetime
@@ -10,15 +11,16 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from trirail_drivers import files
 
 from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.telemetry import provenance, retention
 from trirail.telemetry.candump import CandumpLog
-from trirail.telemetry.rotation import Volumes, claim
-from trirail.telemetry.shown_robot import Subject
+from trirail.telemetry.rotation import RotatedFiles, claim
+from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
-from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Show
+from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import LAYOUT, last_cycle
@@ -42,7 +44,7 @@ class Recorder:
     box, given its `name` and not a path, is one file, which takes what room there is.
 
     `warn` is told what is missing; else that stands in the log alone. Raises ServiceError if the file cannot be
-    written or the live port is taken.
+    written or the live port is taken, FileError if `path` is no regular file.
     """
 
     def __init__(
@@ -74,18 +76,18 @@ class Recorder:
                 f"cannot write a recording to {path or directory}: {error.strerror}; "
                 "telemetry.directory must be a folder that can be written"
             ) from error
-        self._show = show = Show(Subject.configured(config), session, started_ns - monotonic_ns())
-        self._warn = warn or (lambda words: show.say("warning", words))
+        self._streams = streams = Streams(ShownRobot.configured(config), session, started_ns - monotonic_ns())
+        self._warn = warn or (lambda words: streams.say("warning", words))
         reserve = 0 if self._is_black_box else RESERVE
-        self._volumes = Volumes(first, self._open, show.drop, reserve, lambda: monotonic_ns() * 1e-9)
+        self._files = RotatedFiles(first, self._open, streams.drop, reserve, lambda: monotonic_ns() * 1e-9)
         self._records = Batches(config.loop.rate_hz // RECORDS_HZ, self._record)
-        show.attach(self._volumes, DRAWING_HZ)
+        streams.attach(self._files, DRAWING_HZ)
         self._live: Relay | None = None
         self.live_url = ""
         """Where viewers connect; empty without a live view."""
         if server:
-            self._live = live_relay(show.open(server))
-            show.attach(self._live, LIVE_HZ)
+            self._live = live_relay(streams.open(server))
+            streams.attach(self._live, LIVE_HZ)
             self.live_url = server.uri
         self._last: int | None = None
         self._absent = 0
@@ -98,18 +100,18 @@ class Recorder:
     @property
     def path(self) -> Path:
         """The newest file of the recording."""
-        return self._volumes.path
+        return self._files.path
 
     @property
     def lost(self) -> int:
         """Batches of records, events or frames that the disk did not take."""
-        return self._volumes.lost + (self._frames.failures if self._frames else 0)
+        return self._files.lost + (self._frames.failures if self._frames else 0)
 
     @property
     def cause(self) -> str:
         """Why the disk did not take the newest of them; empty if none is lost."""
         frames = "the log of CAN frames takes no more" if self._frames and self._frames.failures else ""
-        return self._volumes.cause or frames
+        return self._files.cause or frames
 
     @property
     def skipped(self) -> int:
@@ -126,28 +128,28 @@ class Recorder:
             self._next_look = last + self._config.loop.rate_hz // LOOKS_HZ
             self._look_after()
         self._records.add(batch)
-        self._show.records(batch)
+        self._streams.records(batch)
 
     def save(self) -> None:
         """Write all records that have been taken, and what was said: they outlive this process."""
         self._records.flush()
-        self._show.save()
+        self._streams.save()
 
     def event(self, event: Event) -> None:
         """Take an event."""
-        self._show.event(event)
+        self._streams.event(event)
 
     def given(self, what: ControlInput) -> None:
         """Take what the control was given."""
-        self._show.given(what)
+        self._streams.given(what)
 
     def target(self, pose: Sequence[float] | None) -> None:
         """Take the pose that the goal leads to; None for no goal."""
-        self._show.target(pose)
+        self._streams.target(pose)
 
     def bus_load(self, share: float) -> None:
         """Take the load of the bus, 1 for a full one."""
-        self._show.bus_load(share)
+        self._streams.bus_load(share)
 
     def frames(self, batch: bytes) -> None:
         """Take captured CAN frames, packed as trirail_drivers.capture.FRAME."""
@@ -158,9 +160,9 @@ class Recorder:
         """Write what is left and complete the file; waits a few seconds at most for a stuck disk or viewer."""
         self._flush()
         if words := self._missing():
-            self._show.say("warning", words)
-            self._show.save()
-        self._volumes.close()
+            self._streams.say("warning", words)
+            self._streams.save()
+        self._files.close()
         if self._frames:
             self._frames.close()
         if self._live:
@@ -168,26 +170,26 @@ class Recorder:
 
     def _open(self, path: Path) -> rr.RecordingStream:
         """Begin a file: with all in it that it takes to be looked at by itself."""
-        stream = self._show.open(rr.FileSink(path))
+        stream = self._streams.open(rr.FileSink(path))
         for entity, text in provenance.texts(self._config).items():
             stream.log(entity, rr.TextDocument(text), static=True)
-        self._show.begin_anew()
+        self._streams.begin_anew()
         return stream
 
     def _record(self, records: NDArray[np.void]) -> None:
-        self._volumes.send(self._show.scene.complete(records))
+        self._files.send(self._streams.scene.complete(records))
 
     def _flush(self) -> None:
         self._records.flush()
-        self._show.flush()
+        self._streams.flush()
 
     def _look_after(self) -> None:
         """Rotate the file, tidy the folder and say what is missing, where it is time to."""
-        t = self._show.t
+        t = self._streams.t
         if not self._is_black_box:
             self._rotate()
         if self._live:  # where nobody watches, it shares the file's drawings
-            self._show.attach(self._live, LIVE_HZ if is_watched(self._config.telemetry.live_port) else DRAWING_HZ)
+            self._streams.attach(self._live, LIVE_HZ if is_watched(self._config.telemetry.live_port) else DRAWING_HZ)
         if self._own_folder is not None and t >= self._next_tidy:
             self._next_tidy = t + TIDY_EVERY
             self._tidy(self._own_folder, self._config.telemetry.keep_mb * MB)
@@ -197,7 +199,7 @@ class Recorder:
 
     def _rotate(self) -> None:
         """Go on in another file where it is time to; not where the disk is full, for that has no room for it."""
-        telemetry, volumes = self._config.telemetry, self._volumes
+        telemetry, volumes = self._config.telemetry, self._files
         full = volumes.age >= telemetry.rotate_minutes * 60.0 or volumes.size >= telemetry.rotate_mb * MB
         if full and not volumes.trouble:
             self._flush()
@@ -226,7 +228,9 @@ class Recorder:
 
 
 def _overwrite(path: Path) -> Path:
-    """Create an empty file, or empty it."""
+    """Create an empty file, or empty it. Raises FileError for what is no file: a FIFO would wait for a reader."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileNotFoundError):
+        files.check(path)
     path.open("wb").close()
     return path

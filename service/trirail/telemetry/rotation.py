@@ -21,7 +21,7 @@ Open = Callable[[Path], rr.RecordingStream]
 Close = Callable[[rr.RecordingStream], None]
 
 
-class Volumes:
+class RotatedFiles:
     """Takes batches into the newest file; `turn` begins another one, and so does a file that fails."""
 
     def __init__(self, path: Path, begin: Open, end: Close, reserve: int, clock: Callable[[], float]) -> None:

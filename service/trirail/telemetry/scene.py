@@ -16,18 +16,17 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from trirail.telemetry import columns, curves, drawing, palette
-from trirail.telemetry.columns import Column
-from trirail.telemetry.shown_robot import Subject
+from trirail.telemetry.columns import FIELDS, RECORD, Column
+from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.vocabulary import MODES
 from trirail.workspace.mechanism import Mechanism
-from trirail.workspace.reach import Outlook
+from trirail.workspace.reach import Reach
 
 DRAWN_HZ = 100
 """Samples a second of what is drawn."""
 OUTLINES_HZ = 10
 """Outlines of the workspace a second, at most."""
 
-FIELDS = rr.ComponentDescriptor("fields")
 SCALARS = rr.Scalars.descriptor_scalars()
 STATE = rr.StateChange.descriptor_state()
 
@@ -35,13 +34,13 @@ STATE = rr.StateChange.descriptor_state()
 class Scene:
     """A robot as Rerun is to show it. `wall_offset_ns` is the wall clock less the monotonic one."""
 
-    def __init__(self, subject: Subject, wall_offset_ns: int) -> None:
-        self._rate_hz = subject.rate_hz
+    def __init__(self, robot: ShownRobot, wall_offset_ns: int) -> None:
+        self._rate_hz = robot.rate_hz
         self._timelines = columns.Timelines(self._rate_hz, wall_offset_ns)
-        self._geometry = subject.geometry
-        self._parts = Mechanism.of(subject.geometry, subject.limits.slider)
-        self._outlook = Outlook(subject.geometry, subject.limits)
-        self._plots = curves.plots(subject)
+        self._geometry = robot.geometry
+        self._parts = Mechanism.of(robot.geometry, robot.limits.slider)
+        self._reach = Reach(robot.geometry, robot.limits)
+        self._plots = curves.plots(robot)
         self.bounds = self._parts.bounds
         """Where the robot lies, (2, 2): lowest and highest x and y [m]."""
 
@@ -66,14 +65,14 @@ class Scene:
 
     def complete(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return records as they are."""
-        return columns.chunks(self._timelines.of(records), [Column("/record", FIELDS, columns.structs(records))])
+        return columns.chunks(self._timelines.of(records), [Column(RECORD, FIELDS, columns.structs(records))])
 
     def drawn(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return records as people see them: one at least, in order."""
         starts, ends = _groups(records["cycle"], self._rate_hz // DRAWN_HZ)
         newest = records[ends]
         parts = drawing.moving(self._geometry, self._parts, records[starts], newest)
-        distance = self._outlook.distance(newest["pose"])
+        distance = self._reach.distance(newest["pose"])
         for path, values in curves.values(records, newest, starts, distance).items():
             table = curves.with_limits(values, self._plots[path])
             parts.append(Column(path, SCALARS, columns.scalars(table)))
@@ -88,11 +87,11 @@ class Scene:
         """Return mode and outline of the workspace at the first record, where the mode changes, and as φ changes."""
         changed = np.diff(records["mode"], prepend=len(MODES)) != 0
         some = np.arange(0, len(records), max(1, self._rate_hz // OUTLINES_HZ))
-        steps = self._outlook.steps(records["pose"][some, 2])
+        steps = self._reach.steps(records["pose"][some, 2])
         changed[some] |= np.diff(steps, prepend=steps[0]) != 0
         at = records[changed]
         modes = pa.array([[MODES[mode]] for mode in at["mode"]])
-        outlines = columns.ragged([[self._outlook.outline(step)] for step in self._outlook.steps(at["pose"][:, 2])])
+        outlines = columns.ragged([[self._reach.outline(step)] for step in self._reach.steps(at["pose"][:, 2])])
         parts = [Column("/mode", STATE, modes), Column("/robot/workspace", drawing.STRIPS, outlines)]
         return columns.chunks(self._timelines.of(at), parts)
 

@@ -9,11 +9,11 @@ import msgspec
 from trirail import config
 from trirail.config import Config, Limits
 from trirail.kinematics.geometry import Geometry, Leg
-from trirail.wire.messages import Info
+from trirail.wire.state import Info
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
+class ShownRobot:
     """The robot that is shown."""
 
     name: str
@@ -22,12 +22,12 @@ class Subject:
     rate_hz: int
 
     @classmethod
-    def configured(cls, settings: Config) -> Subject:
+    def configured(cls, settings: Config) -> ShownRobot:
         """Take it from a configuration."""
         return cls(settings.robot.name, config.geometry(settings.geometry), settings.limits, settings.loop.rate_hz)
 
     @classmethod
-    def told(cls, info: Info) -> Subject:
+    def told(cls, info: Info) -> ShownRobot:
         """Take it from a service's answer. msgspec.ValidationError where that is of another version."""
         first, second, third = (msgspec.convert(_leg(leg), Leg) for leg in info.geometry)
         limits = msgspec.convert(info.limits, Limits)

@@ -16,7 +16,7 @@ from trirail.telemetry import blueprint, journal
 from trirail.telemetry.columns import SECOND
 from trirail.telemetry.journal import EVENTS, Entry
 from trirail.telemetry.scene import Scene
-from trirail.telemetry.shown_robot import Subject
+from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.messages import Event, Level
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE, unpack
@@ -35,15 +35,15 @@ class Sink(Protocol):
         """Take a batch; never waits for long."""
 
 
-class Show:
+class Streams:
     """One recording, with its drawing and its layout, and the sinks that it goes to."""
 
-    def __init__(self, subject: Subject, name: str, wall_offset_ns: int) -> None:
-        self.scene = Scene(subject, wall_offset_ns)
+    def __init__(self, robot: ShownRobot, name: str, wall_offset_ns: int) -> None:
+        self.scene = Scene(robot, wall_offset_ns)
         self._name = name
-        self._rate_hz = subject.rate_hz
+        self._rate_hz = robot.rate_hz
         self._wall_offset_ns = wall_offset_ns
-        self._layout = blueprint.layout(subject, self.scene.bounds)
+        self._layout = blueprint.layout(robot, self.scene.bounds)
         self._recording = str(uuid.uuid4())
         self._streams: list[rr.RecordingStream] = []
         self._waiting: list[Chunk] = []
@@ -149,8 +149,8 @@ class Show:
 class Shortfall:
     """Says in the log what is missing, when that is more than was last said, and not too often."""
 
-    def __init__(self, show: Show, words: str, counts: Callable[[], tuple[int, ...]]) -> None:
-        self._show = show
+    def __init__(self, streams: Streams, words: str, counts: Callable[[], tuple[int, ...]]) -> None:
+        self._streams = streams
         self._words = words
         self._counts = counts
         self._said = counts()
@@ -158,15 +158,15 @@ class Shortfall:
 
     def check(self) -> None:
         """Say it if it is time to."""
-        if self._show.t >= self._next:
+        if self._streams.t >= self._next:
             self.say()
 
     def say(self) -> None:
         """Say it now."""
         missing = self._counts()
         if missing != self._said:
-            self._said, self._next = missing, self._show.t + REPORT_EVERY
-            self._show.say("warning", self._words.format(*missing))
+            self._said, self._next = missing, self._streams.t + REPORT_EVERY
+            self._streams.say("warning", self._words.format(*missing))
 
 
 class Batches:

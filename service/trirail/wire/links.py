@@ -23,7 +23,7 @@ class TooLarge(Exception):
     """A packet that the other side would get cut."""
 
 
-class Link:
+class PacketLink:
     """One side of a connection; neither sending nor receiving ever waits."""
 
     def __init__(self, connected: socket.socket) -> None:
@@ -69,7 +69,7 @@ class Link:
         self._socket.close()
 
 
-def connect(path: Path) -> Link:
+def connect(path: Path) -> PacketLink:
     """Connect to a port of the loop. Raises OSError where nobody listens."""
     connecting = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
@@ -77,7 +77,7 @@ def connect(path: Path) -> Link:
     except OSError:
         connecting.close()
         raise
-    return Link(connecting)
+    return PacketLink(connecting)
 
 
 def listen(path: Path) -> socket.socket:
@@ -94,7 +94,7 @@ class Port:
     def __init__(self, listening: socket.socket) -> None:
         self._listening = listening
         self._listening.setblocking(False)
-        self._link: Link | None = None
+        self._link: PacketLink | None = None
         self._lost = False
         self.dropped = 0
         """Packets that the peer was too slow for, or that are too large."""
@@ -112,7 +112,7 @@ class Port:
             connected, _ = self._listening.accept()
         except BlockingIOError:
             return False
-        self._link = Link(connected)
+        self._link = PacketLink(connected)
         return True
 
     def send(self, packet: bytes | bytearray | memoryview) -> bool:

@@ -1,4 +1,8 @@
-"""What goes over Zenoh: goals, replies, state, events. JSON by default; SI units and radians."""
+"""What clients and service say to each other over Zenoh: goals, commands, replies, events. SI units and radians.
+
+The state, and what is answered on …/info, are in trirail.wire.state. JSON by default, msgpack where the encoding
+says so.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,7 @@ import itertools
 import math
 from typing import Annotated, Any, Literal
 
-import msgspec
 from msgspec import Meta, Struct
-from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode
 from trirail.wire.sizes import MAX_NAME, MAX_POINTS
@@ -39,8 +41,11 @@ class OwnLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """A goal's own limits for x, y [m] and phi [rad], in place of the platform's; none may be above them."""
 
     velocity: OwnTriple | None = None
+    """[m/s, m/s, rad/s]."""
     acceleration: OwnTriple | None = None
+    """[m/s², m/s², rad/s²]."""
     jerk: OwnTriple | None = None
+    """[m/s³, m/s³, rad/s³]."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -50,14 +55,19 @@ class PoseGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
     """Move the platform to a pose, straight in pose space where the start allows."""
 
     x: Coordinate
+    """Of the platform's centre, in the base frame [m]."""
     y: Coordinate
+    """Likewise [m]."""
     phi: Coordinate
+    """The platform's angle in the base frame, counterclockwise [rad]."""
     id: Identifier | None = None
+    """A new one for every goal; the service makes one where there is none."""
     speed: Speed = 1.0
     """Fraction of full speed: 0.5 takes twice as long over the same path."""
     valid_for: Validity | None = None
     """The goal expires unless it starts within so many seconds."""
     limits: OwnLimits | None = None
+    """Lower ones than the platform's, for this goal alone."""
     blend: Annotated[float, Meta(ge=0.0, le=1e3)] | None = None
     """The next pose goal waits for this one, and begins when no point of the platform is farther than that from where
     it is to be [m]; without it, the next goal preempts this one."""
@@ -70,9 +80,13 @@ class SlidersGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="ki
     """Move the sliders to positions, straight in slider space where the start allows."""
 
     position: Coordinates
+    """lambda_10 of the sliders A, B, C [m]."""
     id: Identifier | None = None
+    """As of a pose goal."""
     speed: Speed = 1.0
+    """As of a pose goal."""
     valid_for: Validity | None = None
+    """As of a pose goal [s]."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -82,11 +96,17 @@ class VelocityGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="k
     """Jog: move at a velocity [m/s, rad/s] until `timeout` passes without a fresh one of the same id."""
 
     x: Coordinate
+    """Velocity of the platform's centre along x of the base frame [m/s]."""
     y: Coordinate
+    """Along y [m/s]."""
     phi: Coordinate
+    """Rate of the platform's angle, counterclockwise [rad/s]."""
     id: Identifier | None = None
+    """The same for every renewal of one jog."""
     timeout: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.1
+    """Real time, at every override, after which a jog that is not renewed brakes [s]."""
     valid_for: Validity | None = None
+    """As of a pose goal [s]."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -96,11 +116,17 @@ class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
     """Where the platform is at a time [s]: x, y [m], phi [rad]; how fast and how accelerated, where given."""
 
     t: Moment
+    """[s]; only differences between points count."""
     x: Coordinate
+    """Of the platform's centre, in the base frame [m]."""
     y: Coordinate
+    """Likewise [m]."""
     phi: Coordinate
+    """The platform's angle in the base frame, counterclockwise [rad]."""
     velocity: Coordinates | None = None
+    """Of x, y and phi [m/s, m/s, rad/s]; where it is not given, that between the neighbours, zero at both ends."""
     acceleration: tuple[Acceleration, Acceleration, Acceleration] | None = None
+    """Of x, y and phi [m/s², m/s², rad/s²]; where it is not given, as the velocity."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -110,10 +136,13 @@ class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
     """Follow timed points, quintic between them, from where the robot stands."""
 
     points: Annotated[tuple[TrajectoryPoint, ...], Meta(min_length=2, max_length=MAX_POINTS)]
+    """By rising time; the first is where the robot stands, the last at rest."""
     id: Identifier | None = None
+    """As of a pose goal."""
     stretch: bool = False
     """Slow a trajectory that is too fast for a slider or the platform, instead of refusing it."""
     valid_for: Validity | None = None
+    """As of a pose goal [s]."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -131,6 +160,7 @@ class Override(Struct, frozen=True, forbid_unknown_fields=True):
     """The content of the command override: the share of full speed at which motions run."""
 
     percent: Annotated[float, Meta(ge=0.0, le=200.0)]
+    """0, at which motions stand, or 1 to 200 % of full speed, within the limits."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -142,6 +172,7 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
     """The content, if any, of the command stop: which goal is to be stopped, wherever it is, and no other."""
 
     goal: Identifier | None = None
+    """Its id; none for the robot as a whole."""
 
 
 class NoContent(Struct, frozen=True, forbid_unknown_fields=True):
@@ -167,6 +198,7 @@ class GoalReply(Struct, frozen=True):
     """A goal was accepted; it ends in exactly one event."""
 
     id: str
+    """The goal's own, or the one that was made for it."""
     duration: float | None
     """Expected time from now to arrival [s]; None while the override is zero: then it has no expected end."""
     slowed: float = 1.0
@@ -182,7 +214,9 @@ class CommandReply(Struct, frozen=True):
     """A command was carried out."""
 
     command: str
+    """Its name."""
     mode: str
+    """A trirail.wire.vocabulary.Mode: the robot's, when it had been carried out."""
     ok: Literal[True] = True
 
 
@@ -192,22 +226,30 @@ class ErrorReply(Struct, frozen=True, omit_defaults=True):
     code: RefusalCode
     """Why, for programs; a client takes a code that it does not know for "other"."""
     message: str
+    """Why, for people: one line that says what would be right."""
     slider: str | None = None
+    """A, B or C, where it is about one."""
     value: float | None = None
+    """What was asked, in SI units, where a limit forbids it."""
     limit: float | None = None
+    """What is allowed, in SI units."""
 
 
 class Event(Struct, frozen=True, omit_defaults=True):
     """Something that happened, in order, numbered without gaps by the loop."""
 
     seq: int
+    """Numbered from 1 since the service's start."""
     t: float
     """Nominal time since the loop's start [s]; the same as in records."""
     cycle: int
+    """Its cycle, as in records."""
     time: float
     """Wall clock [s since 1970]."""
     kind: Literal["goal", "mode", "fault", "refused", "service"]
+    """What it is about: the end of a goal, a new mode, a fault, something refused, the service itself."""
     level: Level
+    """How much it matters to people."""
     message: str
     """One line for people."""
     mode: str | None = None
@@ -222,123 +264,3 @@ class Event(Struct, frozen=True, omit_defaults=True):
     """The id of the goal that set the robot in motion, with kind mode."""
     user: str | None = None
     """Who sent the goal, or what was refused."""
-
-
-class Commanded(Struct, frozen=True):
-    """What the robot was told: platform, then sliders."""
-
-    pose: Triple
-    """x, y [m] of the platform's centre and its angle phi [rad], in the base frame."""
-    pose_velocity: Triple
-    """[m/s, m/s, rad/s]."""
-    pose_acceleration: Triple
-    """[m/s², m/s², rad/s²]."""
-    position: Triple
-    """lambda_10 of the sliders A, B, C [m]."""
-    velocity: Triple
-    """[m/s]."""
-    acceleration: Triple
-    """[m/s²]."""
-
-
-class Traffic(Struct, frozen=True):
-    """What of a drive's cyclic frames went wrong since the service started; none of it is a fault by itself."""
-
-    feedback_late: int
-    feedback_lost: int
-    setpoints_late: int
-    setpoints_lost: int
-
-
-class Sliders(Struct, frozen=True):
-    """What the drives say, of A, B, C."""
-
-    position: Triple
-    """[m]."""
-    velocity: Triple
-    """[m/s]."""
-    following_error: Triple
-    """Setpoint less measured position [m]."""
-    following_error_max: Triple
-    """Greatest since the service started, while enabled [m]."""
-    status: tuple[str, str, str]
-    """The power state of each, by its name in CiA 402."""
-    traffic: tuple[Traffic, Traffic, Traffic]
-
-
-class GoalState(Struct, frozen=True):
-    """The goal under way."""
-
-    id: str
-    progress: float
-    """Share of its time that is over, 0 to 1."""
-    remaining: float
-    """Time to its end [s]."""
-    target: Triple | None = None
-    """The pose that it leads to; None for a jog."""
-
-
-class Percentiles(Struct, frozen=True):
-    """Over the service's last 60 s [µs]."""
-
-    p50: float
-    p99: float
-    p999: float
-    max: float
-
-
-class LoopState(Struct, frozen=True):
-    """How well the loop keeps its time."""
-
-    rate_hz: int
-    cycles: int
-    overruns: int
-    lateness_us: Percentiles
-    cycle_us: Percentiles
-    bus_load: float
-    """Worst-case share of the bus that the cycle takes, as computed at the start."""
-    bus_load_measured: float
-    """Share of the bus that was in use in the last second, frames counted with worst-case stuffing."""
-    lacking: tuple[str, ...]
-    """What the loop runs without: real-time rights and the like, each with its remedy."""
-
-
-class State(Struct, frozen=True):
-    """The newest state, published at state_hz."""
-
-    seq: int
-    """The cycle of its record."""
-    t: float
-    """Nominal time since the loop's start [s]; the same as in records and events."""
-    mode: str
-    """A trirail.wire.vocabulary.Mode."""
-    pose: Triple
-    """Measured: x, y [m] and phi [rad] in the base frame, by the forward kinematics of the measured sliders."""
-    velocity: Triple
-    """Measured, as a difference over a batch of records [m/s, m/s, rad/s]."""
-    acceleration: Triple
-    """Measured, as a difference over a batch of records [m/s², m/s², rad/s²]."""
-    commanded: Commanded
-    sliders: Sliders
-    goal: GoalState | None
-    override: float
-    """The share of full speed at which motions are to run, 0 to 2."""
-    faults: tuple[str, ...]
-    """Why the robot is in fault, one line each; empty otherwise."""
-    loop: LoopState
-
-
-class Info(Struct, frozen=True):
-    """What a client needs to know the robot: answered on …/info."""
-
-    robot: str
-    version: str
-    geometry: tuple[dict[str, object], ...]
-    limits: object
-    rate_hz: int
-    state_hz: int
-    recordings: str
-    """The folder of the service's recordings, on its machine."""
-    live: str
-    """Where a Rerun viewer on the service's machine finds the live view; "" for nowhere."""
-    versions: dict[str, str] = msgspec.field(default_factory=dict)

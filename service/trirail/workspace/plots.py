@@ -20,7 +20,7 @@ from trirail.kinematics.algebra import Array
 from trirail.kinematics.geometry import Geometry
 from trirail.workspace.mechanism import Mechanism
 from trirail.workspace.singularity import conditioning, range_of_j1
-from trirail.workspace.workspace import Survey, area, permitted, reachable
+from trirail.workspace.workspace import Extent, area, permitted, reachable
 
 __all__ = ["draw"]
 
@@ -34,9 +34,9 @@ MM = 1e3
 
 
 def draw(
-    file: Path, title: str, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Survey, service: Survey
+    file: Path, title: str, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Extent, service: Extent
 ) -> None:
-    """Draw slices at `angles` [rad] and the areas of two surveys: of `reachable` and of `permitted`.
+    """Draw slices at `angles` [rad] and the areas of two extents: of `reachable` and of `permitted`.
 
     The file's suffix chooses the format. ValueError for one that matplotlib does not write, OSError if the
     file cannot be written.
@@ -112,7 +112,7 @@ def _shade(panel: Axes, geometry: Geometry, polygon: Array, phi: float, opacity:
 
 
 def _areas(
-    strip: Axes, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Survey, service: Survey
+    strip: Axes, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Extent, service: Extent
 ) -> None:
     """Draw the area of the slices along phi, with the angles near which every pose is singular."""
     low, high = np.degrees(range_of_j1(geometry))

@@ -24,7 +24,7 @@ PLACE = 2e-3
 _KEPT = 4096
 
 
-class Outlook:
+class Reach:
     """A robot's workspace and singularities."""
 
     def __init__(self, geometry: Geometry, limits: Limits) -> None:

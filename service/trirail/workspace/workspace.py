@@ -22,7 +22,7 @@ from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Violation
 from trirail.workspace.singularity import det_j2_rows, distance_to_singularity, range_of_j1
 
-__all__ = ["Survey", "area", "permitted", "reachable", "survey", "violations"]
+__all__ = ["Extent", "area", "extent", "permitted", "reachable", "violations"]
 
 NOTHING = np.empty((0, 2))
 TOUCHING = 1e-13  # a vertex nearer than this to the edge of a half-plane is on it [m]
@@ -32,7 +32,7 @@ SLICES = 721  # for the integral over phi
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
-class Survey(NamedTuple):
+class Extent(NamedTuple):
     """A workspace over all phi: extents [m, rad], volume [m² rad], greatest slice, and the area along phi."""
 
     x: Range
@@ -110,7 +110,7 @@ def violations(geometry: Geometry, limits: Limits, pose: ArrayLike) -> list[Viol
     return found
 
 
-def survey(geometry: Geometry, limits: Limits, section: Callable[[Geometry, Limits, float], Array]) -> Survey:
+def extent(geometry: Geometry, limits: Limits, section: Callable[[Geometry, Limits, float], Array]) -> Extent:
     """Measure `reachable` or `permitted` over all phi.
 
     Extents and the greatest slice are found to 1e-9; the volume is an integral by the trapezoidal rule, with
@@ -139,7 +139,7 @@ def survey(geometry: Geometry, limits: Limits, section: Callable[[Geometry, Limi
 
     areas = np.array([area(polygon) for polygon in polygons])
     best_phi, best_area = greatest(area)
-    return Survey(
+    return Extent(
         x=(-reach_towards(-1.0, 0.0), reach_towards(1.0, 0.0)),
         y=(-reach_towards(0.0, -1.0), reach_towards(0.0, 1.0)),
         phi=(float(angles[0]), float(angles[-1])),

@@ -1,4 +1,7 @@
-"""The bus and the driver on real SocketCAN: the kernel's virtual bus, and the simulated drives behind it."""
+"""The driver on a bus between processes and on the kernel's virtual one, with the simulated drives behind it.
+
+Frames go both ways that they can: by python-can, and on the bus's own socket.
+"""
 
 from __future__ import annotations
 
@@ -6,23 +9,26 @@ import contextlib
 import os
 import selectors
 import socket
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
 
 import can
+import carriers
 import pytest
+from carriers import NAME, ip, on_vcan
 from trirail_drivers import bus
+from trirail_drivers import wire as wires
 from trirail_drivers.bus import simulated_bus
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Can, Drive, Drives, Simulated
 from trirail_drivers.errors import BusError
-from trirail_drivers.frames import data_frame
+from trirail_drivers.frames import Frame
 from trirail_drivers.interface import Feedback, PowerState
+from trirail_drivers.unixbus import UnixBus
 
-NAME = f"vcan{os.getpid() % 100_000}"
-SECTION = Can(interface="socketcan", channel=NAME, simulated=Simulated(missed_syncs=1000))
+SIMULATED = Simulated(missed_syncs=1000)
+VCAN = Can(interface="socketcan", channel=NAME, simulated=SIMULATED)
 DRIVES = Drives(
     protocol="cia402",
     A=Drive(node=1, counts_per_metre=1e6),
@@ -35,52 +41,35 @@ PERIOD = 0.02
 WITHIN = 60.0
 """How long a slow machine may take for anything [s]."""
 
-
-def lacking() -> str:
-    """Why there can be no virtual CAN bus here, empty where there can."""
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except OSError:
-        return "this kernel has no SocketCAN (modprobe can_raw): make hil runs these in a machine that has"
-    try:
-        ip("link", "add", NAME, "type", "vcan")
-    except (OSError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", None) or str(error)
-        return f"no virtual CAN bus can be made here (root, modprobe vcan): {said.strip()}"
-    ip("link", "delete", NAME)
-    return ""
-
-
-def ip(*arguments: str) -> None:
-    subprocess.run(("ip", *arguments), capture_output=True, text=True, check=True)
-
-
-LACKING = lacking()
-pytestmark = [
-    pytest.mark.vcan,
-    pytest.mark.skipif(bool(LACKING), reason=LACKING),
-    # python-can leaves its socket to the garbage collector where there is no such interface.
-    pytest.mark.filterwarnings(
-        r"ignore:Exception ignored in. <socket\.socket.*family=29:pytest.PytestUnraisableExceptionWarning"
-    ),
-]
+# python-can leaves its socket to the garbage collector where there is no such interface.
+no_such_interface = pytest.mark.filterwarnings(
+    r"ignore:Exception ignored in. <socket\.socket.*family=29:pytest.PytestUnraisableExceptionWarning"
+)
 
 
 @pytest.fixture
 def interface() -> Iterator[str]:
     """A virtual bus that is up."""
-    ip("link", "add", NAME, "type", "vcan")
-    ip("link", "set", NAME, "up")
-    yield NAME
-    ip("link", "delete", NAME)
+    with carriers.vcan() as name:
+        yield name
+
+
+@pytest.fixture(params=["unix", pytest.param("vcan", marks=carriers.NEEDS_VCAN)])
+def section(request: pytest.FixtureRequest) -> Can:
+    """A bus that is there."""
+    if request.param == "vcan":
+        request.getfixturevalue("interface")
+        return VCAN
+    folder = request.getfixturevalue("tmp_path")
+    return Can(interface="unix", channel=str(folder / "can"), simulated=SIMULATED)
 
 
 @pytest.fixture
-def drives(interface: str) -> Iterator[None]:
+def drives(section: Can) -> Iterator[None]:
     """The simulated drives on it."""
     over, running = socket.socketpair()
-    simulated = simulated_bus(SECTION, DRIVES)
-    wire = bus.open_bus(SECTION, DRIVES)
+    simulated = simulated_bus(section, DRIVES)
+    wire = UnixBus(section.channel, listen=True) if section.interface == "unix" else bus.open_bus(section, DRIVES)
 
     def serve() -> None:
         with selectors.DefaultSelector() as selector:
@@ -103,9 +92,13 @@ def drives(interface: str) -> Iterator[None]:
         part.shutdown() if isinstance(part, can.BusABC) else part.close()
 
 
-@pytest.fixture
-def driver(drives: None) -> Iterator[Cia402]:
-    connected = bus.connect(SECTION, DRIVES)
+@pytest.fixture(params=carriers.WAYS)
+def driver(
+    section: Can, drives: None, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Cia402]:
+    """The driver, whose frames go by python-can, and on the bus's own socket."""
+    monkeypatch.setattr(wires, "frame_io", carriers.WAYS[request.param])
+    connected = bus.connect(section, DRIVES)
     assert isinstance(connected, Cia402)
     yield connected
     connected.close()
@@ -132,24 +125,28 @@ def until(driver: Cia402, condition: Callable[[Feedback], bool], position: float
     return feedback
 
 
+@on_vcan
 def test_frames_pass_between_two_sockets(interface: str) -> None:
-    with bus.open_bus(SECTION, DRIVES) as one, bus.open_bus(SECTION, DRIVES) as other:
-        one.send(data_frame(0x123, b"\x01\x02"))
+    with bus.open_bus(VCAN, DRIVES) as one, bus.open_bus(VCAN, DRIVES) as other:
+        one.send(Frame(0x123, b"\x01\x02").message())
         arrived = other.recv(WITHIN)
         assert arrived is not None
         assert (arrived.arbitration_id, bytes(arrived.data)) == (0x123, b"\x01\x02")
         assert one.recv(0) is None, "a socket hears what it sent itself"
 
 
+@on_vcan
+@no_such_interface
 def test_an_interface_that_is_not_there_is_named_with_its_remedy() -> None:
     with pytest.raises(BusError, match=f"ip link add {NAME} type vcan"):
-        bus.open_bus(SECTION, DRIVES)
+        bus.open_bus(VCAN, DRIVES)
 
 
+@on_vcan
 def test_an_interface_that_is_down_is_named_with_its_remedy(interface: str) -> None:
     ip("link", "set", NAME, "down")
     with pytest.raises(BusError, match="is down"):
-        bus.open_bus(SECTION, DRIVES)
+        bus.open_bus(VCAN, DRIVES)
 
 
 def test_drives_are_set_up_powered_moved_and_left_without_power(driver: Cia402) -> None:
@@ -162,6 +159,7 @@ def test_drives_are_set_up_powered_moved_and_left_without_power(driver: Cia402) 
     until(driver, lambda feedback: set(feedback.state) == {PowerState.SWITCH_ON_DISABLED}, position=1e-4)
 
 
+@pytest.mark.parametrize("section", [pytest.param("vcan", marks=carriers.NEEDS_VCAN)], indirect=True)
 def test_an_interface_that_goes_down_is_a_fault_of_the_bus(driver: Cia402) -> None:
     driver.configure(PERIOD)
     cycle(driver)

@@ -17,15 +17,21 @@ T = TypeVar("T", bound=msgspec.Struct)
 _LOG = logging.getLogger("trirail")
 
 
-class Listener:
-    """Reads samples for one client. Anybody on the network may publish anything on any key."""
+class SampleReader:
+    """Reads samples for one client: makes callbacks of Zenoh's, each for one kind of content.
+
+    Anybody on the network may publish anything on any key: no content raises, in whichever thread it is read.
+    """
 
     def __init__(self) -> None:
         self.skipped = 0
         """Samples that were no messages."""
 
     def messages(self, kind: type[T], take: Callable[[T], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
-        """Return what hands over messages of a kind, at once and in the connection's own thread: it must be quick."""
+        """Return what decodes messages of a `kind`, JSON or msgpack as their encoding says, and hands them to `take`.
+
+        That is called at once and in the connection's own thread: it must be quick.
+        """
 
         def read(sample: zenoh.Sample) -> T:
             what = f"not of kind {kind.__name__.lower()}"
@@ -35,7 +41,7 @@ class Listener:
         return self._handler(read, take)
 
     def batches(self, take: Callable[[bytes], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
-        """Return what hands over batches of records, likewise."""
+        """Return what hands over batches of records, likewise: whole ones, packed as wire.records has them."""
         return self._handler(lambda sample: boundary.batch(sample.payload.to_bytes()), take)
 
     def _handler(

@@ -1,0 +1,39 @@
+"""What python-can's interfaces need beside python-can: another package, or the library of the adapter's maker."""
+
+from __future__ import annotations
+
+from ctypes.util import find_library
+from importlib.util import find_spec
+from typing import Final
+
+_PACKAGES: Final = {
+    "canalystii": (("canalystii",), "canalystii"),
+    "cantact": (("cantact",), "cantact"),
+    "gs_usb": (("gs_usb", "usb"), "gs-usb"),
+    "neovi": (("ics", "filelock"), "neovi"),
+    "robotell": (("serial",), "serial"),
+    "seeedstudio": (("serial",), "seeedstudio"),
+    "serial": (("serial",), "serial"),
+    "slcan": (("serial",), "serial"),
+    "udp_multicast": (("msgpack",), "multicast"),
+}
+"""By interface: the modules that it imports, and python-can's extra that brings them."""
+_LIBRARIES: Final = {
+    "kvaser": ("canlib", "Kvaser's CANlib"),
+    "pcan": ("pcanbasic", "PEAK's PCAN-Basic"),
+}
+"""By interface: the library of the adapter's maker. Linux has drivers of its own for both makers' adapters."""
+
+
+def lacking(interface: str) -> str:
+    """What this machine lacks for an interface, with how to get it; "" where nothing is known to be missing."""
+    modules, extra = _PACKAGES.get(interface, ((), ""))
+    if missing := [module for module in modules if find_spec(module) is None]:
+        return f"the Python module {missing[0]}; install it with: pip install 'python-can[{extra}]'"
+    library, product = _LIBRARIES.get(interface, ("", ""))
+    if library and find_library(library) is None:
+        return (
+            f"{product} (lib{library}.so), which is not installed; Linux knows these adapters without it: "
+            'interface = "socketcan", channel = "can0"'
+        )
+    return ""

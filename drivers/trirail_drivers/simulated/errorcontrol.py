@@ -1,0 +1,74 @@
+"""Error control as CiA 301 has it: heartbeats made and heard, or node guarding and life guarding without them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+from trirail_drivers.simulated.dictionary import Dictionary, Entry
+
+_TOGGLE: Final = 0x80
+
+
+class ErrorControl:
+    """Who watches whom: the master this node by 1017h or guarding, this node the master by 1016h or life guarding."""
+
+    def __init__(self, objects: Dictionary, lost: Callable[[], None], changed: Callable[[], None]) -> None:
+        """`lost` is told that the master is gone, `changed` that another node is watched."""
+        self._lost = lost
+        self._changed = changed
+        self._producer = objects.internal(0x1017, 0)
+        self._consumer = objects.internal(0x1016, 1)
+        self._guard_time = objects.internal(0x100C, 0)
+        self._life_factor = objects.internal(0x100D, 0)
+        self.restart(0.0)
+        objects.on_write(0x1016, self._consumer_written)
+        objects.on_write(0x1017, self._producer_written)
+
+    def restart(self, now: float) -> None:
+        """After a reset: nothing is sent and nobody is watched until it begins again."""
+        self._now = now
+        self._heartbeat_due = self._consumer_due = self._guarding_due = math.inf
+        self._toggle = 0
+
+    @property
+    def watched(self) -> int | None:
+        """The node whose heartbeat is watched."""
+        node, milliseconds = divmod(self._consumer.value, 1 << 16)
+        return node if node and milliseconds else None
+
+    def heard(self, now: float) -> None:
+        """The watched node's heartbeat came; watching begins with the first one, and after a loss with the next."""
+        self._consumer_due = now + (self._consumer.value & 0xFFFF) * 1e-3
+
+    def guarded(self, state: int, now: float) -> bytes | None:
+        """The answer to the master's guarding; None where heartbeats take its place (CiA 301: never both)."""
+        if self._producer.value:
+            return None
+        life_time = self._guard_time.value * self._life_factor.value * 1e-3
+        self._guarding_due = now + life_time if life_time else math.inf
+        answer = bytes([state | self._toggle])
+        self._toggle ^= _TOGGLE
+        return answer
+
+    def poll(self, now: float) -> bool:
+        """Tell of who is lost at time `now` [s]; return whether a heartbeat is due."""
+        self._now = now
+        if now >= self._consumer_due or now >= self._guarding_due:
+            self._consumer_due = self._guarding_due = math.inf
+            self._lost()
+        if now < self._heartbeat_due:
+            return False
+        period = self._producer.value * 1e-3
+        self._heartbeat_due += period
+        if self._heartbeat_due <= now:  # too late for that one as well: leave it out
+            self._heartbeat_due = now + period
+        return True
+
+    def _producer_written(self, entry: Entry, _old: int) -> None:
+        self._heartbeat_due = self._now if entry.value else math.inf
+
+    def _consumer_written(self, _entry: Entry, _old: int) -> None:
+        self._consumer_due = math.inf
+        self._changed()

@@ -1,0 +1,112 @@
+"""The units that a drive's own dictionary gives its objects (CiA 402-2, factor group), in counts and seconds.
+
+A count is the unit of position that the drive has at power-on. What its objects tell holds: 60A8h, 60A9h and 60AAh by
+CiA 303-2 (power of ten, numerator, denominator), else 6096h, a factor over units of position per second, and 6097h, one
+over units of velocity per second; positions change with 608Fh, 6091h and 6092h. What none tells, its maker has fixed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from trirail_drivers.simulated.dictionary import Dictionary, Entry
+
+_METRES: Final = {0x01: 1.0, 0xC1: 0.0254, 0xC2: 0.3048}
+_PER_REVOLUTION: Final = {0x10: math.tau, 0x40: 400.0, 0x41: 360.0, 0x42: 21_600.0, 0x43: 1_296_000.0, 0xB4: 1.0}
+_COUNTS: Final = (0xB5, 0xAC)
+_RPM: Final = 0xC0
+"""EPOS4's numerator of accelerations: its 00C00300h is rpm/s."""
+_SECONDS: Final = {0x03: 1.0, 0x47: 60.0, 0x48: 3600.0}
+_SECOND_SQUARED: Final = 0x57
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What no object tells: the axis behind the drive, and units that the maker has fixed."""
+
+    counts_per_metre: float = math.nan
+    counts_per_revolution: float = math.nan
+    """Of the motor."""
+    velocity: float = 1.0
+    """The fixed unit of velocity [counts/s]."""
+    acceleration: float = 1.0
+    """The fixed unit of acceleration [counts/s²]."""
+
+
+class Units:
+    """The drive's units as its objects have them now."""
+
+    def __init__(self, objects: Dictionary, machine: Machine) -> None:
+        self.position = 1.0
+        """Unit of 607Ah, 6064h and other positions [counts]."""
+        self.velocity = 1.0
+        """Unit of 60B1h, 606Ch, 6099h [counts/s]."""
+        self.acceleration = 1.0
+        """Unit of 6084h, 6085h, 609Ah [counts/s²]."""
+        self._machine = machine
+        self._codes = [objects.internal(index, 0) for index in (0x60A8, 0x60A9, 0x60AA)]
+        ratios = [(objects.internal(index, 1), objects.internal(index, 2)) for index in _RATIOS]
+        self._ratios = dict(zip(_RATIOS, ratios, strict=True))
+        self._at_power_on = self._counts_per_unit()
+        self._code_at_power_on = self._codes[0].default
+        for index in (0x60A8, 0x60A9, 0x60AA, *_RATIOS):
+            objects.on_write(index, self._written)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take up what the objects say."""
+        self.position = self._position()
+        _, velocity, acceleration = (entry.value for entry in self._codes)
+        by_factor, of_factor = self._ratio(0x6096), self._ratio(0x6097)
+        told = self._told(velocity, 1) or (self.position / by_factor if by_factor else None)
+        self.velocity = told or self._machine.velocity
+        told = self._told(acceleration, 2) or (self.velocity / of_factor if of_factor else None)
+        self.acceleration = told or self._machine.acceleration
+
+    def _written(self, _entry: Entry, _old: int) -> None:
+        self.refresh()
+
+    def _position(self) -> float:
+        code = self._codes[0].value
+        if code != self._code_at_power_on and (size := self._told(code, 0)):
+            return size
+        return self._counts_per_unit() / self._at_power_on
+
+    def _counts_per_unit(self) -> float:
+        """Encoder increments of a unit of position: encoder resolution * gear ratio / feed constant."""
+        resolution, gear, feed = (self._ratio(index) or 1.0 for index in (0x608F, 0x6091, 0x6092))
+        return resolution * gear / feed
+
+    def _ratio(self, index: int) -> float | None:
+        """Sub-index 1 by sub-index 2; None where the drive does not have or does not tell them."""
+        numerator, divisor = (entry.value for entry in self._ratios[index])
+        return numerator / divisor if numerator > 0 and divisor > 0 else None
+
+    def _told(self, code: int, power: int) -> float | None:
+        """The size of a unit by CiA 303-2 [counts, per second to a power]; None where it tells none known here."""
+        size = self._decoded(code, power)
+        return size if size is not None and math.isfinite(size) else None
+
+    def _decoded(self, code: int, power: int) -> float | None:
+        prefix, numerator, denominator = code >> 24 & 0xFF, code >> 16 & 0xFF, code >> 8 & 0xFF
+        factor = 10.0 ** (prefix - 256 if prefix > 127 else prefix)
+        if numerator == _RPM and power:
+            rpm = factor * self._machine.counts_per_revolution / 60.0
+            return rpm if power == 1 else rpm / _SECONDS.get(denominator, math.nan)
+        if numerator in _METRES:
+            size = _METRES[numerator] * self._machine.counts_per_metre
+        elif numerator in _PER_REVOLUTION:
+            size = self._machine.counts_per_revolution / _PER_REVOLUTION[numerator]
+        elif numerator in _COUNTS:
+            size = 1.0
+        else:
+            return None
+        if power == 0 or (power == 2 and denominator == _SECOND_SQUARED):
+            return factor * size
+        return factor * size / _SECONDS[denominator] ** power if denominator in _SECONDS else None
+
+
+_RATIOS: Final = (0x608F, 0x6091, 0x6092, 0x6096, 0x6097)
+"""Encoder resolution, gear ratio, feed constant, velocity factor, acceleration factor: each sub-index 1 by 2."""

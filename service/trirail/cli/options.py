@@ -1,0 +1,44 @@
+"""What several commands take: which service or which robot, and how to print."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from trirail.wire.zenoh_session import DEFAULT_LOCATOR
+
+Flag = Parameter(negative="")
+"""An option without a value, that has no opposite."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Service:
+    """Which service to talk to."""
+
+    robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT")] = "demo"
+    "Name of the robot, as in its configuration."
+    connect: Annotated[str, Parameter(env_var="TRIRAIL_CONNECT")] = DEFAULT_LOCATOR
+    "Zenoh locator of the service or of a router."
+    json: Annotated[bool, Flag] = False
+    "Print one JSON object instead of words."
+
+
+HERE = Service()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Offline:
+    """Which robot, and how to print."""
+
+    config: Path | None = None
+    "Configuration file; the simulated robot if absent."
+    json: Annotated[bool, Flag] = False
+    "Print one JSON object, in metres and radians, instead of words."
+
+
+DEFAULT = Offline()

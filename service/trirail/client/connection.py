@@ -1,0 +1,151 @@
+"""Zenoh as one client of one robot uses it: it asks the service, and hears what that publishes."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import weakref
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+import msgspec
+import zenoh
+from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare_advanced_subscriber
+
+from trirail.client.samples import SampleReader
+from trirail.errors import RefusedError, ServiceError
+from trirail.wire import boundary, zenoh_session
+from trirail.wire.messages import ErrorReply, Event
+from trirail.wire.state import State
+from trirail.wire.text import quoted
+
+REPLY_WITHIN = 20.0
+"""How long a command may take to be carried out [s]."""
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+
+class Connection:
+    """A session to the service of a robot at a Zenoh locator. Raises ServiceError where that cannot be reached."""
+
+    def __init__(self, robot: str, connect: str) -> None:
+        self._robot = robot
+        self._connect = connect
+        self._session = zenoh_session.open_client(connect)
+        # Also at the end of a program that does not close it: Zenoh's threads must not outlive the interpreter.
+        self.close = weakref.finalize(self, zenoh_session.close, self._session)
+        """End it; calls after the first do nothing."""
+        self._reader = SampleReader()
+
+    @property
+    def skipped(self) -> int:
+        """How often something was published on this robot's keys that was none of its messages."""
+        return self._reader.skipped
+
+    # ------------------------------------------------------------------ asking
+
+    def ask(
+        self, parts: tuple[str, ...], kind: type[T], payload: bytes | None = None, within: float = REPLY_WITHIN
+    ) -> T:
+        """Query the key of these parts and decode the first reply that can be read as a message of `kind`.
+
+        Raises RefusedError where the service says no, ServiceError where nobody answers within so many seconds: nobody
+        is there, or may be asked. A reply has the quality of service of its query: one that may be dropped would have
+        an answer that may be.
+        """
+        boundary.check_size(len(payload or b""))
+        unreadable: ServiceError | None = None
+        for reply in self._session.get(
+            self._key(*parts),
+            payload=payload,
+            encoding=boundary.JSON if payload else None,
+            timeout=within,
+            consolidation=zenoh.ConsolidationMode.NONE,  # at once, however many more were asked
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+        ):
+            try:
+                if reply.ok is not None:
+                    answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
+                    return answer
+            except RefusedError as error:
+                unreadable = ServiceError(f"somebody answered at {self._connect}, but {error}")
+            if reply.err is not None:
+                refused = refusal(reply.err.payload.to_bytes())
+                if isinstance(refused, RefusedError):
+                    raise refused
+                unreadable = refused
+        raise unreadable or self.nobody()
+
+    def nobody(self) -> ServiceError:
+        """Return what to raise where nobody answers."""
+        return ServiceError(
+            f"no robot {self._robot!r} answers at {self._connect}: is its service running, is the name right "
+            "(--robot), may this user ask it?"
+        )
+
+    # ------------------------------------------------------------------ hearing
+
+    def states(self, timeout: float | None) -> Iterator[State]:
+        """Yield states as they come, the newest where this is too slow; end after `timeout` seconds without one."""
+        received: queue.Queue[State] = queue.Queue(maxsize=1)
+
+        def keep_newest(state: State) -> None:
+            with contextlib.suppress(queue.Empty):
+                received.get_nowait()
+            with contextlib.suppress(queue.Full):
+                received.put_nowait(state)
+
+        with self._session.declare_subscriber(self._key("state"), self._reader.messages(State, keep_newest)):
+            yield from _until_silent(received, timeout)
+
+    def events(self, history: bool, timeout: float | None) -> Iterator[Event]:
+        """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
+        received: queue.Queue[Event] = queue.Queue()
+        last = 0, 0.0
+
+        def keep_new(event: Event) -> None:
+            # A gateway that was started again tells the past once more; a service that was, counts from one.
+            nonlocal last
+            if event.seq > last[0] or event.time > last[1]:
+                last = event.seq, event.time
+                received.put(event)
+
+        with self.subscribe_to_events(keep_new, history=history):
+            yield from _until_silent(received, timeout)
+
+    def subscribe_to_events(self, take: Callable[[Event], None], *, history: bool) -> AdvancedSubscriber[Any]:
+        """Have every event taken, with `history` the past too, that of a gateway that was started again as well."""
+        return declare_advanced_subscriber(
+            self._session,
+            self._key("event"),
+            self._reader.messages(Event, take),
+            history=HistoryConfig(detect_late_publishers=True) if history else None,
+            recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
+        )
+
+    def records(self, take: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
+        """Have every batch of records taken, until the subscriber's context ends."""
+        return self._session.declare_subscriber(self._key("records"), self._reader.batches(take))
+
+    def _key(self, *parts: str) -> str:
+        return zenoh_session.key(self._robot, *parts)
+
+
+def _until_silent(received: queue.Queue[T], timeout: float | None) -> Iterator[T]:
+    """Yield what is received, until nothing is for `timeout` seconds: only what is to be yielded may be put there."""
+    while True:
+        try:
+            yield received.get(timeout=timeout)
+        except queue.Empty:
+            return
+
+
+def refusal(payload: bytes) -> RefusedError | ServiceError:
+    """Return what to raise for an error reply: ServiceError if it is none, but words of somebody else's."""
+    try:
+        error: ErrorReply = boundary.decode(payload, ErrorReply, "not an error reply")
+    except RefusedError:
+        return ServiceError(f"no answer from the service: {quoted(payload.decode(errors='replace'))}")
+    return RefusedError(error.code, error.message, slider=error.slider, value=error.value, limit=error.limit)

@@ -1,0 +1,130 @@
+"""What a client holds of a goal that the service has accepted: how it goes on, and how it ended."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from typing import TYPE_CHECKING, NamedTuple, Self
+
+import msgspec
+
+from trirail.errors import RefusalCode, RefusedError, TrirailError
+from trirail.wire.messages import GoalReply, Stop, VelocityGoal
+from trirail.wire.vocabulary import Command
+
+if TYPE_CHECKING:
+    from trirail.client.client import Robot
+
+STANDS_WITHIN = 10.0
+"""How long the end of a jog may take beyond its own time-out [s]."""
+
+
+class Result(NamedTuple):
+    """How a goal ended; every goal does, exactly once."""
+
+    id: str
+    outcome: str
+    """done, rejected, preempted, stopped, expired or faulted."""
+    message: str
+    """One line for people: why."""
+
+
+class GoalHandle:
+    """A goal that the service has accepted. It is the service's from then on: this object only follows it."""
+
+    def __init__(self, goal_id: str, robot: Robot) -> None:
+        self.id = goal_id
+        self.reply = GoalReply(goal_id, 0.0)
+        """What the service said of it."""
+        self._robot = robot
+        self._ended = threading.Event()
+        self._result: Result | None = None
+
+    @property
+    def result(self) -> Result | None:
+        """How it ended, None while it has not."""
+        return self._result
+
+    @property
+    def duration(self) -> float | None:
+        """Expected time from acceptance to arrival [s]; None while the override is zero."""
+        return self.reply.duration
+
+    @property
+    def expected(self) -> str:
+        """How long it is expected to take, for people."""
+        return f"{self.duration:.2f} s" if self.duration is not None else "no expected end while the override is 0"
+
+    def cancel(self) -> None:
+        """Stop it, if it is under way or waits for another one; return when the robot stands, or it waits no more.
+
+        Other goals go on, but those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
+        ServiceError if nobody answers.
+        """
+        self._robot.command(Command.STOP, msgspec.json.encode(Stop(self.id)))
+
+    def wait(self, timeout: float | None = None) -> Result:
+        """Wait for its end, however it ends; look at `outcome` of the result.
+
+        Raises TimeoutError if that takes longer than `timeout` seconds; the goal itself goes on.
+        """
+        if not self._ended.wait(timeout) or self._result is None:
+            raise TimeoutError(f"goal {self.id} has not ended within {timeout:g} s")
+        return self._result
+
+    def end(self, result: Result) -> None:
+        """Take in how it ended; the connection's own thread does that."""
+        self._result = result
+        self._ended.set()
+
+
+class Jog:
+    """A velocity that is kept alive while the context lasts; `result` tells afterwards how it ended.
+
+    It is renewed three times in each time-out, by a thread of its own. A program that hangs or dies renews it no more,
+    and the robot brakes: the time-out is real time, at every override. What has run out or was paused is over; begin
+    a new one. `error` tells whether it could not be renewed. Leaving the context waits for the standstill.
+
+    `velocity` is that of x, y [m/s] and phi [rad/s] in the base frame, `timeout` in seconds. Entering the context
+    raises RefusedError where the service does not take it, leaving it TimeoutError where no end is heard.
+    """
+
+    def __init__(self, robot: Robot, velocity: tuple[float, float, float], timeout: float) -> None:
+        self._robot = robot
+        self._velocity = velocity
+        self._timeout = timeout
+        self._id = uuid.uuid4().hex[:12]
+        self._over = threading.Event()
+        self._renewing = threading.Thread(target=self._renew, name="jog", daemon=True)
+        self._goal: GoalHandle | None = None
+        self.error: Exception | None = None
+        """Why it could not be renewed any more."""
+
+    @property
+    def result(self) -> Result | None:
+        """How it ended, None while it has not."""
+        return self._goal.result if self._goal else None
+
+    def __enter__(self) -> Self:
+        self._goal = self._send()
+        self._renewing.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._renewing.join()
+        if self._goal is not None and self.error is None:
+            self._goal.wait(self._timeout + STANDS_WITHIN)
+
+    def _send(self) -> GoalHandle:
+        x, y, phi = self._velocity
+        return self._robot.send(lambda name: VelocityGoal(x, y, phi, timeout=self._timeout, id=name), self._id)
+
+    def _renew(self) -> None:
+        while not self._over.wait(self._timeout / 3.0):
+            try:
+                self._send()
+            except TrirailError as error:
+                at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
+                self.error = None if at_limit else error  # at a limit it has ended as it should
+                return

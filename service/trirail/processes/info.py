@@ -1,0 +1,32 @@
+"""What a client is told of the robot when it asks: from the configuration and the software that runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from trirail_drivers.interface import NAMES
+
+from trirail.config import Config, geometry
+from trirail.telemetry.provenance import software, versions
+from trirail.wire.state import Info
+
+
+def info(config: Config) -> Info:
+    """Return what a service of this configuration answers on …/info."""
+    live = config.telemetry.live_port
+    legs: list[dict[str, Any]] = []
+    for name, leg in zip(NAMES, geometry(config.geometry).legs, strict=True):
+        legs.append({"name": name} | {field: getattr(leg, field) for field in leg.__slots__})
+    return Info(
+        robot=config.robot.name,
+        version=software().trirail,
+        geometry=tuple(legs),
+        limits=msgspec.to_builtins(config.limits),
+        rate_hz=config.loop.rate_hz,
+        state_hz=config.telemetry.state_hz,
+        recordings=str(Path(config.telemetry.directory).resolve()),
+        live=f"rerun+http://127.0.0.1:{live}/proxy" if live else "",
+        versions=versions(),
+    )

@@ -1,0 +1,157 @@
+"""What the service publishes of the robot, and what it answers on …/info. SI units and radians, if not said otherwise.
+
+Sliders are in the order A, B, C; poses are x, y [m] of the platform's centre and its angle phi [rad], counterclockwise,
+in the base frame.
+"""
+
+from __future__ import annotations
+
+import msgspec
+from msgspec import Struct
+from trirail_drivers.interface import Triple
+
+
+class Commanded(Struct, frozen=True):
+    """What the robot was told: platform, then sliders."""
+
+    pose: Triple
+    """x, y [m] of the platform's centre and its angle phi [rad], in the base frame."""
+    pose_velocity: Triple
+    """[m/s, m/s, rad/s]."""
+    pose_acceleration: Triple
+    """[m/s², m/s², rad/s²]."""
+    position: Triple
+    """lambda_10 of the sliders A, B, C [m]."""
+    velocity: Triple
+    """[m/s]."""
+    acceleration: Triple
+    """[m/s²]."""
+
+
+class FrameCounts(Struct, frozen=True):
+    """What of a drive's cyclic frames went wrong since the service started; none of it is a fault by itself."""
+
+    feedback_late: int
+    """Positions that came a cycle later than the one before did."""
+    feedback_lost: int
+    """SYNCs that were never answered, as far as later answers show."""
+    setpoints_late: int
+    """Setpoints written after the next SYNC was due."""
+    setpoints_lost: int
+    """Setpoints that the bus did not take."""
+
+
+class Sliders(Struct, frozen=True):
+    """What the drives say, of A, B, C."""
+
+    position: Triple
+    """[m]."""
+    velocity: Triple
+    """[m/s]."""
+    following_error: Triple
+    """Setpoint less measured position [m]."""
+    following_error_max: Triple
+    """Greatest since the service started, while enabled [m]."""
+    status: tuple[str, str, str]
+    """The power state of each, by its name in CiA 402."""
+    traffic: tuple[FrameCounts, FrameCounts, FrameCounts]
+    """Frames of each that were late or lost."""
+
+
+class GoalState(Struct, frozen=True):
+    """The goal under way."""
+
+    id: str
+    """As it was sent, or as the service made it."""
+    progress: float
+    """Share of its time that is over, 0 to 1."""
+    remaining: float
+    """Time to its end [s]."""
+    target: Triple | None = None
+    """The pose that it leads to; None for a jog."""
+
+
+class Percentiles(Struct, frozen=True):
+    """Over the service's last 60 s [µs]."""
+
+    p50: float
+    """The median."""
+    p99: float
+    """What one cycle in a hundred exceeds."""
+    p999: float
+    """What one cycle in a thousand exceeds."""
+    max: float
+    """The greatest."""
+
+
+class LoopState(Struct, frozen=True):
+    """How well the loop keeps its time."""
+
+    rate_hz: int
+    """Cycles a second, as configured."""
+    cycles: int
+    """SYNCs sent since the service started."""
+    overruns: int
+    """Ticks missed since the service started; none is caught up."""
+    lateness_us: Percentiles
+    """How much after its deadline a cycle began [µs]."""
+    cycle_us: Percentiles
+    """How long a cycle worked [µs]."""
+    bus_load: float
+    """Worst-case share of the bus that the cycle takes, as computed at the start."""
+    bus_load_measured: float
+    """Share of the bus that the frames sent and heard took in the last second, counted with worst-case stuffing."""
+    lacking: tuple[str, ...]
+    """What the loop runs without: real-time rights and the like, each with its remedy."""
+
+
+class State(Struct, frozen=True):
+    """The newest state, published at state_hz."""
+
+    seq: int
+    """The cycle of its record."""
+    t: float
+    """Nominal time since the loop's start [s]; the same as in records and events."""
+    mode: str
+    """A trirail.wire.vocabulary.Mode."""
+    pose: Triple
+    """Measured: x, y [m] and phi [rad] in the base frame, by the forward kinematics of the measured sliders."""
+    velocity: Triple
+    """Measured, as a difference over a batch of records [m/s, m/s, rad/s]."""
+    acceleration: Triple
+    """Measured, as a difference over a batch of records [m/s², m/s², rad/s²]."""
+    commanded: Commanded
+    """What the drives were told in the same cycle."""
+    sliders: Sliders
+    """What the drives say."""
+    goal: GoalState | None
+    """The goal under way, or paused; None where there is none."""
+    override: float
+    """The share of full speed at which motions are to run, 0 to 2."""
+    faults: tuple[str, ...]
+    """Why the robot is in fault, one line each; empty otherwise."""
+    loop: LoopState
+    """How well the loop keeps its time."""
+
+
+class Info(Struct, frozen=True):
+    """What a client needs to know the robot: answered on …/info."""
+
+    robot: str
+    """Its name, as in every key."""
+    version: str
+    """Of the service's software."""
+    geometry: tuple[dict[str, object], ...]
+    """The legs A, B, C: `name`, and the keys of [[geometry.leg]] of the configuration [m, rad]."""
+    limits: object
+    """Section [limits] of the configuration, whole: metres, radians, seconds."""
+    rate_hz: int
+    """Cycles a second."""
+    state_hz: int
+    """How often a second the state is published."""
+    recordings: str
+    """The folder of the service's recordings, on its machine."""
+    live: str
+    """Where a Rerun viewer on the service's machine finds the live view; "" for nowhere."""
+    versions: dict[str, str] = msgspec.field(default_factory=dict)
+    """Of Python and the libraries that matter, by name."""

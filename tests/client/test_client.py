@@ -1,0 +1,90 @@
+"""What a client promises whoever else speaks on its robot's keys; no service is needed for that."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import zenoh
+from trirail.client import client
+from trirail.client.client import GoalHandle, Robot
+from trirail.errors import ServiceError
+from trirail.wire.messages import Event
+from trirail.wire.zenoh_session import open_service
+
+TIMEOUT = 0.3
+NEWEST = Event(seq=7, t=0.0, cycle=0, time=5.0, kind="service", level="info", message="the newest there is")
+OLDER = msgspec.structs.replace(NEWEST, seq=3, time=2.0)
+ENDED = msgspec.structs.replace(NEWEST, seq=5, time=3.0, kind="goal", id="another", outcome="done")
+
+
+@pytest.fixture
+def noisy(tmp_path: Path) -> Iterator[Robot]:
+    """A robot on whose keys somebody publishes junk and the same events for ever, and answers queries with junk."""
+    locator = f"unixsock-stream/{tmp_path}/zenoh"
+    over = threading.Event()
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            while not over.wait(0.01):
+                query.reply(query.key_expr, b"junk")
+
+    def publish(session: zenoh.Session) -> None:
+        for content in itertools.cycle((b"junk", *map(msgspec.json.encode, (NEWEST, OLDER, ENDED)), b"{}")):
+            for key in ("event", "state", "records"):
+                session.put(f"trirail/demo/{key}", content)
+            if over.wait(0.01):
+                return
+
+    with open_service([locator]) as session, session.declare_queryable("trirail/demo/**", answer):
+        publisher = threading.Thread(target=publish, args=(session,))
+        publisher.start()
+        try:
+            with Robot("demo", locator) as robot:
+                yield robot
+        finally:
+            over.set()
+            publisher.join()
+
+
+@pytest.mark.parametrize(
+    ("call", "error"),
+    [
+        (lambda robot: list(robot.events(timeout=TIMEOUT)), None),
+        (lambda robot: list(robot.events(history=True, timeout=TIMEOUT)), None),
+        (lambda robot: list(robot.states(timeout=TIMEOUT)), None),
+        (lambda robot: robot.state(timeout=TIMEOUT), ServiceError),
+        (lambda robot: GoalHandle("mine", robot).wait(timeout=TIMEOUT), TimeoutError),
+        (lambda robot: robot.stop(), ServiceError),
+        (lambda robot: robot.home(), ServiceError),
+    ],
+)
+def test_a_call_ends_by_its_timeout_whatever_arrives(
+    noisy: Robot, monkeypatch: pytest.MonkeyPatch, call: Callable[[Robot], object], error: type[Exception] | None
+) -> None:
+    monkeypatch.setattr(client, "REPLY_WITHIN", TIMEOUT)
+    monkeypatch.setattr(client, "HOME_WITHIN", TIMEOUT)
+    ended = threading.Event()
+    raised: list[type[BaseException] | None] = []
+
+    def run() -> None:
+        try:
+            call(noisy)
+            raised.append(None)
+        except (ServiceError, TimeoutError) as found:
+            raised.append(type(found))
+        ended.set()
+
+    threading.Thread(target=run, daemon=True).start()
+    assert ended.wait(10.0), "it waits for ever"
+    assert raised == [error]
+
+
+def test_events_are_told_once_and_in_order_whatever_comes_again(noisy: Robot) -> None:
+    told = [event.seq for event in noisy.events(timeout=TIMEOUT)]
+    assert told == sorted(set(told))
+    assert told[-1] == NEWEST.seq

@@ -1,0 +1,96 @@
+"""What is commanded while the robot has no power, and what the drives get when it has: where the sliders are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import CONFIG, Rig, changed
+from control.test_control import ROBOT
+from trirail.kinematics.robot import inverse
+from trirail.wire.packets import Accepted
+from trirail.wire.vocabulary import Mode
+from trirail_drivers.interface import PowerState
+
+STEP = 0.5 * CONFIG.limits.slider.velocity * CONFIG.period
+"""How far a slider is pushed in a cycle [m]."""
+ELSEWHERE = (0.02, -0.015, 0.1)
+"""Where the platform is pushed to by hand: x, y [m], phi [rad]."""
+
+
+def push(rig: Rig, pose: tuple[float, float, float]) -> None:
+    """Push the sliders by hand, as the platform goes to a pose."""
+    begin, end = rig.control.measured.feedback.position, inverse(ROBOT, np.array(pose)).position
+    cycles = int(np.abs(end - begin).max() / STEP) + 1
+    for share in np.arange(1, cycles + 1) / cycles:
+        for drive, own, metres in zip(rig.drives, rig.config.drives.each, begin + share * (end - begin), strict=True):
+            counts = own.direction * (metres - own.offset) * own.counts_per_metre
+            drive.servo.position = drive.servo.setpoint = counts
+            drive.objects[0x6064, 0].value = round(counts)
+        rig.cycle()
+    rig.cycles(3)
+
+
+def assert_told(rig: Rig, pose: tuple[float, float, float]) -> None:
+    """All that is told of the sliders, the passive ones among it, is that of a pose at rest."""
+    motion = inverse(ROBOT, np.array(pose))
+    expected = np.zeros((6, 3))
+    expected[0], expected[3] = motion.position, motion.passive_position
+    assert rig.setpoints()[-1] == pytest.approx(expected, abs=2e-7)
+    assert rig.control.commanded.pose == pytest.approx(pose, abs=2e-6)
+    assert rig.control.commanded.at_rest
+
+
+@pytest.mark.parametrize("ended_by", ["disable", "quick_stop"])
+def test_a_robot_that_is_pushed_after_a_motion_is_enabled_where_it_was_pushed(rig: Rig, ended_by: str) -> None:
+    rig.enable()
+    rig.goal("g1", -0.05, 0.03, -0.2)
+    rig.cycles(100)
+    rig.command(ended_by)
+    rig.cycles(500)
+    if ended_by == "quick_stop":
+        rig.command("reset")
+    push(rig, ELSEWHERE)
+    assert_told(rig, ELSEWHERE)
+    rig.enable()
+    rig.cycles(10)
+    assert rig.control.fault is None
+    assert_told(rig, ELSEWHERE)
+    assert isinstance(rig.goal("g2", 0.0, 0.0, 0.0), Accepted)
+    rig.until(rig.holds)
+    assert_told(rig, (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("end", [Mode.DISABLED, Mode.FAULT])
+def test_of_a_robot_without_power_no_motion_is_told(rig: Rig, end: Mode) -> None:
+    rig.enable()
+    rig.goal("g1", -0.05, 0.03, -0.2)
+    rig.cycles(100)
+    rig.command("disable" if end is Mode.DISABLED else "quick_stop")
+    rig.cycles(500)
+    assert rig.mode is end
+    assert_told(rig, rig.control.measured.pose)
+
+
+def test_the_first_cycle_already_knows_where_the_sliders_are() -> None:
+    pose = (0.02, -0.015, 0.1)
+    a, b, c = inverse(ROBOT, np.array(pose)).position.tolist()
+    rig = Rig(changed(CONFIG, start=(a, b, c)))
+    rig.cycle()
+    assert_told(rig, pose)
+    rig.bus.shutdown()
+
+
+def test_a_jammed_slider_whose_drive_is_deaf_to_the_stop_does_not_jump_when_it_comes_free(rig: Rig) -> None:
+    rig.enable()
+    rig.goal("g1", 0.1, 0.0, 0.0)
+    rig.cycles(100)
+    drive = rig.drives[1]
+    drive.objects.on_write(0x6040, lambda entry, old: None)
+    drive.servo.forced_velocity = 0.0
+    rig.until(lambda: rig.mode is Mode.FAULT)
+    rig.cycles(100)
+    assert drive.state is PowerState.OPERATION_ENABLED
+    jammed = drive.servo.position
+    drive.servo.forced_velocity = None
+    rig.cycles(100)
+    assert abs(drive.servo.position - jammed) <= 2.0

@@ -1,0 +1,242 @@
+"""Frames to and from a bus: the same whether they go by python-can or on the bus's own socket."""
+
+from __future__ import annotations
+
+import os
+import pty
+import time
+from collections import deque
+from collections.abc import Sequence
+
+import can
+import carriers
+import pytest
+from carriers import FarEnd, over
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail_drivers.capture import FRAME, Capture
+from trirail_drivers.frame_io import FrameIO, PythonCanFrames
+from trirail_drivers.frames import CAN_FRAME, ERROR, EXTENDED, REMOTE, Frame
+from trirail_drivers.wire import Wire
+
+BUSES = [
+    pytest.param(kind, way, id=f"{kind}, {way}", marks=marks)
+    for kind, marks in (
+        ("unix", ()),
+        ("vcan", carriers.NEEDS_VCAN),
+    )
+    for way in carriers.WAYS
+]
+on_every_bus = pytest.mark.parametrize(("kind", "way"), BUSES)
+
+WAIT = 10.0
+"""Longest wait for a frame that has to come [s]."""
+IDENTIFIERS = st.integers(0, 0x7FF)
+DATA = st.binary(max_size=8)
+KINDS = (
+    (0x281, b"\x01\x02\x03\x04"),
+    (0x080, b""),
+    (0x1ABCDEF0 | EXTENDED, bytes(range(8))),
+    (0x185 | REMOTE, b""),
+    (0x204 | ERROR, b"\0\x30" + bytes(6)),
+    (0x7FF, b"\xff" * 8),
+)
+"""One frame of each kind."""
+
+
+def arriving(frames: FrameIO, number: int) -> list[tuple[int, bytes]]:
+    """So many frames, which are on their way, and none after them."""
+    received = [frames.receive(WAIT) for _ in range(number)]
+    assert frames.receive() is None
+    return [(one[0], bytes(one[1])) for one in received if one is not None]
+
+
+@on_every_bus
+def test_a_frame_arrives_as_it_was_made(kind: str, way: str) -> None:
+    with over(kind, way) as (frames, far):
+
+        @given(IDENTIFIERS, DATA)
+        def arrives(identifier: int, data: bytes) -> None:
+            frames.send(Frame(identifier, data))
+            assert far.receive() == (identifier, len(data), data.ljust(8, b"\0"))
+
+        arrives()
+        frames.send(Frame(0x029, remote=True))
+        assert far.receive() == (0x029 | REMOTE, 0, bytes(8))
+
+
+@on_every_bus
+def test_frames_of_every_kind_are_received_in_their_order(kind: str, way: str) -> None:
+    with over(kind, way) as (frames, far):
+        assert frames.receive() is None
+        for identifier, data in KINDS:
+            far.send(identifier, data)
+        assert arriving(frames, len(KINDS)) == list(KINDS)
+
+
+@on_every_bus
+def test_data_stay_what_they_were_when_the_next_frame_comes(kind: str, way: str) -> None:
+    with over(kind, way) as (frames, far):
+        far.send(0x281, b"\x01\x02")
+        far.send(0x282, b"\x03\x04")
+        first, second = frames.receive(WAIT), frames.receive(WAIT)
+        assert first == (0x281, bytearray(b"\x01\x02"))
+        assert second == (0x282, bytearray(b"\x03\x04"))
+
+
+@on_every_bus
+def test_a_remote_frame_has_no_data_whatever_its_length(kind: str, way: str) -> None:
+    with over(kind, way) as (frames, far):
+        far.send(0x185 | REMOTE, length=6)
+        assert arriving(frames, 1) == [(0x185 | REMOTE, b"")]
+
+
+@on_every_bus
+def test_a_wait_for_a_frame_ends_without_one(kind: str, way: str) -> None:
+    with over(kind, way) as (frames, _):
+        began = time.monotonic()
+        assert frames.receive(0.05) is None
+        assert time.monotonic() - began >= 0.05
+
+
+@on_every_bus
+def test_a_capture_has_every_frame_with_its_time(kind: str, way: str) -> None:
+    capture = Capture()
+    began = time.time()
+    with over(kind, way, capture) as (frames, far):
+        frames.hear([0x281])
+        frames.send(Frame(0x201, b"\x06\x00"))
+        far.receive()
+        for identifier, data in KINDS:
+            far.send(identifier, data)
+        arriving(frames, len(KINDS))
+    ended = time.time()
+    noted = [line for chunk in capture.take() for line in FRAME.iter_unpack(chunk)]
+    assert [t for t, _ in noted] == sorted(t for t, _ in noted)
+    assert began <= noted[0][0] <= noted[-1][0] <= ended
+    seen = [CAN_FRAME.unpack(frame) for _, frame in noted]
+    assert seen == [(one, len(data), data.ljust(8, b"\0")) for one, data in ((0x201, b"\x06\x00"), *KINDS)]
+
+
+def test_a_captured_frame_has_the_time_of_its_arrival() -> None:
+    capture = Capture()
+    with over("unix", "socket", capture) as (frames, far):
+        far.send(0x281, bytes(4))
+        arrived_by = time.time()
+        while time.time() - arrived_by < 0.01:
+            os.sched_yield()
+        assert frames.receive() is not None
+    ((t, _),) = (line for chunk in capture.take() for line in FRAME.iter_unpack(chunk))
+    assert t <= arrived_by
+
+
+@pytest.mark.parametrize("way", carriers.WAYS)
+def test_the_end_of_the_bus_is_an_error(way: str) -> None:
+    with over("unix", way) as (frames, far):
+        far.socket.close()
+        with pytest.raises((can.CanError, OSError)):
+            frames.receive()
+        with pytest.raises((can.CanError, OSError)):
+            frames.send(Frame(0x080))
+
+
+class Listener:
+    """Notes what it hears."""
+
+    def __init__(self) -> None:
+        self.heard: list[bytes] = []
+
+    def take(self, data: bytearray, now: float) -> None:
+        self.heard.append(bytes(data))
+
+    def tell(self, cause: str, code: int, text: str) -> None:
+        raise AssertionError(text)
+
+
+@carriers.on_vcan
+def test_the_kernel_keeps_out_what_nobody_listens_to_but_no_report_of_the_controller() -> None:
+    def pour(far: FarEnd) -> None:
+        for identifier in range(0x800):
+            far.send(identifier, bytes(4))
+        far.send(0x281 | EXTENDED, bytes(4))
+        far.send(0x040 | ERROR, bytes(8))
+
+    with carriers.bus("vcan") as (bus, far):
+        listener, wire = Listener(), Wire(bus, lambda: None)
+        wire.listen(0x281, listener, listener.take)
+        wire.listen(0x701, listener, listener.take)
+        pour(far)
+        before = wire.traffic
+        wire.receive(0.0)
+        assert len(listener.heard) == 2
+        assert wire.traffic - before == 2 * 95
+        assert wire.fault is not None
+        assert "bus-off" in wire.fault.message
+
+
+# ---------------------------------------------------------------------- None is not "nothing left"
+
+
+class Hesitant(can.BusABC):
+    """An interface that gives what it is told to, None among it; without a descriptor."""
+
+    def __init__(self, gives: Sequence[can.Message | None]) -> None:
+        self.channel_info = "hesitant"
+        self.gives = deque(gives)
+        super().__init__(channel="hesitant")
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        pass
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        return self.gives.popleft() if self.gives else None
+
+
+@given(st.lists(st.booleans(), max_size=40))
+def test_without_a_descriptor_each_frame_sent_may_be_answered_with_nothing(order: list[bool]) -> None:
+    """`order` has True for a frame, False for an acknowledgement, of which there are no more than frames sent."""
+    gives = [can.Message(arbitration_id=n, is_extended_id=False) if one else None for n, one in enumerate(order)]
+    with Hesitant(gives) as bus:
+        frames = PythonCanFrames(bus)
+        for _ in range(order.count(False)):
+            frames.send(Frame(0x080))
+        received = []
+        while (one := frames.receive()) is not None:
+            received.append(one[0])
+    assert received == [n for n, one in enumerate(order) if one]
+
+
+def test_an_interface_that_never_gives_anything_ends_a_reading() -> None:
+    readable, writable = os.pipe()
+    os.write(writable, b"!")  # readable, but nothing of it is a frame
+    try:
+        with Hesitant([]) as bus:
+            bus.fileno = lambda: readable  # type: ignore[method-assign]
+            assert PythonCanFrames(bus).receive() is None
+    finally:
+        os.close(readable)
+        os.close(writable)
+
+
+def test_slcans_acknowledgements_do_not_hide_the_frames_behind_them() -> None:
+    pytest.importorskip("serial")
+    adapter, terminal = pty.openpty()
+    listener = Listener()
+    try:
+        with can.Bus(os.ttyname(terminal), "slcan", sleep_after_open=0.0, ignore_config=True) as bus:
+            wire = Wire(bus, lambda: None)
+            wire.listen(0x281, listener, listener.take)
+            for cycle in range(1, 51):
+                for node in (1, 2, 3):
+                    wire.send(Frame(0x300 + node, bytes(8)))
+                os.read(adapter, 4096)
+                answer = b"\r" * 3 + b"t2814%08X\r" % cycle
+                os.write(adapter, answer)
+                while bus.serialPortOrig.in_waiting < len(answer):  # type: ignore[attr-defined]
+                    os.sched_yield()
+                wire.receive(0.0)
+                assert len(listener.heard) == cycle
+            assert wire.fault is None
+    finally:
+        os.close(adapter)
+        os.close(terminal)

@@ -1,0 +1,53 @@
+"""Frames as Wireshark's CANopen dissector reads them: what `make hil` says of a log, wrong ones among them."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import hil_dissector
+import pytest
+
+pytestmark = pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
+
+SOUND = """
+(1.000) can1 702#00
+(1.010) can1 602#4041600000000000
+(1.020) can1 582#4B41600040020000
+(1.030) can1 000#0102
+(1.040) can1 702#05
+(1.050) can1 080#
+(1.060) can1 182#4002
+(1.070) can1 302#00000000
+"""
+
+
+def problems(tmp_path: Path, more: str = "", until: float = 9.0) -> list[str]:
+    log = tmp_path / "bus.log"
+    log.write_text((SOUND + more).lstrip())
+    return hil_dissector.problems(hil_dissector.dissect(log), until)
+
+
+def test_a_sound_log_has_no_problem_and_is_counted(tmp_path: Path) -> None:
+    assert problems(tmp_path) == []
+    counted = hil_dissector.statistics(hil_dissector.dissect(tmp_path / "bus.log"))
+    assert counted == {"NMT": 1, "PDO": 2, "SDO": 2, "SYNC and EMCY": 1, "heartbeat": 2}
+
+
+@pytest.mark.parametrize(
+    ("frames", "problem"),
+    [
+        ("(2.0) can1 602#4060600000000000\n", "node 2 leaves 6060:00 without an answer"),
+        ("(2.0) can1 602#4060600000000000\n(2.1) can1 582#4F61600008000000\n", "node 2 is asked for 6060:00 and"),
+        ("(2.0) can1 702#7F\n", "node 2 is operational no more but 7F"),
+        ("(2.0) can1 082#8130110000000000\n", "node 2 sends EMCY 3081"),
+        ("(2.0) can1 602#40\n", "malformed"),
+    ],
+)
+def test_what_is_wrong_is_told(tmp_path: Path, frames: str, problem: str) -> None:
+    (found,) = problems(tmp_path, frames)
+    assert problem in found
+
+
+def test_what_comes_of_a_disturbance_is_no_problem(tmp_path: Path) -> None:
+    assert problems(tmp_path, "(2.0) can1 702#7F\n(2.1) can1 082#8130110000000000\n", until=1.5) == []

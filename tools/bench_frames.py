@@ -1,0 +1,146 @@
+"""What one cycle's frames cost: by python-can's SocketCAN, and on its socket as the drivers do it, in one run.
+
+A cycle is SYNC and three setpoints sent, a bus found empty, three positions received, and a bus found empty again. The
+bus is the kernel's virtual one where that can be made, else python-can's SocketCAN code over a pair of unix sockets.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json as json_format
+import os
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import can
+import numpy as np
+from can.interfaces.socketcan import SocketcanBus
+from trirail_drivers.cia402 import frames as layout
+from trirail_drivers.frame_io import FrameIO, PythonCanFrames, SocketFrames
+from trirail_drivers.frames import Frame
+from trirail_drivers.interface import NAMES
+
+CYCLES = 3000
+AIM = 10.0
+"""What one cycle's frames may cost [µs]."""
+NODES = range(1, 1 + len(NAMES))
+
+
+class Loopback(SocketcanBus):
+    """python-can's SocketCAN over any socket of `struct can_frame`."""
+
+    def __init__(self, carrier: socket.socket) -> None:
+        self.socket = carrier
+        self.channel = self.channel_info = "loopback"
+        self._bcm_sockets = {}
+        self._is_filtered = False
+        self.socket.setsockopt(socket.SOL_SOCKET, 35, 1)  # SO_TIMESTAMPNS, as for every SocketCAN bus
+        can.BusABC.__init__(self, channel=self.channel)
+
+
+class Listener:
+    """Reads positions as a drive's axis does."""
+
+    def __init__(self) -> None:
+        self.heard = 0
+
+    def take(self, data: bytearray) -> None:
+        """Decode a position."""
+        layout.POSITION.unpack(data)
+        self.heard += 1
+
+
+def measure(cycles: int = CYCLES) -> dict[str, Any]:
+    """Return microseconds of one cycle's frames, each way, and their ratio."""
+    with _bus() as (kind, bus, far):
+        # What both have to do with a frame is the same, so it is left to the cycle: here are the frames alone.
+        ways: dict[str, FrameIO] = {"python_can": PythonCanFrames(bus), "socket": SocketFrames(bus.socket)}
+        times: dict[str, list[float]] = {name: [] for name in ways}
+        sync, setpoints = Frame(layout.SYNC), [Frame(layout.RPDO2 + node, bytes(8)) for node in NODES]
+        positions = [Frame(layout.TPDO2 + node, bytes(4)).packed for node in NODES]
+        for _ in range(cycles):
+            for name, frames in ways.items():
+                times[name].append(_cycle(frames, sync, setpoints, positions, far))
+    found = {name: _spread(np.array(each) * 1e6) for name, each in times.items()}
+    return {
+        "bus": kind,
+        "cycles": cycles,
+        **{f"{name}_us": spread for name, spread in found.items()},
+        "ratio": found["python_can"]["p50"] / found["socket"]["p50"],
+        "aim_us": AIM,
+    }
+
+
+def _cycle(
+    frames: FrameIO, sync: Frame, setpoints: list[Frame], positions: list[bytearray], far: socket.socket
+) -> float:
+    began = time.perf_counter()
+    while frames.receive() is not None:
+        pass
+    frames.send(sync)
+    taken = time.perf_counter() - began
+    for position in positions:
+        far.send(position)
+    listener = Listener()
+    began = time.perf_counter()
+    while (received := frames.receive()) is not None:
+        listener.take(received[1])
+    for frame in setpoints:
+        frame.fill(layout.SETPOINT, 123_456, -7890)
+        frames.send(frame)
+    taken += time.perf_counter() - began
+    if listener.heard != len(positions):
+        raise SystemExit(f"{listener.heard} of {len(positions)} frames came")
+    for _ in range(1 + len(setpoints)):
+        far.recv(16)
+    return taken
+
+
+def _spread(microseconds: Any) -> dict[str, float]:
+    return dict(zip(("p10", "p50", "p99"), np.percentile(microseconds, (10, 50, 99)).tolist(), strict=True))
+
+
+@contextlib.contextmanager
+def _bus() -> Iterator[tuple[str, SocketcanBus, socket.socket]]:
+    with contextlib.ExitStack() as stack:
+        try:
+            name, take_down = _vcan()
+            stack.callback(take_down)
+        except (OSError, subprocess.CalledProcessError):
+            near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            stack.enter_context(far)
+            yield "SocketCAN's code over unix sockets", stack.enter_context(Loopback(near)), far
+            return
+        bus = stack.enter_context(SocketcanBus(name))
+        far = stack.enter_context(socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW))
+        far.bind((name,))
+        yield "SocketCAN, virtual bus", bus, far
+
+
+def _vcan() -> tuple[str, Callable[[], object]]:
+    """Make a virtual bus; return its name, and what takes it down."""
+    socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    name = f"vcan{os.getpid() % 100_000}"
+
+    def ip(*arguments: str) -> None:
+        subprocess.run(("ip", "link", *arguments), capture_output=True, check=True)
+
+    ip("add", name, "type", "vcan")
+    ip("set", name, "up")
+    return name, lambda: ip("delete", name)
+
+
+def main(json: bool = False, cycles: int = CYCLES) -> None:
+    """Print the measurements as a table, or as one JSON object."""
+    measured = measure(cycles)
+    if json:
+        print(json_format.dumps(measured))
+        return
+    print(f"one cycle's frames, {measured['bus']}: 4 sent, 3 received, found empty twice [µs]")
+    for name, key in (("python-can's send and receive", "python_can_us"), ("packed, on its socket", "socket_us")):
+        spread = measured[key]
+        print(f"  {name:<32}" + "".join(f"{quantile:>6} {value:8.1f}" for quantile, value in spread.items()))
+    print(f"  {measured['ratio']:.1f} times; the aim is {AIM:g} µs")

@@ -1,0 +1,131 @@
+"""A log of CAN frames as others read it: by the CANopen dissector of Wireshark, which knows CiA 301 and not trirail.
+
+`tshark` decodes the log; its fields are judged here (names: `tshark -G fields`), and nothing that trirail packed.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from hil_needs import SEARCH, Failed
+
+HELD = "Wireshark's dissector reads every frame; each SDO request is answered for its object; started nodes stay so"
+
+FIELDS = (
+    "frame.time_epoch",
+    "canopen.function_code",
+    "canopen.node_id",
+    "_ws.malformed",
+    "canopen.sdo.main_idx",
+    "canopen.sdo.sub_idx",
+    "canopen.sdo.abort_code",
+    "canopen.em.err_code",
+    "canopen.nmt_guard.state",
+)
+SDO_ANSWER, SDO_REQUEST, EMERGENCY, ERROR_CONTROL = 0xB, 0xC, 0x1, 0xE
+"""Function codes, bits 7 to 10 of an identifier (CiA 301, 7.3.3)."""
+BOOT_UP, OPERATIONAL = 0x0, 0x5
+
+
+class Dissected(NamedTuple):
+    """A frame in the dissector's words; None where the frame has no such field."""
+
+    t: float
+    """Seconds since 1970."""
+    function: int | None
+    node: int | None
+    malformed: bool
+    entry: tuple[int, int] | None
+    """Index and sub-index of an SDO."""
+    abort: int | None
+    emergency: int | None
+    """The error code of an EMCY, unless it says "no error"."""
+    state: int | None
+    """The NMT state in a heartbeat or boot-up."""
+
+
+def dissect(log: Path) -> list[Dissected]:
+    """Let tshark read a log in candump's format. Raises Failed where it cannot."""
+    command = ["tshark", "-r", str(log), "-d", "can.subdissector,canopen", "-T", "fields", "-E", "occurrence=f"]
+    for field in FIELDS:
+        command += ["-e", field]
+    done = subprocess.run(command, env={"PATH": SEARCH, "HOME": "/tmp"}, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise Failed(f"tshark cannot read {log}: {done.stderr.strip().splitlines()[-1]}")
+    return [_frame(line.split("\t")) for line in done.stdout.splitlines()]
+
+
+def problems(frames: Sequence[Dissected], until: float) -> list[str]:
+    """Return what is wrong, a line each; nodes are to stay operational and without errors before the time `until`."""
+    return [*_unreadable(frames), *_unanswered(frames), *_fallen([frame for frame in frames if frame.t < until])]
+
+
+def statistics(frames: Sequence[Dissected]) -> dict[str, int]:
+    """Return numbers for people: how many frames of what kind, as the dissector sees it."""
+    kinds = Counter("other" if frame.function is None else _KINDS.get(frame.function, "other") for frame in frames)
+    return dict(sorted(kinds.items()))
+
+
+_KINDS = {0x0: "NMT", 0x1: "SYNC and EMCY", SDO_ANSWER: "SDO", SDO_REQUEST: "SDO", ERROR_CONTROL: "heartbeat"}
+_KINDS |= dict.fromkeys(range(0x3, 0xB), "PDO")
+
+
+def _unreadable(frames: Sequence[Dissected]) -> Iterator[str]:
+    for frame in frames:
+        if frame.malformed:
+            yield f"malformed, says Wireshark: function code {frame.function}, node {frame.node}, at {frame.t:.6f}"
+
+
+def _unanswered(frames: Sequence[Dissected]) -> Iterator[str]:
+    """Each first segment of an SDO is answered for the same object, or with an abort for it."""
+    asked: dict[int, Dissected] = {}
+    for frame in frames:
+        if frame.entry is None or frame.node is None:
+            continue
+        if frame.function == SDO_REQUEST:
+            asked[frame.node] = frame
+        elif frame.function == SDO_ANSWER and (request := asked.pop(frame.node, None)) and request.entry != frame.entry:
+            yield f"node {frame.node} is asked for {_entry(request)} and answers {_entry(frame)}, at {frame.t:.6f}"
+    yield from (f"node {node} leaves {_entry(request)} without an answer" for node, request in asked.items())
+
+
+def _fallen(frames: Sequence[Dissected]) -> Iterator[str]:
+    """A node that has become operational stays so, and sends no EMCY."""
+    operational: set[int] = set()
+    for frame in frames:
+        if frame.emergency:
+            yield f"node {frame.node} sends EMCY {frame.emergency:04X}, at {frame.t:.6f}"
+        if frame.state is None or frame.node is None:
+            continue
+        if frame.state == OPERATIONAL:
+            operational.add(frame.node)
+        elif frame.state != BOOT_UP and frame.node in operational:
+            yield f"node {frame.node} is operational no more but {frame.state:02X}, at {frame.t:.6f}"
+
+
+def _entry(frame: Dissected) -> str:
+    index, sub = frame.entry or (0, 0)
+    return f"{index:04X}:{sub:02X}"
+
+
+def _frame(fields: Sequence[str]) -> Dissected:
+    t, function, node, malformed, *entry, abort, emergency, state = fields
+    index, sub = map(_number, entry)
+    return Dissected(
+        t=float(t),
+        function=_number(function),
+        node=_number(node),
+        malformed=bool(malformed),
+        entry=None if index is None else (index, sub or 0),
+        abort=_number(abort),
+        emergency=_number(emergency),
+        state=_number(state),
+    )
+
+
+def _number(text: str) -> int | None:
+    return int(text, 0) if text else None

@@ -1,0 +1,138 @@
+"""The programs that run inside the emulated machine: the doctor, drives, candump and the service, each with its log."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+WITHIN = 300.0
+"""How long anything may take in this slow machine [s]; the whole run has a time limit of its own, outside."""
+BUFFER = 8_000_000
+"""Of candump's socket [bytes]: it shall see every frame, however busy the machine is."""
+PATIENT = (
+    "from trirail.cli import commands; from trirail.processes import supervisor; "
+    f"supervisor.START_WITHIN = {WITHIN}; commands.main()"
+)
+"""`trirail`, with more patience: the interpreters alone take a minute to start here."""
+
+
+class Failed(Exception):
+    """Something is not as it has to be."""
+
+
+class Machine:
+    """The programs under test, each with its output in a log in `folder`; all ended when the context is left."""
+
+    def __init__(self, folder: Path, frames: Path) -> None:
+        self._folder = folder
+        self._frames = frames
+        self._processes: list[subprocess.Popen[bytes]] = []
+
+    def __enter__(self) -> Machine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in reversed(self._processes):
+            if process.poll() is None:
+                process.terminate()
+        for process in self._processes:
+            try:
+                process.wait(WITHIN)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def start(self, name: str, *command: object, **environment: str) -> subprocess.Popen[bytes]:
+        """Start a program with its output in NAME.log."""
+        with (self._folder / f"{name}.log").open("wb") as log:
+            process = subprocess.Popen(
+                [str(part) for part in command],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                cwd=ROOT,
+                env=os.environ | environment,
+            )
+        self._processes.append(process)
+        return process
+
+    def end(self, process: subprocess.Popen[bytes], name: str) -> None:
+        """End a program by SIGTERM. Raises Failed unless it ends as one that was told to."""
+        process.send_signal(signal.SIGTERM)
+        until(lambda: process.poll() is not None, f"{name} ends")
+        if process.returncode != 0:
+            raise Failed(f"{name} ended with exit code {process.returncode}, not 0, after SIGTERM")
+
+    def log(self, name: str) -> str:
+        """What a program has said so far."""
+        return (self._folder / f"{name}.log").read_text(errors="replace")
+
+    def doctor(self) -> str:
+        """What `trirail doctor` says of can0. Raises Failed unless all of it is well."""
+        command = (sys.executable, "-P", "-m", "trirail", "doctor", self._folder / "robot.toml", "--json")
+        said = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=False)
+        can0 = [check for check in json.loads(said.stdout)["checks"] if check["name"].startswith("can0")]
+        if len(can0) != 3 or any(check["verdict"] != "ok" for check in can0):
+            raise Failed(f"the doctor says of can0: {can0}")
+        return ", ".join(f"{check['name']} {check['found']}" for check in can0)
+
+    def candump(self) -> None:
+        """Start the log of all frames that pass can1."""
+        with self._frames.open("wb") as log:
+            command = ("candump", "-L", "-D", "-r", str(BUFFER), "can1")
+            self._processes.append(subprocess.Popen(command, stdout=log))
+
+    def drives(self, config: str, name: str = "drives") -> subprocess.Popen[bytes]:
+        """Start the drives of a configuration on can1."""
+        # Real drives do not share a processor with a desktop: these get theirs before everything but the loop.
+        process = self.start(
+            name,
+            *("chrt", "--fifo", "50", sys.executable, "tools/virtual_drives.py", self._folder / config),
+            *("--interface", "socketcan", "--channel", "can1"),
+        )
+        until(lambda: "C " in self.log(name), "the virtual drives are there", process)
+        return process
+
+    def service(self, config: str, name: str = "service") -> subprocess.Popen[bytes]:
+        """Start the service; wait until it tells systemd, whose place is taken here, that it is up."""
+        address = f"{os.environ['TMPDIR']}/notify-{name}"
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+            systemd.bind(address)
+            systemd.settimeout(1.0)
+            process = self.start(
+                name,
+                *(sys.executable, "-P", "-c", PATIENT, "run", self._folder / config),
+                NOTIFY_SOCKET=address,
+            )
+            until(lambda: _received(systemd) == "READY=1", "the service is up", process)
+        return process
+
+
+def run(*command: str) -> None:
+    """Run a command to its end. Raises subprocess.SubprocessError if it fails."""
+    subprocess.run(command, check=True)
+
+
+def until(condition: Callable[[], bool], what: str, process: subprocess.Popen[bytes] | None = None) -> None:
+    """Wait for something to come true. Raises Failed if it does not in time, or if the process ends instead."""
+    deadline = time.monotonic() + WITHIN
+    while not condition():
+        if process is not None and process.poll() is not None:
+            raise Failed(f"{what}: no, the process has ended with exit code {process.returncode}")
+        if time.monotonic() > deadline:
+            raise Failed(f"{what}: not within {WITHIN:g} s")
+        time.sleep(0.1)
+
+
+def _received(receiver: socket.socket) -> str:
+    try:
+        return receiver.recv(100).decode()
+    except TimeoutError:
+        return ""

@@ -1,0 +1,213 @@
+"""What happens in the emulated machine, in order: motion, stops, and what neighbours on a bus do to a robot."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable
+from typing import Any
+
+from hil_programs import WITHIN, Failed, Machine, run, until
+from trirail.client.client import Result, Robot
+from trirail.config import Config
+from trirail.errors import RefusedError
+from trirail.wire.state import State
+
+Held = Callable[[str, str], None]
+"""Takes what held, and how."""
+
+FLOOD_GAP = "4"
+"""Between two frames of a flood [ms]: 250 a second, of the highest priority that a stranger's data frames may have."""
+PRE_OPERATIONAL_B = "000#8002"
+"""NMT: drive B, into pre-operational, as a foreign master would send it (CiA 301, 7.2.8.3.1)."""
+
+
+def disturbed(machine: Machine, config: Config, held: Held, result: dict[str, Any]) -> None:
+    """Move, stop, and be disturbed: by strangers on the bus, and by either card that goes down in motion.
+
+    `result` gets "cut": the time up to which the frames on the bus are those of a robot that nobody disturbs.
+    """
+    machine.drives("robot.toml")
+    held("drives", "three virtual drives on can1")
+    service = machine.service("robot.toml")
+    held("service", "up on can0, its drives set up and read back by SDO")
+    with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
+        robot.enable()
+        held("enable", "confirmed, the robot holds")
+        moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(WITHIN)
+        expect(moved, "done", robot)
+        held("goal", moved.message)
+        _refused(robot, held)
+        _stopped(robot, held)
+        robot.disable()
+        held("disable", "confirmed, no drive has power")
+        robot.enable()
+        _quick_stopped(robot, held)
+        result["loops"] |= {f"{config.loop.rate_hz} Hz": _loop(robot.state())}
+        result["cut"] = time.time()
+        _flooded(robot, held)
+        _thrown_out(robot, held)
+        _drives_link_down(robot, machine, held)
+        _link_down(robot, machine, held)
+    machine.end(service, "the service")
+    held("end", "exit code 0 after SIGTERM")
+
+
+def homed(machine: Machine, config: Config, held: Held, result: dict[str, Any]) -> None:
+    """Home drives that have incremental encoders, and move, at another rate than before."""
+    run("ip", "link", "set", "can0", "up")
+    drives = machine.drives("homing.toml", "homing-drives")
+    service = machine.service("homing.toml", "homing-service")
+    with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
+        try:
+            robot.enable()
+            robot.move_to(x=0.01, y=0.0, phi=0.0)
+        except RefusedError as refused:
+            if refused.code != "not_homed":
+                raise
+        else:
+            raise Failed("a goal was accepted of a robot that is not homed")
+        robot.home()
+        state = robot.state()
+        held("homing", f"at {config.loop.rate_hz} Hz, all three, then {state.mode}")
+        moved = robot.move_to(x=0.01, y=0.005, phi=-0.05).wait(WITHIN)
+        expect(moved, "done", robot)
+        held("goal after homing", moved.message)
+        result["loops"] |= {f"{config.loop.rate_hz} Hz": _loop(robot.state())}
+    machine.end(service, "the service")
+    drives.terminate()
+
+
+def _refused(robot: Robot, held: Held) -> None:
+    try:
+        robot.move_to(x=0.5, y=0.0, phi=0.0)
+    except RefusedError as refused:
+        held("goal out of reach", str(refused))
+    else:
+        raise Failed("a goal 0.5 m away was accepted")
+
+
+def _stopped(robot: Robot, held: Held) -> None:
+    goal = robot.move_to(x=-0.08, y=0.0, phi=0.0)
+    _until_moving(robot, goal.id)
+    robot.stop()
+    result = goal.wait(WITHIN)
+    expect(result, "stopped", robot)
+    held("stop", result.message)
+
+
+def _quick_stopped(robot: Robot, held: Held) -> None:
+    goal = robot.move_to(x=0.08, y=0.0, phi=0.0)
+    _until_moving(robot, goal.id)
+    robot.quick_stop()
+    expect(goal.wait(WITHIN), "faulted", robot)
+    state = until_state(robot, lambda state: state.mode == "fault", "fault after a quick stop")
+    _recover(robot)
+    held("quick stop and reset", f"{'; '.join(state.faults)}; then enabled again")
+
+
+def _flooded(robot: Robot, held: Held) -> None:
+    with subprocess.Popen(("cangen", "can1", "-I", "001", "-L", "8", "-g", FLOOD_GAP)) as flood:
+        try:
+            result = robot.move_to(x=0.0, y=0.01, phi=0.0).wait(WITHIN)
+        finally:
+            flood.terminate()
+    expect(result, "done", robot)
+    held("flood at the highest priority", f"{1000 // int(FLOOD_GAP)} frames 001 a second: {result.message}")
+
+
+def _thrown_out(robot: Robot, held: Held) -> None:
+    """Let a foreign master take drive B out of operational in motion: the robot must stop and say which."""
+    goal = robot.move_to(x=-0.08, y=0.0, phi=0.0)
+    _until_moving(robot, goal.id)
+    run("cansend", "can1", PRE_OPERATIONAL_B)
+    held("a foreign master's NMT", _faulted(robot, goal.wait(WITHIN), "drive B"))
+    _recover(robot)
+
+
+def _drives_link_down(robot: Robot, machine: Machine, held: Held) -> None:
+    """Let the drives' card go down in motion: they must stop by themselves, and come back."""
+    goal = robot.move_to(x=0.08, y=0.0, phi=0.0)
+    _until_moving(robot, goal.id)
+    run("ip", "link", "set", "can1", "down")
+    words = _faulted(robot, goal.wait(WITHIN), "drive")
+    until(lambda: _in_fault(machine.log("drives")), "the drives stop by their own watchdogs")
+    run("ip", "link", "set", "can1", "up")
+    _recover(robot)
+    held("drives' interface down in motion", f"{words}; up again, reset and enabled")
+
+
+def _link_down(robot: Robot, machine: Machine, held: Held) -> None:
+    goal = robot.move_to(x=0.0, y=0.0, phi=0.0)
+    _until_moving(robot, goal.id)
+    run("ip", "link", "set", "can0", "down")
+    held("interface down in motion", _faulted(robot, goal.wait(WITHIN), "CAN bus"))
+    until(lambda: _in_fault(machine.log("drives")), "the drives stop by their own watchdogs")
+    held("drives without a master", "all three stopped by their own watchdogs")
+
+
+def _faulted(robot: Robot, result: Result, whose: str) -> str:
+    """Return the fault in words. Raises Failed unless a goal ended by one that names whose it is."""
+    expect(result, "faulted", robot)
+    state = until_state(robot, lambda state: state.mode == "fault", "fault")
+    if not any(whose in fault for fault in state.faults):
+        raise Failed(f"the fault does not name {whose!r}: {state.faults}")
+    return "; ".join(state.faults)
+
+
+def _recover(robot: Robot) -> None:
+    """Reset as soon as the cause is gone, and enable."""
+
+    def cleared() -> bool:
+        try:
+            robot.reset()
+        except RefusedError:
+            return False
+        return True
+
+    until(cleared, "reset")
+    robot.enable()
+
+
+def _until_moving(robot: Robot, goal: str) -> None:
+    until_state(
+        robot,
+        lambda state: state.goal is not None and state.goal.id == goal and state.goal.progress > 0.2,
+        "the robot moves",
+    )
+
+
+def until_state(robot: Robot, condition: Callable[[State], bool], what: str) -> State:
+    """Return the first state for which something holds."""
+    deadline = time.monotonic() + WITHIN
+    for state in robot.states(timeout=WITHIN):
+        if condition(state):
+            return state
+        if time.monotonic() > deadline:
+            raise Failed(f"{what}: not within {WITHIN:g} s; {_about(state)}")
+    raise Failed(f"{what}: the service has gone silent")
+
+
+def expect(result: Result, outcome: str, robot: Robot) -> None:
+    """Raise Failed unless a goal ended as it should."""
+    if result.outcome != outcome:
+        raise Failed(f"goal: {result.message}; wanted is {outcome}. {_about(robot.state())}")
+
+
+def _about(state: State) -> str:
+    return f"mode {state.mode}, faults {state.faults}, missed ticks {state.loop.overruns}"
+
+
+def _in_fault(log: str) -> bool:
+    """Whether the newest line of each drive says that its watchdog has put it in fault, where it has no power."""
+    newest = {line[0]: line for line in log.splitlines() if line[:2] in {"A ", "B ", "C "}}
+    return len(newest) == 3 and all(line[2:].startswith("fault,") for line in newest.values())
+
+
+def _loop(state: State) -> dict[str, Any]:
+    loop = state.loop
+    return {
+        "cycles": loop.cycles,
+        "overruns": loop.overruns,
+        "lateness_us": {"p50": loop.lateness_us.p50, "p99": loop.lateness_us.p99, "max": loop.lateness_us.max},
+    }
