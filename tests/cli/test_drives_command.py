@@ -40,6 +40,7 @@ def test_differences_are_written_when_that_is_asked_for(capsys: pytest.CaptureFi
 
 def test_drives_that_tell_nothing(tmp_path: Path) -> None:
     text = SIM.read_text().replace('protocol = "cia402"', 'protocol = "odrive"')
+    text = text.replace("counts_per_metre = 1e7", "counts_per_metre = 30.0")
     (tmp_path / "odrive.toml").write_text(text)
     with pytest.raises(DriveError, match="have no objects to be shown"):
         run("drives", str(tmp_path / "odrive.toml"))

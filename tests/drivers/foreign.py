@@ -184,6 +184,9 @@ class ForeignDrive:
         self.written: list[tuple[int, int, bytes]] = []
         """What SDO wrote, in order."""
         self._latched: dict[int, bytes] = {}
+        self._valid: dict[int, list[int]] = {}
+        self._mapped_now: dict[int, list[tuple[int, int, int]]] = {}
+        self._last = -math.inf
         self._told: dict[int, bytes] = {}
         self._told_at: dict[int, float] = {}
         self._pending: set[int] = set()
@@ -237,6 +240,9 @@ class ForeignDrive:
         if index & 0xFA00 == 0x1800 and subindex == 3 and not self.value(index, 1) & 1 << 31:
             raise SdoAbortedError(0x0609_0030)  # CiA 301: the inhibit time only while it is invalid
         self.written.append((index, subindex, bytes(data)))
+        if 0x1400 <= index < 0x1C00:
+            self._valid.clear()
+            self._mapped_now.clear()
         if index == 0x6040:
             self.control(value)
         elif index == 0x6060:
@@ -264,7 +270,9 @@ class ForeignDrive:
         """Take in what is on the bus, and do what time asks for."""
         while (message := self.bus.recv(0)) is not None:
             self._take(message)
-        self._time()
+        if self.clock() > self._last:
+            self._last = self.clock()
+            self._time()
 
     def _take(self, message: can.Message) -> None:
         identifier = message.arbitration_id
@@ -317,14 +325,25 @@ class ForeignDrive:
     def boot(self) -> None:
         """Restart."""
         self.local.data_store.clear()
+        self._valid.clear()
+        self._mapped_now.clear()
         self.nmt, self.state, self.mode, self.error = PRE_OPERATIONAL, DISABLED, 0, 0
         self._consumer_heard = None
         self._send(0x700 + self.node, b"\x00")
 
-    def _pdos(self, base: int) -> Iterable[int]:
-        return (index for index in range(base, base + 16) if self.has(index, 1) and not self.value(index, 1) & 1 << 31)
+    def _pdos(self, base: int) -> list[int]:
+        """PDOs that are valid; looked up once, until a parameter is written."""
+        if base not in self._valid:
+            every = (index for index in range(base, base + 16) if self.has(index, 1))
+            self._valid[base] = [index for index in every if not self.value(index, 1) & 1 << 31]
+        return self._valid[base]
 
     def _mapping(self, index: int) -> list[tuple[int, int, int]]:
+        if index not in self._mapped_now:
+            self._mapped_now[index] = self._read_mapping(index)
+        return self._mapped_now[index]
+
+    def _read_mapping(self, index: int) -> list[tuple[int, int, int]]:
         entries = [self.value(index, n + 1) for n in range(self.value(index, 0))]
         return [(entry >> 16, entry >> 8 & 0xFF, (entry & 0xFF) // 8) for entry in entries if entry]
 
@@ -493,7 +512,7 @@ class ForeignDrive:
 class Wires(can.BusABC):
     """python-can's virtual bus; whoever waits on it lets the foreign nodes work and the time pass."""
 
-    STEP: Final = 0.0005
+    STEP: Final = 0.002
 
     def __init__(self, channel: str, clock: Clock) -> None:
         self.inner = can.Bus(channel, interface="virtual")
