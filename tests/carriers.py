@@ -65,9 +65,11 @@ def on_vcan(test: Callable[P, None]) -> Callable[P, None]:
 def vcan() -> Iterator[str]:
     """A virtual bus that is up."""
     ip("link", "add", NAME, "type", "vcan")
-    ip("link", "set", NAME, "up")
-    yield NAME
-    ip("link", "delete", NAME)
+    try:
+        ip("link", "set", NAME, "up")
+        yield NAME
+    finally:
+        ip("link", "delete", NAME)
 
 
 class FarEnd:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import heapq
 import itertools
 import math
 import os
+import tracemalloc
 from collections.abc import Callable, Iterator
 from typing import cast
 
@@ -18,11 +20,15 @@ from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
 from trirail.control.control import Control, Given
 from trirail.control.ledger import Notice
+from trirail.control.local_planner import LocalPlanner
+from trirail.motion.paths import FOR_EVER, Path, constant
+from trirail.motion.runs import MotionState
 from trirail.wire.messages import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.bus import simulated_bus
 from trirail_drivers.cia402 import frames
+from trirail_drivers.interface import Feedback, Triple
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedDrive
 
@@ -83,7 +89,8 @@ class Rig:
         self.driver.configure(config.period)
         if delay is not None:
             delay_answers(self.bus, delay, lambda: self.now)
-        self.control = Control(config, self.driver)
+        self.planner = LocalPlanner(config)
+        self.control = Control(config, self.driver, self.planner)
         self.driver.sync()
         self.control.start(self.driver.read())
         self.answers: list[Answer] = []
@@ -114,7 +121,9 @@ class Rig:
         self.sent.clear()
         control = self.control
         self.driver.sync()
-        given: list[Given] = [] if request is None else [(request, round(self.now * 1e9))]
+        now_ns = round(self.now * 1e9)
+        given: list[Given] = [] if request is None else [(request, now_ns)]
+        given += [(answer, now_ns) for answer in self.planner.answers()]
         control.cycle(self.driver.read(), given)
         self.rows.append(control.setpoints.rows)
         self.seen.append([frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6])
@@ -158,6 +167,16 @@ class Rig:
         """Send a goal in this cycle and do not wait for its answer."""
         self.cycle(GoalRequest(next(self._tickets), "ann", id, goal, round(self.now * 1e9)))
 
+    def go_on_with(self, state: MotionState) -> None:
+        """Let the run under way have this motion in the next cycle, whatever it has now."""
+        run = self.control._schedule.runs[0]
+        pieces = np.zeros((1, 3, 6))
+        pieces[0, :, :3] = np.transpose(state)
+        pieces[0, :, 2] /= 2.0
+        run.path = Path(np.array([0.0, FOR_EVER]), pieces)
+        run.change_law(constant(1.0), 1.0)
+        run.time = -self.config.period
+
     def order(self, name: str, value: float | None = None) -> None:
         """Send a command in this cycle and do not wait for its answer."""
         self.cycle(CommandRequest(next(self._tickets), "ann", Command(name), value))
@@ -186,6 +205,50 @@ class Rig:
         nothing = [(math.nan, math.nan)] * 3
         counts = np.array([sent if len(sent) == 3 else nothing for sent in self.seen])
         return np.stack([counts[:, :, 0] / scale + offset, counts[:, :, 1] / scale], axis=1)
+
+
+class Followers:
+    """Powered drives that are where they were told to be: no bus, no frames, and next to no memory of their own."""
+
+    bus_load = 0.0
+    traffic = 0
+
+    def __init__(self, feedback: Feedback) -> None:
+        self._feedback = feedback._replace(warnings=())
+        self._due = feedback.position, feedback.position
+
+    def sync(self) -> None:
+        """Reach what was written a cycle before the last one."""
+        self._feedback = self._feedback._replace(position=self._due[0], age=(0, 0, 0))
+
+    def read(self) -> Feedback:
+        return self._feedback
+
+    def write(self, position: Triple, velocity: Triple) -> None:
+        self._due = self._due[1], position
+
+
+def what_memory_takes(cycle: Callable[[], None], cycles: int) -> tuple[int, int]:
+    """Return by how many bytes memory grows in so many cycles, and how many are in use for a moment at most.
+
+    Without the garbage collector, as the loop runs. The cycles before are for what is made once, and for the tuples
+    that CPython keeps for later: 2000 of each length, then no more.
+    """
+    gc.collect()
+    gc.disable()
+    tracemalloc.start()
+    try:
+        for _ in range(2500):
+            cycle()
+        before, _ = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        for _ in range(cycles):
+            cycle()
+        after, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+        gc.enable()
+    return after - before, peak - before
 
 
 @pytest.fixture

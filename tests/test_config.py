@@ -169,6 +169,17 @@ def test_options_of_the_bus_that_are_refused(table: str, said: str) -> None:
         parse(f"{TEXT}\n[can.options]\n{table}\n")
 
 
+@pytest.mark.parametrize(("interface", "allowed"), [("simulated", True), ("unix", True), ("socketcan", False)])
+def test_only_a_bus_without_a_wire_is_faster_than_classical_can(interface: str, allowed: bool) -> None:
+    text = TEXT.replace("bitrate = 1_000_000", "bitrate = 8_000_000")
+    text = text.replace('interface = "simulated"', f'interface = "{interface}"\nchannel = "x"')
+    if allowed:
+        assert parse(text).can.bitrate == 8_000_000
+    else:
+        with pytest.raises(ConfigError, match=r"can\.bitrate = 8000000: classical CAN ends at 1000000 bit/s"):
+            parse(text)
+
+
 @pytest.mark.parametrize("name", ["channel", "interface", "bitrate"])
 def test_what_stands_in_can_is_no_option(name: str) -> None:
     text = TEXT.replace('interface = "simulated"', 'interface = "gs_usb"')

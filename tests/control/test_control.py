@@ -430,10 +430,10 @@ def test_a_following_error(rig: Rig) -> None:
         (MotionState((0.05, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 99.0, 0.0)), "acceleration"),
     ],
 )
-def test_the_last_gate(rig: Rig, monkeypatch: pytest.MonkeyPatch, commanded: MotionState, said: str) -> None:
+def test_the_last_gate(rig: Rig, commanded: MotionState, said: str) -> None:
     moving(rig)
     sent = rig.setpoints()[-1, 0]
-    monkeypatch.setattr(rig.control._schedule.runs[0], "state", lambda *_: commanded)
+    rig.go_on_with(commanded)
     rig.cycle()
     assert rig.mode is Mode.FAULT
     assert quick_stops(rig) == {1, 2, 3}
@@ -442,13 +442,13 @@ def test_the_last_gate(rig: Rig, monkeypatch: pytest.MonkeyPatch, commanded: Mot
     assert np.abs(rig.setpoints()[-1, 0] - sent).max() < 1e-3  # what it would send is where the robot is
 
 
-def test_the_last_gate_knows_the_platforms_limits(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_last_gate_knows_the_platforms_limits(rig: Rig) -> None:
     rig.enable()
     rig.goal("there", 0.1498, 0.0, 0.0)
     rig.until(lambda: rig.mode is Mode.HOLDING)
     rig.goal("g1", 0.1499, 0.0, 0.0)
     rig.cycle()
-    monkeypatch.setattr(rig.control._schedule.runs[0], "state", lambda *_: rest((0.1502, 0.0, 0.0)))
+    rig.go_on_with(rest((0.1502, 0.0, 0.0)))
     rig.cycle()
     assert "setpoint refused: platform x: position 0.1502 m is beyond its limit 0.15 m" in (rig.control.fault or "")
     assert quick_stops(rig) == {1, 2, 3}
@@ -604,7 +604,7 @@ def test_a_goal_that_is_paused_too_late_arrives_all_the_same(rig: Rig, before: i
     rig.enable()
     answer = rig.goal("g1", 0.05, 0.0, 0.0)
     assert isinstance(answer, Accepted)
-    rig.until(lambda: rig.control.progress[1] < (before + 0.5) * PERIOD)
+    rig.until(lambda: rig.control._schedule.progress[1] < (before + 0.5) * PERIOD)
     rig.command("pause")
     rig.until(lambda: rig.mode is Mode.HOLDING)
     assert rig.control.commanded.pose == pytest.approx((0.05, 0.0, 0.0), abs=1e-9)

@@ -68,9 +68,11 @@ def test_following_error_is_to_the_setpoint_that_was_due_at_the_sync_of_the_posi
     first = (0.001, -0.002, 0.003)
     measured = standing(first)
     for setpoint in written:
-        measured.note(setpoint)
+        measured.record["commanded_position"] = setpoint
+        measured.take(Feedback(first, ON, None))
+    measured.record["commanded_position"] = last = (0.004, 0.005, -0.006)
     measured.take(Feedback(position, ON, None, age=age, follows=follows))
-    due = [first] * 6 + written
+    due = [first] * 6 + written + [last]
     expected = [due[-2 - age[n]][n] - position[n] if follows[n] else 0.0 for n in range(3)]
     assert measured.following_error == pytest.approx(expected, abs=1e-15)
 

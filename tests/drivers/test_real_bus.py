@@ -42,7 +42,7 @@ WITHIN = 60.0
 """How long a slow machine may take for anything [s]."""
 
 # python-can leaves its socket to the garbage collector where there is no such interface.
-no_such_interface = pytest.mark.filterwarnings(
+pytestmark = pytest.mark.filterwarnings(
     r"ignore:Exception ignored in. <socket\.socket.*family=29:pytest.PytestUnraisableExceptionWarning"
 )
 
@@ -136,7 +136,6 @@ def test_frames_pass_between_two_sockets(interface: str) -> None:
 
 
 @on_vcan
-@no_such_interface
 def test_an_interface_that_is_not_there_is_named_with_its_remedy() -> None:
     with pytest.raises(BusError, match=f"ip link add {NAME} type vcan"):
         bus.open_bus(VCAN, DRIVES)

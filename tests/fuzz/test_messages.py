@@ -24,7 +24,7 @@ from trirail.wire.links import Port, TooLarge
 from trirail.wire.messages import CommandReply, Event, Goal, Override, PoseGoal, Stop, TrajectoryGoal
 from trirail.wire.messages import TrajectoryPoint as Point
 from trirail.wire.packets import Accepted, GoalRequest, Happened, RefusedRequest
-from trirail.wire.records import DTYPE, LAYOUT
+from trirail.wire.records import DTYPE, SIZE
 from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_PACKET, MAX_POINTS
 from trirail.wire.state import Info, State
 from trirail.wire.vocabulary import Mode
@@ -136,10 +136,10 @@ def test_whatever_is_printed_is_shown_and_not_obeyed(words: str) -> None:
         assert json.loads(line) == words
 
 
-@given(payload=st.binary(max_size=2 * LAYOUT.size) | st.binary(min_size=LAYOUT.size, max_size=LAYOUT.size))
+@given(payload=st.binary(max_size=2 * SIZE) | st.binary(min_size=SIZE, max_size=SIZE))
 def test_any_bytes_are_records_or_refused(payload: bytes) -> None:
     with contextlib.suppress(RefusedError):
-        assert len(boundary.batch(payload)) % LAYOUT.size == 0
+        assert len(boundary.batch(payload)) % SIZE == 0
 
 
 def test_records_are_taken_as_records() -> None:

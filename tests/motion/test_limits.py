@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from trirail.control.feedback import Measured
 from trirail.kinematics.robot import inverse
 from trirail.motion.feasibility import PLATFORM_LAWS
-from trirail.motion.limits import EDGE, EXCESS, PLATFORM_EXCESS, Bounds, told_apart
+from trirail.motion.limits import EDGE, EXCESS, PLATFORM_EXCESS, Bounds, Violation, gate, told_apart
 from trirail.motion.planner import START
 from trirail.motion.runs import MotionState, rest
 from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
@@ -24,6 +25,7 @@ from trirail_drivers.interface import Feedback, PowerState
 
 LIMITS = CONFIG.limits
 PLATFORM = np.array([LIMITS.platform.velocity, LIMITS.platform.acceleration, LIMITS.platform.jerk])
+Rows = list[list[float]]
 BETWEEN = 0.01
 """What may lie between the moments at which a path is looked at."""
 
@@ -176,6 +178,12 @@ STANDS = [[0.0] * 3 for _ in range(4)]
 HAIR = 1e-6
 
 
+def at_the_gate(now: Rows, before: Rows, motion: Rows = STANDS, motion_before: Rows = STANDS) -> Violation | None:
+    """Hold rows of sliders and platform against the limits, and against those of the cycle before."""
+    sliders, sliders_before, platform, platform_before = map(np.array, (now, before, motion, motion_before))
+    return BOUNDS.violation(gate(BOUNDS.packed, sliders, sliders_before, platform, platform_before, BOUNDS.found))
+
+
 def rows(leg: int, **values: float) -> list[list[float]]:
     made = [list(row) for row in STANDS]
     for row, name in enumerate(("position", "velocity", "acceleration", "passive")):
@@ -210,8 +218,8 @@ def test_the_gates_slack(
 def test_the_gate_knows_how_far_a_slider_goes_in_a_cycle(leg: int) -> None:
     velocity = SLIDER.velocity
     before, most = rows(leg, velocity=velocity), velocity * (1.0 + EXCESS) * PERIOD
-    assert BOUNDS.step(rows(leg, velocity=velocity, position=velocity * PERIOD), before) is None
-    violation = BOUNDS.step(rows(leg, velocity=velocity, position=most * (1.0 + HAIR)), before)
+    assert at_the_gate(rows(leg, velocity=velocity, position=velocity * PERIOD), before) is None
+    violation = at_the_gate(rows(leg, velocity=velocity, position=most * (1.0 + HAIR)), before)
     assert violation is not None
     assert (violation.what, violation.quantity) == ("ABC"[leg], "step in one cycle")
 
@@ -228,11 +236,11 @@ def test_the_gate_knows_jerk_by_what_each_row_tells(leg: int, sign: float) -> No
             rows(leg, position=j * PERIOD**3 / 4.0 + sign * 1e-9),
         )
         for now in told:
-            violation = BOUNDS.step(now, STANDS)
+            violation = at_the_gate(now, STANDS)
             assert (violation is not None) is refused
             if violation is not None:
                 assert (violation.what, violation.quantity, violation.limit) == ("ABC"[leg], "jerk", SLIDER.jerk)
-    assert BOUNDS.step(rows(leg, acceleration=math.nan), STANDS) is not None
+    assert at_the_gate(rows(leg, acceleration=math.nan), STANDS) is not None
 
 
 @pytest.mark.parametrize("n", range(3))
@@ -250,7 +258,7 @@ def test_the_gate_knows_the_platforms_velocity_acceleration_and_jerk(n: int, sig
                 now[0][n] = share * most * PERIOD
             if quantity == "acceleration":
                 now[1][n], now[0][n] = share * most * PERIOD, share * most * PERIOD**2 / 2.0
-            violation = BOUNDS.platform(now, before)
+            violation = at_the_gate(STANDS, STANDS, now, before)
             assert (violation is not None) is refused, (quantity, violation)
             if violation is not None:
                 assert (violation.what, violation.quantity) == (("x", "y", "phi")[n], quantity)
@@ -265,13 +273,12 @@ def test_the_gate_knows_the_platforms_velocity_acceleration_and_jerk(n: int, sig
     ],
 )
 def test_a_step_in_any_row_is_a_fault_before_it_is_sent(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch, later: object, said: str
+    rig: Rig, later: Callable[[MotionState], MotionState], said: str
 ) -> None:
     rig.enable()
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(20)
-    stepped = later(rig.control.commanded)  # type: ignore[operator]
-    monkeypatch.setattr(rig.control._schedule.runs[0], "state", lambda *_: stepped)
+    rig.go_on_with(later(rig.control.commanded))
     rig.cycle()
     assert rig.mode is Mode.FAULT
     assert "setpoint refused: " in (rig.control.fault or "")
@@ -279,11 +286,11 @@ def test_a_step_in_any_row_is_a_fault_before_it_is_sent(
     assert not any(message.arbitration_id - 0x300 in (1, 2, 3) for message in rig.sent)
 
 
-def test_a_motion_that_ends_at_once_is_a_fault(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_motion_that_ends_at_once_is_a_fault(rig: Rig) -> None:
     rig.enable()
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(100)
-    monkeypatch.setattr(rig.control._schedule.runs[0], "state", lambda *_: rest(rig.control.commanded.pose))
+    rig.go_on_with(rest(rig.control.commanded.pose))
     rig.cycle()
     assert "jerk" in (rig.control.fault or "")
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
-from conftest import Rig
+from conftest import Followers, Rig, what_memory_takes
+from trirail.motion.planning import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
-from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop
+from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop, Ports
 from trirail.wire import links
 from trirail.wire.links import PacketLink, Port
 from trirail.wire.messages import PoseGoal
@@ -28,8 +30,10 @@ from trirail.wire.packets import (
     decode_answer,
     message,
 )
+from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.vocabulary import Command, Mode
+from trirail_drivers.interface import Drives
 
 
 class Shell:
@@ -37,11 +41,16 @@ class Shell:
 
     def __init__(self, rig: Rig, folder: Path) -> None:
         self.rig = rig
-        self.ports = Port(links.listen(folder / "gateway")), Port(links.listen(folder / "recorder"))
+        names = ("gateway", "recorder", "planner")
+        self.ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))
         self.gateway: PacketLink = links.connect(folder / "gateway")
         self.recorder: PacketLink = links.connect(folder / "recorder")
+        self.planner: PacketLink = links.connect(folder / "planner", MAX_PLANNING)
+        self.motion_planner = MotionPlanner(rig.config)
+        self.serves = True
+        """Whether the planner answers what it is asked before the next cycle."""
         self.heartbeats = Heartbeats.create()
-        self.loop = Loop(rig.config, rig.driver, *self.ports, self.heartbeats)
+        self.loop = Loop(rig.config, rig.driver, self.ports, self.heartbeats)
         self.loop.control.start(rig.control.measured.feedback)
 
     def cycles(self, number: int, missed: int = 0) -> None:
@@ -49,6 +58,8 @@ class Shell:
             self.rig.now += self.rig.config.period
             self.rig.sent.clear()
             self.loop.cycle(Tick(round(self.rig.now * 1e9), 0, missed))
+            while self.serves and (packet := self.planner.receive()) is not None:
+                self.planner.send(encode(self.motion_planner.plan(decode_plan_request(packet))))
 
     def enabled(self) -> None:
         self.cycles(self.rig.config.loop.rate_hz // BATCHES_PER_SECOND)  # by then the gateway is accepted
@@ -72,6 +83,7 @@ def shell(rig: Rig, tmp_path: Path) -> Iterator[Shell]:
     yield made
     made.gateway.close()
     made.recorder.close()
+    made.planner.close()
     for port in made.ports:
         port.close()
 
@@ -107,6 +119,28 @@ def test_the_bus_load_is_measured(shell: Shell) -> None:
     said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
     measured = [answer.bus_load for answer in said if isinstance(answer, Status)][-1]
     assert measured == pytest.approx(shell.rig.driver.bus_load, rel=0.05)
+
+
+@pytest.mark.parametrize("in_motion", [False, True])
+def test_a_cycle_that_changes_nothing_takes_no_memory(shell: Shell, in_motion: bool) -> None:
+    """With a gateway that gives signs of life, and records that go to it and to the recorder."""
+    shell.enabled()
+    if in_motion:
+        now = round(shell.rig.now * 1e9)
+        shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.1, 0.02, 0.1, speed=0.02), now)))
+        beating(shell, 50)
+    drives = Followers(shell.loop.control.measured.feedback)
+    shell.loop._drives = shell.loop.control._drives = cast(Drives, drives)
+    heart, tick = shell.heartbeats.of("gateway"), Tick(round(shell.rig.now * 1e9), 0, 0)
+
+    def cycle() -> None:
+        heart.beat()
+        shell.loop.cycle(tick)
+
+    grown, in_use = what_memory_takes(cycle, 500)
+    assert shell.mode() is (Mode.MOVING if in_motion else Mode.HOLDING)
+    assert grown <= 256
+    assert in_use <= 4096
 
 
 def test_missed_ticks_are_counted(shell: Shell) -> None:

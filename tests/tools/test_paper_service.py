@@ -84,7 +84,7 @@ def test_the_cycle_that_takes_the_goal_is_one_period_into_it(rig: conftest.Rig, 
     rig.enable()
     assert isinstance(rig.send("g", TrajectoryGoal(tuple(points(example)))), Accepted)
     first = len(rig.rows) - 1
-    assert rig.control.progress[0] == pytest.approx(PERIOD / DURATION)
+    assert rig.control.measured.record["progress"][0] == pytest.approx(PERIOD / DURATION)
     moving = 1
     measured, error = [rig.control.measured.feedback.position], [rig.control.measured.following_error]
     for _ in range(round(DURATION / PERIOD) + REACHED):

@@ -20,7 +20,7 @@ from trirail.wire.packets import (
     Status,
     Welcome,
 )
-from trirail.wire.records import FIELDS, LAYOUT, Record, pack_into, unpack
+from trirail.wire.records import DTYPE, FIELDS, HEAD, SIZE, unpack
 from trirail.wire.vocabulary import Command
 
 
@@ -55,14 +55,17 @@ def test_answers(answer: Answer) -> None:
     assert packets.decode_answer(packet[1:]) == answer
 
 
-def test_a_record_has_its_fields_where_readers_look_for_them() -> None:
-    """Packed by name, read by name: each field holds what was put into it, and nothing else."""
-    sizes = {name: n for name, _, n in FIELDS}
-    assert tuple(sizes) == Record._fields
+def test_a_record_begins_with_what_the_loop_writes() -> None:
+    """Its head is packed in one piece: field by field, and up to where the control's fields begin."""
+    names = [name for name, _, _ in FIELDS]
+    head = names[: names.index("mode") + 1]
     numbers = iter(range(1, 1000))
-    given = {name: next(numbers) if n == 1 else [next(numbers) for _ in range(n)] for name, n in sizes.items()}
-    buffer = bytearray(5 + LAYOUT.size)
-    pack_into(buffer, 5, Record(**given))  # type: ignore[arg-type]
-    (row,) = unpack(bytes(buffer[5:]))
-    for name, value in given.items():
-        assert row[name].tolist() == value
+    given = {name: [next(numbers) for _ in range(n)] for name, _, n in FIELDS if name in head}
+    buffer = bytearray(SIZE)
+    HEAD.pack_into(buffer, 0, *(number for values in given.values() for number in values))
+    (row,) = unpack(bytes(buffer))
+    for name, values in given.items():
+        assert row[name].ravel().tolist() == values
+    offset = DTYPE.fields["drive_state"][1]  # type: ignore[index]
+    assert HEAD.size == offset
+    assert not any(buffer[offset:])

@@ -6,7 +6,6 @@ and `write` the setpoints behind the last gate. What is to be said of it waits a
 
 from __future__ import annotations
 
-import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable
 
@@ -18,20 +17,19 @@ from trirail.control.feedback import Measured
 from trirail.control.goal_queue import GoalQueue
 from trirail.control.ledger import Ledger
 from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeState, Refusal, step
+from trirail.control.plan_requests import PlannerPort, PlanRequests
 from trirail.control.setpoints import Setpoints
-from trirail.control.stepwise_planner import StepwisePlanner
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.goals import Goals
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
-from trirail.motion.steps import finish
-from trirail.wire.messages import Outcome, PoseGoal, SlidersGoal
-from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest, Request
+from trirail.wire.messages import Outcome
+from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest, PlannerLost, RefusedRequest, Request
+from trirail.wire.planning import PlanAnswer
 from trirail.wire.records import Part
 from trirail.wire.vocabulary import Command, Mode
 
-Given = tuple[Request | Disturbance, int]
+Given = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
 """What the control is given in a cycle, and when, by the monotonic clock [ns]."""
 
 SETTLE = 0.1
@@ -57,20 +55,19 @@ _GO_ON = (
 class Control:
     """Modes, motion, kinematics and limits of one robot over one set of drives."""
 
-    def __init__(self, config: Config, drives: Drives) -> None:
+    def __init__(self, config: Config, drives: Drives, planner: PlannerPort) -> None:
         robot = geometry(config.geometry)
         self._drives = drives
         self._period = config.period
-        self._goals = Goals(robot, config.limits, config.period)
         self._schedule = Schedule(rest(STILL), config.period)
-        self._planner = StepwisePlanner(self._goals, self._schedule, config.period)
+        self._planner = PlanRequests(config, planner, self._schedule)
         self.ledger = Ledger()
         self.goal_queue = GoalQueue(self.ledger, self._planner, self._schedule, config.motion.queue, config.period)
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
-        self.measured = Measured(legs, config.period, step_length)
+        self._following_error_limit = config.limits.slider.following_error
+        self.measured = Measured(legs, config.period, step_length, self._following_error_limit)
         self.setpoints = Setpoints(legs, Bounds(config.limits, config.period, EDGE), self.measured, step_length)
         self._can_home = any(drive.homing is not None for drive in config.drives.each)
-        self._following_error_limit = config.limits.slider.following_error
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._settle_cycles = max(3, round(SETTLE / config.period))
 
@@ -78,6 +75,7 @@ class Control:
         self.state: ModeState = DISABLED
         self.fault: str | None = None
         self._entered = 0
+        self._run: Run | None = None
 
     def cycle(self, feedback: Feedback, given: Iterable[Given], mark: Callable[[Part], None] = lambda _: None) -> None:
         """Run one cycle: what the drives said at its SYNC, and what else is given in it; then motion and setpoints.
@@ -88,10 +86,15 @@ class Control:
         self.observe(feedback)
         try:
             for what, now_ns in given:
-                if isinstance(what, Disturbance):
-                    self.happen(ModeEvent[what.event], what.reason)
-                else:
-                    self.handle(what, now_ns)
+                match what:
+                    case Disturbance():
+                        self.happen(ModeEvent[what.event], what.reason)
+                    case GoalRequest() | CommandRequest() | RefusedRequest():
+                        self.handle(what, now_ns)
+                    case PlannerLost():
+                        self._planner.lose(what.reason)
+                    case answer:
+                        self._planner.hear(answer)
             mark(Part.MODE)
             self.advance()
             mark(Part.MOTION)
@@ -109,18 +112,12 @@ class Control:
         self.measured.start(feedback)
         self.setpoints.start()
         self._follow_measured()
-        # What runs for the first time is slow: plan and check a motion now, not in a cycle.
-        nearby = Schedule(rest([value + 1e-3 for value in self.measured.pose]), self._period)
-        for goal in (PoseGoal(*self.measured.pose), SlidersGoal(feedback.position)):
-            with contextlib.suppress(RefusedError):
-                nearby.take(finish(self._goals.plan(goal, nearby, 1.0)).runs)
-                finish(self._goals.time_scaling.try_change(nearby.runs[0], 0.0, self.measured.pose))
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
         self.cycles += 1
         before = self.measured.feedback
-        self.measured.take(feedback)
+        behind = self.measured.take(feedback)
         for warning in feedback.warnings:
             self.ledger.tell("service", "warning", warning)
         mode = self.state.mode
@@ -131,16 +128,14 @@ class Control:
         elif mode is Mode.ENABLING:
             self._power_up()
         elif mode in (Mode.HOMING, Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
-            for name, error in zip(NAMES, self.measured.following_error, strict=True):
-                if not abs(error) <= self._following_error_limit:
-                    self.trip(
-                        f"slider {name}: following error {error * 1e3:.3f} mm is beyond its limit "
-                        f"{self._following_error_limit * 1e3:g} mm"
-                    )
-                    break
-            else:
-                if not feedback.homing:
-                    self._homing_over()
+            if behind:
+                error = self.measured.following_error[behind - 1]
+                self.trip(
+                    f"slider {NAMES[behind - 1]}: following error {error * 1e3:.3f} mm is beyond its limit "
+                    f"{self._following_error_limit * 1e3:g} mm"
+                )
+            elif not feedback.homing:
+                self._homing_over()
         self.ledger.settle(self._verdict, self.state.mode)
 
     def handle(self, request: Request, now_ns: int) -> None:
@@ -164,36 +159,47 @@ class Control:
         self._withdraw(event, reason)
 
     def advance(self) -> None:
-        """End a jog that nobody renews, plan one step further, and move the commanded state on by one period."""
+        """End a jog that nobody renews, begin what has been planned, and go on to the motion of this cycle."""
         released = self.ledger.release(self.cycles) if self.state.mode is Mode.MOVING else None
         if released is not None:
             self._go(ModeEvent.RELEASE, f"goal {released.id} of {released.user} is not renewed")
         beginning = self.goal_queue.think(self.cycles, self._admit)
         if beginning is not None:
             self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
-        for _ in range(self._schedule.advance()):
-            self.ledger.pass_on()
-        self.goal_queue.expire(self.cycles)
+        self._run = self._schedule.begin_cycle()
 
     def solve(self) -> None:
-        """Solve the sliders for the commanded state, by the paper's recursion; pass the last gate, or trip."""
+        """Move the commanded motion on by one period, solve the sliders by the paper's recursion, pass the last gate.
+
+        All of that is one compiled call; what it finds beside ends goals, a motion, or the robot's moving at all.
+        """
         if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed:
             self._follow_measured()
             return
-        refused = self.setpoints.solve(self.commanded)
+        schedule, run = self._schedule, self._run
+        single = schedule.single
+        found = self.setpoints.solve(schedule, run)
+        if found and run is not None:
+            for _ in range(schedule.end_cycle(run)):
+                self.ledger.pass_on()
+        self.goal_queue.expire(self.cycles)
+        if not single:
+            self.setpoints.tell_progress(*schedule.progress)
+        if found:
+            self._conclude(found)
+
+    def _conclude(self, found: int) -> None:
+        """Trip where the last gate has refused the setpoints; hold where the motion has come to rest."""
+        refused = self.setpoints.refusal(found)
+        schedule = self._schedule
         if refused:
             self.trip(refused)
-            return
-        schedule = self._schedule
-        if self.state.mode in (Mode.MOVING, Mode.STOPPING) and schedule.runs[0].stands and not schedule.turning:
+        elif self.state.mode in (Mode.MOVING, Mode.STOPPING) and schedule.runs[0].stands:
             self._stand(schedule.runs[0])
 
     def write(self) -> None:
         """Send the setpoints."""
-        position, velocity, *_ = self.setpoints.rows
-        setpoint = (position[0], position[1], position[2])
-        self.measured.note(setpoint)
-        self._drives.write(setpoint, (velocity[0], velocity[1], velocity[2]))
+        self._drives.write(*self.setpoints.sent)
 
     # ------------------------------------------------------------------ what others ask of it
 
@@ -206,15 +212,6 @@ class Control:
     def override(self) -> float:
         """The rate at which motions are to run."""
         return self._planner.override
-
-    @property
-    def progress(self) -> tuple[float, float]:
-        """Share of the time of the goal under way that is over, and what remains of it [s]."""
-        schedule = self._schedule
-        if not schedule.runs or schedule.turning:
-            return 0.0, schedule.remaining
-        *stops, run = schedule.runs
-        return run.progress, run.remaining + sum(stop.ends - stop.time for stop in stops)
 
     @property
     def target(self) -> Triple | None:
@@ -334,15 +331,12 @@ class Control:
             self.ledger.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode, goal=begun)
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
             self._schedule.take(deque())
-            self._planner.stop_thinking()
+            self.setpoints.tell_progress(0.0, 0.0)
+            self._planner.leave_rate()
 
     def _brake(self) -> None:
         """Stop on the path of the motion under way; what was to follow it does not."""
-        schedule = self._schedule
-        schedule.keep()
-        schedule.forget()
-        if len(schedule.runs) > 1:  # it is stopping already, for a goal that is not to follow any more
-            schedule.runs.pop()
+        self._schedule.stop_on_path()
         self._planner.run_at(0.0)
 
     def _stand(self, run: Run) -> None:
@@ -394,6 +388,6 @@ class Control:
 
     def _follow_measured(self) -> None:
         """Command the pose that is measured, and the sliders to where they are."""
+        held = self.state.mode not in (Mode.DISABLED, Mode.FAULT)
         stopped_now = self.state.mode is Mode.FAULT and self._entered == self.cycles
-        self._schedule.commanded = rest(self.measured.pose)
-        self.setpoints.follow(held=self.state.mode not in (Mode.DISABLED, Mode.FAULT), stopped_now=stopped_now)
+        self.setpoints.follow(self._schedule, held=held, stopped_now=stopped_now)

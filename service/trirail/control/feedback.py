@@ -2,38 +2,61 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 from trirail_drivers.interface import Feedback, PowerState, Triple
 
+from trirail.control import cycle
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.robot import forward_into
 from trirail.motion.runs import STILL
+from trirail.wire.records import DTYPE
 
-OLDEST = 3
-"""The greatest age of a position that is looked at, in SYNCs: at the next one the drive is silent."""
 CAN_MOVE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 """States in which a drive can move its slider."""
 
 
 class Measured:
-    """The newest feedback, beside the setpoints that it answers. `step` [m] is how far a slider can go in a cycle."""
+    """The newest feedback, beside the setpoints that it answers; all of it in the cycle's record.
 
-    def __init__(self, legs: Array, period: float, step: float) -> None:
+    `step` [m] is how far a slider can go in a cycle, `limit` [m] what following errors are held against.
+    """
+
+    def __init__(self, legs: Array, period: float, step: float, limit: float = np.inf) -> None:
         self.feedback = Feedback(STILL, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
-        self.velocity: Triple = STILL
-        self.following_error: Triple = STILL
-        """Setpoint due less position [m]; none for a drive that moves by itself."""
-        self.pose: Triple = STILL
-        """The newest pose to which measured sliders belonged."""
-        self.jumps = False, False, False
+        self.record = np.zeros(1, DTYPE)
+        """The cycle's record, (1,): what is measured here, what is commanded by the setpoints."""
+        self.numbers = np.zeros(2, cycle.FEEDBACK)
+        """The feedback's numbers, and those of the one before."""
+        self.jumping = np.zeros(3, np.bool)
         """Which sliders were measured where none can be so soon: what they say is not followed."""
         self._legs = legs
         self._period = period
-        self._step = step
-        self._sliders, self._pose = np.zeros(3), np.zeros(3)
-        self._written: deque[Triple] = deque([STILL] * (2 + OLDEST), maxlen=2 + OLDEST)
+        self._fastest = 2.0 * step / period  # the age may be one off, and makes a step a double one
+        self._limit = limit
+        self._packed = self.numbers.view(np.uint8).data
+        self._written = np.zeros((2 + cycle.OLDEST, 3))
+        self._room = np.zeros((2, 3))
+
+    @property
+    def pose(self) -> Triple:
+        """The newest pose to which measured sliders belonged."""
+        return self._recorded("pose")
+
+    @property
+    def velocity(self) -> Triple:
+        """Velocities of the sliders [m/s]."""
+        return self._recorded("velocity")
+
+    @property
+    def following_error(self) -> Triple:
+        """Setpoint due less position [m]; none for a drive that moves by itself."""
+        return self._recorded("following_error")
+
+    @property
+    def jumps(self) -> tuple[bool, bool, bool]:
+        """Which sliders were measured where none can be so soon."""
+        a, b, c = self.jumping.tolist()
+        return a, b, c
 
     @property
     def powered(self) -> bool:
@@ -47,44 +70,46 @@ class Measured:
 
     def start(self, feedback: Feedback) -> None:
         """Take the first feedback, for the setpoints of the past too."""
-        self.feedback = feedback
-        self._written.extend([feedback.position] * (2 + OLDEST))
+        self._pack(feedback)
+        self.numbers[1] = self.numbers[0]
+        self._written[:] = self.record["commanded_position"] = feedback.position
 
-    def note(self, setpoint: Triple) -> None:
-        """Take note of a setpoint as it is written."""
-        self._written.append(setpoint)
-
-    def take(self, feedback: Feedback) -> None:
-        """Take the feedback of the next cycle."""
-        before, self.feedback = self.feedback, feedback
-        self._compare(before)
-        a, b, c = self.velocity
-        most = 2.0 * self._step / self._period  # the age may be one off, and makes a step a double one
-        self.jumps = abs(a) > most, abs(b) > most, abs(c) > most
-        pose = None if any(self.jumps) else self.pose_of(feedback.position)
-        if pose is not None:
-            self.pose = pose
+    def take(self, feedback: Feedback) -> int:
+        """Take the feedback of the next cycle; return 0, or 1 + i if slider i's following error is beyond its limit."""
+        self._pack(feedback)
+        return cycle.observe(
+            self._legs,
+            self.numbers,
+            self._written,
+            self._period,
+            self._fastest,
+            self._limit,
+            self.jumping,
+            self._room,
+            self.record,
+        )
 
     def pose_of(self, sliders: Triple) -> Triple | None:
         """Return the pose to which sliders belong, the one nearest to the newest; None if they belong to none."""
-        self._sliders[:], self._pose[:] = sliders, self.pose
-        if forward_into(self._legs, self._sliders, self._pose, self._pose):
+        self._room[:] = sliders, self.pose
+        if forward_into(self._legs, self._room[0], self._room[1], self._room[1]):
             return None
-        x, y, phi = self._pose.tolist()
+        x, y, phi = self._room[1].tolist()
         return x, y, phi
 
-    def _compare(self, before: Feedback) -> None:
-        """Work out velocities and following errors, for the SYNC at which each position was sampled."""
-        velocity, error = list(self.velocity), [0.0, 0.0, 0.0]
-        follows = self.feedback.follows
-        for n, (now, age, last, last_age) in enumerate(
-            zip(self.feedback.position, self.feedback.age, before.position, before.age, strict=True)
-        ):
-            cycles = 1 + last_age - age
-            if cycles > 0:  # else there is no newer position
-                velocity[n] = (now - last) / (cycles * self._period)
-            # A drive reaches at a SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
-            if follows[n]:
-                error[n] = self._written[-2 - min(age, OLDEST)][n] - now
-        self.velocity = (velocity[0], velocity[1], velocity[2])
-        self.following_error = (error[0], error[1], error[2])
+    def _pack(self, feedback: Feedback) -> None:
+        self.feedback = feedback
+        cycle.SAID.pack_into(
+            self._packed,
+            0,
+            *feedback.position,
+            *feedback.age,
+            *feedback.state,
+            *feedback.follows,
+            *feedback.homed,
+            feedback.homing,
+        )
+
+    def _recorded(self, field: str) -> Triple:
+        x, y, z = self.record[field][0].tolist()
+        return x, y, z

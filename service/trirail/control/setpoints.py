@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from trirail_drivers.interface import NAMES, PowerState
+from trirail_drivers.interface import NAMES, Triple
 
+from trirail.control import cycle
 from trirail.control.feedback import Measured
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.limits import Bounds
-from trirail.motion.runs import MotionState, rest
+from trirail.motion.runs import Run
+from trirail.motion.schedule import Schedule
 
 
 class Setpoints:
@@ -23,70 +25,68 @@ class Setpoints:
         self._bounds = bounds
         self._measured = measured
         self._step = step
+        self._sliders = np.zeros((2, 6, 3))
+        self._sent = self._sliders[0, :2]
         self._motion = np.zeros((3, 3))
-        self._sliders = np.zeros((6, 3))
-        self._before: MotionState | None = None
-        """The platform's motion in the cycle before; None where the sliders were not solved for one."""
-        self.rows: list[list[float]] = self._sliders.tolist()
+        self._tried = np.zeros((6, 3))
+
+    @property
+    def rows(self) -> list[list[float]]:
         """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32."""
+        return self._sliders[0].tolist()  # type: ignore[no-any-return]  # numpy does not tell of what type its lists are
+
+    @property
+    def sent(self) -> tuple[Triple, Triple]:
+        """What the drives get: positions [m] and velocities [m/s]."""
+        (a, b, c), (u, v, w) = self._sent.tolist()
+        return (a, b, c), (u, v, w)
 
     def start(self) -> None:
         """Begin where the sliders are."""
-        self.rows[0] = list(self._measured.feedback.position)
+        self._sliders[0, 0] = self._measured.feedback.position
 
-    def solve(self, commanded: MotionState) -> str | None:
-        """Solve the sliders, by the paper's recursion; return why not, and leave all as it is, at the last gate."""
-        for row, values in enumerate(commanded):
-            self._motion[row] = values
-        singular = inverse_into(self._legs, self._motion, self._sliders)
-        if singular:
-            return f"slider {NAMES[singular - 1]}: no setpoint, the commanded pose is singular or not a number"
-        rows = self._sliders.tolist()
-        bounds = self._bounds
-        before = self._before or rest(commanded.pose)
-        violation = (
-            bounds.setpoint(rows)
-            or bounds.pose(commanded.pose)
-            or bounds.step(rows, self.rows)
-            or bounds.platform(commanded, before)
+    def solve(self, schedule: Schedule, run: Run | None) -> int:
+        """Move the commanded motion on, by the run under way, and solve the sliders by the paper's recursion.
+
+        Where the last gate refuses that they stay as they are. Returns what trirail.control.cycle.command does.
+        """
+        legs, bounds, found = self._legs, self._bounds.packed, self._bounds.found
+        motion, sliders, record = schedule.motion, self._sliders, self._measured.record
+        if run is None:
+            return cycle.hold(legs, bounds, motion, sliders, found, record)
+        path, law, (begun, end, arrival) = run.path, run.law, run.course
+        return cycle.command(
+            *(legs, bounds, path.knots, path.pieces, path.in_sliders, law.knots, law.pieces, run.time, run.target),
+            *(begun, end, arrival, motion, sliders, found, record),
         )
-        if violation:
-            return f"setpoint refused: {violation}"
-        self.rows, self._before = rows, commanded
-        return None
 
-    def follow(self, *, held: bool, stopped_now: bool) -> None:
-        """Make the setpoint of every drive that none holds the position that it measures: nothing moves on enable.
+    def refusal(self, code: int) -> str | None:
+        """Say why the last gate has refused what was just solved; None where it has not."""
+        refused = cycle.refusal(code)
+        if refused == 0:
+            return None
+        violation = self._bounds.violation(refused - 3)
+        if violation is None:
+            return f"slider {NAMES[refused - 1]}: no setpoint, the commanded pose is singular or not a number"
+        return f"setpoint refused: {violation}"
 
-        Where that is not where the slider was commanded to be, the setpoint goes there at the slider's speed: a drive
-        that missed the command to stop must not jump either. A position that jumps is not followed. A drive that
-        moves by itself, to be homed, gets no setpoint: what is meant for it is its position at once. `held` tells
-        whether drives that are enabled hold theirs, `stopped_now` whether all were stopped in this cycle: then no
-        setpoint is sent.
+    def follow(self, schedule: Schedule, *, held: bool, stopped_now: bool) -> None:
+        """Command the pose that is measured, and every drive that holds none the position that it measures.
+
+        Nothing moves on enable. Where that is not where the slider was commanded to be, the setpoint goes there at the
+        slider's speed: a drive that missed the command to stop must not jump either. A position that jumps is not
+        followed. A drive that moves by itself, to be homed, gets no setpoint: what is meant for it is its position at
+        once. `held` tells whether drives that are enabled hold theirs, `stopped_now` whether all were stopped in this
+        cycle: then no setpoint is sent.
         """
         measured = self._measured
-        position = []
-        for last, now, jumps, state, follows in zip(
-            self.rows[0],
-            measured.feedback.position,
-            measured.jumps,
-            measured.feedback.state,
-            measured.feedback.follows,
-            strict=True,
-        ):
-            if not follows:
-                position.append(now)
-            elif stopped_now or jumps or (held and state is PowerState.OPERATION_ENABLED):
-                position.append(last)
-            else:
-                position.append(last + max(-self._step, min(now - last, self._step)))
-        self._motion[:] = 0.0
-        self._motion[0] = measured.pose
-        if inverse_into(self._legs, self._motion, self._sliders) == 0:
-            self.rows = self._sliders.tolist()
-        self._before = None
-        self.rows[0] = position
-        self.rows[1] = self.rows[2] = [0.0, 0.0, 0.0]
+        arrays = schedule.motion, self._sliders, measured.record
+        cycle.follow(self._legs, measured.numbers, measured.jumping, held, stopped_now, self._step, *arrays)
+
+    def tell_progress(self, progress: float, remaining: float) -> None:
+        """Let the record say how much of the goal under way is over, as a share, and what remains [s]."""
+        record = self._measured.record
+        record["progress"], record["remaining"] = progress, remaining
 
     def check_rest(self) -> None:
         """Refuse to enable while a setpoint is on its way to where its slider is."""
@@ -103,11 +103,11 @@ class Setpoints:
         pose = self._measured.pose_of(position)
         self._motion[:] = 0.0
         self._motion[0] = pose or math.nan
-        if pose is None or inverse_into(self._legs, self._motion, self._sliders):
+        if pose is None or inverse_into(self._legs, self._motion, self._tried):
             raise RefusedError(
                 RefusalCode.SINGULAR, "the measured sliders belong to no pose: move them by hand, then enable"
             )
-        violation = self._bounds.pose(pose) or self._bounds.setpoint(self._sliders.tolist())
+        violation = self._bounds.pose(pose) or self._bounds.setpoint(self._tried)
         if violation:
             raise RefusedError(
                 RefusalCode.OUT_OF_WORKSPACE,

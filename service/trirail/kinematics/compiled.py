@@ -27,7 +27,7 @@ def _fingerprint() -> str:
 FINGERPRINT = _fingerprint()
 
 
-def compiled(*signatures: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def compiled(*signatures: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorate a function to run compiled: now, for these signatures; without any, at its first call.
 
     Division by zero gives an infinity or NaN, never an exception. Compiled code is kept beside the source, or

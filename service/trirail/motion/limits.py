@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+from numba import f8, from_dtype, i8
+from numpy.typing import ArrayLike, NDArray
+
 from trirail.config import Limits
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import LEGS
 from trirail.motion.paths import ROUNDING
 
@@ -20,8 +25,32 @@ EXCESS = 1e-3
 PLATFORM_EXCESS = (0.01, 0.05, 0.1)
 """Likewise the platform's velocity, acceleration and jerk: plans make use of all of it (checks.PLATFORM_LAWS)."""
 
-
-Rows = Sequence[Sequence[float]]
+BOUNDS = np.dtype(
+    [
+        ("rows", "f8", (4, 3)),  # low, high and slack of lambda_10, v_10, gamma_10, lambda_32
+        ("pose", "f8", (3, 2)),  # low and high of x, y, phi
+        ("edge", "f8"),  # slack of these
+        ("step", "f8"),  # how far a slider goes in a cycle at most [m]
+        ("slider_jerk", "f8"),
+        ("platform", "f8", (3, 3)),  # velocity, acceleration and jerk of x, y, phi
+        ("period", "f8"),
+    ]
+)
+"""A robot's limits, as compiled code takes them [m, rad, s]."""
+_CHECKS = (
+    ("slider", "position", "m"),
+    ("slider", "velocity", "m/s"),
+    ("slider", "acceleration", "m/s²"),
+    ("slider", "passive position", "m"),
+    ("platform", "position", ""),
+    ("slider", "step in one cycle", "m"),
+    ("slider", "jerk", "m/s³"),
+    ("platform", "velocity", "/s"),
+    ("platform", "acceleration", "/s²"),
+    ("platform", "jerk", "/s³"),
+)
+"""What is checked, of what, and in which unit; of the platform, after that of the coordinate."""
+_POSE, _STEP, _JERK, _PLATFORM = 4, 5, 6, 7  # where in _CHECKS; the sliders' rows stand in front of them
 
 
 class Violation(NamedTuple):
@@ -63,6 +92,109 @@ def told_apart(value: float, other: float) -> tuple[str, str]:
     return shown
 
 
+_BOUNDS, _ROWS, _ROW = from_dtype(BOUNDS)[::1], f8[:, ::1], f8[::1]
+
+
+@compiled()
+def _found(check: int, n: int, value: float, limit: float, found: Array) -> int:
+    """Note what is beyond its limit; return its code: 1 + 3 times the number of the check + the leg or coordinate."""
+    found[0], found[1] = value, limit
+    return 1 + 3 * check + n
+
+
+@compiled()
+def _jerk(now: Array, before: Array, n: int, period: float) -> float:
+    """Return the least jerk that explains rows (position, velocity, acceleration) one cycle after others.
+
+    A jerk j that may change at any moment, an acceleration that may begin or end anywhere in the cycle as large
+    as j makes it in a cycle T: between the two the acceleration changes by j T at most, the velocity differs by
+    j T² / 2 from what the mean acceleration gives, and the position by j T³ / 4 from what the mean velocity does.
+    """
+    half = period / 2.0
+    p, v, a = now[0, n], now[1, n], now[2, n]
+    p0, v0, a0 = before[0, n], before[1, n], before[2, n]
+    by_acceleration: float = abs(a - a0) / period
+    by_velocity: float = abs(v - v0 - half * (a + a0)) / (half * period)
+    by_position: float = 4.0 * (abs(p - p0 - half * (v + v0)) - ROUNDING) / period**3
+    return max(by_acceleration, by_velocity, by_position)
+
+
+@compiled(i8(_BOUNDS, _ROWS, _ROW))
+def check_setpoint(bounds: NDArray[np.void], rows: Array, found: Array) -> int:
+    """Check solved sliders, as many of the rows lambda_10, v_10, gamma_10, lambda_32 as there are [m, s].
+
+    A value that is not a number is beyond every limit.
+    """
+    for row in range(min(len(rows), 4)):
+        limits = bounds[0].rows[row]
+        low, high, slack = limits[0], limits[1], limits[2]
+        for n in range(3):
+            value = rows[row, n]
+            if not low - slack <= value <= high + slack:
+                return _found(row, n, value, low if value < low else high, found)
+    return 0
+
+
+@compiled(i8(_BOUNDS, _ROW, _ROW))
+def check_pose(bounds: NDArray[np.void], pose: Array, found: Array) -> int:
+    """Check a pose x, y [m], phi [rad] alone."""
+    edge = bounds[0].edge
+    for n in range(3):
+        low, high = bounds[0].pose[n, 0], bounds[0].pose[n, 1]
+        if not low - edge <= pose[n] <= high + edge:
+            return _found(_POSE, n, pose[n], low if pose[n] < low else high, found)
+    return 0
+
+
+@compiled()
+def _check_step(bounds: NDArray[np.void], rows: Array, before: Array, found: Array) -> int:
+    """Check solved sliders against those of the cycle before: how far they go, and with which jerk."""
+    most, jerk_limit = bounds[0].step, bounds[0].slider_jerk
+    for n in range(3):
+        step = rows[0, n] - before[0, n]
+        if not abs(step) <= most:
+            return _found(_STEP, n, step, most, found)
+    for n in range(3):
+        jerk = _jerk(rows, before, n, bounds[0].period)
+        if not jerk <= jerk_limit * (1.0 + EXCESS):
+            return _found(_JERK, n, jerk, jerk_limit, found)
+    return 0
+
+
+@compiled()
+def _check_platform(bounds: NDArray[np.void], motion: Array, before: Array, found: Array) -> int:
+    """Check the platform's velocity and acceleration, and the jerk since the cycle before."""
+    for n in range(3):
+        limits = bounds[0].platform[n]
+        for row in range(2):
+            value = motion[1 + row, n]
+            if not abs(value) <= limits[row] * (1.0 + PLATFORM_EXCESS[row]):
+                return _found(_PLATFORM + row, n, value, math.copysign(limits[row], value), found)
+        jerk = _jerk(motion, before, n, bounds[0].period)
+        if not jerk <= limits[2] * (1.0 + PLATFORM_EXCESS[2]):
+            return _found(_PLATFORM + 2, n, jerk, limits[2], found)
+    return 0
+
+
+@compiled(i8(_BOUNDS, _ROWS, _ROWS, _ROWS, _ROWS, _ROW))
+def gate(
+    bounds: NDArray[np.void], rows: Array, rows_before: Array, motion: Array, motion_before: Array, found: Array
+) -> int:
+    """Check solved sliders and the platform's motion against limits, and against those of the cycle before.
+
+    `rows` as of check_setpoint, `motion` (3, 3) the rows pose, velocity, acceleration. Returns 0, or a code for
+    Bounds.violation; then `found` (2,) holds the value and its limit.
+    """
+    code = check_setpoint(bounds, rows, found)
+    if code == 0:
+        code = check_pose(bounds, motion[0], found)
+    if code == 0:
+        code = _check_step(bounds, rows, rows_before, found)
+    if code == 0:
+        code = _check_platform(bounds, motion, motion_before, found)
+    return code
+
+
 class Bounds:
     """The limits of a robot, as bounds on the rows of a solved motion and on the pose.
 
@@ -72,76 +204,39 @@ class Bounds:
     def __init__(self, limits: Limits, period: float, edge: float = ROUNDING) -> None:
         slider, platform = limits.slider, limits.platform
         velocity, acceleration = slider.velocity, slider.acceleration
-        self._rows = (
-            ("position", "m", *slider.position, edge),
-            ("velocity", "m/s", -velocity, velocity, velocity * EXCESS),
-            ("acceleration", "m/s²", -acceleration, acceleration, acceleration * EXCESS),
-            ("passive position", "m", *slider.passive, edge),
+        self.packed = np.zeros(1, BOUNDS)
+        """As compiled code takes them, (1,) of BOUNDS."""
+        self.found = np.zeros(2)
+        """The value that was last found to be beyond its limit, and that limit."""
+        bounds = self.packed[0]
+        bounds["rows"] = (
+            (*slider.position, edge),
+            (-velocity, velocity, velocity * EXCESS),
+            (-acceleration, acceleration, acceleration * EXCESS),
+            (*slider.passive, edge),
         )
-        self._pose = tuple(zip(COORDINATES, UNITS, (platform.x, platform.y, platform.phi), strict=True))
-        self._edge = edge
-        self._step = velocity * (1.0 + EXCESS) * period
-        self._period = period
-        self._slider_jerk = slider.jerk
-        self._platform = tuple(zip(platform.velocity, platform.acceleration, platform.jerk, strict=True))
+        bounds["pose"] = platform.x, platform.y, platform.phi
+        bounds["edge"] = edge
+        bounds["step"] = velocity * (1.0 + EXCESS) * period
+        bounds["slider_jerk"] = slider.jerk
+        bounds["platform"] = np.transpose((platform.velocity, platform.acceleration, platform.jerk))
+        bounds["period"] = period
 
-    def pose(self, pose: Sequence[float]) -> Violation | None:
+    def pose(self, pose: ArrayLike) -> Violation | None:
         """Check a pose x, y [m], phi [rad] alone."""
-        edge = self._edge
-        for value, (name, unit, (low, high)) in zip(pose, self._pose, strict=True):
-            if not low - edge <= value <= high + edge:
-                return Violation(name, "position", value, low if value < low else high, unit)
-        return None
+        return self.violation(check_pose(self.packed, np.array(pose, dtype=np.float64), self.found))
 
-    def setpoint(self, rows: Rows) -> Violation | None:
-        """Check solved sliders: rows lambda_10, v_10, gamma_10, lambda_32 [m, s].
+    def setpoint(self, rows: ArrayLike) -> Violation | None:
+        """Check solved sliders, as many of the rows lambda_10, v_10, gamma_10, lambda_32 as are given [m, s]."""
+        return self.violation(check_setpoint(self.packed, np.array(rows, dtype=np.float64), self.found))
 
-        A value that is not a number is beyond every limit.
-        """
-        for values, (quantity, unit, low, high, slack) in zip(rows, self._rows, strict=False):
-            for leg, value in zip(LEGS, values, strict=True):
-                if not low - slack <= value <= high + slack:
-                    return Violation(leg, quantity, value, low if value < low else high, unit)
-        return None
-
-    def step(self, rows: Rows, before: Rows) -> Violation | None:
-        """Check solved sliders against those of the cycle before: how far they go, and with which jerk."""
-        for leg, value, last in zip(LEGS, rows[0], before[0], strict=True):
-            if not abs(value - last) <= self._step:
-                return Violation(leg, "step in one cycle", value - last, self._step, "m")
-        limit = self._slider_jerk
-        for n, leg in enumerate(LEGS):
-            jerk = self._jerk(rows, before, n)
-            if not jerk <= limit * (1.0 + EXCESS):
-                return Violation(leg, "jerk", jerk, limit, "m/s³")
-        return None
-
-    def platform(self, motion: Rows, before: Rows) -> Violation | None:
-        """Check the platform's velocity and acceleration, and the jerk since the cycle before."""
-        more = PLATFORM_EXCESS
-        for n, (velocity, acceleration, most) in enumerate(self._platform):
-            name, unit = COORDINATES[n], UNITS[n]
-            if not abs(motion[1][n]) <= velocity * (1.0 + more[0]):
-                return Violation(name, "velocity", motion[1][n], math.copysign(velocity, motion[1][n]), f"{unit}/s")
-            if not abs(motion[2][n]) <= acceleration * (1.0 + more[1]):
-                bound = math.copysign(acceleration, motion[2][n])
-                return Violation(name, "acceleration", motion[2][n], bound, f"{unit}/s²")
-            jerk = self._jerk(motion, before, n)
-            if not jerk <= most * (1.0 + more[2]):
-                return Violation(name, "jerk", jerk, most, f"{unit}/s³")
-        return None
-
-    def _jerk(self, now: Rows, before: Rows, n: int) -> float:
-        """Return the least jerk that explains rows (position, velocity, acceleration) one cycle after others.
-
-        A jerk j that may change at any moment, an acceleration that may begin or end anywhere in the cycle as large
-        as j makes it in a cycle T: between the two the acceleration changes by j T at most, the velocity differs by
-        j T² / 2 from what the mean acceleration gives, and the position by j T³ / 4 from what the mean velocity does.
-        """
-        period, half = self._period, self._period / 2.0
-        (p, v, a), (p0, v0, a0) = (now[0][n], now[1][n], now[2][n]), (before[0][n], before[1][n], before[2][n])
-        return max(
-            abs(a - a0) / period,
-            abs(v - v0 - half * (a + a0)) / (half * period),
-            4.0 * (abs(p - p0 - half * (v + v0)) - ROUNDING) / period**3,
-        )
+    def violation(self, code: int) -> Violation | None:
+        """Put into words what has just been found; None for 0."""
+        if code == 0:
+            return None
+        check, n = divmod(code - 1, 3)
+        subject, quantity, unit = _CHECKS[check]
+        value, limit = self.found.tolist()
+        if subject == "slider":
+            return Violation(LEGS[n], quantity, value, limit, unit)
+        return Violation(COORDINATES[n], quantity, value, limit, UNITS[n] + unit)

@@ -53,6 +53,14 @@ class Seam(NamedTuple):
     """The path without the next goal; the same up to the seam."""
 
 
+class Course(NamedTuple):
+    """The goal under way on a path: where it began and where it ends [s], and when its law comes there [s]."""
+
+    begun: float
+    end: float
+    arrival: float
+
+
 class Run:
     """A path and its law, advanced by one period a cycle."""
 
@@ -65,6 +73,8 @@ class Run:
         """Time since the law began [s]."""
         self.seams: deque[Seam] = deque()
         self._begun = 0.0
+        self._course = Course(0.0, 0.0, 0.0)
+        self._course_by: Path | None = None
         self._legs = legs
         self._near = np.zeros(3)
         self._out = np.zeros((3, 3))
@@ -73,7 +83,11 @@ class Run:
     @property
     def at(self) -> Rate:
         """Where the law is."""
-        value(self.law.knots, self.law.pieces, self.time, self._law_out)
+        return self.at_time(self.time)
+
+    def at_time(self, time: float) -> Rate:
+        """Where the law is at a time of its own [s]."""
+        value(self.law.knots, self.law.pieces, time, self._law_out)
         s, rate, change = self._law_out[:, 0].tolist()
         return Rate(s, rate, change)
 
@@ -89,10 +103,18 @@ class Run:
         return at.s >= self.path.duration or (self.target == 0.0 and at.rate == at.change == 0.0)
 
     @property
+    def course(self) -> Course:
+        """The goal under way; worked out anew where law or goal have changed."""
+        begun, end = self._begun, self.seams[0].s if self.seams else self.path.duration
+        if self._course_by is not self.law or self._course[:2] != (begun, end):
+            self._course, self._course_by = Course(begun, end, self.reaches(end)), self.law
+        return self._course
+
+    @property
     def remaining(self) -> float:
         """Time to the end of the goal under way [s]; of one that is stopped before, at full speed."""
-        s = self.seams[0].s if self.seams else self.path.duration
-        return max(0.0, self.reaches(s) - self.time if self.target else s - self.at.s)
+        _, end, arrival = self.course
+        return max(0.0, arrival - self.time if self.target else end - self.at.s)
 
     @property
     def ends(self) -> float:
@@ -107,8 +129,8 @@ class Run:
     @property
     def progress(self) -> float:
         """Share that is over of the time of the goal under way."""
-        end = self.seams[0].s if self.seams else self.path.duration
-        return max(0.0, min(1.0, (self.at.s - self._begun) / (end - self._begun))) if end > self._begun else 1.0
+        begun, end, _ = self.course
+        return max(0.0, min(1.0, (self.at.s - begun) / (end - begun))) if end > begun else 1.0
 
     def destination(self, near: Sequence[float]) -> Sequence[float]:
         """Return the pose that the goal under way leads to, on the branch of the pose `near`."""
@@ -154,6 +176,13 @@ class Run:
         if code:
             self._out[:] = np.nan
         return MotionState(*self._out.tolist())
+
+
+def nominal(path: Path, s: float) -> MotionState:
+    """Return the motion at a time along a path [s], at full speed; in the path's own coordinates."""
+    out = np.zeros((3, 3))
+    value(path.knots, path.pieces, s, out)
+    return MotionState(*out.tolist())
 
 
 def arrival(law: Path, target: float, s: float) -> float:

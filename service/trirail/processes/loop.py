@@ -8,8 +8,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import NamedTuple
 
 import msgspec
+import numpy as np
 from trirail_drivers.bus import connect
 from trirail_drivers.capture import Capture
 from trirail_drivers.interface import DriveFault, Drives
@@ -21,6 +23,7 @@ from trirail.kinematics.robot import warm_up
 from trirail.processes import realtime
 from trirail.processes.clock import Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, Watch
+from trirail.processes.planner_port import PlannerLink
 from trirail.wire.links import Port
 from trirail.wire.messages import Event
 from trirail.wire.packets import (
@@ -28,6 +31,7 @@ from trirail.wire.packets import (
     Disturbance,
     DrivesFault,
     Farewell,
+    GivenInput,
     Kind,
     Request,
     Status,
@@ -37,7 +41,7 @@ from trirail.wire.packets import (
     message,
     told,
 )
-from trirail.wire.records import LAYOUT, Part, Record, pack_into
+from trirail.wire.records import HEAD, SIZE, Part
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import MODES, Mode
 
@@ -47,31 +51,39 @@ REQUESTS_A_CYCLE = 4
 ANSWERS_A_CYCLE = 8
 EVENTS_KEPT = 1000
 """Events kept for a gateway that comes anew: the one before may have died with some that it had not published."""
-OLDEST = 255
-"""No feedback is recorded as older [SYNCs]."""
 LEAST_PATIENCE = 3
 """Cycles for which the gateway may be silent, however few there are a second."""
+PLANNER_WITHIN = 120.0
+"""How long the planner may take to come up: the very first start compiles the kinematics [s]."""
 SHUTDOWN = 3.0
 """How long a controlled stop may take before the drives are left to their own quick stop [s]."""
 
 
+class Ports(NamedTuple):
+    """Where the processes beside the loop connect."""
+
+    gateway: Port
+    recorder: Port
+    planner: Port
+
+
 class Loop:
-    """Ties control, drives, ticks and the two neighbours together; every cycle is `cycle`."""
+    """Ties control, drives, ticks and the neighbours together; every cycle is `cycle`."""
 
     def __init__(
         self,
         config: Config,
         drives: Drives,
-        gateway: Port,
-        recorder: Port,
+        ports: Ports,
         heartbeats: Heartbeats,
         *,
         capture: Capture | None = None,
         lacking: tuple[str, ...] = (),
     ) -> None:
         self._drives = drives
-        self._gateway = gateway
-        self._recorder = recorder
+        self._gateway = ports.gateway
+        self._recorder = ports.recorder
+        self._planner = PlannerLink(ports.planner)
         self._capture = capture
         self._period = config.period
         self._max_overruns = config.watchdogs.max_overruns
@@ -83,7 +95,7 @@ class Loop:
         self._bits = drives.traffic
         self._weighed_at = 0
 
-        self.control = Control(config, drives)
+        self.control = Control(config, drives, self._planner)
         self.ending = False
         """Set from outside to make the loop stop the robot, disable the drives and return."""
         self._ending_since: int | None = None
@@ -102,7 +114,9 @@ class Loop:
         self._given: list[ControlInput] = []
         self._fault: DriveFault | None = None
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
-        self._batch = bytearray(1 + self._batch_size * LAYOUT.size)
+        self._made = self.control.measured.record.view(np.uint8).data
+        """The cycle's record, as the control makes it."""
+        self._batch = memoryview(bytearray(1 + self._batch_size * SIZE))
         self._batch[0] = Kind.RECORDS
         self._batched = 0
         self._marked_ns = 0
@@ -138,7 +152,7 @@ class Loop:
     def _given_in(self, tick: Tick, fault: DriveFault | None) -> Iterator[Given]:
         """Yield what the control is given in a cycle, and keep it for the recorder."""
         now_ns = tick.deadline_ns + tick.lateness_ns
-        for what in itertools.chain(self._watch(tick, fault), self._requests()):
+        for what in itertools.chain(self._watch(tick, fault), self._requests(), self._planner.answers()):
             self._note(tick, what)
             yield what, now_ns
 
@@ -186,7 +200,7 @@ class Loop:
             self._gateway_frozen = False
         return None
 
-    def _note(self, tick: Tick, given: Request | Disturbance | DrivesFault) -> None:
+    def _note(self, tick: Tick, given: GivenInput) -> None:
         """Keep what the control is given in this cycle, for the recorder."""
         self._inputs += 1
         self._given.append(ControlInput(self._inputs, self.control.cycles, tick.deadline_ns + tick.lateness_ns, given))
@@ -201,36 +215,10 @@ class Loop:
     def _record(self, tick: Tick) -> None:
         """Append this cycle's record; pass batch, answers and events on."""
         control = self.control
-        feedback, measured, commanded = control.measured.feedback, control.measured, control.commanded
-        rows = control.setpoints.rows
-        progress, remaining = control.progress
-        record = Record(
-            cycle=control.cycles,
-            deadline_ns=tick.deadline_ns,
-            lateness_ns=tick.lateness_ns,
-            parts_ns=self._parts_ns,
-            overruns=self._overruns,
-            mode=MODES.index(control.state.mode),
-            drive_state=feedback.state,
-            age=[min(age, OLDEST) for age in feedback.age],
-            follows=feedback.follows,
-            homed=feedback.homed,
-            homing=feedback.homing,
-            pose=measured.pose,
-            commanded_pose=commanded.pose,
-            commanded_pose_velocity=commanded.velocity,
-            commanded_pose_acceleration=commanded.acceleration,
-            position=feedback.position,
-            velocity=measured.velocity,
-            commanded_position=rows[0],
-            commanded_velocity=rows[1],
-            commanded_acceleration=rows[2],
-            passive_position=rows[3],
-            following_error=measured.following_error,
-            progress=progress,
-            remaining=remaining,
-        )
-        pack_into(self._batch, 1 + self._batched * LAYOUT.size, record)
+        ticks = control.cycles, tick.deadline_ns, tick.lateness_ns, self._overruns
+        HEAD.pack_into(self._made, 0, *ticks, *self._parts_ns, MODES.index(control.state.mode))
+        begin = 1 + self._batched * SIZE
+        self._batch[begin : begin + SIZE] = self._made
         self._batched += 1
         if self._batched == self._batch_size:
             self._flush()
@@ -243,7 +231,7 @@ class Loop:
         """Give a sign of life; send the batch, take new peers, and what was kept for them; listen to the recorder."""
         self._heart.beat()
         if self._batched:
-            batch = bytes(self._batch[: 1 + self._batched * LAYOUT.size])
+            batch = self._batch[: 1 + self._batched * SIZE]
             self._batched = 0
             self._gateway.send(batch)
             self._recorder.send(batch)
@@ -284,6 +272,7 @@ class Loop:
 
     def _accept_peers(self) -> None:
         """Take new peers."""
+        self._planner.accept()
         for port in (self._gateway, self._recorder):
             if port.accept():
                 port.send(self._welcome)
@@ -337,17 +326,18 @@ class Loop:
             self._told += 1
 
 
-def main(config: Config, gateway: Port, recorder: Port, heartbeats: Heartbeats, ready: Callable[[object], None]) -> int:
+def main(config: Config, ports: Ports, heartbeats: Heartbeats, ready: Callable[[object], None]) -> int:
     """Run the loop's process; `ready` is called with what the loop runs without once it turns."""
     drives: Drives | None = None
     ended_as_told = False
     try:
         warm_up()
+        ports.planner.await_peer(PLANNER_WITHIN)
         capture = Capture() if config.telemetry.capture_can else None
         drives = connect(config.can, config.drives, capture=capture)
         drives.configure(config.period)
         lacking = realtime.acquire(config.loop)
-        loop = Loop(config, drives, gateway, recorder, heartbeats, capture=capture, lacking=lacking)
+        loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)
 
         def end(_signal: int, _frame: FrameType | None) -> None:
             loop.ending = True
@@ -360,8 +350,9 @@ def main(config: Config, gateway: Port, recorder: Port, heartbeats: Heartbeats, 
         heartbeats.of("loop").rest()  # the drives may take their time to stop
         if drives is not None:
             drives.close()
-        for port in (gateway, recorder):
+        for port in (ports.gateway, ports.recorder):
             if ended_as_told:
                 port.send(message(Farewell()))
+        for port in ports:
             port.close()
     return 0

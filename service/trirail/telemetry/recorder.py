@@ -23,7 +23,7 @@ from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live
 from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
-from trirail.wire.records import LAYOUT, last_cycle
+from trirail.wire.records import SIZE, last_cycle
 
 RECORDS_HZ = 5
 """Batches of whole records a second to the file, at least."""
@@ -122,7 +122,7 @@ class Recorder:
         """Take packed records."""
         last = last_cycle(batch)
         if self._last is not None:
-            self._absent += last - self._last - len(batch) // LAYOUT.size
+            self._absent += last - self._last - len(batch) // SIZE
         self._last = last
         if last >= self._next_look:
             self._next_look = last + self._config.loop.rate_hz // LOOKS_HZ

@@ -13,7 +13,7 @@ import numpy as np
 from trirail_drivers.interface import PowerState
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.records import LAYOUT, unpack
+from trirail.wire.records import SIZE, unpack
 from trirail.wire.sizes import MAX_MESSAGE
 from trirail.wire.text import NAME_RULE, is_name, printable, quoted
 from trirail.wire.vocabulary import MODES
@@ -88,10 +88,8 @@ def encode(content: msgspec.Struct, encoded: str = JSON) -> bytes:
 
 def batch(payload: bytes) -> bytes:
     """Return packed records: at least one, all whole, of cycles that follow each other. Raises RefusedError."""
-    if not payload or len(payload) % LAYOUT.size:
-        raise RefusedError(
-            RefusalCode.MALFORMED, f"not records: {len(payload)} bytes, and each record has {LAYOUT.size}"
-        )
+    if not payload or len(payload) % SIZE:
+        raise RefusedError(RefusalCode.MALFORMED, f"not records: {len(payload)} bytes, and each record has {SIZE}")
     rows = unpack(payload)
     known = np.all(rows["mode"] < len(MODES)) and np.all(rows["drive_state"] < len(PowerState))
     if not known or rows["cycle"][0] < 0 or np.any(np.diff(rows["cycle"]) != 1):

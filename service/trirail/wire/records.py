@@ -1,14 +1,14 @@
 """One record a cycle: what the loop commanded, what the drives answered, and how long it took.
 
-Records have a fixed binary layout, are packed by the loop, travel in batches, and are read as numpy arrays.
+Records have a fixed binary layout: compiled code writes them, they travel in batches as they are in memory, and are
+read as numpy arrays.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,41 +30,12 @@ PARTS = tuple(part.name.lower() for part in Part)
 """Their names."""
 
 
-class Record(NamedTuple):
-    """One record, with the fields of FIELDS; a field of several numbers is a sequence of so many."""
-
-    cycle: int
-    deadline_ns: int
-    lateness_ns: int
-    parts_ns: Sequence[int]
-    overruns: int
-    mode: int
-    drive_state: Sequence[int]
-    age: Sequence[int]
-    follows: Sequence[bool]
-    homed: Sequence[bool]
-    homing: bool
-    pose: Sequence[float]
-    commanded_pose: Sequence[float]
-    commanded_pose_velocity: Sequence[float]
-    commanded_pose_acceleration: Sequence[float]
-    position: Sequence[float]
-    velocity: Sequence[float]
-    commanded_position: Sequence[float]
-    commanded_velocity: Sequence[float]
-    commanded_acceleration: Sequence[float]
-    passive_position: Sequence[float]
-    following_error: Sequence[float]
-    progress: float
-    remaining: float
-
-
 FIELDS: tuple[tuple[str, str, int], ...] = (
     ("cycle", "q", 1),  # SYNCs sent since the start; times the period, the nominal time
     ("deadline_ns", "q", 1),  # when this cycle was due, monotonic clock
     ("lateness_ns", "q", 1),  # how much later it began
-    ("parts_ns", "i", len(Part)),  # time spent in each part; "record" is that of the cycle before
     ("overruns", "q", 1),  # ticks missed since the start
+    ("parts_ns", "i", len(Part)),  # time spent in each part; "record" is that of the cycle before
     ("mode", "B", 1),  # index into trirail.control.modes.MODES
     ("drive_state", "B", 3),  # trirail_drivers.interface.PowerState of A, B, C
     ("age", "B", 3),  # how many SYNCs ago the positions of A, B, C were sampled; 255 for any more
@@ -86,32 +57,21 @@ FIELDS: tuple[tuple[str, str, int], ...] = (
     ("remaining", "d", 1),  # of the running goal [s]
 )
 
+_NUMPY = {"q": "<i8", "i": "<i4", "B": "u1", "d": "<f8"}
 DTYPE: np.dtype[Any] = np.dtype(
-    [
-        (name, "<" + {"q": "i8", "i": "i4", "B": "u1", "d": "f8"}[code], (n,) if n > 1 else ())
-        for name, code, n in FIELDS
-    ]
+    [(name, _NUMPY[code], (n,) if n > 1 else ()) for name, code, n in FIELDS],
+    align=True,  # as compiled code likes to read and write it
 )
-LAYOUT = struct.Struct("<" + "".join(f"{n}{code}" for _, code, n in FIELDS))
-"""The same layout as DTYPE, for packing one record: as many values as the fields have, in their order."""
-_SINGLE = tuple(n == 1 for _, _, n in FIELDS)
-
-
-def pack_into(buffer: bytearray, offset: int, record: Record) -> None:
-    """Pack a record into a buffer, where LAYOUT.size bytes are free."""
-    values: list[Any] = []
-    value: Any
-    for value, single in zip(record, _SINGLE, strict=True):
-        if single:
-            values.append(value)
-        else:
-            values.extend(value)
-    LAYOUT.pack_into(buffer, offset, *values)
+"""The layout of a record: in the loop's memory, between the processes and on the wire."""
+SIZE = DTYPE.itemsize
+"""Bytes of a record."""
+HEAD = struct.Struct(f"<4q{len(Part)}iB")
+"""The fields at its beginning that the loop writes, up to `mode`; the control has written the others."""
 
 
 def last_cycle(batch: bytes) -> int:
     """Return the cycle of the last of packed records."""
-    return int.from_bytes(batch[-LAYOUT.size :][:8], "little")
+    return int.from_bytes(batch[-SIZE:][:8], "little")
 
 
 def unpack(batch: bytes | memoryview) -> NDArray[np.void]:

@@ -1,0 +1,230 @@
+"""The arithmetic of one cycle, compiled: where the robot is, and what its sliders are to do next.
+
+`observe` puts together what the drives said at a SYNC. `command` moves the platform one period on along its path and
+solves the sliders for it, behind the last gate; `hold` does that for one that stands, and `follow` leads the sliders to
+where they are. Each is one call over arrays that are made once, allocates nothing, and writes the cycle's record as it
+goes. Between the two calls of a cycle the control decides what changes modes.
+
+Arrays: `legs` is Geometry.packed(), `bounds` Bounds.packed, `feedback` (2,) of FEEDBACK, the newest and the one before,
+`written` (5, 3) the setpoints of the cycles before, the newest last [m], `motion` (2, 3, 3) the platform's rows pose,
+velocity, acceleration as they are commanded, in this cycle and in the one before, `sliders` (2, 6, 3) the rows
+lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 as they are set, and as they are tried, `found` (2,) what the gate
+has found, and `record` (1,) of trirail.wire.records.DTYPE.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+from numba import b1, f8, from_dtype, i8, typeof, void
+from numpy.typing import NDArray
+from trirail_drivers.interface import PowerState
+
+from trirail.kinematics.algebra import Array
+from trirail.kinematics.closure import forward_into, inverse_motion
+from trirail.kinematics.compiled import compiled
+from trirail.kinematics.geometry import Geometry
+from trirail.motion.limits import BOUNDS, gate
+from trirail.motion.paths import law_at, platform_at
+from trirail.wire.records import DTYPE
+
+__all__ = ["FEEDBACK", "OLDEST", "PASSED", "SAID", "STANDS", "command", "follow", "hold", "observe", "refusal"]
+
+OLDEST = 3
+"""The greatest age of a position that is looked at, in SYNCs: at the next one the drive is silent."""
+PASSED, STANDS = 1, 2
+"""What command finds beside what is refused: the goal under way has ended on the path, the motion stands."""
+OLDEST_RECORDED = 255
+"""No feedback is recorded as older [SYNCs]."""
+
+FEEDBACK = np.dtype(
+    [
+        ("position", "<f8", 3),
+        ("age", "<i8", 3),
+        ("drive_state", "u1", 3),
+        ("follows", "u1", 3),
+        ("homed", "u1", 3),
+        ("homing", "u1"),
+    ],
+    align=True,
+)
+"""What the numbers of trirail_drivers.interface.Feedback are here."""
+SAID = struct.Struct("<3d3q10B")
+"""To pack them."""
+
+_LEGS = typeof(Geometry.symmetric().packed())  # type: ignore[no-untyped-call]
+_BOUNDS, _FEEDBACK, _RECORD = from_dtype(BOUNDS)[::1], from_dtype(FEEDBACK)[::1], from_dtype(DTYPE)[::1]
+_MOTION, _SLIDERS = f8[:, :, ::1], f8[:, :, ::1]
+_KNOTS, _PIECES = f8[::1], f8[:, :, ::1]
+_ENABLED = int(PowerState.OPERATION_ENABLED)
+
+
+@compiled(i8(_LEGS, _FEEDBACK, f8[:, ::1], f8, f8, f8, b1[::1], f8[:, ::1], _RECORD))
+def observe(
+    legs: Array,
+    feedback: NDArray[np.void],
+    written: Array,
+    period: float,
+    fastest: float,
+    limit: float,
+    jumps: NDArray[np.bool],
+    room: Array,
+    record: NDArray[np.void],
+) -> int:
+    """Work out pose, velocities and following errors from feedback[0], and keep it as feedback[1].
+
+    `fastest` [m/s] is the velocity above which a slider `jumps`: then the pose stays what it was, as it does where
+    the sliders belong to none; `room` (2, 3) is to seek it in. Returns 0, or 1 + i if the following error of
+    slider i is the first that is beyond `limit` [m].
+    """
+    now, before, told = feedback[0], feedback[1], record[0]
+    written[:-1] = written[1:]
+    written[-1] = told.commanded_position
+    beyond, jumping = 0, False
+    for i in range(3):
+        cycles = 1 + before.age[i] - now.age[i]
+        if cycles > 0:  # else there is no newer position
+            told.velocity[i] = (now.position[i] - before.position[i]) / (cycles * period)
+        # A drive reaches at a SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
+        due = written[len(written) - 2 - min(now.age[i], OLDEST), i]
+        told.following_error[i] = due - now.position[i] if now.follows[i] else 0.0
+        if beyond == 0 and not abs(told.following_error[i]) <= limit:
+            beyond = 1 + i
+        jumps[i] = not abs(told.velocity[i]) <= fastest
+        jumping |= jumps[i]
+        told.position[i], told.age[i] = now.position[i], min(now.age[i], OLDEST_RECORDED)
+        told.drive_state[i], told.follows[i], told.homed[i] = now.drive_state[i], now.follows[i], now.homed[i]
+        room[0, i], room[1, i] = now.position[i], told.pose[i]
+    told.homing = now.homing
+    if not jumping and forward_into(legs, room[0], room[1], room[1]) == 0:
+        told.pose[:] = room[1]
+    feedback[1] = feedback[0]
+    return beyond
+
+
+@compiled()
+def _tell(motion: Array, sliders: Array, progress: float, remaining: float, record: NDArray[np.void]) -> None:
+    """Write what is commanded into the record."""
+    told = record[0]
+    for i in range(3):
+        told.commanded_pose[i] = motion[0, 0, i]
+        told.commanded_pose_velocity[i] = motion[0, 1, i]
+        told.commanded_pose_acceleration[i] = motion[0, 2, i]
+        told.commanded_position[i] = sliders[0, 0, i]
+        told.commanded_velocity[i] = sliders[0, 1, i]
+        told.commanded_acceleration[i] = sliders[0, 2, i]
+        told.passive_position[i] = sliders[0, 3, i]
+    told.progress, told.remaining = progress, remaining
+
+
+@compiled()
+def _solve(legs: Array, bounds: NDArray[np.void], motion: Array, sliders: Array, found: Array) -> int:
+    """Solve the sliders for the platform's motion; leave them as they are where the last gate refuses it.
+
+    Returns 0, 1 + i where leg i is singular or a number is not finite, or 3 + a code of trirail.motion.limits.gate.
+    """
+    singular = inverse_motion(legs, motion[0], sliders[1])
+    if singular:
+        return singular
+    code = gate(bounds, sliders[1], sliders[0], motion[0], motion[1], found)
+    if code:
+        return 3 + code
+    sliders[0] = sliders[1]
+    return 0
+
+
+@compiled(
+    i8(
+        *(_LEGS, _BOUNDS, _KNOTS, _PIECES, b1, _KNOTS, _PIECES),
+        *(f8, f8, f8, f8, f8, _MOTION, _SLIDERS, f8[::1], _RECORD),
+    )
+)
+def command(
+    legs: Array,
+    bounds: NDArray[np.void],
+    knots: Array,
+    pieces: Array,
+    in_sliders: bool,
+    law_knots: Array,
+    law_pieces: Array,
+    time: float,
+    target: float,
+    begun: float,
+    end: float,
+    arrival: float,
+    motion: Array,
+    sliders: Array,
+    found: Array,
+    record: NDArray[np.void],
+) -> int:
+    """Move the platform on along its path, to a time of its law [s], and solve the sliders for that.
+
+    `target` is the rate that the law leads to; the goal under way began and ends at the times `begun` and `end` along
+    the path, and the law comes there at `arrival` [s]. Returns a sum of PASSED, STANDS and 4 times what is refused: see
+    `refusal`.
+    """
+    law = law_at(law_knots, law_pieces, time)
+    s, rate, change = law
+    motion[1] = motion[0]
+    if platform_at(legs, knots, pieces, in_sliders, law, motion[1, 0], motion[0]) != 0:
+        motion[0] = math.nan
+    refused = _solve(legs, bounds, motion, sliders, found)
+    progress = max(0.0, min(1.0, (s - begun) / (end - begun))) if end > begun else 1.0
+    remaining = max(0.0, arrival - time if target != 0.0 else end - s)
+    _tell(motion, sliders, progress, remaining, record)
+    passed = s >= end
+    stands = s >= knots[-1] or (target == 0.0 and rate == 0.0 and change == 0.0)
+    return PASSED * passed + STANDS * stands + 4 * refused
+
+
+@compiled(i8(_LEGS, _BOUNDS, _MOTION, _SLIDERS, f8[::1], _RECORD))
+def hold(
+    legs: Array, bounds: NDArray[np.void], motion: Array, sliders: Array, found: Array, record: NDArray[np.void]
+) -> int:
+    """Solve the sliders for a platform that stays as it is; returns as `command`."""
+    motion[1] = motion[0]
+    refused = _solve(legs, bounds, motion, sliders, found)
+    _tell(motion, sliders, 0.0, 0.0, record)
+    return 4 * refused
+
+
+def refusal(code: int) -> int:
+    """Return what is refused, from what `command` and `hold` return.
+
+    0 for nothing, 1 + i where leg i is singular or a number is not finite, or 3 + a code for Bounds.violation.
+    """
+    return code >> 2
+
+
+@compiled(void(_LEGS, _FEEDBACK, b1[::1], b1, b1, f8, _MOTION, _SLIDERS, _RECORD))
+def follow(
+    legs: Array,
+    feedback: NDArray[np.void],
+    jumps: NDArray[np.bool],
+    held: bool,
+    stopped_now: bool,
+    step: float,
+    motion: Array,
+    sliders: Array,
+    record: NDArray[np.void],
+) -> None:
+    """Command the pose that is measured, at rest, and lead each slider to where it is, by a `step` [m] at most.
+
+    A position that jumps is not followed, nor one that an enabled drive holds where `held`, nor any where all drives
+    were `stopped_now`. A drive that moves by itself gets its own position at once.
+    """
+    now, told = feedback[0], record[0]
+    motion[0] = 0.0
+    motion[0, 0] = told.pose
+    if inverse_motion(legs, motion[0], sliders[1]) == 0:
+        sliders[0, 3:] = sliders[1, 3:]
+    for i in range(3):
+        position, last = now.position[i], sliders[0, 0, i]
+        if not now.follows[i]:
+            sliders[0, 0, i] = position
+        elif not (stopped_now or jumps[i] or (held and now.drive_state[i] == _ENABLED)):
+            sliders[0, 0, i] = last + max(-step, min(position - last, step))
+        sliders[0, 1, i] = sliders[0, 2, i] = 0.0
+    _tell(motion, sliders, 0.0, 0.0, record)
