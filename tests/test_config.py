@@ -21,7 +21,7 @@ from trirail.wire.vocabulary import Mode
 from trirail_drivers.errors import LONGEST, BusError
 
 TEXT = SIM.read_text()
-CONFIGS = sorted(SIM.parent.glob("*.toml"))
+CONFIGS = sorted(SIM.parent.rglob("*.toml"))
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.name)
