@@ -30,11 +30,8 @@ soak: $(READY)  ## a service under a flood of junk, for make soak SECONDS=…: i
 ci-packages:  ## the system's packages for the tests of viewers and unit; those tests are skipped without
 	.ci/packages
 
-bench: $(READY)  ## the loop, the kinematics, planning and the recorder, measured
-	$(VENV)/bin/python tools/bench.py loop
-	$(VENV)/bin/python tools/bench.py kinematics
-	$(VENV)/bin/python tools/bench.py planning
-	$(VENV)/bin/python tools/bench.py recorder
+bench: $(READY)  ## all that is measured, under ten minutes, beside the aims; one alone: tools/bench.py --help
+	$(VENV)/bin/python tools/bench.py all $(ARGS)
 
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "trirail needs Python 3.11 or newer: make PYTHON=python3.12 …")'

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
 from trirail.control.control import Control, Given
 from trirail.control.ledger import Notice
+from trirail.control.local_planner import LocalPlanner
 from trirail.motion.paths import FOR_EVER, Path, constant
 from trirail.motion.runs import MotionState
 from trirail.wire.messages import Goal, PoseGoal
@@ -88,7 +89,8 @@ class Rig:
         self.driver.configure(config.period)
         if delay is not None:
             delay_answers(self.bus, delay, lambda: self.now)
-        self.control = Control(config, self.driver)
+        self.planner = LocalPlanner(config)
+        self.control = Control(config, self.driver, self.planner)
         self.driver.sync()
         self.control.start(self.driver.read())
         self.answers: list[Answer] = []
@@ -119,7 +121,9 @@ class Rig:
         self.sent.clear()
         control = self.control
         self.driver.sync()
-        given: list[Given] = [] if request is None else [(request, round(self.now * 1e9))]
+        now_ns = round(self.now * 1e9)
+        given: list[Given] = [] if request is None else [(request, now_ns)]
+        given += [(answer, now_ns) for answer in self.planner.answers()]
         control.cycle(self.driver.read(), given)
         self.rows.append(control.setpoints.rows)
         self.seen.append([frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6])

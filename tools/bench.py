@@ -1,38 +1,81 @@
-"""Measurements: `python tools/bench.py loop`, `planning`, `recorder` or `kinematics`, with --json for programs."""
+"""Measurements: `python tools/bench.py loop`, `latency`, …, each with --json for programs; `all` is `make bench`.
+
+Speed is a ratio within one run, for the machines that this runs on are not alike.
+"""
 
 from __future__ import annotations
 
-import bench_kinematics
-import bench_loop
-import bench_planning
-import bench_recorder
 from cyclopts import App
 
 app = App(help="Speed, as ratios within one run: the machines this runs on are not alike.")
 
-
-@app.command
-def loop(*, seconds: float = 30.0, json: bool = False) -> None:
-    """Run the whole service on simulated drives and time its loop, beside cyclictest where that is installed."""
-    bench_loop.main(seconds, json)
+# Each command imports what it measures: `frames` runs in an emulated machine too, where an import takes its time.
 
 
 @app.command
-def recorder(*, seconds: float = 60.0, json: bool = False) -> None:
-    """Run the whole service on simulated drives, moving, and measure what its recorder takes, watched and not."""
-    bench_recorder.main(seconds, json)
+def loop(
+    *, seconds: float = 60.0, rates: tuple[int, ...] = (1000, 2000, 4000), runs: int = 5, json: bool = False
+) -> None:
+    """Run the whole service, goals without pause, and time its loop beside cyclictest, at each rate for so long."""
+    import bench_loop
+
+    bench_loop.main(seconds, rates, runs, json)
+
+
+@app.command
+def latency(*, goals: int = 100, json: bool = False) -> None:
+    """Time from a goal's put to the first setpoint that it changes on the bus, at rest and in motion."""
+    import bench_latency
+
+    bench_latency.main(goals, json)
+
+
+@app.command
+def frames(*, cycles: int = 3000, json: bool = False) -> None:
+    """Time one cycle's frames by python-can, and on the bus's own socket."""
+    import bench_frames
+
+    bench_frames.main(cycles, json)
+
+
+@app.command
+def peers(*, seconds: float = 15.0, json: bool = False) -> None:
+    """Measure the intervals of SYNC beside python-canopen's, on the same bus."""
+    import bench_peers
+
+    bench_peers.main(seconds, json)
+
+
+@app.command
+def planning(*, json: bool = False) -> None:
+    """Time the planning of goals."""
+    import bench_planning
+
+    bench_planning.main(json)
 
 
 @app.command
 def kinematics(*, json: bool = False) -> None:
     """Time the recursion against a straightforward numpy port of the paper's matrices."""
+    import bench_kinematics
+
     bench_kinematics.main(json)
 
 
 @app.command
-def planning(*, json: bool = False) -> None:
-    """Time what a goal costs the loop in a cycle."""
-    bench_planning.main(json)
+def recorder(*, seconds: float = 60.0, json: bool = False) -> None:
+    """Run the whole service on simulated drives, moving, and measure what its recorder takes, watched and not."""
+    import bench_recorder
+
+    bench_recorder.main(seconds, json)
+
+
+@app.command(name="all")
+def everything(*, brief: bool = False, json: bool = False) -> None:
+    """Run all of these, under ten minutes, and end with one table against the aims; `brief` only for a look."""
+    import bench_aims
+
+    bench_aims.main(brief, json)
 
 
 if __name__ == "__main__":

@@ -133,7 +133,7 @@ def _vcan() -> tuple[str, Callable[[], object]]:
     return name, lambda: ip("delete", name)
 
 
-def main(json: bool = False, cycles: int = CYCLES) -> None:
+def main(cycles: int = CYCLES, json: bool = False) -> None:
     """Print the measurements as a table, or as one JSON object."""
     measured = measure(cycles)
     if json:

@@ -52,8 +52,8 @@ class Can(Struct, frozen=True, forbid_unknown_fields=True):
     """`simulated`, or the name of a python-can interface, as `socketcan`."""
     channel: Name = ""
     """The interface's channel, as `can0`."""
-    bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
-    """Bits per second: for the bus load, and for interfaces that set it themselves."""
+    bitrate: Annotated[int, Meta(ge=10_000, le=8_000_000)] = 1_000_000
+    """Bits per second: for the bus load, and for interfaces that set it themselves. A wire has at most 1 Mbit/s."""
     options: dict[OptionName, bool | OptionNumber | Name] = {}
     """Handed to python-can as they are: `index` of gs_usb, `host` and `port` of socketcand, `tty_baudrate` of slcan."""
     simulated: Simulated = Simulated()

@@ -11,10 +11,17 @@ _OWN = ("simulated", "unix")
 """Interfaces that are not python-can's."""
 _ELSEWHERE = ("interface", "channel", "bitrate", "ignore_config", "config_context")
 """What `can.Bus` is given from elsewhere, or not at all."""
+_CLASSICAL = 1_000_000
+"""The highest bitrate of classical CAN (ISO 11898-2) [bit/s]."""
 
 
 def check_bus(section: Can) -> None:
-    """Refuse options that python-can cannot be given. Raises DriveError with the key."""
+    """Refuse a bitrate that no wire has, and options that python-can cannot take. Raises DriveError with the key."""
+    if section.bitrate > _CLASSICAL and section.interface not in _OWN:
+        raise DriveError(
+            f"can.bitrate = {section.bitrate}: classical CAN ends at {_CLASSICAL} bit/s; "
+            f"only {' and '.join(_OWN)}, which have no wire, go beyond"
+        )
     for name in section.options:
         if section.interface in _OWN:
             raise DriveError(f'can.options.{name}: "{section.interface}" has no options, python-can\'s interfaces have')

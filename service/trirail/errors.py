@@ -102,6 +102,11 @@ class RefusalCode(StrEnum):
     )
     WRONG_END = "wrong_end", "a trajectory that ends in motion", "let it end at rest"
     NO_PLAN = "no_plan", "no motion to it was found from the present one", "send it again when the robot holds"
+    PLANNER_LOST = (
+        "planner_lost",
+        "the planner has died, or says nothing; what is under way goes on",
+        "send it again: a planner that is lost is started again",
+    )
     NO_VELOCITY = "no_velocity", "a jog that moves nothing", "give it a velocity"
     AT_LIMIT = "at_limit", "the jog has ended at a limit", "begin a new one, away from it"
     JOG_OVER = "jog_over", "the jog was not renewed in time", "begin a new one"

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.control.ledger import REMEMBERED_IDS, Ledger
-from trirail.control.stepwise_planner import AcceptedPlan
+from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.messages import PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig
@@ -11,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.config import Config
 from trirail.control.modes import ModeEvent
-from trirail.motion.goals import PlannedMotion
-from trirail.motion.steps import Steps
 from trirail.wire.messages import PoseGoal, SlidersGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
 from trirail.wire.vocabulary import Command, Mode
 
 PERIOD = CONFIG.period
+NEVER = 10**9
+"""Cycles after which a planner answers that is lost."""
 PROMPT = round(0.05 / PERIOD)
 """What a stop may take beside braking [cycles]."""
 
@@ -71,20 +69,16 @@ def test_goals_blended_at_override_zero_are_run_when_it_is_raised(rig: Rig) -> N
     assert rig.outcomes() == [("g0", "done"), ("g1", "done"), ("g2", "done")]
 
 
-def test_a_plan_that_does_not_end_is_refused(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    def endless(*_: object) -> object:
-        while True:
-            yield
-
+def test_a_plan_that_does_not_end_is_refused(rig: Rig) -> None:
     rig.enable()
-    monkeypatch.setattr(rig.control._goals, "plan", endless)
+    rig.planner.delay = NEVER
     rig.post("g1", PoseGoal(0.01, 0.0, 0.0))
     assert confirmed_after(rig, "override", 3) <= 1
     rig.until(lambda: bool(rig.outcomes()), 600)
     assert rig.outcomes() == [("g1", "rejected")]
     refused = rig.answers[-1]
     assert isinstance(refused, Refused)
-    assert refused.code == "no_plan"
+    assert refused.code == "planner_lost"
 
 
 # ---------------------------------------------------------------------- what has been sent but not begun
@@ -94,17 +88,10 @@ FAR = PoseGoal(0.03, 0.02, 0.1)
 
 
 @pytest.fixture
-def slow(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Rig:
-    """A robot that is enabled, and thinks for 20 cycles about every goal."""
-    plan = rig.control._goals.plan
-
-    def slowly(*arguments: Any) -> Steps[PlannedMotion]:
-        for _ in range(20):
-            yield
-        return (yield from plan(*arguments))
-
+def slow(rig: Rig) -> Rig:
+    """A robot that is enabled, and whose planner thinks for 20 cycles about every goal."""
     rig.enable()
-    monkeypatch.setattr(rig.control._goals, "plan", slowly)
+    rig.planner.delay = 20
     return rig
 
 

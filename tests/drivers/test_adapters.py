@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import pty
+import select
 import socket
 import subprocess
 import sys
@@ -12,15 +14,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 import can
+import msgspec
 import pytest
 from trirail.config import SIM, load
 from trirail_drivers import bus
-from trirail_drivers.config import Can
+from trirail_drivers.config import Can, Simulated
 from trirail_drivers.errors import BusError
 from trirail_drivers.interface import Drives, Feedback, PowerState
 
 ROOT = Path(__file__).parents[2]
 SIMULATED = load(SIM)
+DRIVES = msgspec.structs.replace(SIMULATED.drives, heartbeat=2.0, sdo_timeout=10.0)
+"""A busy machine is no drive that is lost."""
 GROUP = "239.74.163.2"
 """A multicast group of the local scope (RFC 2365)."""
 WITHIN = 30.0
@@ -180,6 +185,79 @@ def test_drives_of_another_process_by_udp_multicast(tmp_path: Path) -> None:
         finally:
             drives.close()
             served.terminate()
+
+
+class SerialLineAdapter:
+    """An adapter on a pseudo-terminal that speaks LAWICEL's protocol and answers each frame, with the drives behind it.
+
+    Its manual: a frame is `t`, three digits of identifier, one of length and the data; CR tells that a command was
+    taken, `z` and CR that a frame was.
+    """
+
+    def __init__(self, taken: bytes) -> None:
+        self._taken = taken
+        self._line, self._other = pty.openpty()  # the other end stays open, so that the line outlives its user
+        self.channel = os.ttyname(self._other)
+        self._told, self._tell = socket.socketpair()
+        self._typed = bytearray()
+        section = msgspec.structs.replace(SIMULATED.can, simulated=Simulated(missed_syncs=10_000))
+        self._drives = bus.simulated_bus(section, DRIVES)
+        self._thread = threading.Thread(target=self._serve)
+
+    def __enter__(self) -> SerialLineAdapter:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._tell.send(b"!")
+        self._thread.join()
+        self._drives.shutdown()
+        self._told.close()
+        self._tell.close()
+        os.close(self._line)
+        os.close(self._other)
+
+    def _serve(self) -> None:
+        while True:
+            readable, _, _ = select.select([self._line, self._told], [], [], 0.01)
+            if self._told in readable:
+                return
+            if readable:
+                self._typed += os.read(self._line, 4096)
+                *commands, self._typed = self._typed.split(b"\r")
+                for command in commands:
+                    self._obey(command)
+            while (answer := self._drives.recv(0)) is not None:
+                frame = f"t{answer.arbitration_id:03X}{len(answer.data)}{answer.data.hex().upper()}\r"
+                os.write(self._line, frame.encode())
+
+    def _obey(self, command: bytes) -> None:
+        if not command.startswith(b"t"):
+            os.write(self._line, b"\r")
+            return
+        os.write(self._line, self._taken)
+        data = bytes.fromhex(command[5:].decode())
+        self._drives.send(can.Message(arbitration_id=int(command[1:4], 16), data=data, is_extended_id=False))
+
+
+@pytest.mark.parametrize("taken", [b"\r", b"z\r"])
+def test_slcan_whose_adapter_acknowledges_every_frame(taken: bytes) -> None:
+    """Set up, powered and led over 300 cycles: each hears the answers to its own SYNC, and no backlog grows."""
+    with SerialLineAdapter(taken) as adapter:
+        options = {"tty_baudrate": 921_600, "sleep_after_open": 0.0, "timeout": 0.0}
+        section = Can(interface="slcan", channel=adapter.channel, options=options)
+        drives = bus.connect(section, DRIVES)
+        try:
+            drives.configure(0.01)
+            cycle(drives)
+            drives.enable()
+            until(drives, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
+            for number in range(300):
+                feedback = cycle(drives, number * 1e-6)
+                assert (feedback.fault, feedback.age) == (None, (0, 0, 0)), number
+            assert min(feedback.position) > 2e-4
+        finally:
+            drives.close()
 
 
 def test_a_virtual_bus_ends_with_its_process() -> None:

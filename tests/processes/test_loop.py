@@ -8,9 +8,10 @@ from typing import cast
 
 import pytest
 from conftest import Followers, Rig, what_memory_takes
+from trirail.motion.planning import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
-from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop
+from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop, Ports
 from trirail.wire import links
 from trirail.wire.links import PacketLink, Port
 from trirail.wire.messages import PoseGoal
@@ -29,6 +30,7 @@ from trirail.wire.packets import (
     decode_answer,
     message,
 )
+from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.interface import Drives
@@ -39,11 +41,16 @@ class Shell:
 
     def __init__(self, rig: Rig, folder: Path) -> None:
         self.rig = rig
-        self.ports = Port(links.listen(folder / "gateway")), Port(links.listen(folder / "recorder"))
+        names = ("gateway", "recorder", "planner")
+        self.ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))
         self.gateway: PacketLink = links.connect(folder / "gateway")
         self.recorder: PacketLink = links.connect(folder / "recorder")
+        self.planner: PacketLink = links.connect(folder / "planner", MAX_PLANNING)
+        self.motion_planner = MotionPlanner(rig.config)
+        self.serves = True
+        """Whether the planner answers what it is asked before the next cycle."""
         self.heartbeats = Heartbeats.create()
-        self.loop = Loop(rig.config, rig.driver, *self.ports, self.heartbeats)
+        self.loop = Loop(rig.config, rig.driver, self.ports, self.heartbeats)
         self.loop.control.start(rig.control.measured.feedback)
 
     def cycles(self, number: int, missed: int = 0) -> None:
@@ -51,6 +58,8 @@ class Shell:
             self.rig.now += self.rig.config.period
             self.rig.sent.clear()
             self.loop.cycle(Tick(round(self.rig.now * 1e9), 0, missed))
+            while self.serves and (packet := self.planner.receive()) is not None:
+                self.planner.send(encode(self.motion_planner.plan(decode_plan_request(packet))))
 
     def enabled(self) -> None:
         self.cycles(self.rig.config.loop.rate_hz // BATCHES_PER_SECOND)  # by then the gateway is accepted
@@ -74,6 +83,7 @@ def shell(rig: Rig, tmp_path: Path) -> Iterator[Shell]:
     yield made
     made.gateway.close()
     made.recorder.close()
+    made.planner.close()
     for port in made.ports:
         port.close()
 

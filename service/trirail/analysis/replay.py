@@ -1,9 +1,11 @@
 """A recorded session again, in process and without waiting: the same control, given the same, cycle by cycle.
 
 What the control decides depends on its configuration, on what the drives say at each SYNC, and on what it is given:
-goals, commands and mishaps. All of that is in a recording, with the cycle that it belongs to, so the setpoints must
-come out the same to the last bit. With another configuration the drives' recorded answers mean nothing any more: then
-simulated drives take their place, on a clock that goes on by one period a cycle.
+goals, commands, mishaps, and what the planner has answered. All of that is in a recording, with the cycle that it
+belongs to, so the setpoints must come out the same to the last bit. What the planner is asked comes of that as well: it
+is planned once more, and compared with what was answered. With another configuration the recorded answers of drives
+and planner mean nothing any more: then simulated drives take their place, on a clock that goes on by one period a
+cycle, and a planner that answers in the next one.
 """
 
 from __future__ import annotations
@@ -20,10 +22,14 @@ from trirail_drivers.bus import connect
 from trirail_drivers.interface import DriveFault, Drives, Feedback, PowerState, Triple
 
 from trirail.config import Config
-from trirail.control.control import Control
+from trirail.control.control import Control, Given
+from trirail.control.local_planner import LocalPlanner
 from trirail.errors import ServiceError
+from trirail.motion.planning import MotionPlanner, revision
+from trirail.telemetry import provenance
 from trirail.telemetry.reading import Recording
-from trirail.wire.packets import ControlInput, DrivesFault
+from trirail.wire.packets import ControlInput, DrivesFault, PlannerLost
+from trirail.wire.planning import PlanAnswer, PlanRequest
 from trirail.wire.vocabulary import MODES, Mode
 
 SETPOINTS = ("commanded_position", "commanded_velocity")
@@ -40,6 +46,10 @@ class Comparison(NamedTuple):
     """So many at the end were not, since what came before them is not in the recording."""
     requests: int
     """Goals, commands and mishaps that were given."""
+    plans: int
+    """Answers of the planner that were given; none where it was asked anew instead."""
+    plans_differing: int
+    """So many of them are not the same to the last bit when the same is planned again."""
     differing: int
     """Cycles whose setpoints or mode are not the same to the last bit."""
     first: int | None
@@ -60,8 +70,14 @@ def again(recording: Recording, config: Config, *, simulated: bool) -> Compariso
     _check(recording, records, config)
     clock = _Clock(config.period)
     drives = _simulated(records, config, clock) if simulated else _Recorded(records)
+    requests = [what for what in given if not isinstance(what.given, PlanAnswer | PlannerLost)]
+    planner: _RecordedPlanner | LocalPlanner
+    if len(requests) < len(given) and _plans_alike(recording, config):
+        planner = _RecordedPlanner(config)
+    else:
+        planner, given = LocalPlanner(config), requests
     try:
-        made, modes = _run(Control(config, drives), drives, clock, records, given)
+        made, modes = _run(Control(config, drives, planner), drives, planner, clock, records, given)
     finally:
         clock.run()
         drives.close()
@@ -71,7 +87,9 @@ def again(recording: Recording, config: Config, *, simulated: bool) -> Compariso
     return Comparison(
         cycles=len(records),
         lacking=len(recording.records) - len(records),
-        requests=len(given),
+        requests=len(requests),
+        plans=planner.given if isinstance(planner, _RecordedPlanner) else 0,
+        plans_differing=planner.differing if isinstance(planner, _RecordedPlanner) else 0,
         differing=int(differs.sum()),
         first=int(records["cycle"][np.argmax(differs)]) if differs.any() else None,
         position=tuple(greatest[0]),
@@ -80,7 +98,12 @@ def again(recording: Recording, config: Config, *, simulated: bool) -> Compariso
 
 
 def _run(
-    control: Control, drives: Drives, clock: _Clock, records: NDArray[np.void], given: Sequence[ControlInput]
+    control: Control,
+    drives: Drives,
+    planner: _RecordedPlanner | LocalPlanner,
+    clock: _Clock,
+    records: NDArray[np.void],
+    given: Sequence[ControlInput],
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return what is sent to the drives in each cycle, (N, 2, 3), and the modes, (N,)."""
     clock.step()
@@ -93,21 +116,26 @@ def _run(
     for row in range(len(records)):
         clock.step()
         drives.sync()
-        _cycle(control, drives, list(_due(waiting, control.cycles + 1)))
+        _cycle(control, drives, planner, list(_due(waiting, control.cycles + 1)))
         made[row] = control.setpoints.rows[:2]
         modes[row] = MODES.index(control.state.mode)
     return made, modes
 
 
-def _cycle(control: Control, drives: Drives, given: Sequence[ControlInput]) -> None:
+def _cycle(
+    control: Control, drives: Drives, planner: _RecordedPlanner | LocalPlanner, given: Sequence[ControlInput]
+) -> None:
     """Do what the loop does in a cycle after its SYNC."""
+    inputs: list[Given] = [(what.given, what.now_ns) for what in given if not isinstance(what.given, DrivesFault)]
+    if isinstance(planner, LocalPlanner):
+        inputs += [(answer, 0) for answer in planner.answers()]
+    else:
+        planner.compare(given)
     if isinstance(drives, _Recorded):
         for what in given:
             if isinstance(what.given, DrivesFault):
                 drives.fail(what.given.message)
-    control.cycle(
-        drives.read(), [(what.given, what.now_ns) for what in given if not isinstance(what.given, DrivesFault)]
-    )
+    control.cycle(drives.read(), inputs)
     control.ledger.answers.clear()
     control.ledger.notices.clear()
 
@@ -139,6 +167,36 @@ def _check(recording: Recording, records: NDArray[np.void], config: Config) -> N
     rate = round(1.0 / float(np.median(np.diff(recording.t[:1000])))) if len(recording.t) > 1 else 0
     if rate and rate != config.loop.rate_hz:
         raise ServiceError(f"loop.rate_hz = {config.loop.rate_hz}: the recording has {rate} cycles a second")
+
+
+def _plans_alike(recording: Recording, config: Config) -> bool:
+    """Whether what was planned in a recording can be used with a configuration: nothing that plans depend on differs.
+
+    Where the recording has no configuration, the one that is given is taken for its own.
+    """
+    recorded = provenance.configuration(recording.texts)
+    return recorded is None or revision(recorded) == revision(config)
+
+
+class _RecordedPlanner:
+    """Plans what is asked again, and compares it with what was answered: its answers are those of the recording."""
+
+    def __init__(self, config: Config) -> None:
+        self.given = 0
+        self.differing = 0
+        self._planner = MotionPlanner(config)
+        self._planned: dict[int, PlanAnswer] = {}
+
+    def ask(self, request: PlanRequest) -> None:
+        """See trirail.control.plan_requests.PlannerPort."""
+        self._planned[request.number] = self._planner.plan(request)
+
+    def compare(self, given: Sequence[ControlInput]) -> None:
+        """Count the answers among what is given in a cycle, and those that would be others now."""
+        for what in given:
+            if isinstance(what.given, PlanAnswer):
+                self.given += 1
+                self.differing += self._planned.get(what.given.number) != what.given
 
 
 class _Recorded:

@@ -66,7 +66,8 @@ def replay(
         terminal.json({"name": recording.name} | compared._asdict() | same)
     else:
         _print_comparison(recording, compared, by, here, config)
-    return 1 if compared.differing and by == here and config is None else 0
+    differs = compared.differing or compared.plans_differing
+    return 1 if differs and by == here and config is None else 0
 
 
 def report(*file: Path, plot: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
@@ -146,6 +147,12 @@ def _print_comparison(
         lines.add("[yellow]replayed by[/]", f"{terminal.plain(str(here))}: other software may plan otherwise")
     if compared.lacking:
         lines.add("[yellow]not replayed[/]", f"{compared.lacking} cycles: what came before them is not recorded")
+    if compared.plans:
+        otherwise = f"[bold red]{compared.plans_differing} come out otherwise[/]"
+        again = otherwise if compared.plans_differing else "all come out the same to the last bit"
+        lines.add("plans", f"{compared.plans} as they were answered; planned again, {again}")
+    else:
+        lines.add("plans", "made anew: those of the recording are of another configuration, or not in it")
     if compared.first is None:
         lines.add("setpoints", "[bold green]the same to the last bit[/], in every cycle")
     else:

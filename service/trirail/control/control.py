@@ -6,7 +6,6 @@ and `write` the setpoints behind the last gate. What is to be said of it waits a
 
 from __future__ import annotations
 
-import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable
 
@@ -18,20 +17,19 @@ from trirail.control.feedback import Measured
 from trirail.control.goal_queue import GoalQueue
 from trirail.control.ledger import Ledger
 from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeState, Refusal, step
+from trirail.control.plan_requests import PlannerPort, PlanRequests
 from trirail.control.setpoints import Setpoints
-from trirail.control.stepwise_planner import StepwisePlanner
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.goals import Goals
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
-from trirail.motion.steps import finish
-from trirail.wire.messages import Outcome, PoseGoal, SlidersGoal
-from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest, Request
+from trirail.wire.messages import Outcome
+from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest, PlannerLost, RefusedRequest, Request
+from trirail.wire.planning import PlanAnswer
 from trirail.wire.records import Part
 from trirail.wire.vocabulary import Command, Mode
 
-Given = tuple[Request | Disturbance, int]
+Given = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
 """What the control is given in a cycle, and when, by the monotonic clock [ns]."""
 
 SETTLE = 0.1
@@ -57,13 +55,12 @@ _GO_ON = (
 class Control:
     """Modes, motion, kinematics and limits of one robot over one set of drives."""
 
-    def __init__(self, config: Config, drives: Drives) -> None:
+    def __init__(self, config: Config, drives: Drives, planner: PlannerPort) -> None:
         robot = geometry(config.geometry)
         self._drives = drives
         self._period = config.period
-        self._goals = Goals(robot, config.limits, config.period)
         self._schedule = Schedule(rest(STILL), config.period)
-        self._planner = StepwisePlanner(self._goals, self._schedule, config.period)
+        self._planner = PlanRequests(config, planner, self._schedule)
         self.ledger = Ledger()
         self.goal_queue = GoalQueue(self.ledger, self._planner, self._schedule, config.motion.queue, config.period)
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
@@ -89,10 +86,15 @@ class Control:
         self.observe(feedback)
         try:
             for what, now_ns in given:
-                if isinstance(what, Disturbance):
-                    self.happen(ModeEvent[what.event], what.reason)
-                else:
-                    self.handle(what, now_ns)
+                match what:
+                    case Disturbance():
+                        self.happen(ModeEvent[what.event], what.reason)
+                    case GoalRequest() | CommandRequest() | RefusedRequest():
+                        self.handle(what, now_ns)
+                    case PlannerLost():
+                        self._planner.lose(what.reason)
+                    case answer:
+                        self._planner.hear(answer)
             mark(Part.MODE)
             self.advance()
             mark(Part.MOTION)
@@ -110,12 +112,6 @@ class Control:
         self.measured.start(feedback)
         self.setpoints.start()
         self._follow_measured()
-        # What runs for the first time is slow: plan and check a motion now, not in a cycle.
-        nearby = Schedule(rest([value + 1e-3 for value in self.measured.pose]), self._period)
-        for goal in (PoseGoal(*self.measured.pose), SlidersGoal(feedback.position)):
-            with contextlib.suppress(RefusedError):
-                nearby.take(finish(self._goals.plan(goal, nearby, 1.0)).runs)
-                finish(self._goals.time_scaling.try_change(nearby.runs[0], 0.0, self.measured.pose))
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
@@ -163,7 +159,7 @@ class Control:
         self._withdraw(event, reason)
 
     def advance(self) -> None:
-        """End a jog that nobody renews, plan one step further, and go on to the motion of this cycle."""
+        """End a jog that nobody renews, begin what has been planned, and go on to the motion of this cycle."""
         released = self.ledger.release(self.cycles) if self.state.mode is Mode.MOVING else None
         if released is not None:
             self._go(ModeEvent.RELEASE, f"goal {released.id} of {released.user} is not renewed")
@@ -198,7 +194,7 @@ class Control:
         schedule = self._schedule
         if refused:
             self.trip(refused)
-        elif self.state.mode in (Mode.MOVING, Mode.STOPPING) and schedule.runs[0].stands and not schedule.turning:
+        elif self.state.mode in (Mode.MOVING, Mode.STOPPING) and schedule.runs[0].stands:
             self._stand(schedule.runs[0])
 
     def write(self) -> None:
@@ -336,15 +332,11 @@ class Control:
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
             self._schedule.take(deque())
             self.setpoints.tell_progress(0.0, 0.0)
-            self._planner.stop_thinking()
+            self._planner.leave_rate()
 
     def _brake(self) -> None:
         """Stop on the path of the motion under way; what was to follow it does not."""
-        schedule = self._schedule
-        schedule.keep()
-        schedule.forget()
-        if len(schedule.runs) > 1:  # it is stopping already, for a goal that is not to follow any more
-            schedule.runs.pop()
+        self._schedule.stop_on_path()
         self._planner.run_at(0.0)
 
     def _stand(self, run: Run) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from trirail.control.ledger import Ledger, Withdrawal
-from trirail.control.stepwise_planner import StepwisePlanner
+from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.schedule import Schedule
 from trirail.wire.messages import Outcome, PoseGoal, VelocityGoal
@@ -25,9 +25,9 @@ class _Sent(NamedTuple):
 class GoalQueue:
     """Takes goals in their order to the planner, and to the ledger what becomes of them."""
 
-    def __init__(self, ledger: Ledger, pilot: StepwisePlanner, schedule: Schedule, queue: int, period: float) -> None:
+    def __init__(self, ledger: Ledger, planner: PlanRequests, schedule: Schedule, queue: int, period: float) -> None:
         self._ledger = ledger
-        self._planner = pilot
+        self._planner = planner
         self._schedule = schedule
         self._queue = queue
         self._period = period
@@ -47,7 +47,7 @@ class GoalQueue:
         self._ledger.keep_alive(request, self._alive_until(sent))
 
     def think(self, cycle: int, admit: Callable[[], bool]) -> GoalRequest | None:
-        """Begin with the next goal if none is being planned, and take one step; return a goal that begins.
+        """Have the next goal planned if none is, and take what has been planned; return a goal that begins.
 
         `admit` raises RefusedError where the robot takes no goal, and says whether it is moving to one.
         """
@@ -60,6 +60,7 @@ class GoalQueue:
         try:
             if self._planner.busy and self._planned is not None:
                 self._ledger.check_id(self._planned.request)  # a jog may end while its renewal is being planned
+                self._check_age(self._planned, cycle)
             taken = self._planner.think()
         except RefusedError as refusal:
             self._planner.give_up()
@@ -123,15 +124,20 @@ class GoalQueue:
                 RefusalCode.NO_VELOCITY, "a jog of no velocity moves nothing: give it one along x, y or phi"
             )
         moving = admit()
-        if goal.valid_for is not None and cycle - sent.cycle > goal.valid_for / self._period:
-            raise RefusedError(RefusalCode.EXPIRED, f"the goal came too late: it was valid for {goal.valid_for:g} s")
-        if cycle > self._alive_until(sent):
-            raise RefusedError(RefusalCode.EXPIRED, "the jog came too late: its timeout was over before it could begin")
+        self._check_age(sent, cycle)
         blend = ledger.goals[-1].blend if moving and ledger.goals and isinstance(goal, PoseGoal) else None
         if blend is not None and len(ledger.goals) > self._queue:
             text = f"{self._queue} goals are waiting already (motion.queue): send it when one has ended"
             raise RefusedError(RefusalCode.QUEUE_FULL, text, value=len(ledger.goals), limit=self._queue)
         self._planner.plan(goal, blend)
+
+    def _check_age(self, sent: _Sent, cycle: int) -> None:
+        """Refuse what can no more begin in time."""
+        valid = sent.request.goal.valid_for
+        if valid is not None and cycle - sent.cycle > valid / self._period:
+            raise RefusedError(RefusalCode.EXPIRED, f"the goal came too late: it was valid for {valid:g} s")
+        if cycle > self._alive_until(sent):
+            raise RefusedError(RefusalCode.EXPIRED, "the jog came too late: its timeout was over before it could begin")
 
     def _alive_until(self, sent: _Sent) -> float:
         """Return the cycle in which a jog ends that nobody renews; infinite for other goals."""
@@ -142,5 +148,5 @@ class GoalQueue:
         """End a goal that waits, and those behind it."""
         self._ledger.end("stopped", f"goal {goal_id} before it {outcome}", but=number + 1)
         self._ledger.end(outcome, reason, but=number)
-        self._schedule.runs[-1].drop(number - 1)
+        self._schedule.drop(number - 1)
         self._planner.run_at(self._planner.override)

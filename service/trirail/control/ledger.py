@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from trirail.control.stepwise_planner import AcceptedPlan
+from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.messages import Level, Outcome, PoseGoal, VelocityGoal
 from trirail.wire.packets import (

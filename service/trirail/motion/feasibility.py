@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +16,8 @@ from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.limits import COORDINATES, Bounds, Violation
 from trirail.motion.path_sampling import survey
-from trirail.motion.paths import ROUNDING, Path, advance, constant
+from trirail.motion.paths import ROUNDING, Path, advance, constant, reached, value
 from trirail.motion.runs import STILL
-from trirail.motion.steps import Steps
 
 PLANNED = (0.98, 0.98, 0.93)
 """Share of the sliders' limits of velocity, acceleration and jerk that plans make use of: the rest is for what lies
@@ -32,8 +32,8 @@ GAP = 0.02
 """Between moments at which a path is looked at, besides its knots [s]."""
 FEWEST, MOST = 16, 64
 """Such moments, however short or long the path."""
-KNOTS_A_STEP = 48
-"""Knots of a path that are looked at in one step."""
+KNOTS_A_PART = 48
+"""Knots of a path that is planned which are looked at together: each part has at least FEWEST moments of its own."""
 POWERS = 1.0 / np.arange(1.0, 4.0)
 LONGEST = 600.0
 """No path is looked at for longer [s]."""
@@ -74,6 +74,18 @@ def fastest(worst: Array) -> str:
     return f"the platform's {COORDINATES[row - 1]}" if row else "a slider"
 
 
+def parts(path: Path, law: Path, first: float, until: float, knots: int) -> list[tuple[float, float]]:
+    """Return times of a law between which a path is looked at part by part, each with at most so many of its knots."""
+    at = np.zeros((3, 1))
+    value(law.knots, law.pieces, first, at)
+    begin = int(np.searchsorted(path.knots, at[0, 0], side="right"))
+    value(law.knots, law.pieces, until, at)
+    end = int(np.searchsorted(path.knots, at[0, 0]))
+    between = path.knots[begin + knots - 1 : end : knots].tolist()
+    times = [first, *(reached(law.knots, law.pieces, s, until) for s in between), until]
+    return list(pairwise(times))
+
+
 class Checker:
     """Looks at paths of one robot."""
 
@@ -106,13 +118,10 @@ class Checker:
         """Whether sliders and platform can bear a motion of such shares, with what is kept for changes of rate."""
         return bool((worst <= self._laws).all())
 
-    def whole(self, path: Path, pose: Sequence[float]) -> Steps[Array]:
+    def whole(self, path: Path, pose: Sequence[float]) -> Array:
         """Return Look.worst of a whole path. Raises RefusedError where it leaves the workspace."""
         law, worst = constant(1.0), np.zeros((4, 3))
-        ends = [*path.knots[KNOTS_A_STEP : -KNOTS_A_STEP // 2 : KNOTS_A_STEP].tolist(), path.duration]
-        for first, until in zip([0.0, *ends[:-1]], ends, strict=True):
-            if first:
-                yield
+        for first, until in parts(path, law, 0.0, path.duration, KNOTS_A_PART):
             found = self.look(path, law, first, until, pose)
             if not math.isnan(found.leaves_at):
                 raise self.refusal(path, found.leaves_at, pose)

@@ -20,7 +20,6 @@ from trirail.motion.paths import Path, constant
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.ruckig_call import solved
 from trirail.motion.runs import STILL, MotionState, from_ruckig, joined, stretched
-from trirail.motion.steps import Steps
 
 GENTLEST = 0.1
 """Share of any limit below which no plan from motion is tried."""
@@ -128,24 +127,24 @@ class Planner:
 
     def to_pose(
         self, start: MotionState, target: Sequence[float], speed: float = 1.0, limits: Kinodynamic | None = None
-    ) -> Steps[Plan]:
+    ) -> Plan:
         """Plan to rest at a pose, straight in pose space from rest; at `speed` 0.5 it takes twice as long.
 
         A path that is too fast for a slider or the platform is slowed. Raises RefusedError with slider or coordinate,
         value and limit where it leaves the workspace, or where it cannot be slowed since it starts in motion.
         """
         self.check_pose(target)
-        return (yield from self._to_rest(start, start, target, limits or self._platform, speed))
+        return self._to_rest(start, start, target, limits or self._platform, speed)
 
-    def to_sliders(self, start: MotionState, target: Sequence[float], speed: float = 1.0) -> Steps[Plan]:
+    def to_sliders(self, start: MotionState, target: Sequence[float], speed: float = 1.0) -> Plan:
         """Plan to rest at slider positions, straight in slider space from rest; as to_pose otherwise."""
         self.check_sliders(target)
         rows = np.zeros((6, 3))
         inverse_into(self._legs, np.array(start), rows)
         sliders = MotionState(*rows[:3].tolist())
-        return (yield from self._to_rest(start, sliders, target, self._sliders, speed, in_sliders=True))
+        return self._to_rest(start, sliders, target, self._sliders, speed, in_sliders=True)
 
-    def jog(self, start: MotionState, velocity: Sequence[float], timeout: float) -> Steps[Plan]:
+    def jog(self, start: MotionState, velocity: Sequence[float], timeout: float) -> Plan:
         """Plan to a velocity, held until `timeout` is surely over or a limit comes near, and to rest.
 
         `timeout` is real time, and time along the path runs at up to twice its rate: who ends the jog is the control.
@@ -163,28 +162,25 @@ class Planner:
                 return Plan(path, 1.0 / share, bound)
             if math.isnan(found.leaves_at):
                 share *= ROOM / found.excess
-                yield
                 continue
             bound = self._checker.bound(path, found.leaves_at, start.pose)
             if hold > 0.0:
                 hold = max(0.0, found.leaves_at - ramp - brake)  # to rest where it would have been out of reach
             else:
                 share /= 2.0
-            yield
         path = self._to_velocity(start, STILL, self._platform)
-        if not self._checker.bears((yield from self._checker.whole(path, start.pose))):
+        if not self._checker.bears(self._checker.whole(path, start.pose)):
             raise TOO_FAST_IN_MOTION
         return Plan(path, bound=bound)
 
-    def follow(self, start: MotionState, points: Sequence[Point], stretch: bool) -> Steps[Plan]:
+    def follow(self, start: MotionState, points: Sequence[Point], stretch: bool) -> Plan:
         """Take timed points for a path, quintic between them. Raises RefusedError.
 
         Too fast is refused, or slowed with `stretch`.
         """
         _check_ends(points, start)
         path = quintic(points, start.pose)
-        yield
-        worst = yield from self._checker.whole(path, start.pose)
+        worst = self._checker.whole(path, start.pose)
         slower = excess(worst)
         if slower <= 1.0:
             return Plan(path)
@@ -196,8 +192,7 @@ class Planner:
                 value=slower,
                 limit=1.0,
             )
-        yield
-        path, slower = yield from self._slowed(path, slower, start.pose)
+        path, slower = self._slowed(path, slower, start.pose)
         return Plan(path, slower)
 
     def nearness(self, pose: Sequence[float], target: Sequence[float]) -> float:
@@ -215,38 +210,35 @@ class Planner:
         limits: Kinodynamic,
         speed: float,
         in_sliders: bool = False,
-    ) -> Steps[Plan]:
+    ) -> Plan:
         """Plan from `begin`, the platform's motion `start` or that of the sliders."""
         if start.at_rest:
             path = self._solve(begin, limits, in_sliders, target=target)
-            slower = max(1.0 / speed, excess((yield from self._checker.whole(path, start.pose))))
+            slower = max(1.0 / speed, excess(self._checker.whole(path, start.pose)))
             if slower > 1.0:
-                yield
-                path, slower = yield from self._slowed(path, slower, start.pose)
+                path, slower = self._slowed(path, slower, start.pose)
             return Plan(path, slower * speed)
         shares = np.full(3, speed)
         for _ in range(TRIES):
             lower = Kinodynamic(*(np.array(limits) * shares[:, None]).tolist())
             path = self._solve(begin, lower, in_sliders, target=target)
-            worst = yield from self._checker.whole(path, start.pose)
+            worst = self._checker.whole(path, start.pose)
             if self._checker.bears(worst):
                 return Plan(path, speed / float(shares.min()))
             shares = shares * np.clip(ROOM / worst.max(axis=0), GENTLEST, 1.0)
-            yield
         raise TOO_FAST_IN_MOTION
 
-    def _slowed(self, path: Path, factor: float, pose: Sequence[float]) -> Steps[tuple[Path, float]]:
+    def _slowed(self, path: Path, factor: float, pose: Sequence[float]) -> tuple[Path, float]:
         """Return a path, so many times slower or as many more as it takes to fit, and how many that is.
 
         Slower it is not the same motion: what was over within a step, as a short jerk, lasts longer.
         """
         for _ in range(LOOKS):
             slow = stretched(path, factor)
-            found = excess((yield from self._checker.whole(slow, pose)))
+            found = excess(self._checker.whole(slow, pose))
             if found <= 1.0:
                 return slow, factor
             factor *= found * A_HAIR_MORE
-            yield
         raise RefusedError(RefusalCode.TOO_FAST, f"the path does not fit its limits even {factor:.3g} times slower")
 
     def _jog(self, start: MotionState, velocity: Sequence[float], hold: float) -> tuple[float, float, Path]:

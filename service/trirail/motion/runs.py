@@ -83,7 +83,11 @@ class Run:
     @property
     def at(self) -> Rate:
         """Where the law is."""
-        value(self.law.knots, self.law.pieces, self.time, self._law_out)
+        return self.at_time(self.time)
+
+    def at_time(self, time: float) -> Rate:
+        """Where the law is at a time of its own [s]."""
+        value(self.law.knots, self.law.pieces, time, self._law_out)
         s, rate, change = self._law_out[:, 0].tolist()
         return Rate(s, rate, change)
 
@@ -172,6 +176,13 @@ class Run:
         if code:
             self._out[:] = np.nan
         return MotionState(*self._out.tolist())
+
+
+def nominal(path: Path, s: float) -> MotionState:
+    """Return the motion at a time along a path [s], at full speed; in the path's own coordinates."""
+    out = np.zeros((3, 3))
+    value(path.knots, path.pieces, s, out)
+    return MotionState(*out.tolist())
 
 
 def arrival(law: Path, target: float, s: float) -> float:

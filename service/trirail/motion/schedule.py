@@ -6,6 +6,7 @@ from collections import deque
 
 import numpy as np
 
+from trirail.motion.paths import Path
 from trirail.motion.runs import MotionState, Run
 
 
@@ -19,9 +20,9 @@ class Schedule:
         self.runs: deque[Run] = deque()
         """The motion under way, and those to follow at its end."""
         self.cycle = 0
+        self.version = 0
+        """Of the motion under way: another one as soon as it is not to go on as it would have gone on by itself."""
         self._period = period
-        self._later: deque[Run] = deque()
-        self._turn: int | None = None
 
     @property
     def commanded(self) -> MotionState:
@@ -33,53 +34,55 @@ class Schedule:
         self.motion[0] = motion
 
     @property
-    def turning(self) -> bool:
-        """Whether another motion is soon to take the place of the one under way."""
-        return self._turn is not None
-
-    @property
     def last(self) -> Run | None:
         """The run at whose end the robot stands, as far as is decided."""
-        runs = self._later or self.runs
-        return runs[-1] if runs else None
+        return self.runs[-1] if self.runs else None
 
     @property
     def remaining(self) -> float:
         """Time until it stands [s]."""
-        if self._turn is not None:
-            waiting = (self._turn - self.cycle) * self._period
-            return waiting + sum(run.ends for run in self._later)
         return sum(run.ends - run.time for run in self.runs)
 
     @property
     def single(self) -> bool:
         """Whether it is one motion to one goal at most: then its run alone tells how far it has come."""
-        return len(self.runs) <= 1 and self._turn is None and not (self.runs and self.runs[0].seams)
+        return len(self.runs) <= 1 and not (self.runs and self.runs[0].seams)
 
     @property
     def progress(self) -> tuple[float, float]:
         """Share of the time of the goal under way that is over, and what remains of it [s]."""
-        if not self.runs or self.turning:
-            return 0.0, self.remaining
+        if not self.runs:
+            return 0.0, 0.0
         *stops, run = self.runs
         return run.progress, run.remaining + sum(stop.ends - stop.time for stop in stops)
 
-    def take(self, runs: deque[Run], turn: int | None = None) -> None:
-        """Go on with other runs, at once or from the cycle `turn` on; they begin with the motion commanded then."""
-        if turn is None or turn <= self.cycle or not self.runs:
-            self.runs, self._later, self._turn = runs, deque(), None
-        else:
-            self._later, self._turn = runs, turn
-            self.forget()
+    def take(self, runs: deque[Run]) -> None:
+        """Go on with other runs; they begin with the motion that is commanded now."""
+        self.runs = runs
+        self.version += 1
 
-    def forget(self) -> None:
-        """Let the goals on the way go: what is under way leads to none of them."""
+    def append(self, s: float, path: Path) -> None:
+        """Go on from a time along the last path by another one: Run.append."""
+        self.runs[-1].append(s, path)
+        self.version += 1
+
+    def drop(self, number: int) -> None:
+        """Leave out the goals behind a seam of the last path: Run.drop."""
+        self.runs[-1].drop(number)
+        self.version += 1
+
+    def change_law(self, run: Run, law: Path, target: float) -> None:
+        """Let the time along a run's path go on by another law: Run.change_law."""
+        run.change_law(law, target)
+        self.version += 1
+
+    def stop_on_path(self) -> None:
+        """Let what was to follow the motion under way go, and the goals on its way: it leads to none of them."""
+        while len(self.runs) > 1:
+            self.runs.pop()
         for run in self.runs:
             run.seams.clear()
-
-    def keep(self) -> None:
-        """Stay with the motion under way: none is to take its place."""
-        self._later, self._turn = deque(), None
+        self.version += 1
 
     def advance(self) -> int:
         """Move the commanded state on by one period; return how many goals have ended where the next one begins."""
@@ -91,8 +94,6 @@ class Schedule:
 
     def begin_cycle(self) -> Run | None:
         """Go on to the next cycle; return the run under way in it, whose time is one period on."""
-        if self._turn == self.cycle:
-            self.take(self._later)
         self.cycle += 1
         if not self.runs:
             return None
@@ -111,8 +112,7 @@ class Schedule:
         """Return the schedule as it will be so many cycles later, if nothing happens in between."""
         other = Schedule(self.commanded, self._period)
         other.runs = deque(run.copy() for run in self.runs)
-        other._later = deque(run.copy() for run in self._later)
-        other.cycle, other._turn = self.cycle, self._turn
+        other.cycle = self.cycle
         for _ in range(cycles):
             other.advance()
         return other

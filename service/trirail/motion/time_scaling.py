@@ -9,11 +9,10 @@ from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
 from trirail.config import PlatformLimits
 from trirail.kinematics.geometry import Geometry
-from trirail.motion.feasibility import Checker
+from trirail.motion.feasibility import Checker, Look
 from trirail.motion.paths import Path, constant
 from trirail.motion.ruckig_call import solved
-from trirail.motion.runs import Run, arrival, law_from_ruckig
-from trirail.motion.steps import Steps
+from trirail.motion.runs import Rate, Run, arrival, law_from_ruckig
 
 SHARES = tuple(0.6**k for k in range(12))
 """Of the quickest change of rate, tried one after the other."""
@@ -33,58 +32,33 @@ class TimeScaling:
         self._change = min(a / v for a, v in zip(platform.acceleration, platform.velocity, strict=True))
         self._change_jerk = min(j / v for j, v in zip(platform.jerk, platform.velocity, strict=True))
 
-    def begin(self, path: Path, rate: float, pose: Sequence[float]) -> Steps[Run]:
+    def begin(self, path: Path, rate: float, pose: Sequence[float]) -> Run:
         """Start a path at a rate, or as near to it as the limits allow."""
-        rate = yield from self.possible(path, 0.0, rate, pose)
+        rate = self.possible(path, rate, pose)
         return Run(self._legs, path, constant(rate), rate)
 
-    def change(self, run: Run, rate: float, pose: Sequence[float]) -> Steps[None]:
-        """Let the time along a path run at another rate: as soon as the limits allow, as fast as they do.
+    def possible(self, path: Path, rate: float, pose: Sequence[float]) -> float:
+        """Return the rate, or the greatest at which sliders and platform can take a whole path."""
+        return rate if rate <= 1.0 else greatest(rate, self.look(path, constant(1.0), 0.0, path.duration, pose))
 
-        Until then the old law goes on, as the run does between the steps: at the end of the path it stands too.
-        A stop becomes quicker as it goes on: the slower the motion, the more is left of the limits.
-        """
-        rate = yield from self.possible(run.path, run.at.s, rate, pose)
-        while not run.arrived and not rate == run.target == 0.0:
-            if (yield from self.try_change(run, rate, pose)):
-                break
-        while rate == 0.0 and not run.stands:
-            yield
-            yield from self.try_change(run, rate, pose, sooner=True)
-
-    def try_change(
-        self, run: Run, rate: float, pose: Sequence[float], shares: Sequence[float] = SHARES, *, sooner: bool = False
-    ) -> Steps[bool]:
-        """Do the same at one of some shares of the quickest change, the first that the limits allow, if any.
-
-        With `sooner` only where the run comes to stand sooner than by the law that it has.
-        """
+    def stop(self, run: Run, pose: Sequence[float], shares: Sequence[float]) -> Path | None:
+        """Return the law of a stop, from where a run is: the first of some shares of the quickest that fits, if any."""
         for share in shares:
-            law = self._ramp(run, rate, share)
-            if sooner and (law is None or float(law.knots[-2]) > run.ends - run.time - self._period):
-                return False
-            if law is not None:
-                until = min(arrival(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
-                if self._checker.look(run.path, law, 0.0, until, pose).within_limits:
-                    run.change_law(law, rate)
-                    return True
-            yield
-        return False
+            law = self.ramp(run.at, 0.0, share)
+            if law is not None and self.look(run.path, law, 0.0, self.until(run, law, 0.0), pose).within_limits:
+                return law
+        return None
 
-    def possible(self, path: Path, s: float, rate: float, pose: Sequence[float]) -> Steps[float]:
-        """Return the rate, or the greatest at which sliders and platform can take the path from `s` on.
+    def until(self, run: Run, law: Path, rate: float) -> float:
+        """Return until when a law is to be looked at that leads a run to a rate [s]: after that nothing is new."""
+        return min(arrival(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
 
-        Every path fits at one: above that there is only what makes it slower than its limits.
-        """
-        if rate <= 1.0:
-            return rate
-        found = self._checker.look(path, constant(1.0, s), 0.0, path.duration - s, pose)
-        yield
-        return min(rate, max(1.0, 1.0 / found.excess)) if math.isnan(found.leaves_at) and found.excess > 0.0 else 1.0
+    def look(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Look:
+        """Look at a path under a law: Checker.look."""
+        return self._checker.look(path, law, first, until, pose)
 
-    def _ramp(self, run: Run, rate: float, share: float) -> Path | None:
-        """Return the law from the present rate to another, at a share of the quickest change; None without one."""
-        at = run.at
+    def ramp(self, at: Rate, rate: float, share: float) -> Path | None:
+        """Return the law from one rate to another, at a share of the quickest change; None without one."""
         request = InputParameter(1)
         request.control_interface = ControlInterface.Velocity
         request.current_position, request.current_velocity = [at.s], [at.rate]
@@ -94,3 +68,11 @@ class TimeScaling:
         request.max_jerk = [share * self._change_jerk]
         trajectory = Trajectory(1)
         return law_from_ruckig(trajectory, rate) if solved(self._ruckig, request, trajectory) else None
+
+
+def greatest(rate: float, found: Look) -> float:
+    """Return the rate, or the greatest one that a path bears that has been looked at at its nominal rate.
+
+    Every path fits at one: above that there is only what makes it slower than its limits.
+    """
+    return min(rate, max(1.0, 1.0 / found.excess)) if math.isnan(found.leaves_at) and found.excess > 0.0 else 1.0

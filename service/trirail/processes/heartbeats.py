@@ -9,7 +9,7 @@ from __future__ import annotations
 import mmap
 import os
 
-PROCESSES = ("loop", "gateway")
+PROCESSES = ("loop", "gateway", "planner")
 """Those that beat. The recorder does not: nothing depends on it."""
 BEAT_EVERY = 0.05
 """How often a process beats at least, while it waits for work as well [s]."""

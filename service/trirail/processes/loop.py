@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -22,6 +23,7 @@ from trirail.kinematics.robot import warm_up
 from trirail.processes import realtime
 from trirail.processes.clock import Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, Watch
+from trirail.processes.planner_port import PlannerLink
 from trirail.wire.links import Port
 from trirail.wire.messages import Event
 from trirail.wire.packets import (
@@ -29,6 +31,7 @@ from trirail.wire.packets import (
     Disturbance,
     DrivesFault,
     Farewell,
+    GivenInput,
     Kind,
     Request,
     Status,
@@ -50,27 +53,37 @@ EVENTS_KEPT = 1000
 """Events kept for a gateway that comes anew: the one before may have died with some that it had not published."""
 LEAST_PATIENCE = 3
 """Cycles for which the gateway may be silent, however few there are a second."""
+PLANNER_WITHIN = 120.0
+"""How long the planner may take to come up: the very first start compiles the kinematics [s]."""
 SHUTDOWN = 3.0
 """How long a controlled stop may take before the drives are left to their own quick stop [s]."""
 
 
+class Ports(NamedTuple):
+    """Where the processes beside the loop connect."""
+
+    gateway: Port
+    recorder: Port
+    planner: Port
+
+
 class Loop:
-    """Ties control, drives, ticks and the two neighbours together; every cycle is `cycle`."""
+    """Ties control, drives, ticks and the neighbours together; every cycle is `cycle`."""
 
     def __init__(
         self,
         config: Config,
         drives: Drives,
-        gateway: Port,
-        recorder: Port,
+        ports: Ports,
         heartbeats: Heartbeats,
         *,
         capture: Capture | None = None,
         lacking: tuple[str, ...] = (),
     ) -> None:
         self._drives = drives
-        self._gateway = gateway
-        self._recorder = recorder
+        self._gateway = ports.gateway
+        self._recorder = ports.recorder
+        self._planner = PlannerLink(ports.planner)
         self._capture = capture
         self._period = config.period
         self._max_overruns = config.watchdogs.max_overruns
@@ -82,7 +95,7 @@ class Loop:
         self._bits = drives.traffic
         self._weighed_at = 0
 
-        self.control = Control(config, drives)
+        self.control = Control(config, drives, self._planner)
         self.ending = False
         """Set from outside to make the loop stop the robot, disable the drives and return."""
         self._ending_since: int | None = None
@@ -139,7 +152,7 @@ class Loop:
     def _given_in(self, tick: Tick, fault: DriveFault | None) -> Iterator[Given]:
         """Yield what the control is given in a cycle, and keep it for the recorder."""
         now_ns = tick.deadline_ns + tick.lateness_ns
-        for what in itertools.chain(self._watch(tick, fault), self._requests()):
+        for what in itertools.chain(self._watch(tick, fault), self._requests(), self._planner.answers()):
             self._note(tick, what)
             yield what, now_ns
 
@@ -187,7 +200,7 @@ class Loop:
             self._gateway_frozen = False
         return None
 
-    def _note(self, tick: Tick, given: Request | Disturbance | DrivesFault) -> None:
+    def _note(self, tick: Tick, given: GivenInput) -> None:
         """Keep what the control is given in this cycle, for the recorder."""
         self._inputs += 1
         self._given.append(ControlInput(self._inputs, self.control.cycles, tick.deadline_ns + tick.lateness_ns, given))
@@ -259,6 +272,7 @@ class Loop:
 
     def _accept_peers(self) -> None:
         """Take new peers."""
+        self._planner.accept()
         for port in (self._gateway, self._recorder):
             if port.accept():
                 port.send(self._welcome)
@@ -312,17 +326,18 @@ class Loop:
             self._told += 1
 
 
-def main(config: Config, gateway: Port, recorder: Port, heartbeats: Heartbeats, ready: Callable[[object], None]) -> int:
+def main(config: Config, ports: Ports, heartbeats: Heartbeats, ready: Callable[[object], None]) -> int:
     """Run the loop's process; `ready` is called with what the loop runs without once it turns."""
     drives: Drives | None = None
     ended_as_told = False
     try:
         warm_up()
+        ports.planner.await_peer(PLANNER_WITHIN)
         capture = Capture() if config.telemetry.capture_can else None
         drives = connect(config.can, config.drives, capture=capture)
         drives.configure(config.period)
         lacking = realtime.acquire(config.loop)
-        loop = Loop(config, drives, gateway, recorder, heartbeats, capture=capture, lacking=lacking)
+        loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)
 
         def end(_signal: int, _frame: FrameType | None) -> None:
             loop.ending = True
@@ -335,8 +350,9 @@ def main(config: Config, gateway: Port, recorder: Port, heartbeats: Heartbeats, 
         heartbeats.of("loop").rest()  # the drives may take their time to stop
         if drives is not None:
             drives.close()
-        for port in (gateway, recorder):
+        for port in (ports.gateway, ports.recorder):
             if ended_as_told:
                 port.send(message(Farewell()))
+        for port in ports:
             port.close()
     return 0

@@ -20,6 +20,7 @@ from trirail.errors import TrirailError
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.realtime import die_with_parent
 from trirail.wire import links
+from trirail.wire.planning import MAX_PLANNING
 
 
 class Order(msgspec.Struct, frozen=True):
@@ -37,8 +38,13 @@ def _main(name: str, runtime: Path, heartbeats: Heartbeats, ready: Callable[[obj
     if name == "loop":
         from trirail.processes import loop
 
-        gateway, recorder = (links.Port(socket.socket(fileno=number)) for number in sockets)
-        return loop.main(config, gateway, recorder, heartbeats, ready)
+        gateway, recorder, planner = (socket.socket(fileno=number) for number in sockets)
+        ports = loop.Ports(links.Port(gateway), links.Port(recorder), links.Port(planner, MAX_PLANNING))
+        return loop.main(config, ports, heartbeats, ready)
+    if name == "planner":
+        from trirail.processes import planner as thinking
+
+        return thinking.main(config, runtime / name, heartbeats.of(name), ready)
     link = links.connect(runtime / name)
     if name == "gateway":
         from trirail.processes import gateway as gate

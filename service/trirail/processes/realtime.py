@@ -14,6 +14,9 @@ from trirail.errors import ServiceError
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
 
+BELOW = 10
+"""By so much is the planner's priority lower than the loop's."""
+
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -36,8 +39,13 @@ def _lock_memory(_: LoopTable) -> None:
     _call("mlockall", _MCL_CURRENT | _MCL_FUTURE)
 
 
+def _processor(loop: LoopTable) -> int:
+    """Return the loop's processor."""
+    return max(os.sched_getaffinity(0)) if loop.cpu is None else loop.cpu
+
+
 def _pin(loop: LoopTable) -> None:
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0)) if loop.cpu is None else loop.cpu})
+    os.sched_setaffinity(0, {_processor(loop)})
 
 
 def _stay_awake(_: LoopTable) -> None:
@@ -55,6 +63,23 @@ _MEASURES: tuple[tuple[str, Callable[[LoopTable], None], str], ...] = (
     ),
     ("pinned processor", _pin, "name a processor that this process may use in loop.cpu"),
 )
+
+
+def stay_beside(loop: LoopTable) -> tuple[str, ...]:
+    """Keep off the loop's processor where there is another, and below its priority; return what failed, and why."""
+    gc.collect()
+    gc.freeze()
+    if loop.realtime == "off":
+        return ()
+    lacking = []
+    others = os.sched_getaffinity(0) - {_processor(loop)}
+    try:
+        if others:
+            os.sched_setaffinity(0, others)
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(max(1, loop.priority - BELOW)))
+    except OSError as error:
+        lacking.append(f"SCHED_FIFO: {error.strerror}")
+    return tuple(lacking)
 
 
 def acquire(loop: LoopTable) -> tuple[str, ...]:

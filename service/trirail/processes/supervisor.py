@@ -1,4 +1,4 @@
-"""`trirail run`: starts the three processes, watches them, restarts those that may be, and ends them in order."""
+"""`trirail run`: starts the other processes, watches them, restarts those that may be, and ends them in order."""
 
 from __future__ import annotations
 
@@ -24,8 +24,17 @@ from trirail.processes.process import Order
 from trirail.processes.systemd import Watchdog, notify
 from trirail.wire import links
 
-CHILDREN = ("loop", "gateway", "recorder")
-PORTS = ("gateway", "recorder")
+CHILDREN = ("loop", "planner", "gateway", "recorder")
+PORTS = ("gateway", "recorder", "planner")
+"""Where the others connect to the loop, in the order of trirail.processes.loop.Ports."""
+WATCHED_BY_SYSTEMD = ("loop", "gateway")
+"""Without which there is no service; the planner may be away, and is started again."""
+CONSEQUENCES = {
+    "gateway": "the loop stops the robot and holds",
+    "planner": "the motion under way goes on, new goals are refused",
+    "recorder": "the robot is not affected",
+}
+"""What the death of a process means for the robot."""
 START_WITHIN = 120.0
 """How long the processes may take to come up; the very first start compiles the kinematics [s]."""
 END_WITHIN = 6.0
@@ -39,7 +48,7 @@ SILENT = 0.7
 LEAST_CYCLES = 3
 """So many cycles the loop may take for a sign of life, however long they are."""
 RETRY = 10.0
-"""How long it is waited before any more, for a recorder; the gateway's are the service's end [s]."""
+"""How long it is waited before any more, for recorder and planner; the gateway's are the service's end [s]."""
 
 
 class _Child:
@@ -104,11 +113,15 @@ class Supervisor:
         self._due: dict[str, float] = {}
         self._heartbeats = Heartbeats.create()
         loop_silent = max(SILENT, LEAST_CYCLES * config.period)
-        self._patience = {"loop": loop_silent, "gateway": max(SILENT, config.watchdogs.gateway_timeout)}
+        self._patience = {
+            "loop": loop_silent,
+            "gateway": max(SILENT, config.watchdogs.gateway_timeout),
+            "planner": SILENT,
+        }
         self._watches = {
             name: Watch(self._heartbeats.of(name), round(seconds / TURN)) for name, seconds in self._patience.items()
         }
-        self._watchdog = Watchdog([self._heartbeats.of(name) for name in PROCESSES])
+        self._watchdog = Watchdog([self._heartbeats.of(name) for name in WATCHED_BY_SYSTEMD])
         self._next_turn = 0.0
         self._ending = False
         self._failed = False
@@ -211,9 +224,8 @@ class Supervisor:
         if wait and name == "gateway":
             self._fail(f"the gateway keeps dying ({child.how}): ending the service")
             return
-        consequence = "the loop stops the robot and holds" if name == "gateway" else "the robot is not affected"
         when = f" in {wait:g} s" if wait else ""
-        self._say(f"the {name} has died ({child.how}): {consequence}; starting it again{when}")
+        self._say(f"the {name} has died ({child.how}): {CONSEQUENCES[name]}; starting it again{when}")
         self._orders[name] = structs.replace(self._orders[name], record=None)  # never over the first recording
         self._due[name] = now + wait
 

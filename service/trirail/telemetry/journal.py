@@ -17,7 +17,16 @@ from rerun.chunk import Chunk
 from trirail.telemetry import columns
 from trirail.telemetry.columns import SECOND, Column
 from trirail.wire.messages import Event, Level
-from trirail.wire.packets import CommandRequest, ControlInput, Disturbance, DrivesFault, GoalRequest
+from trirail.wire.packets import (
+    CommandRequest,
+    ControlInput,
+    Disturbance,
+    DrivesFault,
+    GoalRequest,
+    PlannerLost,
+    RefusedRequest,
+)
+from trirail.wire.planning import Extended, NotPlanned, Planned
 
 EVENTS, REQUESTS = "/events", "/requests"
 TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
@@ -83,5 +92,13 @@ def _words(what: ControlInput) -> str:
             return f"{event.lower().replace('_', ' ')}: {reason}"
         case DrivesFault(message=message):
             return message or "the drives' fault is over"
-        case refused:
-            return refused.message
+        case Planned(number=number, run=run):
+            return f"plan {number}: a motion of {len(run.path.knots) // 8 - 1} pieces"
+        case Extended(number=number, s=s):
+            return f"plan {number}: a motion that follows the one before it, {s:.3f} s along its path"
+        case NotPlanned(number=number, message=message):
+            return f"plan {number}: {message}"
+        case PlannerLost(reason=reason):
+            return reason
+        case RefusedRequest(message=message):
+            return message

@@ -27,8 +27,9 @@ class TooLarge(Exception):
 class PacketLink:
     """One side of a connection; neither sending nor receiving ever waits."""
 
-    def __init__(self, connected: socket.socket) -> None:
+    def __init__(self, connected: socket.socket, largest: int = MAX_PACKET) -> None:
         connected.setblocking(False)
+        self._largest = largest
         for option in (socket.SO_SNDBUF, 32):  # 32: SO_SNDBUFFORCE, beyond the system's limit, for root only
             with contextlib.suppress(PermissionError):
                 connected.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
@@ -45,8 +46,8 @@ class PacketLink:
 
         Raises Closed when the peer has gone, TooLarge for what it would get cut.
         """
-        if len(packet) > MAX_PACKET:
-            raise TooLarge(f"a packet of {len(packet)} bytes: at most {MAX_PACKET} go between the processes")
+        if len(packet) > self._largest:
+            raise TooLarge(f"a packet of {len(packet)} bytes: at most {self._largest} go between these processes")
         try:
             self._socket.send(packet)
         except BlockingIOError:
@@ -60,7 +61,7 @@ class PacketLink:
         if not self._arrivals.poll(0):  # a third of what it takes to fail at receiving: most of the loop's cycles
             return None
         try:
-            packet = self._socket.recv(MAX_PACKET)
+            packet = self._socket.recv(self._largest)
         except BlockingIOError:
             return None
         except OSError as error:
@@ -74,15 +75,15 @@ class PacketLink:
         self._socket.close()
 
 
-def connect(path: Path) -> PacketLink:
-    """Connect to a port of the loop. Raises OSError where nobody listens."""
+def connect(path: Path, largest: int = MAX_PACKET) -> PacketLink:
+    """Connect to a port of the loop, for packets of so many bytes at most. Raises OSError where nobody listens."""
     connecting = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         connecting.connect(str(path))
     except OSError:
         connecting.close()
         raise
-    return PacketLink(connecting)
+    return PacketLink(connecting, largest)
 
 
 def listen(path: Path) -> socket.socket:
@@ -96,8 +97,9 @@ def listen(path: Path) -> socket.socket:
 class Port:
     """The loop's side: listens, so that a restarted peer can come back; has one peer at most."""
 
-    def __init__(self, listening: socket.socket) -> None:
+    def __init__(self, listening: socket.socket, largest: int = MAX_PACKET) -> None:
         self._listening = listening
+        self._largest = largest
         self._listening.setblocking(False)
         self._link: PacketLink | None = None
         self._lost = False
@@ -117,8 +119,13 @@ class Port:
             connected, _ = self._listening.accept()
         except BlockingIOError:
             return False
-        self._link = PacketLink(connected)
+        self._link = PacketLink(connected, self._largest)
         return True
+
+    def await_peer(self, seconds: float) -> bool:
+        """Wait for a peer, before the loop turns; whether one has come."""
+        select.select([self._listening], [], [], seconds)
+        return self.accept()
 
     def send(self, packet: bytes | bytearray | memoryview) -> bool:
         """Send if there is a peer that keeps up; what it is too slow for, or is too large, is dropped and counted."""
@@ -129,7 +136,7 @@ class Port:
         except TooLarge:
             sent = False
         except Closed:
-            self._drop_link()
+            self.hang_up()
             return False
         if not sent:
             self.dropped += 1
@@ -142,7 +149,7 @@ class Port:
         try:
             return self._link.receive()
         except Closed:
-            self._drop_link()
+            self.hang_up()
             return None
 
     def take_lost(self) -> bool:
@@ -150,7 +157,8 @@ class Port:
         lost, self._lost = self._lost, False
         return lost
 
-    def _drop_link(self) -> None:
+    def hang_up(self) -> None:
+        """Let go of the peer, as if it had gone."""
         if self._link is not None:
             self._link.close()
             self._link = None
@@ -158,5 +166,5 @@ class Port:
 
     def close(self) -> None:
         """Let go of the peer and of the name."""
-        self._drop_link()
+        self.hang_up()
         self._listening.close()

@@ -9,6 +9,7 @@ from trirail_drivers.interface import Counts, Triple
 
 from trirail.errors import RefusalCode
 from trirail.wire.messages import Event, Goal, Level
+from trirail.wire.planning import PlanAnswer
 from trirail.wire.sizes import MAX_PACKET
 from trirail.wire.vocabulary import Command
 
@@ -139,6 +140,15 @@ class DrivesFault(Struct, frozen=True, tag=True):
     """None when nothing is any more."""
 
 
+class PlannerLost(Struct, frozen=True, tag=True):
+    """The planner will not answer what it was asked: it has died, or is not there."""
+
+    reason: str
+
+
+GivenInput = GoalRequest | CommandRequest | RefusedRequest | Disturbance | DrivesFault | PlanAnswer | PlannerLost
+
+
 class ControlInput(Struct, frozen=True, tag="Input"):  # as recordings have it
     """Loop to recorder: what the control was given in a cycle, beside the feedback that is in its record.
 
@@ -150,7 +160,7 @@ class ControlInput(Struct, frozen=True, tag="Input"):  # as recordings have it
     cycle: int
     now_ns: int
     """The monotonic clock then: how old a goal was."""
-    given: GoalRequest | CommandRequest | RefusedRequest | Disturbance | DrivesFault
+    given: GivenInput
 
 
 class Remark(Struct, frozen=True, tag=True):

@@ -1,0 +1,32 @@
+"""The planner in this process, for replays, tests and tools: it answers a set number of cycles after it was asked."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from trirail.config import Config
+from trirail.motion.planning import MotionPlanner
+from trirail.wire.planning import PlanAnswer, PlanRequest
+
+
+class LocalPlanner:
+    """Answers what the control asks: trirail.control.plan_requests.PlannerPort."""
+
+    def __init__(self, config: Config, delay: int = 1) -> None:
+        self.delay = delay
+        """Cycles from the question to the answer."""
+        self._planner = MotionPlanner(config)
+        self._answers: deque[tuple[int, PlanAnswer]] = deque()
+        self._turns = 0
+
+    def ask(self, request: PlanRequest) -> None:
+        """Plan now, to answer later."""
+        self._answers.append((self._turns + self.delay, self._planner.plan(request)))
+
+    def answers(self) -> list[PlanAnswer]:
+        """Return what is to be given to the control in this cycle; asked once in each."""
+        self._turns += 1
+        due = []
+        while self._answers and self._answers[0][0] <= self._turns:
+            due.append(self._answers.popleft()[1])
+        return due

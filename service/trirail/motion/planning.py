@@ -1,0 +1,84 @@
+"""The planner: one function, from a goal and the motion under way to a motion that leads there, or why none does.
+
+It keeps nothing between two requests: all that a plan depends on is in the request, and in the robot's geometry and
+limits, which have a revision. So it may be asked in a process of its own, in this one, or once more from a recording.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import deque
+
+import msgspec
+
+from trirail.config import Config, geometry
+from trirail.errors import RefusalCode, RefusedError
+from trirail.motion.goals import Extension, Goals, PlannedMotion
+from trirail.motion.packing import pack_path, pack_run, unpack_run
+from trirail.motion.runs import MotionState
+from trirail.motion.schedule import Schedule
+from trirail.wire.messages import PoseGoal, SlidersGoal
+from trirail.wire.planning import Extended, NotPlanned, PackedRun, PlanAnswer, Planned, PlanRequest
+
+
+def revision(config: Config) -> int:
+    """Return a number that stands for all of a configuration on which plans depend."""
+    return zlib.crc32(msgspec.json.encode((config.geometry, config.limits, config.loop.rate_hz)))
+
+
+class MotionPlanner:
+    """Plans the motions of one robot."""
+
+    def __init__(self, config: Config) -> None:
+        robot = geometry(config.geometry)
+        self._legs = robot.packed()
+        self._period = config.period
+        self._revision = revision(config)
+        self._goals = Goals(robot, config.limits, config.period)
+
+    def plan(self, request: PlanRequest) -> PlanAnswer:
+        """Return the motion to a goal, or why there is none. Whatever goes wrong is an answer."""
+        try:
+            decided = self._decide(request)
+        except RefusedError as refusal:
+            return _refusal(request, refusal)
+        except Exception as error:  # noqa: BLE001 - who asked waits for an answer
+            words = f"internal error in planning, please report it: {error!r}"
+            return _refusal(request, RefusedError(RefusalCode.INTERNAL, words))
+        number, version = request.number, request.version
+        if isinstance(decided, Extension):
+            return Extended(number, version, decided.s, pack_path(decided.path), decided.slowed)
+        return Planned(
+            number,
+            version,
+            decided.first,
+            pack_run(decided.run),
+            decided.duration,
+            decided.slowed,
+            decided.stops_first,
+            pack_path(decided.stop) if decided.stop is not None else None,
+            decided.bound,
+        )
+
+    def warm_up(self) -> None:
+        """Plan a motion of each kind: what runs for the first time is slow."""
+        start = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        runs: tuple[PackedRun, ...] = ()
+        for goal in (PoseGoal(0.02, 0.01, 0.1), PoseGoal(-0.01, 0.0, 0.0, blend=0.01), SlidersGoal((0.01, 0.0, 0.0))):
+            answer = self.plan(PlanRequest(0, 0, self._revision, 0, 2, 1.0, start, runs, goal))
+            if isinstance(answer, Planned):
+                runs = (answer.run,)
+
+    def _decide(self, request: PlanRequest) -> PlannedMotion | Extension:
+        if request.revision != self._revision:
+            raise RefusedError(RefusalCode.INTERNAL, "the planner has another geometry or other limits than the loop")
+        runs = deque(unpack_run(self._legs, run) for run in request.runs)
+        if request.blend is not None and isinstance(request.goal, PoseGoal) and runs:
+            return self._goals.append(request.goal, runs[-1], request.blend, request.lead)
+        schedule = Schedule(MotionState(*request.commanded), self._period)
+        schedule.cycle, schedule.runs = request.cycle, runs
+        return self._goals.plan(request.goal, schedule, request.rate, request.lead)
+
+
+def _refusal(request: PlanRequest, error: RefusedError) -> NotPlanned:
+    return NotPlanned(request.number, request.version, error.code, str(error), error.slider, error.value, error.limit)

@@ -1,0 +1,45 @@
+"""The planner's process: thinks about one request at a time, beside the loop and never on its processor."""
+
+from __future__ import annotations
+
+import select
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from trirail.config import Config
+from trirail.motion.planning import MotionPlanner
+from trirail.processes import realtime
+from trirail.processes.heartbeats import BEAT_EVERY, Heart
+from trirail.wire import links
+from trirail.wire.links import Closed
+from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
+
+
+def main(config: Config, path: Path, heart: Heart, ready: Callable[[object], None]) -> int:
+    """Answer what the loop asks until the loop has gone. It keeps nothing, so it may be killed at any time."""
+    signal.signal(signal.SIGTERM, _end)
+    planner = MotionPlanner(config)
+    planner.warm_up()
+    lacking = realtime.stay_beside(config.loop)
+    link = links.connect(path, MAX_PLANNING)
+    ready({"lacking": lacking})
+    poll = select.poll()
+    poll.register(link.fileno(), select.POLLIN)
+    try:
+        while True:
+            heart.beat()
+            poll.poll(BEAT_EVERY * 1e3)
+            newest = None  # nobody waits any more for what was asked before
+            while (packet := link.receive()) is not None:
+                newest = packet
+            if newest is not None:
+                link.send(encode(planner.plan(decode_plan_request(newest))))
+    except Closed:
+        heart.rest()
+    return 0
+
+
+def _end(_signal: int, _frame: object) -> None:
+    sys.exit(0)

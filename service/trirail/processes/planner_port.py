@@ -1,0 +1,60 @@
+"""The loop's side of the planner: asks it, and gives the control what it answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import msgspec
+
+from trirail.wire.links import Port
+from trirail.wire.packets import PlannerLost
+from trirail.wire.planning import PlanAnswer, PlanRequest, decode_plan_answer, encode
+
+ANSWERS_A_CYCLE = 2
+"""Packets of the planner's that are taken in one cycle: it has been asked once."""
+
+
+class PlannerLink:
+    """Where the control asks the planner: trirail.control.plan_requests.PlannerPort."""
+
+    def __init__(self, port: Port) -> None:
+        self._port = port
+        self._awaiting = False
+        self._unsent: str | None = None
+
+    def ask(self, request: PlanRequest) -> None:
+        """Send a request; what cannot be sent is said in the next cycle."""
+        if not self._port.connected:
+            self._unsent = "the planner is not there, it is being started again"
+        elif not self._port.send(encode(request)):
+            self._unsent = "the planner cannot be asked, it takes no more"
+        else:
+            self._awaiting = True
+
+    def answers(self) -> Iterator[PlanAnswer | PlannerLost]:
+        """Yield what there is to be given to the control in this cycle; nothing is read that was not asked for."""
+        if self._unsent is not None:
+            unsent, self._unsent = self._unsent, None
+            yield PlannerLost(unsent)
+        for _ in range(ANSWERS_A_CYCLE if self._awaiting else 0):
+            packet = self._port.receive()
+            if packet is None:
+                break
+            try:
+                answer = decode_plan_answer(packet)
+            except msgspec.DecodeError as error:  # one that says such things is started again
+                self._port.hang_up()
+                self._awaiting = False
+                yield PlannerLost(f"the planner has said something unreadable, {error}")
+                return
+            self._awaiting = False
+            yield answer
+        if self._port.take_lost() and self._awaiting:
+            self._awaiting = False
+            yield PlannerLost("the planner has died")
+
+    def accept(self) -> None:
+        """Notice a planner that has gone, and take one that comes anew."""
+        if self._port.connected and not self._awaiting:
+            self._port.receive()
+        self._port.accept()

@@ -1,0 +1,115 @@
+"""What the loop asks the planner, and what the planner answers: all that a plan depends on, and all that comes of it.
+
+Numbers that become motion are packed as they are in memory, so that a plan is the same to the last bit wherever it is
+made, sent, or read from a recording.
+"""
+
+from __future__ import annotations
+
+from msgspec import Struct, msgpack
+from trirail_drivers.interface import Triple
+
+from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.messages import Goal
+
+
+class PackedPath(Struct, frozen=True, array_like=True):
+    """A path in time: float64 of this machine's byte order, as trirail.motion.paths has them."""
+
+    knots: bytes
+    pieces: bytes
+    in_sliders: bool = False
+
+
+class PackedRun(Struct, frozen=True, array_like=True):
+    """A path, and the law by which its time runs."""
+
+    path: PackedPath
+    law: PackedPath
+    target: float
+    """The rate that the law leads to."""
+    time: float = 0.0
+    """Time since the law began [s]."""
+    seams: tuple[float, ...] = ()
+    """Where on the path one goal ends and the next one begins, as times along it [s]."""
+
+
+class PlanRequest(Struct, frozen=True):
+    """Loop to planner: a goal, and the motion from which it is to be reached."""
+
+    number: int
+    """By which the answer is known."""
+    version: int
+    """Of the motion under way."""
+    revision: int
+    """Of the robot's geometry and limits: a planner with others must not answer."""
+    cycle: int
+    """Of the schedule, now."""
+    lead: int
+    """In how many cycles the new motion is to begin; it has no meaning where the robot stands."""
+    rate: float
+    """At which the goal's motion is to run."""
+    commanded: tuple[Triple, Triple, Triple]
+    """The platform's pose, velocity and acceleration now."""
+    runs: tuple[PackedRun, ...]
+    """The motion under way, and what follows it."""
+    goal: Goal
+    blend: float | None = None
+    """How far from the end of the last run this goal may follow it [m]; None where it preempts the motion."""
+
+
+class Planned(Struct, frozen=True, tag=True):
+    """Planner to loop: a motion that preempts the one under way."""
+
+    number: int
+    version: int
+    first: int | None
+    """The cycle in whose commanded state it begins; None where the robot stands, and it may begin at any time."""
+    run: PackedRun
+    duration: float
+    """From when it begins to arrival [s]; infinite at override zero."""
+    slowed: float
+    """How many times slower than was asked for, for the limits' sake."""
+    stops_first: bool = False
+    """Whether the robot stops on its old path before."""
+    stop: PackedPath | None = None
+    """The law of that stop; None where the law that the motion under way has is the one to stand by."""
+    bound: str | None = None
+    """The limit before which a jog comes to rest."""
+
+
+class Extended(Struct, frozen=True, tag=True):
+    """Planner to loop: a path that follows the last one under way."""
+
+    number: int
+    version: int
+    s: float
+    """From which time along that path [s]."""
+    path: PackedPath
+    slowed: float
+
+
+class NotPlanned(Struct, frozen=True, tag=True):
+    """Planner to loop: why no motion leads there."""
+
+    number: int
+    version: int
+    code: RefusalCode
+    message: str
+    slider: str | None = None
+    value: float | None = None
+    limit: float | None = None
+
+    def error(self) -> RefusedError:
+        """Return it as what is raised."""
+        return RefusedError(self.code, self.message, slider=self.slider, value=self.value, limit=self.limit)
+
+
+PlanAnswer = Planned | Extended | NotPlanned
+
+MAX_PLANNING = 262_144
+"""A request or an answer, as msgpack: the largest goal, and the longest motion under way, fit twice [bytes]."""
+
+encode = msgpack.Encoder().encode
+decode_plan_request = msgpack.Decoder(PlanRequest).decode
+decode_plan_answer = msgpack.Decoder(PlanAnswer).decode

@@ -1,0 +1,389 @@
+"""The planner beside the control: late, twice, for another motion, garbage, or never; no stop waits for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from conftest import CONFIG, Rig
+from control.test_control import assert_within_limits
+from control.test_stop import PROMPT, STEP, braking, confirmed_after, play
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trirail.control.plan_requests import LEADS, PATIENCE
+from trirail.motion.feasibility import Look
+from trirail.motion.paths import Path
+from trirail.motion.planning import MotionPlanner, revision
+from trirail.motion.rate_change import FEWEST_KNOTS, KNOTS_A_SECOND
+from trirail.motion.runs import nominal
+from trirail.motion.time_scaling import TimeScaling
+from trirail.wire.messages import Goal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.packets import Accepted, CommandRequest, PlannerLost, Refused
+from trirail.wire.planning import (
+    MAX_PLANNING,
+    PackedPath,
+    PlanAnswer,
+    Planned,
+    PlanRequest,
+    decode_plan_answer,
+    decode_plan_request,
+    encode,
+)
+from trirail.wire.sizes import MAX_PACKET, MAX_POINTS
+from trirail.wire.vocabulary import Command, Mode
+
+PERIOD = CONFIG.period
+SILENT = round(PATIENCE / PERIOD)
+
+
+Said = PlanAnswer | PlannerLost
+
+
+class Meddler:
+    """A planner whose answers can be changed, held back and repeated: as LocalPlanner otherwise."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.planner = MotionPlanner(rig.config)
+        self.asked: list[PlanRequest] = []
+        self.waiting: list[tuple[int, Said]] = []
+        self.turns = 0
+        self.delays: list[int] = []
+        """Cycles to each answer, the last one for all that follow."""
+        self.change: Callable[[PlanAnswer], Sequence[Said]] = lambda answer: [answer]
+
+    def ask(self, request: PlanRequest) -> None:
+        delay = self.delays.pop(0) if len(self.delays) > 1 else (self.delays or [1])[0]
+        self.asked.append(request)
+        for answer in self.change(self.planner.plan(request)):
+            self.waiting.append((self.turns + delay, answer))
+
+    def answers(self) -> list[Said]:
+        self.turns += 1
+        due = [answer for turn, answer in self.waiting if turn <= self.turns]
+        self.waiting = [(turn, answer) for turn, answer in self.waiting if turn > self.turns]
+        return due
+
+
+@pytest.fixture
+def meddler(rig: Rig) -> Meddler:
+    """In the place of an enabled robot's planner."""
+    made = Meddler(rig)
+    rig.planner = rig.control._planner._port = made  # type: ignore[assignment]
+    rig.enable()
+    return made
+
+
+def moving(rig: Rig) -> None:
+    rig.goal("g1", 0.08, 0.0, 0.0)
+    rig.cycles(200)
+
+
+def code(rig: Rig) -> str:
+    refused = rig.answers[-1]
+    assert isinstance(refused, Refused), refused
+    return refused.code
+
+
+def test_a_goal_from_rest_begins_when_its_motion_comes(rig: Rig, meddler: Meddler) -> None:
+    meddler.delays = [100]
+    sent = len(rig.rows)
+    rig.post("g1", PoseGoal(0.05, 0.0, 0.0))
+    rig.until(lambda: rig.mode is Mode.MOVING)
+    assert len(rig.rows) - sent == 101
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g1", "done")]
+
+
+def test_a_motion_from_motion_that_comes_too_late_is_asked_for_anew_with_more_time(rig: Rig, meddler: Meddler) -> None:
+    moving(rig)
+    meddler.asked.clear()
+    meddler.delays = [round(LEADS[0] / PERIOD) + 1, round(LEADS[1] / PERIOD) + 1, 5]
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    rig.until(lambda: ("g1", "preempted") in rig.outcomes())
+    assert [request.lead for request in meddler.asked] == [round(lead / PERIOD) for lead in LEADS]
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
+    assert rig.control.commanded.pose == pytest.approx((0.0, 0.05, 0.0))
+    assert_within_limits(rig)
+
+
+def test_a_planner_that_is_always_late_is_asked_three_times(rig: Rig, meddler: Meddler) -> None:
+    moving(rig)
+    meddler.asked.clear()
+    meddler.delays = [60]
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    rig.until(lambda: isinstance(rig.answers[-1], Refused))
+    assert (code(rig), len(meddler.asked)) == ("no_plan", 3)
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g2", "rejected"), ("g1", "done")]
+    assert rig.control.commanded.pose == pytest.approx((0.08, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("in_motion", [False, True])
+def test_a_planner_that_says_nothing_is_lost_and_what_is_under_way_goes_on(
+    rig: Rig, meddler: Meddler, in_motion: bool
+) -> None:
+    if in_motion:
+        moving(rig)
+    meddler.change = lambda _: []
+    sent = len(rig.rows)
+    rig.post("lost", PoseGoal(0.0, 0.05, 0.0))
+    rig.until(lambda: isinstance(rig.answers[-1], Refused))
+    assert code(rig) == "planner_lost"
+    assert len(rig.rows) - sent <= SILENT + 3
+    rig.until(rig.holds)
+    assert dict(rig.outcomes()) == {"lost": "rejected"} | ({"g1": "done"} if in_motion else {})
+    meddler.change = lambda answer: [answer]
+    assert isinstance(rig.goal("next", 0.0, 0.0, 0.0), Accepted)
+
+
+def test_a_planner_that_has_died_is_said_at_once(rig: Rig, meddler: Meddler) -> None:
+    moving(rig)
+    meddler.change = lambda _: [PlannerLost("the planner has died")]
+    rig.post("lost", PoseGoal(0.0, 0.05, 0.0))
+    rig.cycles(2)
+    assert code(rig) == "planner_lost"
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("lost", "rejected"), ("g1", "done")]
+
+
+def test_an_answer_that_comes_twice_is_taken_once(rig: Rig, meddler: Meddler) -> None:
+    meddler.change = lambda answer: [answer, answer]
+    for number, x in enumerate([0.05, -0.03, 0.02]):
+        assert isinstance(rig.goal(f"g{number}", x, 0.0, 0.0), Accepted)
+        rig.cycles(100)
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g0", "preempted"), ("g1", "preempted"), ("g2", "done")]
+    assert_within_limits(rig)
+
+
+def test_an_answer_for_another_motion_is_left_aside(rig: Rig, meddler: Meddler) -> None:
+    moving(rig)
+    meddler.change = lambda answer: [msgspec.structs.replace(answer, version=answer.version - 1)]
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    rig.until(lambda: len(rig.outcomes()) == 2)
+    assert dict(rig.outcomes()) == {"g2": "rejected", "g1": "done"}
+    assert code(rig) == "planner_lost"
+
+
+def test_an_override_while_a_goal_is_planned_has_it_planned_from_the_new_motion(rig: Rig, meddler: Meddler) -> None:
+    moving(rig)
+    meddler.delays = [2]
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    rig.order("override", 0.5)
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
+    assert meddler.asked[-1].version > meddler.asked[-2].version
+    assert_within_limits(rig)
+
+
+def test_a_motion_that_begins_elsewhere_is_never_begun(rig: Rig, meddler: Meddler) -> None:
+    """It has the right number and the right version: where the robot is to be then it does not begin."""
+    moving(rig)
+
+    def elsewhere(answer: PlanAnswer) -> list[PlanAnswer]:
+        assert isinstance(answer, Planned)
+        pieces = np.frombuffer(answer.run.path.pieces).copy()
+        pieces[0] += 1e-5
+        path = msgspec.structs.replace(answer.run.path, pieces=pieces.tobytes())
+        return [msgspec.structs.replace(answer, run=msgspec.structs.replace(answer.run, path=path))]
+
+    meddler.change = elsewhere
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g2", "rejected"), ("g1", "done")]
+    assert rig.control.fault is None
+
+
+GARBAGE = [
+    PackedPath(b"", b""),
+    PackedPath(b"123", b"45"),
+    PackedPath(np.array([0.0, 1.0]).tobytes(), np.zeros(17).tobytes()),
+    PackedPath(np.array([0.0, 1.0]).tobytes(), np.full(18, math.nan).tobytes()),
+    PackedPath(np.array([1.0, 0.0]).tobytes(), np.zeros(18).tobytes()),
+    PackedPath(np.array([0.0, 1.0]).tobytes(), np.zeros(18).tobytes()),  # a path, that lies elsewhere
+]
+
+
+@pytest.mark.parametrize("place", ["path", "law"])
+@pytest.mark.parametrize("garbage", GARBAGE)
+def test_garbage_is_refused_and_the_motion_goes_on(rig: Rig, meddler: Meddler, garbage: PackedPath, place: str) -> None:
+    moving(rig)
+
+    def spoilt(answer: PlanAnswer) -> list[PlanAnswer]:
+        assert isinstance(answer, Planned)
+        return [msgspec.structs.replace(answer, run=msgspec.structs.replace(answer.run, **{place: garbage}))]
+
+    meddler.change = spoilt
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g2", "rejected"), ("g1", "done")]
+    assert code(rig) in ("planner_lost", "no_plan")
+    assert rig.control.fault is None
+
+
+def test_a_jog_whose_dead_man_is_over_before_it_is_planned_does_not_begin(rig: Rig, meddler: Meddler) -> None:
+    meddler.delays = [300]
+    rig.post("j1", VelocityGoal(0.05, 0.0, 0.0, timeout=0.2))
+    rig.cycles(400)
+    assert rig.outcomes() == [("j1", "expired")]
+    assert not rig.setpoints()[-400:, 1].any()
+
+
+def test_a_goal_that_is_planned_too_late_for_its_time_expires(rig: Rig, meddler: Meddler) -> None:
+    meddler.delays = [300]
+    rig.post("g1", PoseGoal(0.05, 0.0, 0.0, valid_for=0.1))
+    rig.cycles(400)
+    assert rig.outcomes() == [("g1", "expired")]
+
+
+def test_a_jog_is_over_in_time_though_its_renewals_are_never_answered(rig: Rig, meddler: Meddler) -> None:
+    jog = VelocityGoal(0.05, 0.0, 0.0, timeout=0.1)
+    rig.send("j1", jog)
+    meddler.change = lambda _: []
+    for _ in range(10):
+        rig.post("j1", jog)
+        rig.cycles(20)
+    rig.cycles(round(0.1 / PERIOD) + braking(CONFIG) + PROMPT)
+    assert rig.control.commanded.at_rest
+    rig.cycles(SILENT)
+    assert rig.mode is Mode.HOLDING
+
+
+class Silent(Rig):
+    """A robot whose planner is as a test wants it to be from some time on."""
+
+    def spoil(self, how: str) -> None:
+        if how == "frozen":
+            self.planner.delay = 10**9
+        elif how == "killed":
+            self.planner.ask = lambda request: None  # type: ignore[method-assign]
+        elif how == "late":
+            self.planner.delay = 40
+
+
+@pytest.mark.parametrize("how", ["frozen", "killed", "late"])
+@settings(max_examples=15)
+@given(st.lists(STEP, min_size=1, max_size=5), st.lists(STEP, max_size=8))
+def test_a_stop_is_confirmed_in_time_whatever_the_planner_does(
+    how: str, before: list[tuple[object, int]], after: list[tuple[object, int]]
+) -> None:
+    rig = Silent()
+    rig.command("enable")
+    play(rig, before)
+    rig.spoil(how)
+    play(rig, after)
+    assert confirmed_after(rig, "stop", braking(CONFIG) + PROMPT + 5000) <= braking(CONFIG) + PROMPT
+    assert rig.control.commanded.at_rest
+    rig.bus.shutdown()
+
+
+def test_a_stop_behind_a_flood_of_goals_is_confirmed_in_time(rig: Rig, meddler: Meddler) -> None:
+    moving(rig)
+    for number in range(200):
+        rig.post(f"f{number}", PoseGoal(0.05, 0.001 * number - 0.1, 0.0))
+    assert confirmed_after(rig, "stop", braking(CONFIG) + PROMPT) <= braking(CONFIG) + PROMPT
+    counted = [goal for goal, _ in rig.outcomes()]
+    assert len(counted) == len(set(counted)) == 201
+
+
+def wave(points: int, seconds: float) -> TrajectoryGoal:
+    """A trajectory there and back, with as many points as there may be."""
+    times = np.linspace(0.0, seconds, points)
+    x = 0.02 * (1.0 - np.cos(2.0 * np.pi * times / seconds)) ** 2 / 4.0
+    return TrajectoryGoal(tuple(TrajectoryPoint(float(t), float(x), 0.0, 0.0) for t, x in zip(times, x, strict=True)))
+
+
+@pytest.mark.parametrize("wait", [50, 200, 350, 600])
+def test_a_stop_on_the_longest_path_is_confirmed_in_time(rig: Rig, wait: int) -> None:
+    rig.enable()
+    assert isinstance(rig.send("g1", wave(MAX_POINTS, 1.0)), Accepted)
+    rig.cycles(wait)
+    assert confirmed_after(rig, "stop", braking(CONFIG) + PROMPT + 500) <= braking(CONFIG) + PROMPT
+    assert_within_limits(rig)
+
+
+def test_no_cycle_looks_at_more_of_the_longest_path_than_it_has_time_for(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many points a path has, a change of rate looks at a bounded part of it in each cycle."""
+    rig.enable()
+    rig.send("g1", wave(MAX_POINTS, 1.0))
+    looked: list[int] = []
+    look = TimeScaling.look
+
+    def counted(self: TimeScaling, path: Path, law: Path, first: float, until: float, pose: Any) -> Look:
+        begin, end = (nominal(law, time).pose[0] for time in (first, until))
+        looked.append(int(((path.knots > begin) & (path.knots < end)).sum()))
+        return look(self, path, law, first, until, pose)
+
+    monkeypatch.setattr(TimeScaling, "look", counted)
+    most = max(FEWEST_KNOTS, int(KNOTS_A_SECOND * PERIOD))
+    for name, value in (("override", 2.0), ("override", 0.3), ("pause", None), ("resume", None), ("stop", None)):
+        rig.order(name, value)
+        for _ in range(60):
+            before = len(looked)
+            rig.cycle()
+            assert len(looked) - before <= 1
+    assert len(looked) > 20
+    assert max(looked) <= most
+    assert any(looked)
+
+
+def test_the_planner_is_a_function_of_the_request() -> None:
+    """Asked in any order, by any number of planners, through the wire: the same answer to the last bit."""
+    rig = Rig()
+    planner = Meddler(rig)
+    rig.planner = rig.control._planner._port = planner  # type: ignore[assignment]
+    rig.command("enable")
+    goals: list[Goal] = [
+        PoseGoal(0.05, 0.02, 0.3, blend=0.01),
+        PoseGoal(-0.05, 0.03, 0.0, blend=0.01),
+        VelocityGoal(0.1, 0.0, 0.0, timeout=0.3),
+        PoseGoal(0.0, 0.0, 0.0),
+    ]
+    for number, goal in enumerate(goals):
+        rig.post(f"g{number}", goal)
+        rig.cycles(120)
+    requests = planner.asked
+    answers = [encode(planner.planner.plan(request)) for request in requests]
+    for request, answer in reversed(list(zip(requests, answers, strict=True))):
+        again = MotionPlanner(CONFIG).plan(decode_plan_request(encode(request)))
+        assert encode(again) == answer
+        assert decode_plan_answer(answer) == again
+    rig.bus.shutdown()
+
+
+def test_a_planner_with_other_limits_plans_nothing(rig: Rig, meddler: Meddler) -> None:
+    limits = msgspec.structs.replace(CONFIG.limits.slider, velocity=CONFIG.limits.slider.velocity / 2.0)
+    other = msgspec.structs.replace(CONFIG, limits=msgspec.structs.replace(CONFIG.limits, slider=limits))
+    assert revision(other) != revision(CONFIG)
+    meddler.planner = MotionPlanner(other)
+    rig.post("g1", PoseGoal(0.05, 0.0, 0.0))
+    rig.until(lambda: bool(rig.outcomes()))
+    assert code(rig) == "internal"
+
+
+def test_the_largest_goal_on_the_longest_motion_fits_a_packet(rig: Rig, meddler: Meddler) -> None:
+    rig.send("g1", wave(MAX_POINTS, 3.0))
+    rig.cycles(100)
+    rig.post("g2", wave(MAX_POINTS, 3.0))
+    answers = [encode(meddler.planner.plan(request)) for request in meddler.asked]
+    assert max(len(encode(request)) for request in meddler.asked) < MAX_PLANNING
+    assert max(map(len, answers)) < MAX_PACKET - 1000  # it goes to the recorder, in a ControlInput
+
+
+def test_an_override_that_never_ends_changing_keeps_no_goal_for_ever(rig: Rig, meddler: Meddler) -> None:
+    moving(rig)
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    for number in range(300):
+        rig.cycle(CommandRequest(5000 + number, "eve", Command.OVERRIDE, 0.5 + 0.5 * (number % 2)))
+    assert "g2" in dict(rig.outcomes()) or rig.control.ledger.goal is not None
+    rig.command("override", 1.0)
+    rig.until(rig.holds)
+    ends = [goal for goal, _ in rig.outcomes()]
+    assert sorted(map(str, ends)) == ["g1", "g2"]

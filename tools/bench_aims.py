@@ -1,0 +1,133 @@
+"""All measurements, one after the other, and what came of them beside what the service aims at."""
+
+from __future__ import annotations
+
+import json as json_format
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from trirail.processes.interpreter import python
+
+Results = dict[str, Any]
+"""What each measurement gave, by its name."""
+
+COMMANDS = {
+    "frames": (),
+    "kinematics": (),
+    "planning": (),
+    "latency": ("--goals", "80"),
+    "loop": ("--rates", "1000", "--rates", "2000", "--rates", "4000", "--seconds", "60", "--runs", "5"),
+    "peers": ("--seconds", "10"),
+    "recorder": ("--seconds", "30"),
+}
+"""The measurements, with what they take: together under ten minutes."""
+BRIEF = {
+    "frames": ("--cycles", "50"),
+    "latency": ("--goals", "3"),
+    "loop": ("--rates", "1000", "--seconds", "2", "--runs", "1"),
+    "peers": ("--seconds", "1"),
+    "recorder": ("--seconds", "2"),
+}
+"""What they take for a look."""
+
+
+class Aim(NamedTuple):
+    """A line of the table."""
+
+    name: str
+    before: str
+    """As it was before the loop was relieved of planning, and its cycle compiled."""
+    aim: tuple[float, ...]
+    measured: Callable[[Results], tuple[float, ...]]
+    """As many numbers as the aim has; none of them is to be greater."""
+
+
+def at(results: Results, rate: int) -> Results:
+    """What `loop` gave at a rate."""
+    return next(found for found in results["loop"]["rates"] if found["rate_hz"] == rate)
+
+
+def _missed(results: Results, rate: int) -> tuple[float, ...]:
+    """Ticks missed beyond those that the machine lost in the same time."""
+    found = at(results, rate)
+    return (float(max(0, found["missed"] - found["lost_by_the_machine"])),)
+
+
+def _planner(results: Results) -> tuple[float, ...]:
+    """The p99 of planning a pose goal [ms]."""
+    return (results["planning"]["pose_p99_us"] / 1000.0,)
+
+
+AIMS = (
+    Aim(
+        "whole cycle at 1 kHz, goals without pause, p50 / p99 / p99.9 [µs]",
+        "100 / 230 / 850",
+        (60.0, 100.0, 150.0),
+        lambda results: tuple(at(results, 1000)["cycle"][:3]),
+    ),
+    Aim("ticks missed at 1 kHz beyond the machine's", "81 in 45 s", (0.0,), lambda results: _missed(results, 1000)),
+    Aim("ticks missed at 4 kHz beyond the machine's", "338 in 12 s", (10.0,), lambda results: _missed(results, 4000)),
+    Aim(
+        "lateness p99.9 to the machine's, the worst of the runs",
+        "0.5 to 1.0",
+        (1.2,),
+        lambda results: (max(run["ratio"][2] for run in at(results, 1000)["runs"]),),
+    ),
+    Aim(
+        "goal to first changed setpoint, at rest, p50 / p99 [ms]",
+        "2.2 / 3.5",
+        (3.0, 4.0),
+        lambda results: tuple(results["latency"]["at_rest_ms"][:2]),
+    ),
+    Aim(
+        "goal to first changed setpoint, in motion, p50 / p99 [ms]",
+        "2.3 / 4.1",
+        (5.0, 7.0),
+        lambda results: tuple(results["latency"]["in_motion_ms"][:2]),
+    ),
+    Aim("frames of one cycle, p50 [µs]", "43", (10.0,), lambda results: (results["frames"]["socket_us"]["p50"],)),
+    Aim("planning a pose goal, p99 [ms]", "0.35 to 0.9, in the loop", (5.0,), _planner),
+)
+
+
+def table(results: Results) -> list[dict[str, Any]]:
+    """Each aim with what was measured, and whether it is met; what was not measured is left out."""
+    rows = []
+    for aim in AIMS:
+        try:
+            measured = aim.measured(results)
+        except (KeyError, StopIteration):
+            continue
+        met = all(value <= limit for value, limit in zip(measured, aim.aim, strict=True))
+        rows.append({"name": aim.name, "before": aim.before, "measured": measured, "aim": aim.aim, "met": met})
+    return rows
+
+
+def measure(brief: bool) -> Results:
+    """Run every measurement, each in a process of its own; what they gave, and the table."""
+    program = str(Path(__file__).with_name("bench.py"))
+    results: Results = {}
+    for name, options in COMMANDS.items():
+        print(f"{name} …", file=sys.stderr, flush=True)
+        given = BRIEF.get(name, ()) if brief else options
+        done = subprocess.run(python(program, name, "--json", *given), stdout=subprocess.PIPE, check=True)
+        results[name] = json_format.loads(done.stdout)
+    return {**results, "aims": table(results)}
+
+
+def main(brief: bool, json: bool = False) -> None:
+    """Run all; print the table, or everything as one JSON object."""
+    results = measure(brief)
+    if json:
+        print(json_format.dumps(results))
+        return
+    print(f"{'':68}{'before':>26}{'measured':>26}{'aim':>20}   met")
+    for row in results["aims"]:
+        measured, aim = (" / ".join(f"{value:.4g}" for value in row[key]) for key in ("measured", "aim"))
+        print(f"{row['name']:68}{row['before']:>26}{measured:>26}{aim:>20}   {'yes' if row['met'] else 'NO'}")
+    deviation = results["peers"]["deviation_us"]
+    print("SYNC's interval off its period, p99.9 [µs]: " + ", ".join(f"{k} {v[2]:.0f}" for k, v in deviation.items()))
+    print(f"LinuxCNC's servo thread: {results['peers']['linuxcnc']}")

@@ -1,0 +1,79 @@
+"""What the machine itself can do while something is measured: cyclictest or, without that, a loop that only sleeps.
+
+Both sleep to absolute deadlines with SCHED_FIFO on the loop's processor, one priority above it, and at its period. Each
+time that they wake later than a period, ticks went by in which no program could have run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+from numpy.typing import NDArray
+from trirail.processes.clock import Ticker
+from trirail.processes.interpreter import python
+
+LONGEST = 100_000
+"""Latenesses that are told apart [µs]."""
+
+
+class Beside:
+    """A measurement of the machine's own lateness, which ends by itself after so many seconds."""
+
+    def __init__(self, seconds: float, period_us: int, priority: int, result: Path) -> None:
+        self.period_us = period_us
+        self._result = result
+        self.name = "cyclictest" if shutil.which("cyclictest") and os.geteuid() == 0 else "a loop that only sleeps"
+        processor = max(os.sched_getaffinity(0))
+        if self.name == "cyclictest":
+            options = f"-q -m -p {min(99, priority + 1)} -i {period_us} -a {processor} -t 1 -h {LONGEST}"
+            command = ["cyclictest", *options.split(), "-D", str(max(1, round(seconds))), f"--json={result}"]
+        else:
+            given = (str(value) for value in (seconds, period_us, priority + 1, processor))
+            command = python(__file__, *given, str(result))
+        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+
+    def lateness(self) -> NDArray[np.float64]:
+        """Wait for its end; how late it woke, each time [µs]."""
+        self._process.wait(60)
+        found = json.loads(self._result.read_text(encoding="utf-8"))
+        counts = found["thread"]["0"]["histogram"] if "thread" in found else found
+        return np.repeat([float(value) for value in counts], list(counts.values()))
+
+    def ticks_lost(self, lateness: NDArray[np.float64]) -> int:
+        """Ticks that went by in sleeps that were longer than a period."""
+        return int(np.sum(lateness // self.period_us))
+
+
+def main() -> None:
+    """Sleep from deadline to deadline; leave a histogram."""
+    seconds, period_us, priority, processor = (float(value) for value in sys.argv[1:5])
+    signal.signal(signal.SIGTERM, _end)
+    try:
+        os.sched_setaffinity(0, {int(processor)})
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(priority)))
+    except OSError as error:
+        print(f"without real-time rights: {error}", file=sys.stderr)
+    histogram = np.zeros(LONGEST + 1, dtype=np.int64)
+    ticker, end = Ticker(round(period_us * 1e3)), time.monotonic() + seconds
+    while time.monotonic() < end:
+        tick = ticker.wait()
+        histogram[min(LONGEST, round((tick.lateness_ns * 1e-3) + tick.missed * period_us))] += 1
+    counts = {str(value): int(histogram[value]) for value in np.flatnonzero(histogram)}
+    Path(sys.argv[5]).write_text(json.dumps(counts), encoding="utf-8")
+
+
+def _end(_signal: int, _frame: FrameType | None) -> None:
+    raise SystemExit
+
+
+if __name__ == "__main__":
+    main()

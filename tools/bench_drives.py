@@ -1,0 +1,53 @@
+"""Simulated drives that listen on a bus between processes, and do nothing else: the loop is measured with them.
+
+python tools/bench_drives.py CONFIG PATH        real-time where the rights allow it, away from the loop's processor
+
+tools/virtual_drives.py is the one for people: it takes faults, and tells what the drives do.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+
+from trirail.config import load
+from trirail_drivers.bus import simulated_bus
+from trirail_drivers.unixbus import UnixBus
+
+PRIORITY = 70
+"""SCHED_FIFO, below the loop's 80."""
+POLL = 0.01
+"""How often the drives' own timers are looked at where no frame comes [s]."""
+
+
+def main() -> None:
+    """Serve until SIGTERM."""
+    config = load(Path(sys.argv[1]))
+    signal.signal(signal.SIGTERM, _end)
+    with contextlib.suppress(OSError):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    with UnixBus(sys.argv[2], listen=True) as wire, simulated_bus(config.can, config.drives) as drives:
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        print("ready", flush=True)
+        while True:
+            frame = wire.recv(POLL)
+            if frame is not None:
+                drives.send(frame)
+            while (answer := drives.recv(0.0)) is not None:
+                wire.send(answer)
+
+
+def _end(_signal: int, _frame: FrameType | None) -> None:
+    raise SystemExit
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""From a goal's put to the first setpoint that it changes, as a third party on the bus sees it.
+
+At rest, and in motion: there the robot cruises on a straight line, where each slider's velocity feed-forward stays what
+it is, until the goal that turns it back changes it. Setpoints have the kernel's time of arrival at the third party, to
+which the drives' process passes them on; a goal's time is that before the client's call.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json as json_format
+import random
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from bench_rig import rig
+from trirail.client.client import Robot
+from trirail.errors import TrirailError
+from trirail_drivers.capture import FRAME, Capture
+from trirail_drivers.cia402 import frames as layout
+from trirail_drivers.frame_io import SocketFrames
+from trirail_drivers.frames import CAN_FRAME
+from trirail_drivers.interface import NAMES
+from trirail_drivers.unixbus import UnixBus
+
+QUANTILES = (50.0, 99.0, 100.0)
+SETPOINTS = {layout.RPDO2 + node for node in range(1, 1 + len(NAMES))}
+STEADY = 20
+"""Feed-forward that changes by less is that of a cruise: rounding, at 1e7 counts per metre [counts/s]."""
+WITHIN = 0.1
+"""A goal that has changed nothing by then is left out, and counted [s]."""
+END = 0.08
+"""Where goals lead, and turn back [m]."""
+
+
+class Setpoint(NamedTuple):
+    """A setpoint as it passed the bus."""
+
+    t: float
+    """Seconds since 1970."""
+    identifier: int
+    velocity: int
+    """Feed-forward [counts/s]."""
+
+
+class Listener:
+    """A third party on the bus: keeps every setpoint with the time of its arrival."""
+
+    def __init__(self, path: str) -> None:
+        self._bus = UnixBus(path)
+        if self._bus.carrier is None:
+            raise SystemExit(f"{path}: nobody listens there")
+        self._bus.carrier.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+        self._capture = Capture()
+        self._frames = SocketFrames(self._bus.carrier, self._capture)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._listen)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        while not self._over.is_set():
+            self._frames.receive(0.1)
+
+    def setpoints(self) -> list[Setpoint]:
+        """Those that have arrived since the last time."""
+        return [
+            Setpoint(t, identifier, layout.SETPOINT.unpack(data)[1])
+            for t, identifier, data in self._taken()
+            if identifier in SETPOINTS
+        ]
+
+    def arrivals(self, identifier: int) -> list[float]:
+        """When frames of an identifier have arrived since the last time [s]."""
+        return [t for t, one, _ in self._taken() if one == identifier]
+
+    def _taken(self) -> Iterator[tuple[float, int, bytes]]:
+        for chunk in self._capture.take():
+            for t, frame in FRAME.iter_unpack(chunk):
+                identifier, _, data = CAN_FRAME.unpack(frame)
+                yield t, identifier, data
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._over.set()
+        self._thread.join()
+        self._bus.shutdown()
+
+
+@contextlib.contextmanager
+def listener(path: str) -> Iterator[Listener]:
+    """A third party on a bus."""
+    made = Listener(path)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def measure(goals: int, rate: int = 1000) -> dict[str, Any]:
+    """Send so many goals at rest, and as many in motion; return milliseconds at QUANTILES."""
+    chance = random.Random(3)
+    with rig(rate) as made:
+        if made.bus is None:
+            raise SystemExit("the drives are inside: there is no bus to look at")
+        with listener(made.bus) as heard:
+            made.robot.move_to(x=-END, y=0.0, phi=0.0).wait(10.0)
+            at_rest = [_at_rest(made.robot, heard, chance) for _ in range(goals)]
+            made.robot.move_to(x=-END, y=0.0, phi=0.0).wait(10.0)
+            in_motion = [_in_motion(made.robot, heard, chance) for _ in range(goals)]
+    return {
+        "rate_hz": rate,
+        "quantiles": QUANTILES,
+        "at_rest_ms": _spread(at_rest),
+        "in_motion_ms": _spread(in_motion),
+        "goals": goals,
+        "without_effect": at_rest.count(None) + in_motion.count(None),
+    }
+
+
+def _at_rest(robot: Robot, heard: Listener, chance: random.Random) -> float | None:
+    """A small goal from standstill, and its end."""
+    time.sleep(chance.uniform(0.02, 0.04))  # at any phase of the cycle
+    heard.setpoints()
+    put = time.time()
+    goal = robot.move_to(x=-END + chance.uniform(0.0, 0.004), y=chance.uniform(-0.004, 0.004), phi=0.0)
+    time.sleep(WITHIN)
+    found = _first_change(heard.setpoints(), put)
+    goal.wait(10.0)
+    return found
+
+
+def _in_motion(robot: Robot, heard: Listener, chance: random.Random) -> float | None:
+    """A goal across, and in its cruise another that leads back."""
+    state = robot.state()
+    side = 1.0 if state.commanded.pose[0] < 0.0 else -1.0
+    robot.move_to(x=side * END, y=0.0, phi=0.0)
+    time.sleep(0.32 + chance.uniform(0.0, 0.02))
+    heard.setpoints()
+    time.sleep(0.02)
+    put = time.time()
+    goal = robot.move_to(x=-side * END, y=0.0, phi=0.0)
+    time.sleep(WITHIN)
+    found = _first_change(heard.setpoints(), put)
+    with contextlib.suppress(TrirailError):
+        goal.wait(10.0)
+    return found
+
+
+def _first_change(setpoints: list[Setpoint], put: float) -> float | None:
+    """Seconds from the put to the first setpoint with another feed-forward than before; None if there is none."""
+    steady = {one.identifier: one.velocity for one in setpoints if one.t <= put}
+    for one in setpoints:
+        if one.t <= put or one.identifier not in steady:
+            continue
+        if abs(one.velocity - steady[one.identifier]) > STEADY:
+            return one.t - put if one.t - put <= WITHIN else None
+    return None
+
+
+def _spread(seconds: list[float | None]) -> list[float]:
+    known = [1e3 * value for value in seconds if value is not None]
+    if not known:
+        raise SystemExit("no goal had an effect")
+    return [float(value) for value in np.percentile(known, QUANTILES)]
+
+
+def main(goals: int, json: bool = False) -> None:
+    """Print the measurements as a table, or as one JSON object."""
+    measured = measure(goals)
+    if json:
+        print(json_format.dumps(measured))
+        return
+    print(f"goal put to first changed setpoint on the bus, {measured['rate_hz']} Hz, {goals} goals each [ms]")
+    print(f"{'':12}{'p50':>8}{'p99':>8}{'max':>8}")
+    for name, key in (("at rest", "at_rest_ms"), ("in motion", "in_motion_ms")):
+        print(f"{name:12}" + "".join(f"{value:8.2f}" for value in measured[key]))
+    if measured["without_effect"]:
+        print(f"{measured['without_effect']} goals changed nothing within {WITHIN:g} s, and are left out")

@@ -1,0 +1,110 @@
+"""The intervals of SYNC at a receiver: trirail's loop, python-canopen's own periodic SYNC, and LinuxCNC's servo thread.
+
+trirail and python-canopen send over the same bus between processes, with the same drives on it; the receiver is a
+third party there, and takes the kernel's time of arrival. python-canopen runs as it comes, and with the loop's rights.
+"""
+
+from __future__ import annotations
+
+import json as json_format
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_latency import listener
+from bench_rig import configured, drives, rig, without_pause
+from trirail.processes.interpreter import python
+from trirail_drivers.cia402 import frames as layout
+from trirail_drivers.unixbus import UnixBus
+
+RATE = 1000
+QUANTILES = (50.0, 99.0, 99.9, 100.0)
+PRIORITY = 80
+
+
+def measure(seconds: float) -> dict[str, Any]:
+    """Listen to each for so many seconds; return deviations of SYNC's interval from its period, microseconds."""
+    return {
+        "rate_hz": RATE,
+        "quantiles": QUANTILES,
+        "deviation_us": {
+            "trirail, moving": _trirail(seconds),
+            "python-canopen": _canopen(seconds, real_time=False),
+            "python-canopen, SCHED_FIFO": _canopen(seconds, real_time=True),
+        },
+        "linuxcnc": _linuxcnc(),
+    }
+
+
+def _trirail(seconds: float) -> list[float]:
+    with rig(RATE) as made:
+        if made.bus is None:
+            raise SystemExit("the drives are inside: there is no bus to look at")
+        without_pause(made.robot, 1.0)
+        with listener(made.bus) as heard:
+            without_pause(made.robot, seconds)
+            return _deviations(heard.arrivals(layout.SYNC))
+
+
+def _canopen(seconds: float, real_time: bool) -> list[float]:
+    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+        config, _ = configured(Path(folder), RATE, inside=False)
+        path = f"{folder}/can"
+        with drives(config, path), listener(path) as heard:
+            command = python(__file__, path, str(seconds), str(int(real_time)))
+            subprocess.run(command, check=True)
+            return _deviations(heard.arrivals(layout.SYNC))
+
+
+def _deviations(arrivals: list[float]) -> list[float]:
+    """How far the intervals are from the period, without sign [µs]."""
+    if len(arrivals) < RATE // 10:
+        raise SystemExit(f"only {len(arrivals)} SYNCs arrived")
+    deviations = np.abs(np.diff(arrivals) - 1.0 / RATE) * 1e6
+    return [float(value) for value in np.percentile(deviations, QUANTILES)]
+
+
+def _linuxcnc() -> str:
+    """What there is to say of LinuxCNC's servo thread on this machine."""
+    if shutil.which("halrun") is None:
+        return "not installed (Debian's package is linuxcnc-uspace): no servo thread to compare with"
+    return "installed: run its latency-histogram beside this, it measures its servo thread itself"
+
+
+def main(seconds: float, json: bool = False) -> None:
+    """Print the measurements as a table, or as one JSON object."""
+    measured = measure(seconds)
+    if json:
+        print(json_format.dumps(measured))
+        return
+    print(f"SYNC at a receiver, {RATE} Hz for {seconds:g} s each: how far its interval is from the period [µs]")
+    print(f"{'':32}{'p50':>9}{'p99':>9}{'p99.9':>9}{'max':>9}")
+    for name, values in measured["deviation_us"].items():
+        print(f"{name:32}" + "".join(f"{value:9.1f}" for value in values))
+    print(f"LinuxCNC's servo thread: {measured['linuxcnc']}")
+
+
+def _send_sync(path: str, seconds: float, real_time: bool) -> None:
+    """python-canopen's periodic SYNC on the bus, for so long."""
+    import canopen
+
+    if real_time:
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    with UnixBus(path) as bus:
+        network = canopen.Network(bus)
+        network.sync.start(1.0 / RATE)
+        time.sleep(seconds)
+        network.sync.stop()  # type: ignore[no-untyped-call]
+
+
+if __name__ == "__main__":
+    _send_sync(sys.argv[1], float(sys.argv[2]), bool(int(sys.argv[3])))

@@ -1,0 +1,100 @@
+"""A service to be measured, its drives in a process of their own where they can keep up, and goals without pause."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from trirail.client import own_service
+from trirail.client.client import Robot
+from trirail.errors import TrirailError
+from trirail.processes.interpreter import python
+
+GOALS_HZ = 20.0
+"""Goals a second that are "without pause": none has ended when the next takes over."""
+SPAN = (0.05, 0.05, 0.4)
+"""They lie so far from the middle [m, m, rad]."""
+BITRATE = 8_000_000
+"""Of a bus without a wire: the load of no real one keeps a rate from being measured [bit/s]."""
+
+
+class Rig:
+    """A running service and a client of it."""
+
+    def __init__(self, robot: Robot, pid: int, bus: str | None) -> None:
+        self.robot = robot
+        self.pid = pid
+        self.bus = bus
+        """Path of the bus between processes; None where the drives are inside the loop."""
+
+
+@contextlib.contextmanager
+def rig(rate_hz: int, inside: bool = False) -> Iterator[Rig]:
+    """A service on simulated drives at a rate, enabled; `inside` keeps the drives in the loop's process."""
+    with tempfile.TemporaryDirectory(prefix="trirail-") as name, contextlib.ExitStack() as stack:
+        folder = Path(name)
+        config, locator = configured(folder, rate_hz, inside)
+        bus = None if inside else str(folder / "can")
+        if bus is not None:
+            stack.enter_context(drives(config, bus))
+        service = stack.enter_context(own_service.service(config, folder / "bench.rrd"))
+        robot = stack.enter_context(Robot("demo", locator, user="bench"))
+        robot.enable()
+        yield Rig(robot, service.pid, bus)
+        with contextlib.suppress(TrirailError):  # it may be in fault, which is told elsewhere
+            robot.disable()
+
+
+def configured(folder: Path, rate_hz: int, inside: bool) -> tuple[Path, str]:
+    """Write the configuration; return the file, and the locator of the service."""
+    config, locator = own_service.private(folder)
+    text = config.read_text(encoding="utf-8")
+    changes = {"rate_hz": str(rate_hz), "bitrate": str(BITRATE)}
+    if not inside:
+        changes["interface"] = f'"unix"\nchannel = "{folder}/can"'
+    for key, value in changes.items():
+        text, found = re.subn(rf"^{key} = [^#\n]*", f"{key} = {value} ", text, flags=re.MULTILINE)
+        if found != 1:
+            raise SystemExit(f"{config}: {key} was expected once, it is there {found} times")
+    config.write_text(text, encoding="utf-8")
+    return config, locator
+
+
+@contextlib.contextmanager
+def drives(config: Path, bus: str) -> Iterator[None]:
+    """The drives of a configuration in a process of their own."""
+    command = python(str(Path(__file__).with_name("bench_drives.py")), str(config), bus)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            if process.stdout is None or process.stdout.readline() != "ready\n":
+                raise SystemExit("the drives could not start")
+            yield
+        finally:
+            process.terminate()
+
+
+def without_pause(robot: Robot, seconds: float, each: Callable[[], None] = lambda: None) -> int:
+    """Send goal after goal, GOALS_HZ a second, for so long; return how many were accepted. `each` comes before each."""
+    choice, accepted = random.Random(1), 0
+    shown = sys.stderr.isatty()
+    due = began = time.monotonic()
+    while (now := time.monotonic()) < began + seconds:
+        if shown:
+            print(f"\r{began + seconds - now:4.0f} s left ", end="", file=sys.stderr, flush=True)
+        each()
+        x, y, phi = (choice.uniform(-span, span) for span in SPAN)
+        with contextlib.suppress(TrirailError):
+            robot.move_to(x=x, y=y, phi=phi)
+            accepted += 1
+        due += 1.0 / GOALS_HZ
+        time.sleep(max(0.0, due - time.monotonic()))
+    if shown:
+        print("\r", end="", file=sys.stderr)
+    return accepted
