@@ -219,14 +219,14 @@ class SerialLineAdapter:
 
     def _serve(self) -> None:
         while True:
-            readable, _, _ = select.select([self._line, self._told], [], [], 0.01)
-            if self._told in readable:
+            readable, _, _ = select.select([self._line, self._told.fileno()], [], [], 0.01)
+            if self._told.fileno() in readable:
                 return
             if readable:
                 self._typed += os.read(self._line, 4096)
                 *commands, self._typed = self._typed.split(b"\r")
                 for command in commands:
-                    self._obey(command)
+                    self._obey(bytes(command))
             while (answer := self._drives.recv(0)) is not None:
                 frame = f"t{answer.arbitration_id:03X}{len(answer.data)}{answer.data.hex().upper()}\r"
                 os.write(self._line, frame.encode())
@@ -244,7 +244,11 @@ class SerialLineAdapter:
 def test_slcan_whose_adapter_acknowledges_every_frame(taken: bytes) -> None:
     """Set up, powered and led over 300 cycles: each hears the answers to its own SYNC, and no backlog grows."""
     with SerialLineAdapter(taken) as adapter:
-        options = {"tty_baudrate": 921_600, "sleep_after_open": 0.0, "timeout": 0.0}
+        options: dict[str, bool | int | float | str] = {
+            "tty_baudrate": 921_600,
+            "sleep_after_open": 0.0,
+            "timeout": 0.0,
+        }
         section = Can(interface="slcan", channel=adapter.channel, options=options)
         drives = bus.connect(section, DRIVES)
         try:

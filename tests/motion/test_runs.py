@@ -265,7 +265,7 @@ def test_goals_that_are_dropped_leave_those_before_them(left: int) -> None:
 def test_a_schedule_goes_from_run_to_run_and_tells_how_long_it_takes() -> None:
     schedule = Schedule(rest(HERE), PERIOD)
     assert schedule.advance() == 0
-    assert (schedule.remaining, schedule.last, schedule.turning) == (0.0, None, False)
+    assert (schedule.remaining, schedule.last) == (0.0, None)
     first, second = run_of(way(LINE[0])), run_of(way(LINE[1], LINE[0]), 0.5)
     schedule.take(deque([first, second]))
     assert schedule.last is second
@@ -287,7 +287,7 @@ def test_a_schedule_goes_from_run_to_run_and_tells_how_long_it_takes() -> None:
 
 
 @pytest.mark.parametrize("wait", [0, 1, 30])
-def test_another_motion_takes_its_turn_in_its_cycle(wait: int) -> None:
+def test_to_look_ahead_changes_nothing_and_tells_what_then_comes(wait: int) -> None:
     schedule = Schedule(rest(HERE), PERIOD)
     for _ in range(5):
         schedule.advance()
@@ -295,42 +295,32 @@ def test_another_motion_takes_its_turn_in_its_cycle(wait: int) -> None:
     schedule.take(deque([under_way]))
     for _ in range(100):
         schedule.advance()
-    ahead = schedule.ahead(wait)
-    state = under_way.state(wait * PERIOD, HERE)
-    assert ahead.commanded.pose == pytest.approx(state.pose, abs=1e-9)
-    assert under_way.time == pytest.approx(100 * PERIOD)  # to look ahead changes nothing
-    later = run_of(way(LINE[2], state.pose))
-    schedule.take(deque([later]), schedule.cycle + wait)
-    assert schedule.turning is (wait > 0)
-    assert schedule.last is later
-    assert schedule.remaining == pytest.approx(wait * PERIOD + later.ends)
-    assert not under_way.seams or not wait  # it leads to none of its goals any more
-    looked = schedule.ahead(wait + 50)
+    version, ahead = schedule.version, schedule.ahead(wait)
+    assert under_way.time == pytest.approx(100 * PERIOD)
+    assert ahead.commanded.pose == pytest.approx(under_way.state(wait * PERIOD, HERE).pose, abs=1e-9)
     for _ in range(wait):
-        assert schedule.turning
-        assert list(schedule.runs) == [under_way]
         schedule.advance()
-    schedule.advance()
-    assert not schedule.turning
-    assert list(schedule.runs) == [later]
-    for _ in range(49):
-        schedule.advance()
-    assert later.time == pytest.approx(50 * PERIOD)
-    assert looked.commanded.pose == pytest.approx(schedule.commanded.pose, abs=1e-12)
-    assert looked.remaining == pytest.approx(schedule.remaining, abs=1e-9)
+    assert ahead.commanded.pose == pytest.approx(schedule.commanded.pose, abs=1e-12)
+    assert ahead.remaining == pytest.approx(schedule.remaining, abs=1e-9)
+    assert (schedule.version, schedule.cycle) == (version, ahead.cycle)
 
 
-def test_a_motion_that_is_not_to_come_any_more_does_not() -> None:
+def test_whatever_changes_what_is_to_come_makes_another_version() -> None:
     schedule = Schedule(rest(HERE), PERIOD)
-    under_way = run_of(way(LINE[0]))
-    schedule.take(deque([under_way]))
-    schedule.advance()
-    schedule.take(deque([run_of(way(LINE[1]))]), schedule.cycle + 10)
-    schedule.keep()
-    assert (schedule.turning, schedule.last) == (False, under_way)
-    for _ in range(20):
-        schedule.advance()
-    assert list(schedule.runs) == [under_way]
+    versions = [schedule.version]
+    run, _ = chain()
+    schedule.take(deque([run]))
+    versions.append(schedule.version)
+    schedule.change_law(run, run.law, run.target)
+    versions.append(schedule.version)
+    schedule.drop(len(run.seams) - 1)
+    versions.append(schedule.version)
+    schedule.append(run.path.duration, way(LINE[2], LINE[len(run.seams)]))
+    versions.append(schedule.version)
+    schedule.stop_on_path()
+    versions.append(schedule.version)
+    assert len(set(versions)) == len(versions)
+    assert not run.seams
 
 
 def test_a_schedule_tells_of_each_goal_that_ends_on_the_way() -> None:
