@@ -10,7 +10,7 @@ import json
 import math
 import struct
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any, Final
@@ -91,17 +91,15 @@ def dictionary(name: str, node: int, habits: Habits, *, rebased: bool = True) ->
         if habits.fixed_pdos and (0x1400 <= index < 0x1C00) and (subindex == 1 or index & 0x200):
             variable.access_type = "ro"
         variable.pdo_mappable = mappable
-        variable.default = default
+        value = habits.values.get((index, subindex), FITTED[name].get((index, subindex), default))
         if (
             rebased
-            and isinstance(default, int)
-            and (index in (0x1014,) or (index & 0xFA00 in (0x1400, 0x1800) and subindex == 1))
+            and isinstance(value, int)
+            and (index == 0x1014 or (0x1400 <= index < 0x1C00 and not index & 0x200 and subindex == 1))
         ):
-            low = default & 0x7FF
-            if low - 1 in _NODE_BASED:
-                variable.default = default - 1 + node
-        if (value := habits.values.get((index, subindex), FITTED[name].get((index, subindex)))) is not None:
-            variable.default = value
+            based = (value & 0x7FF) - 1 in _NODE_BASED
+            value += (node - 1) * based
+        variable.default = value
         if index in records:
             if index not in objects:
                 objects.add_object(ODRecord(f"{index:04X}", index))
@@ -164,7 +162,7 @@ class ForeignDrive:
         rebased: bool = True,
     ) -> None:
         self.node, self.clock, self.truth = node, clock, truth
-        self.habits = habits or Habits()
+        self.habits = replace(habits) if habits else Habits()
         self.bus = can.Bus(channel, interface="virtual")
         self.network = canopen.Network(self.bus)
         self.local = canopen.LocalNode(node, dictionary(name, node, self.habits, rebased=rebased))
@@ -314,6 +312,7 @@ class ForeignDrive:
     def _connection_lost(self) -> None:
         if self.state != ENABLED:
             return
+        self.cyclic = self.cyclic and self.value(0x6007) == 0
         match self.value(0x6007):
             case 1:
                 self.fail(0x8130)

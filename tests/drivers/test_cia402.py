@@ -141,6 +141,7 @@ class TestConfigure:
         assert feedback.position == pytest.approx(START, abs=1e-6)
         assert feedback.state == (P.SWITCH_ON_DISABLED,) * 3
         assert feedback.fault is None
+        assert not feedback.homing
 
     def test_takes_power_off_that_was_left_on(self, new: Rig) -> None:
         device = new.devices[1]

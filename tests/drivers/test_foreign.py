@@ -53,12 +53,16 @@ MAKES = {
 class Rig:
     """Three drives of a make, the driver under test, and a loop that turns the clock."""
 
-    def __init__(self, name: str, habits: Habits | None = None, truth: Truth | None = None, **keys: Any) -> None:
+    def __init__(
+        self, name: str, habits: Habits | None = None, truth: Truth | None = None, *, rebased: bool = True, **keys: Any
+    ) -> None:
         make = MAKES[name]
         drive = {"counts_per_metre": COUNTS, **make.keys, **keys}
         a, b, c = (Drive(node=node, **drive) for node in (1, 2, 3))
         self.config = Drives("cia402", a, b, c, sdo_timeout=0.05, quick_stop_deceleration=2.0)
-        self.wires, self.clock = three(name, dict.fromkeys((1, 2, 3), truth or make.truth), habits=habits)
+        self.wires, self.clock = three(
+            name, dict.fromkeys((1, 2, 3), truth or make.truth), habits=habits, rebased=rebased
+        )
         self.drives = Cia402(self.wires, 1_000_000, self.config, self.clock)
         self.warnings: list[str] = []
 
@@ -231,3 +235,31 @@ def test_a_unit_that_cannot_be_set_and_that_nobody_says_is_refused(rigs: list[Ri
     rigs.append(rig)
     with pytest.raises(DriveError, match=r"object 60A9 is rev/min and cannot be set .*say drives.A.rev"):
         rig.ready()
+
+
+def test_drives_whose_fixed_identifiers_are_the_same_are_refused(rigs: list[Rig]) -> None:
+    """All three as node 1 has them by default: one setpoint would move them all."""
+    values = {
+        (0x1600, 0): 1,
+        (0x1601, 0): 1,
+        (0x1601, 1): 0x607A_0020,
+        (0x1A00, 0): 1,
+        (0x1A01, 0): 1,
+        (0x1A01, 1): 0x6064_0020,
+    }
+    rig = Rig("elmo_gold", Habits(fixed_pdos=True, values=values), rebased=False)
+    rigs.append(rig)
+    with pytest.raises(
+        DriveError, match=r"drives A and B: both have a PDO with identifier \d+h that cannot be changed"
+    ):
+        rig.ready()
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_dictionaries_whose_identifiers_are_those_of_node_1(rigs: list[Rig], name: str) -> None:
+    """They can be written; an EMCY that cannot is taken at the predefined identifier."""
+    rig = Rig(name, rebased=False)
+    rigs.append(rig)
+    rig.ready()
+    rig.enable()
+    rig.move(0.1, 20)

@@ -170,5 +170,5 @@ def shown(index: int, subindex: int, value: int) -> str:  # noqa: ARG001
 def same(index: int, subindex: int, one: int, other: int) -> bool:
     """Whether two values are the same to this service."""
     # Bit 30 of a PDO's COB-ID tells whether remote requests are answered: unused here, so either will do.
-    ignored = NO_REMOTE_REQUEST if index & 0xFA00 in (0x1400, 0x1800) and subindex == 1 else 0
+    ignored = NO_REMOTE_REQUEST if is_pdo(index) and not index & 0x200 and subindex == 1 else 0
     return one | ignored == other | ignored

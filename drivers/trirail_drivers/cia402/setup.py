@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -101,6 +101,7 @@ def configure(
         made, differences = _bring(remote, drive, drives, scale, period, apply=True)
         differences.check_accepted(drive.accept_without)
         done.append(made._replace(notes=tuple(differences.notes), lacking=tuple(differences.lacking)))
+    _check_identifiers(done)
     for drive in drives.each:
         _send(bus, frames.nmt(frames.NMT_START, drive.node))
     return tuple((made, _start(remote)) for made, remote in zip(done, remotes, strict=True))
@@ -112,6 +113,22 @@ def look(bus: can.BusABC, name: str, drives: Drives, scale: Scale, period: float
     remote, drive = _remotes(bus, drives, clock)[at], drives.each[at]
     _check_is_servo(remote)
     return _bring(remote, drive, drives, scale, period, apply=False)[0]
+
+
+def _check_identifiers(done: Sequence[SetUp]) -> None:
+    """No two drives may hear or send frames of one identifier, as fixed ones of drives with one default would."""
+    owners: dict[int, str] = {}
+    for made in done:
+        way = made.way
+        for identifier in (way.setpoints.identifier, way.controlword, way.feedback.identifier, way.status):
+            if identifier is None:
+                continue
+            if identifier in owners:
+                raise DriveError(
+                    f"drives {owners[identifier]} and {made.name}: both have a PDO with identifier {identifier:03X}h "
+                    f"that cannot be changed (1400:01, 1800:01 and on); give each its own with its maker's tool"
+                )
+            owners[identifier] = made.name
 
 
 def told(made: Iterable[SetUp]) -> list[str]:
