@@ -9,8 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from trirail.processes.interpreter import python
-
 Results = dict[str, Any]
 """What each measurement gave, by its name."""
 
@@ -58,7 +56,7 @@ def _missed(results: Results, rate: int) -> tuple[float, ...]:
 
 def _planner(results: Results) -> tuple[float, ...]:
     """The p99 of planning a pose goal [ms]."""
-    return (results["planning"]["pose_p99_us"] / 1000.0,)
+    return (results["planning"]["goal_us"]["pose"]["p99"] / 1000.0,)
 
 
 AIMS = (
@@ -113,7 +111,7 @@ def measure(brief: bool) -> Results:
     for name, options in COMMANDS.items():
         print(f"{name} …", file=sys.stderr, flush=True)
         given = BRIEF.get(name, ()) if brief else options
-        done = subprocess.run(python(program, name, "--json", *given), stdout=subprocess.PIPE, check=True)
+        done = subprocess.run([sys.executable, program, name, "--json", *given], stdout=subprocess.PIPE, check=True)
         results[name] = json_format.loads(done.stdout)
     return {**results, "aims": table(results)}
 

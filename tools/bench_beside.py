@@ -19,7 +19,6 @@ from types import FrameType
 import numpy as np
 from numpy.typing import NDArray
 from trirail.processes.clock import Ticker
-from trirail.processes.interpreter import python
 
 LONGEST = 100_000
 """Latenesses that are told apart [µs]."""
@@ -38,7 +37,7 @@ class Beside:
             command = ["cyclictest", *options.split(), "-D", str(max(1, round(seconds))), f"--json={result}"]
         else:
             given = (str(value) for value in (seconds, period_us, priority + 1, processor))
-            command = python(__file__, *given, str(result))
+            command = [sys.executable, __file__, *given, str(result)]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
 
     def lateness(self) -> NDArray[np.float64]:

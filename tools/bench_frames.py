@@ -40,6 +40,9 @@ class Loopback(SocketcanBus):
         self.socket.setsockopt(socket.SOL_SOCKET, 35, 1)  # SO_TIMESTAMPNS, as for every SocketCAN bus
         can.BusABC.__init__(self, channel=self.channel)
 
+    def _apply_filters(self, filters: can.typechecking.CanFilters | None) -> None:
+        """Do nothing: identifiers are filtered by the kernel's CAN sockets alone."""
+
 
 class Listener:
     """Reads positions as a drive's axis does."""

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from bench_latency import listener
 from bench_rig import configured, drives, rig, without_pause
-from trirail.processes.interpreter import python
 from trirail_drivers.cia402 import frames as layout
 from trirail_drivers.unixbus import UnixBus
 
@@ -58,7 +57,7 @@ def _canopen(seconds: float, real_time: bool) -> list[float]:
         config, _ = configured(Path(folder), RATE, inside=False)
         path = f"{folder}/can"
         with drives(config, path), listener(path) as heard:
-            command = python(__file__, path, str(seconds), str(int(real_time)))
+            command = [sys.executable, __file__, path, str(seconds), str(int(real_time))]
             subprocess.run(command, check=True)
             return _deviations(heard.arrivals(layout.SYNC))
 

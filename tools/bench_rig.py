@@ -15,7 +15,6 @@ from pathlib import Path
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
-from trirail.processes.interpreter import python
 
 GOALS_HZ = 20.0
 """Goals a second that are "without pause": none has ended when the next takes over."""
@@ -70,7 +69,7 @@ def configured(folder: Path, rate_hz: int, inside: bool) -> tuple[Path, str]:
 @contextlib.contextmanager
 def drives(config: Path, bus: str) -> Iterator[None]:
     """The drives of a configuration in a process of their own."""
-    command = python(str(Path(__file__).with_name("bench_drives.py")), str(config), bus)
+    command = [sys.executable, str(Path(__file__).with_name("bench_drives.py")), str(config), bus]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             if process.stdout is None or process.stdout.readline() != "ready\n":

@@ -129,6 +129,9 @@ def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict
         raise Failed(f"the tests marked vcan: exit code {code}{_logs(folder, 'vcan')}")
     say(f"tests marked vcan: {summary.strip()}")
     report["checks"]["vcan"] = summary.strip()
+    price = _price(folder)
+    say(f"a cycle's frames: {price['socket_us']['p50']:.0f} µs, by python-can {price['ratio']:.1f} times as much")
+    report["price"] = price
     report["loops"] = result["loops"]
     check_frames(folder, config, result, say, report)
 
@@ -163,6 +166,14 @@ def _result(folder: Path) -> dict[str, Any]:
         return json.loads((folder / "result.json").read_text())  # type: ignore[no-any-return]
     except FileNotFoundError:
         raise Failed(f"the machine ended without a result{_logs(folder, *LOGS)}") from None
+
+
+def _price(folder: Path) -> dict[str, Any]:
+    """What tools/bench.py has measured of a cycle's frames in the machine."""
+    try:
+        return json.loads((folder / "price.json").read_text())  # type: ignore[no-any-return]
+    except (FileNotFoundError, json.JSONDecodeError):
+        raise Failed(f"a cycle's frames could not be measured in the machine{_logs(folder, 'vcan')}") from None
 
 
 def check_frames(folder: Path, config: Config, result: dict[str, Any], say: Progress, report: dict[str, Any]) -> None:

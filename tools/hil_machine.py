@@ -99,6 +99,7 @@ set +e
 {sys.executable} tools/hil_guest.py {folder}
 {sys.executable} -m pytest -m vcan -rA --tb=short {" ".join(TESTS)} 2>&1 | tee {folder}/vcan.log
 echo ${{PIPESTATUS[0]}} > {folder}/vcan.code
+{sys.executable} tools/bench.py frames --cycles 300 --json > {folder}/price.json
 """
 
 

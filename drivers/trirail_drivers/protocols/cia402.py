@@ -7,6 +7,7 @@ from pathlib import Path
 from trirail_drivers import config
 from trirail_drivers.cia402 import checks, frames
 from trirail_drivers.cia402.drives import Cia402
+from trirail_drivers.cia402.inspection import inspect
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import EDS, Frames, Machine, Servo, SimulatedDevice, SimulatedDrive
 
@@ -32,6 +33,7 @@ CIA402 = Protocol(
     check=checks.check,
     traffic=frames.TRAFFIC,
     simulated_drive=_simulated_drive,
+    inspect=inspect,
     fault_frames={
         "nmt": Frames(True, frames.NMT),
         "sync": Frames(True, frames.SYNC),

@@ -1,0 +1,77 @@
+"""Measurements run, and what they tell programs is whole; no test asserts what comes of them: see `make bench`."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import bench_aims
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def measured(command: str) -> dict[str, Any]:
+    """What a command tells programs, measured as briefly as can be."""
+    options = ("--json", *bench_aims.BRIEF.get(command, ()))
+    done = subprocess.run(
+        [sys.executable, "tools/bench.py", command, *options], cwd=ROOT, stdout=subprocess.PIPE, timeout=110, check=True
+    )
+    told = json.loads(done.stdout)
+    assert isinstance(told, dict)
+    return told
+
+
+def is_spread(values: list[float], quantiles: list[float]) -> bool:
+    """Whether these are numbers at quantiles, rising."""
+    return len(values) == len(quantiles) and all(map(math.isfinite, values)) and values == sorted(values)
+
+
+def test_frames_are_measured_both_ways() -> None:
+    told = measured("frames")
+    assert told["cycles"] > 0
+    assert told["ratio"] == told["python_can_us"]["p50"] / told["socket_us"]["p50"]
+
+
+@pytest.mark.slow
+def test_the_loop_is_measured_beside_the_machine() -> None:
+    (told,) = measured("loop")["rates"]
+    assert told["rate_hz"] == 1000
+    assert told["goals"] > 0
+    assert told["moving"] > 0.5
+    assert set(told["parts"]) == {"sync", "read", "mode", "motion", "kinematics", "write", "record"}
+    quantiles = [50.0, 99.0, 99.9, 100.0]
+    assert is_spread(told["cycle"], quantiles)
+    for run in told["runs"]:
+        assert is_spread(run["lateness"], quantiles)
+        assert is_spread(run["beside"], quantiles)
+
+
+@pytest.mark.slow
+def test_the_time_from_a_goal_to_its_first_setpoint_is_measured() -> None:
+    told = measured("latency")
+    assert told["without_effect"] < 2 * told["goals"]
+    for where in ("at_rest_ms", "in_motion_ms"):
+        assert is_spread(told[where], told["quantiles"])
+        assert told[where][0] > 0.0
+
+
+@pytest.mark.slow
+def test_sync_is_measured_beside_python_canopens() -> None:
+    told = measured("peers")
+    assert set(told["deviation_us"]) == {"trirail, moving", "python-canopen", "python-canopen, SCHED_FIFO"}
+    for values in told["deviation_us"].values():
+        assert is_spread(values, told["quantiles"])
+    assert told["linuxcnc"]
+
+
+def test_an_aim_is_met_where_no_number_is_greater() -> None:
+    results = {"frames": {"socket_us": {"p50": 9.0}}, "latency": {"at_rest_ms": [2.0, 4.5, 9.0]}}
+    rows = {row["name"]: row for row in bench_aims.table(results)}
+    assert [row["met"] for name, row in rows.items() if name.startswith("frames")] == [True]
+    assert [row["met"] for name, row in rows.items() if "at rest" in name] == [False]
+    assert len(rows) == 2, "what was not measured is left out"
