@@ -265,7 +265,7 @@ def test_goals_that_are_dropped_leave_those_before_them(left: int) -> None:
 def test_a_schedule_goes_from_run_to_run_and_tells_how_long_it_takes() -> None:
     schedule = Schedule(rest(HERE), PERIOD)
     assert schedule.advance() == 0
-    assert (schedule.remaining, schedule.last, schedule.turning) == (0.0, None, False)
+    assert (schedule.remaining, schedule.last) == (0.0, None)
     first, second = run_of(way(LINE[0])), run_of(way(LINE[1], LINE[0]), 0.5)
     schedule.take(deque([first, second]))
     assert schedule.last is second
@@ -287,7 +287,7 @@ def test_a_schedule_goes_from_run_to_run_and_tells_how_long_it_takes() -> None:
 
 
 @pytest.mark.parametrize("wait", [0, 1, 30])
-def test_another_motion_takes_its_turn_in_its_cycle(wait: int) -> None:
+def test_a_motion_that_was_looked_ahead_for_takes_over_where_it_begins(wait: int) -> None:
     schedule = Schedule(rest(HERE), PERIOD)
     for _ in range(5):
         schedule.advance()
@@ -298,38 +298,46 @@ def test_another_motion_takes_its_turn_in_its_cycle(wait: int) -> None:
     ahead = schedule.ahead(wait)
     state = under_way.state(wait * PERIOD, HERE)
     assert ahead.commanded.pose == pytest.approx(state.pose, abs=1e-9)
+    assert ahead.cycle == schedule.cycle + wait
     assert under_way.time == pytest.approx(100 * PERIOD)  # to look ahead changes nothing
-    later = run_of(way(LINE[2], state.pose))
-    schedule.take(deque([later]), schedule.cycle + wait)
-    assert schedule.turning is (wait > 0)
-    assert schedule.last is later
-    assert schedule.remaining == pytest.approx(wait * PERIOD + later.ends)
-    assert not under_way.seams or not wait  # it leads to none of its goals any more
-    looked = schedule.ahead(wait + 50)
     for _ in range(wait):
-        assert schedule.turning
-        assert list(schedule.runs) == [under_way]
         schedule.advance()
-    schedule.advance()
-    assert not schedule.turning
-    assert list(schedule.runs) == [later]
-    for _ in range(49):
+    assert schedule.commanded == ahead.commanded  # to the last bit
+    later = run_of(way(LINE[2], state.pose))
+    schedule.take(deque([later]))
+    assert schedule.last is later
+    assert schedule.remaining == pytest.approx(later.ends)
+    looked = schedule.ahead(50)
+    for _ in range(50):
         schedule.advance()
     assert later.time == pytest.approx(50 * PERIOD)
     assert looked.commanded.pose == pytest.approx(schedule.commanded.pose, abs=1e-12)
     assert looked.remaining == pytest.approx(schedule.remaining, abs=1e-9)
 
 
-def test_a_motion_that_is_not_to_come_any_more_does_not() -> None:
+def test_whatever_changes_the_motion_under_way_makes_it_another_version() -> None:
+    """And nothing else does: a motion that goes on as it would have is the one that was planned from."""
     schedule = Schedule(rest(HERE), PERIOD)
     under_way = run_of(way(LINE[0]))
-    schedule.take(deque([under_way]))
-    schedule.advance()
-    schedule.take(deque([run_of(way(LINE[1]))]), schedule.cycle + 10)
-    schedule.keep()
-    assert (schedule.turning, schedule.last) == (False, under_way)
+    seen = [schedule.version]
+
+    def another() -> bool:
+        seen.append(schedule.version)
+        return seen[-1] > seen[-2]
+
+    schedule.take(deque([under_way, run_of(way(LINE[1]))]))
+    assert another()
     for _ in range(20):
         schedule.advance()
+    assert not another()
+    schedule.change_law(under_way, constant(0.5, under_way.at.s), 0.5)
+    assert another()
+    schedule.append(schedule.runs[-1].path.duration, way(LINE[2]))
+    assert another()
+    schedule.drop(0)
+    assert another()
+    schedule.stop_on_path()
+    assert another()
     assert list(schedule.runs) == [under_way]
 
 
