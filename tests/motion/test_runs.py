@@ -287,7 +287,7 @@ def test_a_schedule_goes_from_run_to_run_and_tells_how_long_it_takes() -> None:
 
 
 @pytest.mark.parametrize("wait", [0, 1, 30])
-def test_to_look_ahead_changes_nothing_and_tells_what_then_comes(wait: int) -> None:
+def test_a_motion_that_was_looked_ahead_for_takes_over_where_it_begins(wait: int) -> None:
     schedule = Schedule(rest(HERE), PERIOD)
     for _ in range(5):
         schedule.advance()
@@ -295,32 +295,50 @@ def test_to_look_ahead_changes_nothing_and_tells_what_then_comes(wait: int) -> N
     schedule.take(deque([under_way]))
     for _ in range(100):
         schedule.advance()
-    version, ahead = schedule.version, schedule.ahead(wait)
-    assert under_way.time == pytest.approx(100 * PERIOD)
-    assert ahead.commanded.pose == pytest.approx(under_way.state(wait * PERIOD, HERE).pose, abs=1e-9)
+    ahead = schedule.ahead(wait)
+    state = under_way.state(wait * PERIOD, HERE)
+    assert ahead.commanded.pose == pytest.approx(state.pose, abs=1e-9)
+    assert ahead.cycle == schedule.cycle + wait
+    assert under_way.time == pytest.approx(100 * PERIOD)  # to look ahead changes nothing
     for _ in range(wait):
         schedule.advance()
-    assert ahead.commanded.pose == pytest.approx(schedule.commanded.pose, abs=1e-12)
-    assert ahead.remaining == pytest.approx(schedule.remaining, abs=1e-9)
-    assert (schedule.version, schedule.cycle) == (version, ahead.cycle)
+    assert schedule.commanded == ahead.commanded  # to the last bit
+    later = run_of(way(LINE[2], state.pose))
+    schedule.take(deque([later]))
+    assert schedule.last is later
+    assert schedule.remaining == pytest.approx(later.ends)
+    looked = schedule.ahead(50)
+    for _ in range(50):
+        schedule.advance()
+    assert later.time == pytest.approx(50 * PERIOD)
+    assert looked.commanded.pose == pytest.approx(schedule.commanded.pose, abs=1e-12)
+    assert looked.remaining == pytest.approx(schedule.remaining, abs=1e-9)
 
 
-def test_whatever_changes_what_is_to_come_makes_another_version() -> None:
+def test_whatever_changes_the_motion_under_way_makes_it_another_version() -> None:
+    """And nothing else does: a motion that goes on as it would have is the one that was planned from."""
     schedule = Schedule(rest(HERE), PERIOD)
-    versions = [schedule.version]
-    run, _ = chain()
-    schedule.take(deque([run]))
-    versions.append(schedule.version)
-    schedule.change_law(run, run.law, run.target)
-    versions.append(schedule.version)
-    schedule.drop(len(run.seams) - 1)
-    versions.append(schedule.version)
-    schedule.append(run.path.duration, way(LINE[2], LINE[len(run.seams)]))
-    versions.append(schedule.version)
+    under_way = run_of(way(LINE[0]))
+    seen = [schedule.version]
+
+    def another() -> bool:
+        seen.append(schedule.version)
+        return seen[-1] > seen[-2]
+
+    schedule.take(deque([under_way, run_of(way(LINE[1]))]))
+    assert another()
+    for _ in range(20):
+        schedule.advance()
+    assert not another()
+    schedule.change_law(under_way, constant(0.5, under_way.at.s), 0.5)
+    assert another()
+    schedule.append(schedule.runs[-1].path.duration, way(LINE[2]))
+    assert another()
+    schedule.drop(0)
+    assert another()
     schedule.stop_on_path()
-    versions.append(schedule.version)
-    assert len(set(versions)) == len(versions)
-    assert not run.seams
+    assert another()
+    assert list(schedule.runs) == [under_way]
 
 
 def test_a_schedule_tells_of_each_goal_that_ends_on_the_way() -> None:
