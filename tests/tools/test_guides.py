@@ -70,10 +70,10 @@ def test_every_file_that_is_named_exists(guide: Path) -> None:
         assert any((place / name).is_file() for place in places), f"{name} is not in any of {package or '.'}"
 
 
-def steps() -> Iterator[str]:
-    """Yield the numbered steps of the lists in CONTRIBUTING.md."""
+def steps() -> list[str]:
+    """Return the numbered steps of the lists in CONTRIBUTING.md."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    yield from re.findall(r"^\d\. .*\n(?:   .*\n)*", text.partition("## To add")[2], re.MULTILINE)
+    return re.findall(r"^\d\. .*\n(?:   .*\n)*", text.partition("## To add")[2], re.MULTILINE)
 
 
 @pytest.mark.parametrize("step", steps())
