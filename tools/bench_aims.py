@@ -105,27 +105,38 @@ def table(results: Results) -> list[dict[str, Any]]:
 
 
 def measure(brief: bool) -> Results:
-    """Run every measurement, each in a process of its own; what they gave, and the table."""
+    """Run every measurement, each in a process of its own; what they gave, which failed, and the table."""
     program = str(Path(__file__).with_name("bench.py"))
     results: Results = {}
+    failed = []
     for name, options in COMMANDS.items():
         print(f"{name} …", file=sys.stderr, flush=True)
         given = BRIEF.get(name, ()) if brief else options
-        done = subprocess.run([sys.executable, program, name, "--json", *given], stdout=subprocess.PIPE, check=True)
-        results[name] = json_format.loads(done.stdout)
-    return {**results, "aims": table(results)}
+        done = subprocess.run([sys.executable, program, name, "--json", *given], stdout=subprocess.PIPE, check=False)
+        if done.returncode == 0:
+            results[name] = json_format.loads(done.stdout)
+        else:
+            failed.append(name)
+    return {**results, "failed": failed, "aims": table(results)}
 
 
 def main(brief: bool, json: bool = False) -> None:
-    """Run all; print the table, or everything as one JSON object."""
+    """Run all; print the table, or everything as one JSON object. Exit code 1 where a measurement failed."""
     results = measure(brief)
     if json:
         print(json_format.dumps(results))
-        return
+    else:
+        _show(results)
+    if results["failed"]:
+        raise SystemExit(f"failed: {', '.join(results['failed'])}")
+
+
+def _show(results: Results) -> None:
     print(f"{'':68}{'before':>26}{'measured':>26}{'aim':>20}   met")
     for row in results["aims"]:
         measured, aim = (" / ".join(f"{value:.4g}" for value in row[key]) for key in ("measured", "aim"))
         print(f"{row['name']:68}{row['before']:>26}{measured:>26}{aim:>20}   {'yes' if row['met'] else 'NO'}")
-    deviation = results["peers"]["deviation_us"]
-    print("SYNC's interval off its period, p99.9 [µs]: " + ", ".join(f"{k} {v[2]:.0f}" for k, v in deviation.items()))
-    print(f"LinuxCNC's servo thread: {results['peers']['linuxcnc']}")
+    if "peers" in results:
+        off = results["peers"]["deviation_us"]
+        print("SYNC's interval off its period, p99.9 [µs]: " + ", ".join(f"{k} {v[2]:.0f}" for k, v in off.items()))
+        print(f"LinuxCNC's servo thread: {results['peers']['linuxcnc']}")

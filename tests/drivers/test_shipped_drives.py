@@ -9,13 +9,17 @@ import pytest
 import rigs
 from edsfiles import make_eds
 from trirail.config import SIM, Config, load
+from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import Drives, Feedback, PowerState
 from trirail_drivers.protocols import PROTOCOLS
 
 FOLDER = SIM.parent / "drives"
 DICTIONARIES = {
-    "elmo_gold": ("elmo_gold", {}),
-    "odrive_s1": (None, {}),
+    "elmo_gold": "elmo_gold",
+    "maxon_epos4": "maxon_epos4_compact50_5",
+    "nanotec_pd4": "nanotec_pd4n",
+    "odrive_s1": None,
+    "technosoft_ipos": "technosoft_ipos",
 }
 """Of which facts each example's drives are; an ODrive has no dictionary."""
 DISTANCE = 1e-3
@@ -25,10 +29,10 @@ VELOCITY = 0.01
 def example(name: str, folder: Path) -> Config:
     """The shipped file, with drives of its make's dictionary in the place of real ones."""
     config = load(FOLDER / f"{name}.toml")
-    make, values = DICTIONARIES[name]
+    make = DICTIONARIES[name]
     drives = config.drives
     if make is not None:
-        path = str(make_eds(folder, make, values))
+        path = str(make_eds(folder, make))
         axes = {axis: msgspec.structs.replace(getattr(drives, axis), eds=path) for axis in "ABC"}
         drives = msgspec.structs.replace(drives, **axes)
     return msgspec.structs.replace(config, drives=drives)
@@ -89,6 +93,24 @@ def test_an_example_starts_moves_and_stops(name: str, tmp_path: Path) -> None:
         run.until(PowerState.SWITCH_ON_DISABLED)
     finally:
         run.drives.close()
+
+
+@pytest.mark.parametrize("name", [name for name in DICTIONARIES if name != "odrive_s1"])
+def test_what_an_example_says_of_its_drives_it_needs_to_say(name: str, tmp_path: Path) -> None:
+    """Without its units and what it accepts to be lacking, such drives are refused by name; Elmo's need no word."""
+    config = example(name, tmp_path)
+    bare = {
+        axis: msgspec.structs.replace(
+            getattr(config.drives, axis), velocity_unit=None, acceleration_unit=None, accept_without=()
+        )
+        for axis in "ABC"
+    }
+    plain = msgspec.structs.replace(config, drives=msgspec.structs.replace(config.drives, **bare))
+    if name == "elmo_gold":
+        Run(plain).drives.close()
+    else:
+        with pytest.raises(DriveError, match=r"drive A|drives\.A"):
+            Run(plain)
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)
