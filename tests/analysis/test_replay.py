@@ -145,11 +145,9 @@ def test_on_simulated_drives_it_comes_out_the_same_too(recording: Recording, con
     assert again(recording, config, simulated=True).differing == 0
 
 
-def test_a_goal_one_cycle_later_is_noticed(recording: Recording, config: Config) -> None:
+def test_a_motion_one_cycle_later_is_noticed(recording: Recording, config: Config) -> None:
     number, what = next(
-        (number, what)
-        for number, what in enumerate(recording.requests)
-        if isinstance(what.given, GoalRequest) and not isinstance(what.given.goal, VelocityGoal)
+        (number, what) for number, what in enumerate(recording.requests) if isinstance(what.given, Planned)
     )
     requests = list(recording.requests)
     requests[number] = msgspec.structs.replace(what, cycle=what.cycle + 1)
