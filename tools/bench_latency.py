@@ -201,5 +201,6 @@ def main(goals: int, json: bool = False) -> None:
         print(f"{name:12}" + "".join(f"{value:8.2f}" for value in measured[key]))
     if measured["without_effect"]:
         print(
-            f"{measured['without_effect']} goals changed nothing within {WITHIN:g} s or met a fault of the stalled drives, and are left out"
+            f"{measured['without_effect']} goals are left out: they changed nothing within {WITHIN:g} s, "
+            f"or the machine stalled the drives into a fault"
         )
