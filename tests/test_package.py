@@ -57,7 +57,8 @@ def test_the_wheel_holds_the_packages_the_configurations_and_nothing_of_the_work
         (metadata,) = (archive.read(name).decode() for name in names if name.endswith(".dist-info/METADATA"))
     tops = {name.split("/")[0] for name in names}
     assert tops == {"trirail", "trirail_drivers", f"trirail-{trirail.__version__}.dist-info"}
-    shipped = {f"trirail/configs/{path.name}" for path in (ROOT / "configs").iterdir()}
+    configs = ROOT / "configs"
+    shipped = {f"trirail/configs/{path.relative_to(configs)}" for path in configs.rglob("*") if path.is_file()}
     typed = {"trirail/py.typed", "trirail_drivers/py.typed"}
     data = {f"trirail_drivers/{path.relative_to(ROOT / 'drivers/trirail_drivers')}" for path in ROOT.rglob("*.eds")}
     assert shipped | typed | data <= names

@@ -1,8 +1,11 @@
 """What `from trirail import …` offers, and what each name costs: nothing is loaded that was not asked for."""
 
+import ast
 import importlib
 import subprocess
 import sys
+from collections import Counter
+from pathlib import Path
 
 import pytest
 import trirail
@@ -36,6 +39,13 @@ def test_every_public_name_is_there_and_is_the_one_at_its_home() -> None:
     assert set(trirail.__all__) <= set(dir(trirail))
     for name, home in trirail._HOME.items():
         assert getattr(trirail, name) is getattr(importlib.import_module(home), name)
+
+
+def test_no_two_classes_of_the_service_share_a_name() -> None:
+    files = Path(trirail.__file__).parent.rglob("*.py")
+    trees = (ast.parse(file.read_text(encoding="utf-8")) for file in files)
+    names = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 def test_what_is_not_there_is_said_as_python_does() -> None:

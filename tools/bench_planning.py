@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+import bench_time_optimal
 import numpy as np
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from trirail.config import SIM, geometry, load
@@ -48,14 +49,16 @@ def main(json: bool) -> None:
             zip(("p50", "p99", "max"), np.percentile(np.array(times) * 1e6, (50, 99, 100)).tolist(), strict=True)
         )
     bare = _bare(config.period)
+    weak = bench_time_optimal.measure()
     if json:
-        print(json_format.dumps({"goal_us": results, "ruckig_alone_us": bare, "aim_us": AIM}))
+        print(json_format.dumps({"goal_us": results, "ruckig_alone_us": bare, "aim_us": AIM, "weak_sliders": weak}))
         return
     print(f"planning a goal beside the loop, processor time [µs]; the aim is {AIM:g}")
     for kind, found in results.items():
         p50, p99, greatest = found.values()
         print(f"{kind:<10} p50 {p50:5.0f}  p99 {p99:5.0f}  max {greatest:5.0f}")
     print(f"Ruckig alone, for one pose from rest: {bare:.1f} µs; the rest is the look along the path")
+    bench_time_optimal.report(weak)
 
 
 def _pose(rnd: random.Random) -> tuple[float, float, float]:

@@ -1,6 +1,6 @@
 """Kill matrix: every process of the service killed, ended and frozen in every mode, with the drives in a process apart.
 
-python tools/chaos.py                   all of it, half an hour
+python tools/chaos.py                   all of it, forty minutes
 python tools/chaos.py --sample 10       ten cases, drawn by --seed
 python tools/chaos.py --only moving/loop/KILL
 

@@ -30,7 +30,7 @@ from trirail_drivers.unixbus import UnixBus
 ROOT = Path(__file__).parents[1]
 PATIENCE = 20.0
 """How long anything may take that has to come [s]."""
-PROCESSES = ("supervisor", "gateway", "loop", "recorder")
+PROCESSES = ("supervisor", "gateway", "loop", "planner", "recorder")
 NODES = (1, 2, 3)
 # Three processes share what may be a slow machine: a rate and watchdogs that leave them time.
 CHANGES = {

@@ -19,6 +19,10 @@ Timeout = Annotated[float, Meta(ge=0.01, le=600.0)]
 """[s]."""
 Name = Annotated[str, Meta(max_length=4096, pattern=r"^[^\x00-\x1f\x7f]*$")]
 """A file's or a device's name: no control characters."""
+UnitName = Annotated[str, Meta(max_length=32)]
+"""A unit of velocity or acceleration."""
+ObjectName = Annotated[str, Meta(pattern=r"^[0-9A-F]{4}(:[0-9A-F]{2})?$")]
+"""An object's index in hexadecimal, as 605A."""
 NodeId = Annotated[int, Meta(ge=0, le=127)]
 """CANopen has 1 to 127, ODrive 0 to 62; the driver refuses the rest."""
 
@@ -92,7 +96,20 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     homing: Homing | None = None
     """None where the encoder is absolute."""
     eds: Name | None = None
-    """Its maker's EDS, relative to the configuration file; the shipped servo.eds when absent."""
+    """Its maker's EDS, relative to the configuration file: which objects are mappable, and what types those have that
+    cannot be read. All else the drive is asked for."""
+    velocity_unit: UnitName | None = None
+    """The drive's unit of velocity, as "counts/s", "0.1 counts/s", "rpm", "deg/s", "mm/s": wanted where it does not
+    tell (objects 60A9h, 6096h); refused where it contradicts the drive."""
+    acceleration_unit: UnitName | None = None
+    """The drive's unit of acceleration, as "counts/s2", "rpm/s", "rev/s2", "mm/s2": wanted where it does not tell
+    (objects 60AAh, 6097h); refused where it contradicts the drive."""
+    revolutions_per_metre: Annotated[float, Meta(ge=1e-6, le=1e9)] | None = None
+    """Revolutions by which the drive counts velocities, per metre of the slider: wanted where these are in rpm or
+    the like and the drive does not tell how many counts a revolution has."""
+    accept_without: tuple[ObjectName, ...] = ()
+    """Protections that the drive may lack, each named by its object, as ["1006", "6007"]: those of the table in
+    drivers/README.md; "6041" where bit 12 of its statusword says nothing."""
 
 
 class Drives(Struct, frozen=True, forbid_unknown_fields=True):

@@ -10,12 +10,14 @@ import contextlib
 import select
 import socket
 import time
+from collections import deque
 from collections.abc import Collection
 from struct import Struct
 from typing import Final, Protocol
 
 import can
 from can.interfaces.socketcan import SocketcanBus
+from can.interfaces.udp_multicast import UdpMulticastBus
 
 from trirail_drivers.capture import Capture, CapturedBus
 from trirail_drivers.frames import CAN_FRAME, DATA_AT, HEAD, REMOTE, STANDARD_BITS, Frame, can_id
@@ -55,7 +57,7 @@ def frame_io(bus: can.BusABC) -> FrameIO:
     if isinstance(inner, SocketcanBus) and inner.channel and inner.protocol is can.CanProtocol.CAN_20:
         # What is captured is everything that passes; else the kernel keeps out what nobody listens to.
         return SocketFrames(inner.socket, capture, filtered=None if capture else inner)
-    return PythonCanFrames(bus)
+    return PythonCanFrames(bus, heard_by_itself=isinstance(inner, UdpMulticastBus))
 
 
 class SocketFrames:
@@ -122,10 +124,14 @@ class PythonCanFrames:
 
     None from python-can is no sign that nothing is left: its slcan gives one for each acknowledgement. So it is read
     until its descriptor is empty; where it has none, once more for each frame sent, which may have been acknowledged.
+
+    What this end has sent itself is no frame that has arrived: gs_usb marks it, a multicast group just brings it back.
     """
 
-    def __init__(self, bus: can.BusABC) -> None:
+    def __init__(self, bus: can.BusABC, *, heard_by_itself: bool = False) -> None:
+        """`heard_by_itself`: the bus brings back, unmarked and in order, what is sent on it."""
         self._bus = bus
+        self._own: deque[tuple[int, bytes]] | None = deque(maxlen=MOST_NOTHINGS) if heard_by_itself else None
         self._poll: select.poll | None = None
         self._unanswered = 0
         """Frames sent that the interface may still answer with nothing."""
@@ -136,17 +142,34 @@ class PythonCanFrames:
 
     def send(self, frame: Frame) -> None:
         """Send a frame at once, or raise."""
-        self._bus.send(frame.message(), timeout=0)
+        message = frame.message()
+        self._bus.send(message, timeout=0)
         self._unanswered = min(self._unanswered + 1, MOST_NOTHINGS)
+        if self._own is not None:
+            self._own.append((can_id(message), bytes(message.data)))
 
     def receive(self, timeout: float = 0.0) -> Received | None:
         """The next frame that has arrived, or arrives within `timeout` [s]; None where there is none left."""
-        message = self._bus.recv(timeout)
-        for _ in range(MOST_NOTHINGS):
-            if message is not None or not self._may_have_more():
-                break
-            message = self._bus.recv(0)
-        return None if message is None else (can_id(message), message.data)
+        for _ in range(MOST_NOTHINGS + 1):
+            message = self._bus.recv(timeout)
+            if message is None:
+                if not self._may_have_more():
+                    break
+            elif not self._is_own(message):
+                return can_id(message), message.data
+            timeout = 0.0
+        return None
+
+    def _is_own(self, message: can.Message) -> bool:
+        """Whether this end has sent it; those sent before it that have not come back are lost."""
+        if self._own is None:
+            return not message.is_rx
+        sent = can_id(message), bytes(message.data)
+        if sent not in self._own:
+            return False
+        while self._own.popleft() != sent:
+            pass
+        return True
 
     def hear(self, identifiers: Collection[int]) -> None:
         """Do nothing: filters are each interface's own affair."""

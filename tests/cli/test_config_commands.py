@@ -11,7 +11,7 @@ from trirail.config import SIM, load, parse
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry
 
-SHIPPED = sorted(SIM.parent.glob("*.toml"))
+SHIPPED = sorted(SIM.parent.rglob("*.toml"))
 
 
 def as_built() -> str:
@@ -49,7 +49,8 @@ def changed(tmp_path: Path) -> Path:
 
 def test_what_is_shipped_is_listed_with_a_line_each(capsys: pytest.CaptureFixture[str], answer: Any) -> None:
     files = answer("config")["files"]
-    assert {path.name for path in SHIPPED} | {"trirail.service"} == set(files)
+    assert {str(path.relative_to(SIM.parent)) for path in SHIPPED} | {"trirail.service"} == set(files)
+    assert "drives/elmo_gold.toml" in files
     assert all(len(purpose) > 20 for purpose in files.values())
     assert call("config") == 0
     lines = capsys.readouterr().out.splitlines()
@@ -59,7 +60,7 @@ def test_what_is_shipped_is_listed_with_a_line_each(capsys: pytest.CaptureFixtur
 def test_each_can_be_copied_to_a_file_or_into_a_folder_but_never_over_one(tmp_path: Path, answer: Any) -> None:
     for name in answer("config")["files"]:
         answer(f"config copy {name} {tmp_path}")
-        assert (tmp_path / name).read_bytes() == (SIM.parent / name).read_bytes()
+        assert (tmp_path / Path(name).name).read_bytes() == (SIM.parent / name).read_bytes()
     assert answer(f"config copy sim {tmp_path / 'mine.toml'}")["file"] == str(tmp_path / "mine.toml")
     (tmp_path / "mine.toml").write_text("precious")
     with pytest.raises(ConfigError, match=r"mine\.toml exists already: name another file"):

@@ -10,8 +10,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 import can
 import msgspec
@@ -107,10 +109,18 @@ def test_an_interface_that_this_machine_does_not_have_is_one_line(interface: str
     assert "\n" not in str(refused.value)
 
 
-def forget(interface: str) -> None:
-    """Have python-can import an interface anew."""
-    for name in [name for name in sys.modules if name.startswith(f"can.interfaces.{interface}")]:
-        del sys.modules[name]
+@contextmanager
+def imported_anew(interface: str) -> Iterator[None]:
+    """Have python-can import an interface anew, and afterwards have what it had before."""
+
+    def taken() -> dict[str, ModuleType]:
+        names = [name for name in sys.modules if name.startswith(f"can.interfaces.{interface}")]
+        return {name: sys.modules.pop(name) for name in names}
+
+    before = taken()
+    yield
+    taken()
+    sys.modules.update(before)
 
 
 @pytest.mark.parametrize(
@@ -128,11 +138,14 @@ def test_a_missing_library_is_named_with_its_package(
 ) -> None:
     for module in modules:
         monkeypatch.setitem(sys.modules, module, None)
-    forget(interface)
-    with pytest.raises(BusError) as refused:
+    with imported_anew(interface), pytest.raises(BusError) as refused:
         bus.open_bus(Can(interface=interface, channel="0"), SIMULATED.drives)
-    forget(interface)
     assert remedy in str(refused.value)
+
+
+def slowly() -> float:
+    """The driver's clock: on a busy machine a stall of a second is none of its time-outs."""
+    return 0.1 * time.monotonic()
 
 
 def cycle(drives: Drives, position: float = 0.0) -> Feedback:
@@ -175,7 +188,7 @@ def test_drives_of_another_process_by_udp_multicast(tmp_path: Path) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as served:
         assert served.stdout is not None
         assert "switch on disabled" in served.stdout.readline()
-        drives = bus.connect(config.can, config.drives)
+        drives = bus.connect(config.can, config.drives, slowly)
         try:
             drives.configure(config.period)
             cycle(drives)
@@ -219,14 +232,14 @@ class SerialLineAdapter:
 
     def _serve(self) -> None:
         while True:
-            readable, _, _ = select.select([self._line, self._told], [], [], 0.01)
-            if self._told in readable:
+            readable, _, _ = select.select([self._line, self._told.fileno()], [], [], 0.01)
+            if self._told.fileno() in readable:
                 return
             if readable:
                 self._typed += os.read(self._line, 4096)
                 *commands, self._typed = self._typed.split(b"\r")
                 for command in commands:
-                    self._obey(command)
+                    self._obey(bytes(command))
             while (answer := self._drives.recv(0)) is not None:
                 frame = f"t{answer.arbitration_id:03X}{len(answer.data)}{answer.data.hex().upper()}\r"
                 os.write(self._line, frame.encode())
@@ -244,9 +257,9 @@ class SerialLineAdapter:
 def test_slcan_whose_adapter_acknowledges_every_frame(taken: bytes) -> None:
     """Set up, powered and led over 300 cycles: each hears the answers to its own SYNC, and no backlog grows."""
     with SerialLineAdapter(taken) as adapter:
-        options = {"tty_baudrate": 921_600, "sleep_after_open": 0.0, "timeout": 0.0}
+        options: dict[str, bool | int | float | str] = {"tty_baudrate": 921_600, "sleep_after_open": 0, "timeout": 0}
         section = Can(interface="slcan", channel=adapter.channel, options=options)
-        drives = bus.connect(section, DRIVES)
+        drives = bus.connect(section, DRIVES, slowly)
         try:
             drives.configure(0.01)
             cycle(drives)

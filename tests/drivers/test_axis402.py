@@ -6,7 +6,7 @@ import math
 
 import pytest
 from trirail_drivers.cia402 import frames
-from trirail_drivers.cia402.axis import Axis
+from trirail_drivers.cia402.axis import REGISTER_TIME, Axis
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.scaling import Scale
 
@@ -74,8 +74,13 @@ def test_a_fault_has_the_code_of_its_emergency_until_it_is_over() -> None:
     axis = made()
     axis.on_emergency(ERROR, T)
     assert axis.fault(T, WANTED) == ("B", "emcy", 0x4310, "drive B: emergency 4310, error register 08")
-    axis.forgive(T)
-    assert axis.fault(T, WANTED) == ("B", "emcy", 0x4310, "drive B: emergency 4310 is still in force")
+    axis.forgive(T)  # its error register is asked for, and does not answer
+    assert axis.register_wanted
+    axis.on_status(ENABLED, T + REGISTER_TIME)
+    axis.heard = T + REGISTER_TIME
+    assert axis.fault(T + REGISTER_TIME - 0.01, OFF) is None
+    said = ("B", "emcy", 0x4310, "drive B: emergency 4310 is still in force")
+    assert axis.fault(T + REGISTER_TIME, OFF) == said
     axis.on_emergency(OVER, T)
     assert axis.fault(T, WANTED) is None
 
@@ -136,11 +141,13 @@ def test_a_restart_stays_whatever_is_forgiven() -> None:
 
 def test_only_the_answer_about_the_statusword_is_one() -> None:
     axis = made()
+    axis.sdo_asked = b"\x40\x60"
     axis.on_sdo(b"\x4b\x41\x60\0" + READY + b"\0\0", T + 1.0)
     assert (axis.state, axis.status_heard) == (P.READY_TO_SWITCH_ON, T + 1.0)
     axis.on_sdo(b"\x4b\x40\x60\0" + ENABLED + b"\0\0", T + 2.0)
     axis.on_sdo(b"\x4b\x41\x60\0" + ENABLED, T + 2.0)  # too short for an SDO
     assert (axis.state, axis.status_heard) == (P.READY_TO_SWITCH_ON, T + 1.0)
+    assert axis.sdo_asked is None
     assert axis.sdo_answer == b"\x4b\x40\x60\0" + ENABLED + b"\0\0"
 
 

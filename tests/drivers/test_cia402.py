@@ -15,7 +15,7 @@ from rigs import START, STEP, Bus, Clock, DriverRig, ideal_servo
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.drives import REPEAT_AFTER, Cia402
 from trirail_drivers.cia402.eds import SERVO
-from trirail_drivers.cia402.settings import interpolation_period, settings_of
+from trirail_drivers.cia402.settings import interpolation_periods
 from trirail_drivers.config import Drive, Drives, Homing
 from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 from trirail_drivers.interface import PowerState
@@ -141,6 +141,7 @@ class TestConfigure:
         assert feedback.position == pytest.approx(START, abs=1e-6)
         assert feedback.state == (P.SWITCH_ON_DISABLED,) * 3
         assert feedback.fault is None
+        assert not feedback.homing
 
     def test_takes_power_off_that_was_left_on(self, new: Rig) -> None:
         device = new.devices[1]
@@ -175,28 +176,42 @@ class TestConfigure:
             new.drives.configure(PERIOD)
 
     def test_refused_write_tells_the_drives_reason(self, new: Rig) -> None:
-        new.devices[2].objects[0x6085, 0]._limits = None
+        ramp = new.devices[2].objects[0x6085, 0]
+        ramp.value, ramp._limits = 5, None
         with pytest.raises(
-            DriveError, match=r"drive C: cannot write 10000000 to object 6085:00 .*read only .*06010002"
+            DriveError, match=r"drive C lacks .* cannot write 10000000 to object 6085:00 .*read only .*06010002"
         ):
             new.drives.configure(PERIOD)
 
     def test_refusal_names_object_wanted_and_found(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Of every object that is set: a drive that says it took the value and did not."""
         objects = canopen.import_od(str(SERVO))
-        told = Entry.encode
-        settings = [*dict.fromkeys(setting[:2] for setting in settings_of("A", CONFIG.A, CONFIG, SCALE, PERIOD))]
-        assert {index for index, _ in settings} >= {0x60C2, 0x6065, 0x605A, 0x605E, 0x1016, 0x1017, 0x1029}
-        assert {index for index, _ in settings} >= {0x1400, 0x1401, 0x1600, 0x1601, 0x1800, 0x1801, 0x1A00, 0x1A01}
+        told, take = Entry.encode, Entry.write
+        other = Rig()
+        other.drives.configure(PERIOD)
+        writes = [
+            data for can_id, data in other.bus.sent if can_id == frames.SDO_REQUEST + 1 and data[0] & 0xE0 == 0x20
+        ]
+        settings = [*dict.fromkeys((int.from_bytes(data[1:3], "little"), data[3]) for data in writes)]
+        settings = [key for key in settings if key not in ((0x6040, 0), (0x6060, 0))]  # 6041 and 6061 tell
+        other.drives.close()
+        assert {index for index, _ in settings} >= {0x6065, 0x1006, 0x1016, 0x1017}
+        assert {index for index, _ in settings} >= {0x1401, 0x1601, 0x1800, 0x1801, 0x1A01}
         for index, subindex in settings:
             rig = Rig()
             lying = rig.devices[0].objects[index, subindex]
+            written: list[Entry] = []
 
-            def encode(entry: Entry, lying: Entry = lying) -> bytes:
+            def encode(entry: Entry, lying: Entry = lying, written: list[Entry] = written) -> bytes:
                 truth = told(entry)
-                return bytes([truth[0] ^ 1]) + truth[1:] if entry is lying else truth
+                return bytes([truth[0] ^ 1]) + truth[1:] if entry is lying and lying in written else truth
+
+            def write(entry: Entry, value: int, written: list[Entry] = written) -> None:
+                written.append(entry)
+                take(entry, value)
 
             monkeypatch.setattr(Entry, "encode", encode)
+            monkeypatch.setattr(Entry, "write", write)
             with pytest.raises(ConfigurationRefused) as refused:
                 rig.drives.configure(PERIOD)
             variable = objects.get_variable(index, subindex)
@@ -230,17 +245,15 @@ class TestConfigure:
             Rig(changed("A", eds=str(tmp_path / "x.eds"))).drives.configure(PERIOD)
         assert "\n" not in str(refused.value)
 
-    def test_eds_without_an_object_that_is_needed(self, tmp_path: Path) -> None:
+    def test_what_an_eds_leaves_out_the_drive_is_asked_for(self, tmp_path: Path) -> None:
         text = SERVO.read_text()
-        begin = text.index("[60B1]")
-        (tmp_path / "x.eds").write_text(text[:begin] + text[text.index("[60C2]") :].replace("0x60B1", "0x60F4"))
+        begin = text.index("[6085]")
+        (tmp_path / "x.eds").write_text(text[:begin] + text[text.index("[6098]") :].replace("0x6085", "0x60F4"))
         rig = Rig(changed("A", eds=str(tmp_path / "x.eds")))
-        with pytest.raises(
-            DriveError,
-            match=r"drive A: EDS \S*x\.eds lacks object 60B1:00 \(Velocity offset\), needed for the velocity",
-        ):
-            rig.drives.configure(PERIOD)
-        assert rig.bus.sent == []  # refused before any drive was spoken to
+        rig.devices[0].objects[0x6085, 0].value = 5
+        rig.drives.configure(PERIOD)
+        assert rig.devices[0].objects[0x6085, 0].value == 10_000_000
+        rig.drives.close()
 
     def test_homing_is_set_where_the_encoder_is_not_absolute(self) -> None:
         rig = Rig(changed("B", homing=HOMING))
@@ -304,15 +317,15 @@ class TestConfigure:
 
     @pytest.mark.parametrize(
         ("rate", "said"),
-        [(1000, (1, -3)), (400, (25, -4)), (800, (125, -5)), (100, (1, -2)), (4000, (25, -5))],
+        [(1000, (1, -3)), (400, (25, -4)), (800, (125, -5)), (100, (10, -3)), (200, (5, -3)), (4000, (25, -5))],
     )
     def test_period_as_value_and_power_of_ten(self, rate: float, said: tuple[int, int]) -> None:
-        assert interpolation_period(1 / rate) == said
+        assert interpolation_periods(1 / rate)[0] == said
 
     @pytest.mark.parametrize("rate", [300, 3000, 700])
     def test_period_that_no_drive_can_be_told(self, rate: float) -> None:
         with pytest.raises(DriveError, match=r"60C2h .*the nearest is .* Hz\)"):
-            interpolation_period(1 / rate)
+            interpolation_periods(1 / rate)
 
 
 class TestPower:

@@ -184,7 +184,10 @@ STOP = [
     Case("C corrupt tpdo2", 30, r"slider C: following error", lasts=False),
     Case("C corrupt rpdo2", 60, r"(slider C: following error|drive C: emergency 8611)", lasts=False),
     Case(
-        "B corrupt tpdo1", 400, r"drive B: (statusword \w{4} is that of no|left operation enabled|fault)", lasts=False
+        "B corrupt tpdo1",
+        400,
+        r"drive B: (statusword \w{4} is that of no|left operation enabled|does not follow|fault)",
+        lasts=False,
     ),
     Case("A dlc 3 tpdo2", 1, r"drive A: frame 281 has wrong length 3"),
     Case("A dlc 8 tpdo2", 1, r"drive A: frame 281 has wrong length 8"),

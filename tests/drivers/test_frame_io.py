@@ -236,3 +236,34 @@ def test_slcans_acknowledgements_do_not_hide_the_frames_behind_them() -> None:
     finally:
         os.close(adapter)
         os.close(terminal)
+
+
+class EchoingBus(can.BusABC):
+    """A bus that brings back what is sent on it: marked as gs_usb does it, or unmarked as a multicast group does."""
+
+    def __init__(self, *, marked: bool) -> None:
+        self.channel_info = "echoing"
+        self.arrived: deque[can.Message] = deque()
+        self.marked = marked
+        super().__init__("echoing")
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self.arrived.append(msg)
+        msg.is_rx = not self.marked
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        return self.arrived.popleft() if self.arrived else None
+
+
+@pytest.mark.parametrize("marked", [True, False])
+def test_what_this_end_has_sent_has_not_arrived(marked: bool) -> None:
+    """But what another has sent has, though it be the same frame; one of ours that is lost hides none of theirs."""
+    with EchoingBus(marked=marked) as bus:
+        frames = PythonCanFrames(bus, heard_by_itself=not marked)
+        theirs = can.Message(arbitration_id=0x080, is_extended_id=False)
+        bus.arrived.append(can.Message(arbitration_id=0x181, data=b"\1", is_extended_id=False))
+        for identifier in (0x201, 0x080, 0x202):
+            frames.send(Frame(identifier))
+        bus.arrived.append(theirs)
+        del bus.arrived[1]  # our first one
+        assert arriving(frames, 2) == [(0x181, b"\1"), (0x080, b"")]

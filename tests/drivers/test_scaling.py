@@ -7,9 +7,10 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drive
 from trirail_drivers.errors import DriveError
-from trirail_drivers.scaling import INT32_MAX, UINT32_MAX, Scale, scale_of, unsigned
+from trirail_drivers.scaling import INT32_MAX, UINT32_MAX, Scale, scale_of
 
 drives = st.builds(
     Drive,
@@ -19,6 +20,11 @@ drives = st.builds(
     offset=st.floats(-1.0, 1.0),
 )
 positions = st.floats(-2.0, 2.0)
+
+
+def units_of(scale: Scale) -> Units:
+    """Counts, counts/s, counts/s²."""
+    return Units(scale, scale.counts_per_metre, abs(scale.counts_per_metre))
 
 
 @given(drive=drives, position=positions)
@@ -38,7 +44,7 @@ def test_counts_to_metres_and_back_is_exact(drive: Drive, counts: int) -> None:
 def test_direction_is_the_sign_of_counts_and_of_velocity(drive: Drive, position: float, step: float) -> None:
     scale = scale_of("A", drive)
     assert math.copysign(1, scale.counts(position + step) - scale.counts(position)) == drive.direction
-    assert math.copysign(1, scale.counts_per_second(step)) == drive.direction
+    assert math.copysign(1, units_of(scale).velocity(step)) == drive.direction
 
 
 @given(drive=drives)
@@ -46,7 +52,7 @@ def test_zero_counts_are_at_the_offset(drive: Drive) -> None:
     scale = scale_of("A", drive)
     assert scale.counts(drive.offset) == 0
     assert scale.metres(0) == drive.offset
-    assert scale.counts_per_second(0.0) == 0
+    assert units_of(scale).velocity(0.0) == 0
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -55,7 +61,7 @@ def test_what_is_not_finite_has_no_counts(value: float) -> None:
     with pytest.raises((ValueError, OverflowError)):
         scale.counts(value)
     with pytest.raises((ValueError, OverflowError)):
-        scale.counts_per_second(value)
+        units_of(scale).velocity(value)
 
 
 @pytest.mark.parametrize("offset", [2148.0, -2148.0, math.inf, math.nan])
@@ -71,10 +77,10 @@ def test_the_largest_offset_is_taken() -> None:
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_windows_and_ramps_have_no_direction(direction: float) -> None:
-    assert unsigned("A", Scale(direction * 1e6, 0.3), "following_error", 0.005) == 5000
+    assert units_of(Scale(direction * 1e6, 0.3)).length("A", "following_error", 0.005) == 5000
 
 
 @pytest.mark.parametrize("value", [1e-9, UINT32_MAX * 1e-6, math.inf, math.nan])
 def test_a_window_that_means_none_is_refused(value: float) -> None:
     with pytest.raises(DriveError, match="drive C: following_error"):
-        unsigned("C", Scale(1e6, 0.0), "following_error", value)
+        units_of(Scale(1e6, 0.0)).length("C", "following_error", value)

@@ -14,7 +14,7 @@ import pytest
 from drivers.test_cia402 import PERIOD
 from rigs import Bus, DeviceRig
 from trirail_drivers.cia402 import frames as canopen
-from trirail_drivers.cia402 import homing, sdo, settings
+from trirail_drivers.cia402 import homing, sdo, ways
 from trirail_drivers.interface import PowerState
 from trirail_drivers.odrive import frames as cansimple
 from trirail_drivers.simulated import Servo, SimulatedDrive, SimulatedOdrive
@@ -50,7 +50,14 @@ CANOPEN: dict[str, dict[str, object]] = {
     "CiA 301, 7.2.4 SDO: initiate upload, expedited with two bytes": {
         "STATUSWORD_UPLOAD": bytes.fromhex("4041600000000000"),
         "STATUSWORD_UPLOADED": bytes.fromhex("4b416000"),
+        "CONTROLWORD_DOWNLOAD": bytes.fromhex("2b406000"),
     },
+    "CiA 301, 7.2.4 SDO: expedited with one byte; 7.5.2 error register 1001h": {
+        "ERROR_REGISTER_UPLOAD": bytes.fromhex("4001100000000000"),
+        "ERROR_REGISTER_UPLOADED": bytes.fromhex("4f011000"),
+    },
+    "CiA 301, 7.2.8 node guarding: bits 0 to 6 are the state": {"NMT_STATE_BITS": 0x7F},
+    "CiA 402-2, modes 7 and 8: controlword bit 4, statusword bit 12": {"INTERPOLATE": 0x0010, "FOLLOWS": 0x1000},
     "CiA 402-2, controlword 6040h: coding of commands, and bits 4 and 8": {
         "CONTROLWORD": "<H",
         "DISABLE_VOLTAGE": 0b0000_0000,
@@ -64,7 +71,7 @@ CANOPEN: dict[str, dict[str, object]] = {
     },
     "CiA 402-2, types of 6041h, 607Ah with 60B1h, 6064h": {"STATUSWORD": "<H", "SETPOINT": "<ii", "POSITION": "<i"},
 }
-OWN = {"STATUS_PERIOD", "TRAFFIC"}
+OWN = {"POLL_PERIOD", "STATUS_PERIOD", "TRAFFIC"}
 """What this driver decides, not the standard."""
 
 CANSIMPLE: dict[str, dict[str, object]] = {
@@ -159,14 +166,14 @@ def test_every_statusword(word: int) -> None:
 
 def test_modes_of_operation_and_bits_of_objects() -> None:
     # CiA 402-2: 6060h, 6061h, 6041h; statusword bits 10, 12, 13 in homing mode.
-    assert (homing.HOMING, homing.CYCLIC_SYNCHRONOUS_POSITION) == (6, 8)
+    assert (homing.HOMING, ways.INTERPOLATED_POSITION, ways.CYCLIC_SYNCHRONOUS_POSITION) == (6, 7, 8)
     assert (homing._MODE, homing._MODE_DISPLAY, homing._STATUSWORD) == (0x6060, 0x6061, 0x6041)
     assert (homing._REACHED, homing._ATTAINED, homing._ERROR) == (0x0400, 0x1000, 0x2000)
     # CiA 301, 7.2.4: initiate download of one byte, initiate upload, abort; index, subindex, data.
     assert (homing._WRITE_BYTE, homing._READ, homing._ABORTED) == (0x2F, 0x40, 0x80)
     assert homing._SDO.format == "<BHB4s"
     # CiA 301, 7.5.2: a PDO's COB-ID, bits 31 and 30; 7.2.4: abort codes of an object or subindex that is not there.
-    assert (settings.INVALID, settings.NO_REMOTE_REQUEST) == (0x8000_0000, 0x4000_0000)
+    assert (sdo.INVALID, sdo.NO_REMOTE_REQUEST) == (0x8000_0000, 0x4000_0000)
     assert sdo.NO_SUCH_OBJECT == (0x0602_0000, 0x0609_0011)
 
 
@@ -311,8 +318,8 @@ def test_the_cia402_driver_by_its_bytes() -> None:
     rig = test_cia402.Rig()
     rig.drives.configure(PERIOD)
     said = sent(rig.bus)
-    # Drive B is node 5: its heartbeat 100 ms, the master's watched for 300 ms, quick stop by ramp, mode 8, start.
-    for frame in ("605#2B17100064000000", "605#231610012C017E00", "605#2B5A600002000000", "605#2F60600008000000"):
+    # Drive B is node 5: its heartbeat 100 ms, the master's watched for 300 ms, window 5 mm, mode 8, start.
+    for frame in ("605#2B17100064000000", "605#231610012C017E00", "605#2365600010270000", "605#2F60600008000000"):
         assert frame in said, frame
     assert "000#0105" in said
     rig.cycle()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import CONFIG, Rig, changed
 from control.test_control import GOAL, PERIOD, ROBOT, assert_within_limits, refusal
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from trirail.control.feedback import Measured
@@ -295,6 +295,7 @@ def test_a_motion_that_ends_at_once_is_a_fault(rig: Rig) -> None:
     assert "jerk" in (rig.control.fault or "")
 
 
+@example(-0.0, 0.0)
 @given(st.floats(-1.0, 1.0), st.floats(-1e-3, 1e-3))
 def test_a_value_is_shown_with_the_digits_that_tell_it_from_its_limit(limit: float, beyond: float) -> None:
     shown, bound = told_apart(limit + beyond, limit)

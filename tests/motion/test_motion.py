@@ -460,7 +460,7 @@ def test_a_stop_is_kept_though_the_rate_of_the_goal_to_come_is_thought_about(
     rig.command("override", 0.7)
     rig.cycles(100)
     assert accepted(rig.goal("g2", -0.05, 0.05, -0.3)).stops_first
-    rig.command("override", 0.9)
+    rig.order("override", 1.5)
     schedule = rig.control._schedule
     rig.cycles(later)
     assert len(schedule.runs) == 2

@@ -122,7 +122,7 @@ def test_a_killed_supervisor_leaves_a_complete_recording(service: Service) -> No
     """The loop stops the robot; the recorder outlives it, to have what it said of that."""
     with service.robot() as robot:
         in_motion(robot)
-        children = [service.child(name) for name in ("loop", "gateway", "recorder")]
+        children = [service.child(name) for name in ("loop", "gateway", "planner", "recorder")]
         service.process.kill()
         for child in children:
             wait_gone(child)

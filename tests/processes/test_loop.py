@@ -13,7 +13,7 @@ from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop, Ports
 from trirail.wire import links
-from trirail.wire.links import PacketLink, Port
+from trirail.wire.links import Closed, PacketLink, Port
 from trirail.wire.messages import PoseGoal
 from trirail.wire.packets import (
     CommandRequest,
@@ -24,13 +24,14 @@ from trirail.wire.packets import (
     GoalRequest,
     Happened,
     Kind,
+    Refused,
     Remark,
     Status,
     Welcome,
     decode_answer,
     message,
 )
-from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
+from trirail.wire.planning import MAX_PLANNING, Planned, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.interface import Drives
@@ -344,3 +345,98 @@ def test_nobody_is_told_what_a_gateway_that_is_gone_was_asked(shell: Shell, tmp_
     shell.gateway = links.connect(tmp_path / "gateway")
     shell.cycles(30)
     assert answered(shell.received()) == []
+
+
+# ---------------------------------------------------------------------- the planner
+
+
+def sent_in_motion(shell: Shell) -> None:
+    """A robot on its way to g-1, whose planner serves no more, that has just been sent g-2."""
+    moving(shell)
+    shell.serves = False
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(3, "ann", "g-2", PoseGoal(0.0, 0.05, 0.0), now)))
+    shell.cycles(1)
+
+
+def refusals(shell: Shell) -> list[tuple[int, str]]:
+    said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
+    return [(answer.ticket, answer.code) for answer in said if isinstance(answer, Refused)]
+
+
+def test_a_planner_that_dies_is_noticed_in_the_next_cycle(shell: Shell) -> None:
+    sent_in_motion(shell)
+    shell.planner.close()
+    shell.cycles(1)
+    assert refusals(shell) == [(3, "planner_lost")]
+    assert shell.mode() is Mode.MOVING
+
+
+def test_a_planner_that_is_not_there_costs_the_goal_and_the_next_one_is_taken(shell: Shell, tmp_path: Path) -> None:
+    shell.enabled()
+    shell.serves = False
+    shell.planner.close()
+    beating(shell, 50)
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.05, 0.0, 0.0), now)))
+    shell.cycles(2)
+    assert refusals(shell) == [(2, "planner_lost")]
+    shell.planner, shell.serves = links.connect(tmp_path / "planner", MAX_PLANNING), True
+    beating(shell, 50)
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(3, "ann", "g-2", PoseGoal(0.05, 0.0, 0.0), now)))
+    shell.cycles(3)
+    assert shell.mode() is Mode.MOVING
+
+
+@pytest.mark.parametrize("junk", [b"", b"\x00", b"nonsense", message(Remark("info", "hello")), b"\xff" * 1000])
+def test_what_is_no_answer_ends_the_planner_and_not_the_robot(shell: Shell, junk: bytes) -> None:
+    """An empty packet is how an end looks; after anything else the loop hangs up, and the supervisor starts another."""
+    sent_in_motion(shell)
+    shell.planner.send(junk)
+    shell.cycles(1)
+    assert refusals(shell) == [(3, "planner_lost")]
+    shell.cycles(20)
+    assert not shell.ports.planner.connected
+    with pytest.raises(Closed):
+        shell.received(shell.planner)
+    assert shell.mode() is Mode.MOVING
+
+
+def test_a_planner_that_floods_the_loop_is_not_read(shell: Shell) -> None:
+    """Nobody asked: what it says stands in the socket, and costs it its life once it is asked."""
+    moving(shell)
+    while shell.planner.send(b"junk" * 100):
+        pass
+    shell.gateway.send(message(CommandRequest(9, "ann", Command.STOP)))
+    shell.cycles(600)
+    assert answered(shell.received())[-1] == 9
+    assert shell.mode() is Mode.HOLDING
+
+
+def test_an_answer_to_what_was_asked_before_is_not_the_last(shell: Shell) -> None:
+    """The motion has changed since: what was asked from it is answered, and then what was asked from the new one."""
+    sent_in_motion(shell)
+    shell.gateway.send(message(CommandRequest(4, "ann", Command.OVERRIDE, 0.8)))
+    shell.cycles(3)
+    asked = [decode_plan_request(packet) for packet in shell.received(shell.planner)]
+    assert len(asked) == 2
+    for request in asked:
+        shell.planner.send(encode(shell.motion_planner.plan(request)))
+        shell.cycles(1)
+    shell.cycles(20)
+    target = shell.loop.control.target
+    assert target is not None
+    assert target == pytest.approx((0.0, 0.05, 0.0), abs=1e-6)
+
+
+def test_the_recorder_has_every_answer_with_the_cycle_in_which_it_was_taken(shell: Shell) -> None:
+    shell.enabled()
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.05, 0.0, 0.0), now)))
+    shell.cycles(3)
+    said = [decode_answer(packet[1:]) for packet in shell.received(shell.recorder) if packet[0] == Kind.MESSAGE]
+    goal, planned = [answer for answer in said if isinstance(answer, ControlInput)][-2:]
+    assert isinstance(goal.given, GoalRequest)
+    assert isinstance(planned.given, Planned)
+    assert planned.cycle == goal.cycle + 1

@@ -37,7 +37,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Service, 
     """One enabled service, which no test may end; it has the processes afterwards that it had before."""
     service = Service(tmp_path_factory.mktemp("shared"))
     service.wait_up()
-    names = ("loop", "gateway", "recorder")
+    names = ("loop", "gateway", "planner", "recorder")
     before = [service.child(name) for name in names]
     with service.robot() as robot, open_client(service.locator) as session:
         robot.enable()

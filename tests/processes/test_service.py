@@ -477,6 +477,49 @@ def test_a_killed_gateway_is_a_controlled_stop(service: Service) -> None:
     assert "the gateway has died (killed by SIGKILL)" in service.log.read_text()
 
 
+def planned_again(robot: Robot) -> None:
+    """Wait until goals are planned again, with the last one reached."""
+    deadline = time.monotonic() + END_WITHIN
+    while True:
+        with contextlib.suppress(RefusedError):
+            assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
+            return
+        assert time.monotonic() < deadline
+
+
+@pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])
+def test_a_planner_that_is_lost_costs_a_goal_and_no_more(service: Service, harm: signal.Signals) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        os.kill(service.child("planner"), harm)
+        with pytest.raises(RefusedError) as refused:
+            robot.move_to(x=0.0, y=0.0, phi=0.0)
+        assert refused.value.code == "planner_lost"
+        robot.override(50.0)
+        robot.override(100.0)
+        state = until(robot, lambda state: state.mode == "holding")
+        assert state.pose[0] == pytest.approx(0.1, abs=1e-5)
+        planned_again(robot)
+    assert service.end() == 0
+    assert_stopped_smoothly(service.frames())
+    log = service.log.read_text()
+    assert "the motion under way goes on, new goals are refused; starting it again" in log
+    assert "Traceback" not in log
+
+
+@pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_robot_is_stopped_without_a_planner(service: Service, harm: signal.Signals) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        os.kill(service.child("planner"), harm)
+        robot.stop()
+        state = robot.state()
+        assert state.mode == "holding"
+        assert state.pose[0] < 0.09
+    assert service.end() == 0
+    assert_stopped_smoothly(service.frames())
+
+
 def test_a_killed_recorder_does_not_matter(service: Service) -> None:
     with service.robot() as robot:
         in_motion(robot)

@@ -60,7 +60,7 @@ def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def run(told: list[str], folder: Path, **children: str) -> int:
-    for name, does in children.items():
+    for name, does in ({"planner_1": RECORDING} | children).items():
         (folder / name.replace("_", "-")).write_text(does)
     return supervisor.Supervisor(load(SIM), None, told.append).run(lambda _: told.append("up"))
 
@@ -111,6 +111,24 @@ def test_a_frozen_loop_ends_the_service(told: list[str], tmp_path: Path) -> None
     assert told[1] == (
         "the loop is dead (no sign of life for 0.7 s, so it was killed): the drives stop by their own watchdogs; ending"
     )
+
+
+def test_a_hung_planner_is_killed_and_started_again(told: list[str], tmp_path: Path) -> None:
+    code = run(
+        told,
+        tmp_path,
+        loop_1="ready(); beat_until(lambda: begun('planner-2')); heartbeats.of('loop').rest()",
+        gateway_1=SERVING,
+        planner_1="ready(); heartbeats.of(name).beat(); freeze()",
+        planner_2="ready()",
+        recorder_1=RECORDING,
+    )
+    assert code == 1
+    assert told[:2] == [
+        "up",
+        "the planner has died (no sign of life for 0.7 s, so it was killed): the motion under way goes on, "
+        "new goals are refused; starting it again",
+    ]
 
 
 def test_those_that_end_because_the_loop_ends_are_not_started_again(told: list[str], tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
+from trirail.processes.supervisor import WATCHED_BY_SYSTEMD
 from trirail.processes.systemd import FEEDS, Watchdog, notify
 
 UNIT = Path(__file__).parents[2] / "configs" / "trirail.service"
@@ -53,7 +54,7 @@ def turns(watchdog: Watchdog, clock: Clock, seconds: float, *beating: str, of: H
 
 
 def watchdog_of(hearts: Heartbeats, clock: Clock, **environment: str) -> Watchdog:
-    return Watchdog([hearts.of(name) for name in PROCESSES], environment, clock)
+    return Watchdog([hearts.of(name) for name in WATCHED_BY_SYSTEMD], environment, clock)
 
 
 def test_it_is_fed_several_times_within_its_time(told: socket.socket) -> None:
@@ -66,7 +67,7 @@ def test_it_is_fed_several_times_within_its_time(told: socket.socket) -> None:
     assert FEEDS * 5 - 1 <= fed <= FEEDS * 5 + 1
 
 
-@pytest.mark.parametrize("alive", [(), ("loop",), ("gateway",)])
+@pytest.mark.parametrize("alive", [(), ("loop",), ("gateway",), ("loop", "planner")])
 def test_it_starves_unless_both_are_alive(told: socket.socket, alive: tuple[str, ...]) -> None:
     hearts, clock = Heartbeats.create(), Clock()
     watchdog = watchdog_of(hearts, clock, WATCHDOG_USEC="1000000")

@@ -48,7 +48,7 @@ def test_a_place_that_is_not_there_cannot_be_named(monkeypatch: pytest.MonkeyPat
 
 
 def test_the_service_bounds_the_following_error_before_the_drives_do_in_every_file_that_is_shipped() -> None:
-    for path in SIM.parent.glob("*.toml"):
+    for path in SIM.parent.rglob("*.toml"):
         config = load(path)
         assert config.limits.slider.following_error < config.drives.following_error, path.name
 
@@ -63,7 +63,7 @@ def leaves(value: Any, path: str = "") -> Iterator[str]:
 
 def test_every_key_of_a_file_that_is_shipped_is_in_the_reference() -> None:
     told = {f"{heading.strip('[]')}.{key}" for headings, key, _ in ROWS for heading in headings}
-    for path in SIM.parent.glob("*.toml"):
+    for path in SIM.parent.rglob("*.toml"):
         for key in leaves(msgspec.to_builtins(load(path))):
             tables = {"geometry.leg", "drives.A.homing", "drives.B.homing", "drives.C.homing"}  # None where absent
             assert key in told | tables, key

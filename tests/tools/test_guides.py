@@ -70,6 +70,22 @@ def test_every_file_that_is_named_exists(guide: Path) -> None:
         assert any((place / name).is_file() for place in places), f"{name} is not in any of {package or '.'}"
 
 
+def steps() -> Iterator[str]:
+    """Yield the numbered steps of the lists in CONTRIBUTING.md."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    yield from re.findall(r"^\d\. .*\n(?:   .*\n)*", text.partition("## To add")[2], re.MULTILINE)
+
+
+@pytest.mark.parametrize("step", steps())
+def test_what_a_step_names_is_in_one_of_its_files(step: str) -> None:
+    words = re.findall(r"`([^`\n]+)`", step)
+    paths = [place / word for word in words for place in (ROOT, ROOT / "service/trirail") if (place / word).is_file()]
+    code = "".join(path.read_text(encoding="utf-8") for path in paths)
+    for name in (word for word in words if re.fullmatch(r"_?[A-Za-z]\w*", word)):
+        if name not in {"completion"} and paths:
+            assert re.search(rf"\b{name}\b", code), f"{name} is in none of {', '.join(map(str, paths))}"
+
+
 @every_guide
 def test_every_command_can_be_typed_as_it_is_shown(guide: Path) -> None:
     for line in "".join(blocks(guide, "sh")).splitlines():

@@ -5,11 +5,18 @@ from __future__ import annotations
 import math
 
 from trirail_drivers import axis
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import frames, ways
+from trirail_drivers.cia402.units import Units
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.scaling import Scale
 
 MISSED_STATUSES = 3
+FOLLOW_TIME = MISSED_STATUSES * frames.STATUS_PERIOD
+"""How long an enabled drive may take to say that it follows setpoints [s]."""
+REGISTER_TIME = 0.5
+"""How long a drive may take to tell its error register after a reset [s]."""
+SECOND_ANSWERS = 3
+"""So many SYNCs in a row that are answered twice are answered by two nodes."""
 RESET_TIME = 2 * frames.STATUS_PERIOD
 """How long a drive may take to leave fault after a fault reset, in which it tells its state twice [s]."""
 
@@ -26,31 +33,48 @@ class Axis(axis.Axis):
     """One drive's newest feedback; the `on_` methods take a frame's data or raise struct.error."""
 
     __slots__ = (
+        "_answered_twice",
+        "_came",
+        "_followed",
         "_operational",
+        "_register_until",
         "_restarted",
+        "_unfollowed_since",
         "actual",
         "command_age",
         "controlword",
         "cyclic",
         "error_code",
         "follows",
+        "has_followed",
         "held",
         "homed",
         "left_operational",
         "mode_bits",
         "mute",
+        "poll_due",
+        "register_wanted",
         "reset_until",
         "sdo_answer",
+        "sdo_asked",
         "seen_clear",
+        "setpoint",
         "state",
         "status_heard",
         "statusword",
+        "stopped",
+        "units",
+        "way",
     )
 
     def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
         super().__init__(name, node, scale, heartbeat)
         self.actual = 0
         """Actual position [counts]."""
+        self.way = ways.usual(node)
+        self.units = Units(scale, scale.counts_per_metre, abs(scale.counts_per_metre))
+        self.setpoint: tuple[int, int] | None = None
+        """Position and velocity that were sent last, in its units."""
         self.statusword = 0
         """The newest one."""
         self.seen_clear = 0
@@ -65,9 +89,11 @@ class Axis(axis.Axis):
         self.held: int | None = None
         """The position [counts] that it gets in place of setpoints."""
         self.cyclic = True
-        """It is in cyclic synchronous position mode for sure."""
+        """It is for sure in the mode in which it follows setpoints."""
         self.follows = True
         """It follows setpoints, or soon will: those that come are to hold it."""
+        self.has_followed = False
+        """It has said that it follows setpoints, since it was to get power."""
         self.homed = True
         """Its position is counted from a known place."""
         self.sdo_answer: bytes | None = None
@@ -82,13 +108,25 @@ class Axis(axis.Axis):
         """Its last heartbeat was that of a drive that sends no PDO: its state has to be asked for."""
         self.left_operational = False
         """It said that it is operational no more, and was not started again since."""
-        self._operational = self._restarted = False
+        self.sdo_asked: bytes | None = None
+        """The index of the object that is asked about and was not answered."""
+        self.poll_due = self._register_until = -math.inf
+        """When its statusword is to be asked for again [s]."""
+        self.register_wanted = False
+        """Its error register 1001h is to be asked for."""
+        self._operational = self._restarted = self._followed = self.stopped = False
+        self._unfollowed_since: float | None = None
+        self._came = self._answered_twice = 0
 
-    def on_position(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
-        """TPDO2: the position sampled at a SYNC."""
-        (counts,) = frames.POSITION.unpack(data)
+    def on_position(self, data: bytes | bytearray, now: float) -> None:
+        """TPDO2: the position sampled at a SYNC, and the statusword where the drive's way has it here."""
+        counts, statusword = self.way.feedback.unpack(data)
+        self._came += not self._came or counts != self.actual  # the same again is one frame that came twice
         self.take_position(counts)
         self.answers.come()
+        if statusword is not None:
+            self.status_heard = now
+            self.take_status(statusword)
         self._operational = True  # CiA 301: PDOs are sent in NMT operational only
 
     def take_position(self, counts: int) -> None:
@@ -100,9 +138,14 @@ class Axis(axis.Axis):
         """An SDO server's answer; one that is not eight bytes long is none (CiA 301)."""
         if len(data) != 8:
             return
-        self.sdo_answer = bytes(data)
-        if self.sdo_answer[:4] == frames.STATUSWORD_UPLOADED:
+        if data[1:3] == self.sdo_asked:
+            self.sdo_answer, self.sdo_asked = bytes(data), None
+        if data[:4] == frames.STATUSWORD_UPLOADED:
             self.on_status(data[4:6], now)
+        elif data[:4] == frames.ERROR_REGISTER_UPLOADED and now < self._register_until:
+            self._register_until = -math.inf
+            if data[4] == 0:
+                self.error_code = 0  # CiA 301, 1001h: there is no error
 
     def on_status(self, data: bytes | bytearray, now: float) -> None:
         """TPDO1: the statusword, when it changes and from time to time."""
@@ -126,6 +169,20 @@ class Axis(axis.Axis):
             self.reset_until = -math.inf
         self.state = state
 
+    def cycle_over(self) -> None:
+        """Note that the frames of a cycle are in: a node answers a SYNC once."""
+        self._answered_twice = self._answered_twice + 1 if self._came > 1 else 0
+        self._came = 0
+        if self._answered_twice >= SECOND_ANSWERS:
+            self._answered_twice = 0
+            self.tell("frame", 0, f"two nodes answer as node {self.node}: each SYNC has two positions")
+
+    @property
+    def shown_state(self) -> PowerState:
+        """Its state; "switched on" while it has power and does not say yet that it follows setpoints."""
+        waits = self.way.tells_following and self.cyclic and not self.has_followed
+        return PowerState.SWITCHED_ON if waits and self.state is PowerState.OPERATION_ENABLED else self.state
+
     def on_emergency(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """EMCY: an error code, of which 00xxh say that errors are over (CiA 301)."""
         code, register, _ = frames.EMERGENCY.unpack(data)
@@ -136,9 +193,13 @@ class Axis(axis.Axis):
         self.tell("emcy", code, f"emergency {code:04X}, error register {register:02X}")
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
-        """Heartbeat or boot-up: the drive lives, and should be operational."""
+        """Heartbeat, answer to node guarding or boot-up: the drive lives, and should be operational."""
         (state,) = frames.NMT_STATE.unpack(data)
-        self.heard = now
+        if self.way.guarded:
+            state &= frames.NMT_STATE_BITS
+        if self.way.heard:
+            self.heard = now
+        self.stopped = state == frames.STOPPED
         if state == frames.OPERATIONAL:
             self._operational = True
         elif state == frames.BOOT_UP:
@@ -147,12 +208,20 @@ class Axis(axis.Axis):
             # Takes the place of an earlier event, for it is the one that a reset cannot help.
             self.event = self.made("state", 0, "has restarted and lost its set-up; restart the service")
         elif self._operational:  # before that, it is a heartbeat from before the drive was started
-            self._operational = False
-            self.left_operational = True
-            # Unknown until it answers, which stopped ones do not; by 6007h it stops when it leaves operational.
-            self.state = PowerState.NOT_READY_TO_SWITCH_ON
+            self.leave_operational()
             self.tell("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
         self.mute = self.left_operational and state != frames.OPERATIONAL
+
+    def leave_operational(self) -> None:
+        """It hears PDOs no more: its state is unknown until it answers, which stopped ones do not."""
+        self._operational = False
+        self.left_operational = True
+        self.state = PowerState.NOT_READY_TO_SWITCH_ON
+
+    @property
+    def may_be_deaf(self) -> bool:
+        """It may hear no PDO: what it is to do it has to be told by SDO too."""
+        return self.left_operational or self.answers.missed > 0
 
     def forgive(self, now: float) -> None:
         """Forget what happened, but not what lasts, and allow time for a fault reset."""
@@ -164,6 +233,10 @@ class Axis(axis.Axis):
             self.left_operational = False
             self.answers.forgive()
             self.status_heard = now
+        if self.error_code and self.state not in _IN_FAULT:
+            # An EMCY that was never followed by "error reset": the register tells whether it is over.
+            self.register_wanted = True
+            self._register_until = now + REGISTER_TIME
 
     def word(self, now: float, wanted: frames.Wanted) -> int:
         """The controlword that the drive is to have at time `now`, on its way to the state that is `wanted`."""
@@ -171,7 +244,12 @@ class Axis(axis.Axis):
             # Bit 7 stays up until the drive is out of fault: some look at it once in a few cycles only.
             return frames.FAULT_RESET
         word = frames.controlword(self.state, wanted)
-        return word | self.mode_bits if word == frames.ENABLE_OPERATION else word
+        if word != frames.ENABLE_OPERATION:
+            return word
+        interpolates = self.way.mode == ways.INTERPOLATED_POSITION and self.cyclic
+        if interpolates and self.state is PowerState.OPERATION_ENABLED:
+            word |= frames.INTERPOLATE
+        return word | self.mode_bits
 
     def is_not_followed(self, word: int, wanted: frames.Wanted) -> bool:
         """Whether a controlword, by what the drive says, has not taken it where it is to go."""
@@ -201,7 +279,9 @@ class Axis(axis.Axis):
                 if self.reset_until > -math.inf:
                     reason += f", still {RESET_TIME:g} s after a fault reset"
                 return self.made("fault", self.error_code, f"{self.state}{reason}")
-        elif self.error_code:  # CiA 301: in force until the drive sends "error reset", code 00xxh
+        elif (
+            self.error_code and now >= self._register_until
+        ):  # CiA 301: in force until the drive sends "error reset", code 00xxh
             return self.made("emcy", self.error_code, f"emergency {self.error_code:04X} is still in force")
         elif silent := self.silence(now):
             return silent
@@ -213,4 +293,22 @@ class Axis(axis.Axis):
             and self.state is not PowerState.OPERATION_ENABLED
         ):
             return self.made("state", 0, f"left operation enabled unasked: {self.state}")
+        else:
+            return self._not_following(now, wanted)
         return None
+
+    def _not_following(self, now: float, wanted: frames.Wanted) -> DriveFault | None:
+        """CiA 402-2, modes 7 and 8: bit 12 of the statusword says that setpoints are followed, not ignored."""
+        meant_to = wanted is self.state is PowerState.OPERATION_ENABLED and self.cyclic and self.way.tells_following
+        if not meant_to or self.statusword & frames.FOLLOWS:
+            self._followed = meant_to
+            self.has_followed = self.has_followed or meant_to
+            self._unfollowed_since = None
+            return None
+        if self._unfollowed_since is None:
+            self._unfollowed_since = now
+        if not self._followed and now - self._unfollowed_since <= FOLLOW_TIME:
+            return None
+        text = f"does not follow setpoints: bit 12 of its statusword {self.statusword:04X} is clear"
+        never = "" if self._followed else '; if it never sets that, say accept_without = ["6041"]'
+        return self.made("state", 0, text + never)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from trirail_drivers.cia402 import settings
+from trirail_drivers.cia402 import settings, units
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
@@ -17,7 +17,10 @@ def check(drives: Drives, required: Requirements) -> None:
         scale = scale_of(name, drive)
         check_resolution(name, drive, drives, required, 1.0 / drive.counts_per_metre, _finer)
         _check_counts(name, drive, scale, required)
-        settings.settings_of(name, drive, drives, scale, required.period)
+        units.check(name, drive)
+        units.Units(scale, scale.counts_per_metre, 1.0).length(name, "following_error", drives.following_error)
+    settings.heartbeat_of(drives)
+    settings.interpolation_periods(required.period)
 
 
 def _finer(widest: float) -> str:

@@ -1,4 +1,4 @@
-"""Three CiA 402 drives on CANopen in cyclic synchronous position mode, and homing: trirail_drivers.interface.Drives.
+"""Three CiA 402 drives on CANopen that follow positions, and homing: trirail_drivers.interface.Drives.
 
 The identifiers give the priorities on the bus: SYNC, emergencies, statuswords, controlwords, positions,
 setpoints, heartbeats. So the controlword of a quick stop goes before setpoints that still wait.
@@ -13,9 +13,10 @@ import time
 import can
 
 from trirail_drivers import config
-from trirail_drivers.cia402 import frames, setup
+from trirail_drivers.cia402 import frames, setup, ways
 from trirail_drivers.cia402.axis import Axis
 from trirail_drivers.cia402.homing import Homing
+from trirail_drivers.cia402.strangers import Strangers
 from trirail_drivers.driver import Clock, Driver
 from trirail_drivers.frames import Frame
 from trirail_drivers.interface import Feedback, PowerState, Triple
@@ -29,16 +30,13 @@ class Cia402(Driver[Axis]):
 
     def __init__(self, bus: can.BusABC, bitrate: int, drives: config.Drives, clock: Clock = time.monotonic) -> None:
         super().__init__(bus, bitrate, drives, clock, Axis)
+        self._strangers = Strangers(self._wire, self._axes, drives.master_node)
         for axis in self._axes:
-            self._wire.listen(frames.TPDO1 + axis.node, axis, axis.on_status)
-            self._wire.listen(frames.TPDO2 + axis.node, axis, axis.on_position)
-            self._wire.listen(frames.EMCY + axis.node, axis, axis.on_emergency)
-            self._wire.listen(frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
-            self._wire.listen(frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
+            self._listen(axis)
         self._homing = Homing(self._axes, drives, self._wire.send)
         self._sync = Frame(frames.SYNC)
         self._heartbeat = Frame(frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL))
-        self._setpoints = tuple(Frame(frames.RPDO2 + axis.node, bytes(frames.SETPOINT.size)) for axis in self._axes)
+        self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
@@ -51,11 +49,27 @@ class Cia402(Driver[Axis]):
         """
         self._set_period(period, frames.TRAFFIC)
         scales = tuple(axis.scale for axis in self._axes)
-        starts = setup.configure(self._wire.bus, self._drives, scales, period, self._clock)
-        for axis, start in zip(self._axes, starts, strict=True):
+        done = setup.configure(self._wire.bus, self._drives, scales, period, self._clock)
+        self._set_period(period, ways.traffic(made.way for made, _ in done))
+        for axis, (made, start) in zip(self._axes, done, strict=True):
+            axis.way, axis.units = made.way, made.units
+            self._listen(axis)
             axis.take_position(start.counts)
             axis.error_code = start.error_code
             axis.take_status(start.statusword)
+        self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
+        for line in setup.told(made for made, _ in done):
+            self._wire.warn(line)
+
+    def _listen(self, axis: Axis) -> None:
+        listen, way = self._wire.listen, axis.way
+        listen(way.feedback.identifier, axis, axis.on_position)
+        if way.status is not None:
+            listen(way.status, axis, axis.on_status)
+        listen(way.emergency, axis, axis.on_emergency)
+        listen(frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
+        listen(frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
+        self._strangers.listen_to(axis)
 
     def sync(self) -> None:
         """Send SYNC: the drives take up the setpoints written since the last one and sample positions.
@@ -71,10 +85,14 @@ class Cia402(Driver[Axis]):
             # The drives' watchdogs and ours begin with the first cycle, however long ago the set-up was.
             self._heartbeat_due = now
             for axis in self._axes:
-                axis.heard = axis.status_heard = now
+                axis.status_heard = now
+                axis.heard = now if axis.way.heard else math.inf
         if now >= self._heartbeat_due:
             self._heartbeat_due = now + self._drives.heartbeat
             self._wire.send(self._heartbeat)
+            for axis in self._axes:
+                if axis.way.guarded:
+                    self._wire.send(Frame(frames.HEARTBEAT + axis.node, b"\0", remote=True))
         for axis in self._axes:
             axis.answers.sync_sent()
             axis.command_age += 1
@@ -86,9 +104,7 @@ class Cia402(Driver[Axis]):
         a, b, c = self._axes
         for axis in self._axes:
             axis.answers.read_over()
-            if axis.mute:
-                axis.mute = False
-                self._wire.send(Frame(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
+            axis.cycle_over()
             fault = axis.fault(now, self._wanted) if self._wire.fault is None else None
             if fault is not None:
                 self._wire.fail(fault)
@@ -97,9 +113,11 @@ class Cia402(Driver[Axis]):
             fault = self._homing.step(now)
             if fault is not None:
                 self._wire.fail(fault)
+        for axis in self._axes:
+            self._ask(axis, now)
         return Feedback(
             (a.position, b.position, c.position),
-            (a.state, b.state, c.state),
+            (a.shown_state, b.shown_state, c.shown_state),
             self._wire.fault,
             (a.counts, b.counts, c.counts),
             self._wire.warnings(),
@@ -122,13 +140,16 @@ class Cia402(Driver[Axis]):
             self._command()  # where frames have to wait, those that stop go before setpoints
         for axis, frame, metres, rate in zip(self._axes, self._setpoints, position, velocity, strict=True):
             try:
-                if axis.held is None:
-                    frame.fill(frames.SETPOINT, axis.scale.counts(metres), axis.scale.counts_per_second(rate))
+                if axis.held is not None:
+                    setpoint = axis.held, 0
                 else:
-                    frame.fill(frames.SETPOINT, axis.held, 0)
+                    offset = axis.units.velocity(rate) if axis.way.setpoints.has_velocity else 0
+                    setpoint = axis.scale.counts(metres), offset
+                axis.way.setpoints.fill(frame, *setpoint, axis.controlword)
             except (ValueError, OverflowError, struct.error):
                 self._refuse_setpoint(axis, metres, rate)
                 return
+            axis.setpoint = setpoint
         for axis, frame in zip(self._axes, self._setpoints, strict=True):
             if not self._wire.send(frame):
                 axis.setpoints_lost += 1
@@ -146,7 +167,7 @@ class Cia402(Driver[Axis]):
         self._wanted = PowerState.OPERATION_ENABLED
         self._off_by = math.inf
         for axis in self._axes:
-            axis.powered_up = False
+            axis.powered_up = axis.has_followed = False
         self._homing.restore()
 
     def home(self) -> None:
@@ -186,28 +207,57 @@ class Cia402(Driver[Axis]):
             if axis.left_operational:  # its set-up is still there: only a restarted drive needs a new one
                 self._wire.send(frames.nmt(frames.NMT_START, axis.node))
             axis.forgive(now)
+            if axis.register_wanted:
+                axis.register_wanted = False
+                self._wire.send(Frame(frames.SDO_REQUEST + axis.node, frames.ERROR_REGISTER_UPLOAD))
         self._command()
 
     def _leave(self) -> None:
-        off = frames.CONTROLWORD.pack(frames.DISABLE_VOLTAGE)
         for axis in self._axes:
-            self._wire.send(Frame(frames.RPDO1 + axis.node, off))
-            # PDOs are heard in NMT operational only, SDOs in pre-operational too: two bytes for object 6040h.
-            self._wire.send(Frame(frames.SDO_REQUEST + axis.node, b"\x2b\x40\x60\x00" + off + b"\x00\x00"))
+            self._send_word(axis, frames.DISABLE_VOLTAGE)
+            self._send_word_by_sdo(axis, frames.DISABLE_VOLTAGE)
         for axis in self._axes:
             self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
+
+    def _ask(self, axis: Axis, now: float) -> None:
+        """Ask for what no PDO tells, without waiting: one request at a time."""
+        if axis.sdo_asked is not None:
+            return
+        if axis.mute or (axis.way.polled and now >= axis.poll_due):
+            axis.mute = False
+            axis.poll_due = now + frames.POLL_PERIOD
+            self._wire.send(Frame(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
 
     def _command(self) -> None:
         """Send the controlwords that are due: one transition per drive at a time."""
         now = self._clock()
         for axis in self._axes:
             word = axis.word(now, self._next)
-            repeat = axis.command_age >= REPEAT_AFTER and axis.is_not_followed(word, self._next)
-            if (word != axis.controlword or repeat) and self._wire.send(
-                Frame(frames.RPDO1 + axis.node, frames.CONTROLWORD.pack(word))
-            ):
+            deaf = axis.may_be_deaf and self._wanted is not PowerState.OPERATION_ENABLED
+            repeat = axis.command_age >= REPEAT_AFTER and (deaf or axis.is_not_followed(word, self._next))
+            if not (word != axis.controlword or repeat):
+                continue
+            if deaf:
+                # PDOs are heard in NMT operational only (CiA 301): what stops it goes both ways.
+                self._send_word_by_sdo(axis, word)
+            if self._send_word(axis, word):
                 axis.controlword = word
                 axis.command_age = 0
+
+    def _send_word(self, axis: Axis, word: int) -> bool:
+        """Send a controlword by PDO; where it goes with the setpoint, with the last one or with where the drive is."""
+        if axis.way.controlword is not None:
+            return self._wire.send(Frame(axis.way.controlword, frames.CONTROLWORD.pack(word)))
+        frame = axis.way.setpoints.frame()
+        axis.way.setpoints.fill(frame, *(axis.setpoint or (axis.actual, 0)), word)
+        return self._wire.send(frame)
+
+    def _send_word_by_sdo(self, axis: Axis, word: int) -> None:
+        """Send a controlword by SDO, which is heard in pre-operational too; a stopped node is first brought there."""
+        if axis.stopped:
+            self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
+        data = frames.CONTROLWORD_DOWNLOAD + frames.CONTROLWORD.pack(word) + bytes(2)
+        self._wire.send(Frame(frames.SDO_REQUEST + axis.node, data))
 
     @property
     def _next(self) -> frames.Wanted:

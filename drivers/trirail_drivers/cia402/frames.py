@@ -38,6 +38,12 @@ NMT_STATE: Final = Struct("<B")
 
 STATUSWORD_UPLOAD: Final = b"\x40\x41\x60\x00" + bytes(4)
 """SDO request for the statusword 6041h."""
+ERROR_REGISTER_UPLOAD: Final = b"\x40\x01\x10\x00" + bytes(4)
+"""SDO request for the error register 1001h."""
+ERROR_REGISTER_UPLOADED: Final = b"\x4f\x01\x10\x00"
+"""How its answer begins; the byte of the register follows."""
+CONTROLWORD_DOWNLOAD: Final = b"\x2b\x40\x60\x00"
+"""How an SDO begins that writes the controlword 6040h; its two bytes and two empty ones follow."""
 STATUSWORD_UPLOADED: Final = b"\x4b\x41\x60\x00"
 """How its answer begins; the two bytes of the statusword follow."""
 
@@ -48,6 +54,8 @@ BOOT_UP: Final = 0x00
 STOPPED: Final = 0x04
 OPERATIONAL: Final = 0x05
 PRE_OPERATIONAL: Final = 0x7F
+NMT_STATE_BITS: Final = 0x7F
+"""Of an answer to node guarding; bit 7 toggles."""
 
 DISABLE_VOLTAGE: Final = 0x00
 QUICK_STOP: Final = 0x02
@@ -62,6 +70,13 @@ HALT: Final = 0x100
 
 STATUS_PERIOD: Final = 0.1
 """A drive repeats an unchanged statusword this often: event timer 1800h:05 [s]."""
+
+POLL_PERIOD: Final = 0.02
+"""A statusword that no PDO repeats is asked for this often [s]."""
+INTERPOLATE: Final = 0x10
+"""Bit 4 in interpolated position mode, beside ENABLE_OPERATION."""
+FOLLOWS: Final = 1 << 12
+"""Statusword bit of a drive that follows setpoints: modes 8 and 7."""
 
 # CiA 402-2, statusword coding: mask 4Fh (bit 5 is free) for the first four states, 6Fh for the others.
 _STATES: Final = {

@@ -1,6 +1,6 @@
 """Homing of CiA 402 drives, from within the cycle: homing mode (CiA 402-2, mode 6).
 
-One drive after the other, while the others hold their positions in cyclic synchronous position mode. The three
+One drive after the other, while the others hold their positions in the mode that they follow setpoints in. The three
 sliders together place the platform, so each of them moves it, and before homing nobody knows where it is. With one
 slider moving, slowly, the platform follows it alone, on a path that a person can foresee and watch; a wrong
 direction or a missing switch moves one slider; and the two that hold report a following error when the platform is
@@ -22,7 +22,6 @@ from trirail_drivers.frames import Frame
 from trirail_drivers.interface import DriveFault
 
 HOMING = 6
-CYCLIC_SYNCHRONOUS_POSITION = 8
 _MODE, _MODE_DISPLAY, _STATUSWORD = 0x6060, 0x6061, 0x6041
 
 FRESH: Final = 4
@@ -159,7 +158,7 @@ class Homing:
         )
 
     def _follow_setpoints(self, axis: Axis) -> Steps:
-        """Back to cyclic synchronous position mode, when the drive's setpoint is where it stands."""
+        """Back to the mode of setpoints, when the drive's setpoint is where it stands."""
         answered = axis.answers.sampled + FRESH
         yield from self._until(lambda: axis.answers.sampled >= answered, self._sdo_timeout, "there was no new position")
         standing = axis.actual
@@ -169,7 +168,7 @@ class Homing:
         axis.follows = True
         taken_up = axis.answers.syncs + TAKEN_UP
         yield from self._until(lambda: axis.answers.syncs >= taken_up, self._sdo_timeout, "there was no SYNC")
-        yield from self._change_mode(axis, CYCLIC_SYNCHRONOUS_POSITION)
+        yield from self._change_mode(axis, axis.way.mode)
         axis.cyclic = True
         axis.held = None
 
@@ -182,12 +181,12 @@ class Homing:
 
     def _ask(self, axis: Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
         """One SDO, without waiting: the cycle goes on, and a later one has the answer."""
-        axis.sdo_answer = None
+        axis.sdo_answer, axis.sdo_asked = None, index.to_bytes(2, "little")
         self._send(Frame(frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value]))))
-        about = index.to_bytes(2, "little")
         deadline = self._now + self._sdo_timeout
-        while (answer := axis.sdo_answer) is None or answer[1:3] != about:
+        while (answer := axis.sdo_answer) is None:
             if self._now >= deadline:
+                axis.sdo_asked = None
                 raise HomingFailedError(f"no answer about object {index:04X}:00 within {self._sdo_timeout:g} s")
             yield
         if answer[0] == _ABORTED:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Final
 
 import can
 import canopen
-from canopen.objectdictionary import ObjectDictionary, ODVariable
+from canopen.objectdictionary import INTEGER_TYPES, ObjectDictionary
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from trirail_drivers.cia402 import frames
-from trirail_drivers.cia402.settings import INVALID, NO_REMOTE_REQUEST
+from trirail_drivers.cia402.objects import Key, signed, use, width
 from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 
 # What canopen would say of a failed transfer is in the DriveError; standard error is for that one line.
@@ -21,8 +22,13 @@ logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 Clock = Callable[[], float]
 
-NO_SUCH_OBJECT = (0x0602_0000, 0x0609_0011)
+NO_SUCH_OBJECT: Final = (0x0602_0000, 0x0609_0011)
 """SDO abort codes: object does not exist, subindex does not exist (CiA 301)."""
+INVALID: Final = 1 << 31
+"""Bit of a PDO's COB-ID: the PDO is not used."""
+NO_REMOTE_REQUEST: Final = 1 << 30
+"""Bit of a TPDO's COB-ID; some drives report it always, some never."""
+_BIT_FIELDS: Final = (0x1005, 0x1014, 0x60A8, 0x60A9, 0x60AA, 0x6502)
 
 
 class Client(SdoClient):
@@ -48,66 +54,121 @@ class Client(SdoClient):
         return response
 
 
+class SdoRefused(DriveError):
+    """A drive refused a request about an object."""
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.code = code
+
+
 class Remote:
-    """A drive's object dictionary over SDO; every failure is told as this drive's and this object's."""
+    """A drive's object dictionary over SDO; every failure is told as this drive's and this object's.
+
+    What was read is kept until it is written: nobody else sets the drive up meanwhile.
+    """
 
     def __init__(self, name: str, client: Client) -> None:
         self.name = name
         self.client = client
+        self._read: dict[Key, bytes | None] = {}
+        self._missing: set[Key] = set()
+
+    def look(self, index: int, subindex: int = 0) -> int | None:
+        """Value of an object; None where the drive has none to tell: it lacks the object, or cannot read it."""
+        key = index, subindex
+        if key not in self._read and key not in self._missing:
+            try:
+                with self._told("read", key):
+                    self._read[key] = bytes(self.client.upload(index, subindex))
+            except SdoRefused as refusal:
+                if refusal.code in NO_SUCH_OBJECT:
+                    self._missing.add(key)
+                else:
+                    self._read[key] = None
+        data = self._read.get(key)
+        return None if data is None else int.from_bytes(data, "little", signed=signed(key))
+
+    def has(self, index: int, subindex: int = 0) -> bool:
+        """Whether the drive has an object."""
+        self.look(index, subindex)
+        return (index, subindex) not in self._missing
 
     def read(self, index: int, subindex: int = 0) -> int:
-        """Value of an object."""
-        variable = self._variable(index, subindex)
-        with self._told("read", index, subindex, variable.qualname):
-            return int(variable.decode_raw(self.client.upload(index, subindex)))
+        """Value of an object, as it is now; SdoRefused where the drive has none to tell."""
+        key = index, subindex
+        with self._told("read", key):
+            data = bytes(self.client.upload(index, subindex))
+        self._read[key] = data
+        return int.from_bytes(data, "little", signed=signed(key))
 
     def write(self, index: int, subindex: int, value: int) -> None:
-        """Give an object a value."""
-        variable = self._variable(index, subindex)
-        with self._told(f"write {value} to", index, subindex, variable.qualname):
-            self.client.download(index, subindex, variable.encode_raw(value))
+        """Give an object a value; SdoRefused where the drive does not take it."""
+        key = index, subindex
+        known = self._read.get(key)
+        self._read.pop(key, None)
+        size = len(known) if known else self._size(key)
+        with self._told(f"write {shown(index, subindex, value)} to", key):
+            data = (value & (1 << 8 * size) - 1).to_bytes(size, "little")
+            self.client.download(index, subindex, data)
 
     def check(self, index: int, subindex: int, wanted: int) -> None:
         """Read an object back; ConfigurationRefused if its value is not the wanted one."""
         found = self.read(index, subindex)
-        # Bit 30 of a PDO's COB-ID tells whether remote requests are answered: unused here, so either will do.
-        ignored = NO_REMOTE_REQUEST if index & 0xFA00 in (0x1400, 0x1800) and subindex == 1 else 0
-        if found | ignored != wanted | ignored:
-            name = self._variable(index, subindex).qualname
-            # PDO parameters are bit fields, and read as the standard writes them.
-            form = "{:08X}h" if 0x1400 <= index < 0x1C00 else "{}"
-            raise ConfigurationRefused(self.name, name, index, subindex, form.format(wanted), form.format(found))
+        if not same(index, subindex, found, wanted):
+            raise ConfigurationRefused(
+                self.name,
+                self.name_of((index, subindex)),
+                index,
+                subindex,
+                shown(index, subindex, wanted),
+                shown(index, subindex, found),
+            )
 
-    def invalidate(self, index: int) -> None:
-        """Switch off the PDO whose communication parameters are at `index`, if the drive has it at all."""
-        with self._told("switch off the PDO of", index, 1, "COB-ID used by PDO"):
-            try:
-                identifier = int.from_bytes(self.client.upload(index, 1), "little")
-            except SdoAbortedError as error:
-                if error.code in NO_SUCH_OBJECT:
-                    return
-                raise
-            if not identifier & INVALID:
-                self.client.download(index, 1, (identifier | INVALID).to_bytes(4, "little"))
+    def _size(self, key: Key) -> int:
+        """Bytes of an object that could not be read: by the drive's EDS, else by the standards."""
+        variable = self.client.od.get_variable(*key)
+        return len(variable) // 8 if variable is not None and variable.data_type in INTEGER_TYPES else width(key)
 
-    def _variable(self, index: int, subindex: int) -> ODVariable:
-        variable = self.client.od.get_variable(index, subindex)
-        if variable is None:
-            raise DriveError(f"drive {self.name}: object {index:04X}:{subindex:02X} is not in its EDS")
-        return variable
+    def name_of(self, key: Key) -> str:
+        """What people call an object."""
+        variable = self.client.od.get_variable(*key)
+        if variable is not None:
+            return str(variable.qualname)
+        found = use(key)
+        return found[1].name if found else "not in its EDS"
 
     @contextmanager
-    def _told(self, attempt: str, index: int, subindex: int, name: str) -> Iterator[None]:
+    def _told(self, attempt: str, key: Key) -> Iterator[None]:
         """Turn what canopen and the bus raise into the one tree of errors."""
-        called = f"object {index:04X}:{subindex:02X} ({name})"
+        called = f"object {key[0]:04X}:{key[1]:02X} ({self.name_of(key)})"
         try:
             yield
         except SdoAbortedError as error:
             reason = error.CODES.get(error.code, "for a reason of its own")
-            raise DriveError(
-                f"drive {self.name}: cannot {attempt} {called}: {reason} (SDO abort {error.code:08X})"
+            raise SdoRefused(
+                f"drive {self.name}: cannot {attempt} {called}: {reason} (SDO abort {error.code:08X})", error.code
             ) from error
         except SdoCommunicationError as error:
             raise DriveTimeout(self.name, f"answer about {called}", self.client.timeout) from error
         except (can.CanError, OSError) as error:
             raise BusError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
+
+
+def is_pdo(index: int) -> bool:
+    """Whether an object is a PDO's parameter or mapping."""
+    return 0x1400 <= index < 0x1C00
+
+
+def shown(index: int, subindex: int, value: int) -> str:  # noqa: ARG001
+    """A value as people read it: bit fields as the standards write them."""
+    if is_pdo(index) or index in _BIT_FIELDS:
+        return f"{value & 0xFFFF_FFFF:08X}h"
+    return str(value)
+
+
+def same(index: int, subindex: int, one: int, other: int) -> bool:
+    """Whether two values are the same to this service."""
+    # Bit 30 of a PDO's COB-ID tells whether remote requests are answered: unused here, so either will do.
+    ignored = NO_REMOTE_REQUEST if is_pdo(index) and not index & 0x200 and subindex == 1 else 0
+    return one | ignored == other | ignored

@@ -1,31 +1,31 @@
-"""What a CiA 402 drive is told before the cycle runs: objects and values, in order."""
+"""What a CiA 402 drive is to hold before the cycle runs: objects, values, and what will do as well."""
 
 from __future__ import annotations
 
 import math
 from typing import Final
 
-from trirail_drivers.cia402 import frames
-from trirail_drivers.cia402.homing import CYCLIC_SYNCHRONOUS_POSITION
-from trirail_drivers.config import Drive, Drives, Homing
+from trirail_drivers.cia402.differences import Differences
+from trirail_drivers.cia402.objects import title
+from trirail_drivers.cia402.sdo import SdoRefused
+from trirail_drivers.cia402.units import Units
+from trirail_drivers.config import Drives, Homing
 from trirail_drivers.errors import DriveError
-from trirail_drivers.scaling import Scale, unsigned
 
-INVALID: Final = 1 << 31
-"""Bit of a PDO's COB-ID: the PDO is not used."""
-NO_REMOTE_REQUEST: Final = 1 << 30
-"""Bit of a TPDO's COB-ID; some drives report it always, some never."""
-
-Setting = tuple[int, int, int]
-"""Index, subindex and value of an object."""
+PREFERRED_EXPONENT: Final = -3
+"""Of 60C2h: milliseconds, which every drive takes; some take nothing else."""
 
 
-def interpolation_period(period: float) -> tuple[int, int]:
-    """Value and power of ten [s] for object 60C2h; DriveError if none from 1 to 255 says `period` exactly."""
-    for exponent in range(0, -7, -1):
-        value = round(period * 10**-exponent)
-        if 1 <= value <= 255 and math.isclose(value * 10.0**exponent, period, rel_tol=1e-9):
-            return value, exponent
+def interpolation_periods(period: float) -> list[tuple[int, int]]:
+    """Values and powers of ten [s] for object 60C2h that say `period`, milliseconds first; DriveError if none does."""
+    found = [
+        (round(period * 10**-exponent), exponent)
+        for exponent in range(0, -7, -1)
+        if math.isclose(round(period * 10**-exponent) * 10.0**exponent, period, rel_tol=1e-9)
+        and 1 <= round(period * 10**-exponent) <= 255
+    ]
+    if found:
+        return sorted(found, key=lambda each: (each[1] != PREFERRED_EXPONENT, -each[1]))
     finest = max(-6, math.ceil(math.log10(period / 255)))
     nearest = max(1, round(period * 10**-finest)) * 10.0**finest
     raise DriveError(
@@ -43,66 +43,79 @@ def check_nodes(drives: Drives) -> None:
         raise DriveError("node id 0 is all nodes' on CANopen; wanted 1 to 127")
 
 
-def settings_of(name: str, drive: Drive, drives: Drives, scale: Scale, period: float) -> list[Setting]:
-    """Everything a drive must be told, in order."""
+def heartbeat_of(drives: Drives) -> int:
+    """The heartbeats' period [ms]; DriveError where a drive cannot take it."""
     heartbeat = round(1000 * drives.heartbeat)
     if not 1 <= 3 * heartbeat <= 0xFFFF or heartbeat < 1:
         raise DriveError(f"heartbeat {drives.heartbeat:g} s: a drive takes 0.001 to 21.845 s")
-    value, exponent = interpolation_period(period)
-    window = unsigned(name, scale, "following_error", drives.following_error)
-    deceleration = unsigned(name, scale, "quick_stop_deceleration", drives.quick_stop_deceleration)
-    return [
-        (0x1006, 0, round(1e6 * period)),
-        (0x1017, 0, heartbeat),
-        (0x1016, 1, drives.master_node << 16 | 3 * heartbeat),
-        (0x1029, 1, 0),  # a drive that lost its master turns pre-operational: deaf to setpoints
-        (0x6007, 0, 3),  # ... and quick-stops
-        (0x605A, 0, 2),  # quick stop: down the ramp 6085h, then without power
-        (0x605E, 0, 2),  # its own fault: down the same ramp
-        (0x6085, 0, deceleration),
-        (0x6065, 0, window),
-        (0x6060, 0, CYCLIC_SYNCHRONOUS_POSITION),
-        (0x60C2, 1, value),
-        (0x60C2, 2, exponent),
-        *(_homing(name, drive.homing, scale) if drive.homing is not None else ()),
-        *_pdo(0x1400, frames.RPDO1 + drive.node, ((0x1400, 2, 255),), (0x6040_00_10,)),
-        *_pdo(0x1401, frames.RPDO2 + drive.node, ((0x1401, 2, 1),), (0x607A_00_20, 0x60B1_00_20)),
-        *_pdo(
-            0x1800,
-            frames.TPDO1 + drive.node | NO_REMOTE_REQUEST,
-            ((0x1800, 2, 255), (0x1800, 5, round(1000 * frames.STATUS_PERIOD))),
-            (0x6041_00_10,),
-        ),
-        *_pdo(
-            0x1801,
-            frames.TPDO2 + drive.node | NO_REMOTE_REQUEST,
-            ((0x1801, 2, 1),),
-            (0x6064_00_20,),
-        ),
-    ]
+    return heartbeat
 
 
-def _homing(name: str, homing: Homing, scale: Scale) -> list[Setting]:
-    def speed(key: str, value: float) -> int:
-        return unsigned(name, scale, f"homing.{key}", value)
+def give_cycle(drive: Differences, period: float) -> None:
+    """Tell the drive the cycle's period [s]: 1005h, 1006h, 60C2h."""
+    sync = drive.remote.look(0x1005)
+    if sync is not None and sync & 0x4000_07FF != 0x80:  # bit 30: it would make SYNC itself
+        drive.give(0x1005, 0, 0x80)
+        if drive.apply and (drive.remote.look(0x1005) or 0) & 0x4000_07FF != 0x80:
+            raise DriveError(
+                f"drive {drive.remote.name}: {title((0x1005, 0))} is {sync:08X}h and stays; wanted SYNC 080h"
+            )
+    drive.give(0x1006, 0, round(1e6 * period))
+    _give_interpolation(drive, interpolation_periods(period))
 
-    return [
-        (0x6098, 0, homing.method),
-        (0x6099, 1, speed("speed_switch", homing.speed_switch)),
-        (0x6099, 2, speed("speed_zero", homing.speed_zero)),
-        (0x609A, 0, speed("acceleration", homing.acceleration)),
-        (0x607C, 0, 0),  # makers differ in its sign; where home is, the drive's `offset` says
-    ]
+
+def _give_interpolation(drive: Differences, periods: list[tuple[int, int]]) -> None:
+    remote = drive.remote
+    if not (remote.has(0x60C2, 1) and remote.has(0x60C2, 2)):
+        drive.lack((0x60C2, 1), "it has no such object")
+        return
+    held = remote.look(0x60C2, 1), remote.look(0x60C2, 2)
+    if held in periods:
+        return
+    refusal: SdoRefused | None = None
+    for value, exponent in periods:
+        try:
+            if remote.look(0x60C2, 2) != exponent:
+                _write(drive, (0x60C2, 2), exponent)
+            if remote.look(0x60C2, 1) != value:
+                _write(drive, (0x60C2, 1), value)
+        except SdoRefused as error:
+            refusal = error
+            continue
+        return
+    if refusal is not None:
+        raise refusal
 
 
-def _pdo(index: int, identifier: int, parameters: tuple[Setting, ...], objects: tuple[int, ...]) -> list[Setting]:
-    """The order CiA 301 wants for a mapping: invalid, cleared, mapped, counted, valid again."""
-    mapping = index + 0x200
-    return [
-        (index, 1, identifier | INVALID),
-        *parameters,
-        (mapping, 0, 0),
-        *((mapping, position, entry) for position, entry in enumerate(objects, start=1)),
-        (mapping, 0, len(objects)),
-        (index, 1, identifier),
-    ]
+def _write(drive: Differences, key: tuple[int, int], value: int) -> None:
+    drive.note(key, drive.remote.look(*key), value)
+    if drive.apply:
+        drive.remote.write(*key, value)
+        drive.confirm(key, value)
+
+
+def give_reactions(drive: Differences, drives: Drives, units: Units) -> None:
+    """Tell the drive what it does when something is wrong: 6007h, 605Ah, 605Eh, 6065h, 6085h."""
+    name, has = drive.remote.name, drive.remote.has
+    drive.give(0x6007, 0, 3, also=(2, 1))  # a drive that lost its master quick-stops; power off or a fault will do
+    drive.give(0x605A, 0, 2)  # quick stop: down the ramp 6085h, then without power
+    drive.give(0x605E, 0, 2, also=(1, 0))  # its own fault: down the same ramp; another, or none, is a stop as well
+    if has(0x6085):
+        ramp = units.acceleration(name, "quick_stop_deceleration", drives.quick_stop_deceleration)
+        drive.give(0x6085, 0, ramp)
+    else:
+        drive.lack((0x6085, 0), "it has no such object")
+    drive.give(0x6065, 0, units.length(name, "following_error", drives.following_error))
+
+
+def give_homing(drive: Differences, homing: Homing, units: Units) -> None:
+    """Tell the drive how it finds its home: 6098h, 6099h, 609Ah, 607Ch."""
+    name = drive.remote.name
+    drive.give(0x6098, 0, homing.method)
+    drive.give(0x6099, 1, units.speed(name, "homing.speed_switch", homing.speed_switch))
+    drive.give(0x6099, 2, units.speed(name, "homing.speed_zero", homing.speed_zero))
+    if drive.remote.has(0x609A):
+        drive.give(0x609A, 0, units.acceleration(name, "homing.acceleration", homing.acceleration))
+    else:
+        drive.lack((0x609A, 0), "it has no such object")
+    drive.give(0x607C, 0, 0)  # makers differ in its sign; where home is, the drive's `offset` says

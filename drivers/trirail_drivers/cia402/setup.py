@@ -1,17 +1,31 @@
-"""Sets CiA 402 drives up over SDO, and reads every value back, before the cycle runs."""
+"""Sets CiA 402 drives up over SDO before the cycle runs: reads first, writes the differences, reads them back."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import can
 
 from trirail_drivers.cia402 import eds, frames
-from trirail_drivers.cia402.homing import CYCLIC_SYNCHRONOUS_POSITION, HOMING
-from trirail_drivers.cia402.sdo import Client, Clock, Remote
-from trirail_drivers.cia402.settings import Setting, check_nodes, settings_of
-from trirail_drivers.config import Drives
+from trirail_drivers.cia402.differences import Difference, Differences
+from trirail_drivers.cia402.drive_units import read_units
+from trirail_drivers.cia402.guarding import give_watchdogs
+from trirail_drivers.cia402.modes import choose_mode, give_mode
+from trirail_drivers.cia402.pdos import Pdos
+from trirail_drivers.cia402.sdo import Client, Clock, Remote, SdoRefused
+from trirail_drivers.cia402.settings import (
+    check_nodes,
+    give_cycle,
+    give_homing,
+    give_reactions,
+    heartbeat_of,
+    interpolation_periods,
+)
+from trirail_drivers.cia402.units import Units
+from trirail_drivers.cia402.ways import Way
+from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.frames import Frame
 from trirail_drivers.interface import NAMES, PowerState
@@ -20,8 +34,35 @@ from trirail_drivers.scaling import Scale
 HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 """States in which a drive may have current in its motor."""
 
-_USED = ((0x1000, 0), (0x603F, 0), (0x6040, 0), (0x6041, 0), (0x6061, 0), (0x6064, 0), (0x607A, 0), (0x60B1, 0))
-"""Objects that are read or mapped, beside those that are set."""
+
+class Identity(NamedTuple):
+    """Who a drive says it is."""
+
+    device_type: int
+    """1000h."""
+    vendor: int | None
+    product: int | None
+    revision: int | None
+    serial: int | None
+    """1018h."""
+    modes: int | None
+    """6502h."""
+
+
+class SetUp(NamedTuple):
+    """What is known of a drive once it was looked at, or set up."""
+
+    name: str
+    node: int
+    identity: Identity
+    way: Way
+    units: Units
+    differences: tuple[Difference, ...]
+    """What was written, or would be."""
+    notes: tuple[str, ...]
+    """What is done otherwise than usual, and the protections that it lacks: lines for people."""
+    lacking: tuple[str, ...]
+    """Protections that it lacks, as `accept_without` names them."""
 
 
 class Start(NamedTuple):
@@ -37,33 +78,115 @@ class Start(NamedTuple):
 
 def configure(
     bus: can.BusABC, drives: Drives, scales: tuple[Scale, ...], period: float, clock: Clock
-) -> tuple[Start, ...]:
+) -> tuple[tuple[SetUp, Start], ...]:
     """Set the three drives up for a cycle of `period` seconds; without power, and NMT operational at the end.
 
     Raises DriveError; of its kinds, ConfigurationRefused for a value that reads back differently and
     DriveTimeout for a drive that does not answer.
     """
     check_nodes(drives)
-    settings = [
-        settings_of(name, drive, drives, scale, period)
-        for name, drive, scale in zip(NAMES, drives.each, scales, strict=True)
-    ]
-    remotes = []
-    for name, drive, wanted in zip(NAMES, drives.each, settings, strict=True):
-        needed = (*_USED, *(setting[:2] for setting in wanted), *([(0x6502, 0)] if drive.homing else []))
-        objects = eds.load(name, Path(drive.eds) if drive.eds else eds.SERVO, drive.node, needed)
-        remotes.append(Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock)))
+    heartbeat_of(drives)
+    interpolation_periods(period)
+    remotes = _remotes(bus, drives, clock)
     for drive in drives.each:
         _send(bus, frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node))
-    for remote, drive in zip(remotes, drives.each, strict=True):
-        _check_is_idle_servo(remote)
-        if drive.homing is not None:
-            _check_homes(remote)
-    for remote, wanted in zip(remotes, settings, strict=True):
-        _apply(remote, wanted)
+    for remote in remotes:
+        _check_is_servo(remote)
+        _take_power_off(remote)
+    for remote, drive, scale in zip(remotes, drives.each, scales, strict=True):
+        # Everything is refused that can be, of every drive, before the first value is written.
+        _bring(remote, drive, drives, scale, period, apply=False)[1].check_accepted(drive.accept_without)
+    done = []
+    for remote, drive, scale in zip(remotes, drives.each, scales, strict=True):
+        made, differences = _bring(remote, drive, drives, scale, period, apply=True)
+        differences.check_accepted(drive.accept_without)
+        done.append(made._replace(notes=tuple(differences.notes), lacking=tuple(differences.lacking)))
+    _check_identifiers(done)
     for drive in drives.each:
         _send(bus, frames.nmt(frames.NMT_START, drive.node))
-    return tuple(_start(remote) for remote in remotes)
+    return tuple((made, _start(remote)) for made, remote in zip(done, remotes, strict=True))
+
+
+def look(bus: can.BusABC, name: str, drives: Drives, scale: Scale, period: float, clock: Clock) -> SetUp:
+    """Read what the drive called `name` is and what its set-up would change; nothing is written, no state changes."""
+    at = NAMES.index(name)
+    remote, drive = _remotes(bus, drives, clock)[at], drives.each[at]
+    _check_is_servo(remote)
+    return _bring(remote, drive, drives, scale, period, apply=False)[0]
+
+
+def _check_identifiers(done: Sequence[SetUp]) -> None:
+    """No two drives may hear or send frames of one identifier, as fixed ones of drives with one default would."""
+    owners: dict[int, str] = {}
+    for made in done:
+        way = made.way
+        for identifier in (way.setpoints.identifier, way.controlword, way.feedback.identifier, way.status):
+            if identifier is None:
+                continue
+            if identifier in owners:
+                raise DriveError(
+                    f"drives {owners[identifier]} and {made.name}: both have a PDO with identifier {identifier:03X}h "
+                    f"that cannot be changed (1400:01, 1800:01 and on); give each its own with its maker's tool"
+                )
+            owners[identifier] = made.name
+
+
+def told(made: Iterable[SetUp]) -> list[str]:
+    """What people should know of drives, a line each: what is so of several is said once."""
+    names: dict[str, list[str]] = {}
+    for each in made:
+        for note in each.notes:
+            names.setdefault(note, []).append(each.name)
+    return [f"drive{'s' * (len(of) > 1)} {', '.join(of)}: {note}" for note, of in names.items()]
+
+
+def _remotes(bus: can.BusABC, drives: Drives, clock: Clock) -> list[Remote]:
+    remotes = []
+    for name, drive in zip(NAMES, drives.each, strict=True):
+        objects = eds.load(name, Path(drive.eds) if drive.eds else eds.SERVO, drive.node)
+        remotes.append(Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock)))
+    return remotes
+
+
+def _bring(
+    remote: Remote, drive: Drive, drives: Drives, scale: Scale, period: float, *, apply: bool
+) -> tuple[SetUp, Differences]:
+    """Bring one drive to what the cycle needs, or only look what that would change."""
+    differences = Differences(remote, apply=apply)
+    mode = choose_mode(remote, homes=drive.homing is not None)
+    units = read_units(differences, drive, scale)
+    give_cycle(differences, period)
+    watched = give_watchdogs(differences, drives, heartbeat_of(drives), drive.node)
+    give_reactions(differences, drives, units)
+    give_mode(differences, mode)
+    if drive.homing is not None:
+        give_homing(differences, drive.homing, units)
+    pdos = Pdos(differences, drive.node)
+    setpoints, controlword = pdos.setpoints(mode)
+    if apply and setpoints.has_velocity:  # a drive may refuse to map it, and then its unit does not matter
+        units.check_velocity(remote.name)
+    feedback, status, polled = pdos.feedback()
+    pdos.switch_off_others()
+    for key in ((0x603F, 0), (0x1001, 0)):
+        if not remote.has(*key):
+            differences.lack(key, "it has no such object")
+    way = Way(
+        mode,
+        setpoints,
+        controlword,
+        feedback,
+        status,
+        polled,
+        watched.guarded,
+        watched.heard,
+        watched.emergency,
+        "6041" not in drive.accept_without,
+    )
+    vendor, product, revision, serial = (remote.look(0x1018, subindex) for subindex in range(1, 5))
+    identity = Identity(remote.look(0x1000) or 0, vendor, product, revision, serial, remote.look(0x6502))
+    found, notes = tuple(differences.found), tuple(differences.notes)
+    made = SetUp(remote.name, drive.node, identity, way, units, found, notes, tuple(differences.lacking))
+    return made, differences
 
 
 def _send(bus: can.BusABC, frame: Frame) -> None:
@@ -73,42 +196,30 @@ def _send(bus: can.BusABC, frame: Frame) -> None:
         raise BusError(f"cannot send on {bus.channel_info}: {error}; is the interface up?") from error
 
 
-def _check_is_idle_servo(remote: Remote) -> None:
-    """The node is there, is a CiA 402 drive, and has no power on its motor."""
+def _check_is_servo(remote: Remote) -> None:
+    """The node is there, and is a CiA 402 drive."""
     device_type = remote.read(0x1000)
     if device_type & 0xFFFF != 402:
         raise DriveError(
             f"drive {remote.name}: object 1000:00 (device type) is {device_type:08X}, of CiA profile "
             f"{device_type & 0xFFFF}; wanted a drive, profile 402"
         )
+
+
+def _take_power_off(remote: Remote) -> None:
     remote.write(0x6040, 0, frames.DISABLE_VOLTAGE)
     statusword = remote.read(0x6041)
     if frames.power_state(statusword) in HAS_POWER:
         raise DriveError(f"drive {remote.name}: keeps its power on when told off (statusword {statusword:04X})")
 
 
-def _check_homes(remote: Remote) -> None:
-    """CiA 402-2, 6502h: bit n - 1 stands for mode n."""
-    modes = remote.read(0x6502)
-    if not modes >> (HOMING - 1) & 1:
-        raise DriveError(
-            f"drive {remote.name}: object 6502:00 (supported drive modes) is {modes:08X}, without homing mode; "
-            f"leave [drives.{remote.name}.homing] out if its encoder is absolute"
-        )
-
-
-def _apply(remote: Remote, settings: list[Setting]) -> None:
-    """Write the settings in order, then read back what each object was given last."""
-    for index in (0x1402, 0x1403, 0x1802, 0x1803):  # other PDOs would take a share of the bus nobody counted
-        remote.invalidate(index)
-    for setting in settings:
-        remote.write(*setting)
-    for (index, subindex), value in {setting[:2]: setting[2] for setting in settings}.items():
-        remote.check(index, subindex, value)
-    remote.check(0x6061, 0, CYCLIC_SYNCHRONOUS_POSITION)
-
-
 def _start(remote: Remote) -> Start:
     statusword = remote.read(0x6041)
     in_fault = frames.power_state(statusword) in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
-    return Start(remote.read(0x6064), statusword, remote.read(0x603F) if in_fault else 0)
+    error_code = 0
+    if in_fault and remote.has(0x603F):
+        try:
+            error_code = remote.read(0x603F)
+        except SdoRefused:
+            error_code = 0
+    return Start(remote.read(0x6064), statusword, error_code)

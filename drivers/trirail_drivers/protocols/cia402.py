@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from trirail_drivers import config
-from trirail_drivers.cia402 import checks, frames
+from trirail_drivers.cia402 import checks, frames, units
 from trirail_drivers.cia402.drives import Cia402
+from trirail_drivers.cia402.inspection import inspect
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import EDS, Frames, Machine, Servo, SimulatedDevice, SimulatedDrive
 
@@ -22,8 +24,23 @@ def _simulated_drive(
     switch = None if drive.homing is None else -counts
     servo = Servo.configured(simulated, drive, counts if switch is None else 0)
     eds = Path(drive.eds) if drive.eds is not None else EDS
-    machine = Machine(counts_per_metre=drive.counts_per_metre)
-    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, machine)
+    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, machine_of(drive))
+
+
+def machine_of(drive: config.Drive) -> Machine:
+    """The axis as it is configured: what of the drive's units its dictionary does not tell."""
+    counts, revolutions = drive.counts_per_metre, drive.revolutions_per_metre
+
+    def fixed(key: str, text: str | None, power: int) -> float:
+        per_metre = units.written(key, text, power).per_metre(counts, revolutions) if text is not None else None
+        return counts / per_metre if per_metre is not None else 1.0
+
+    return Machine(
+        counts_per_metre=counts,
+        counts_per_revolution=math.nan if revolutions is None else counts / revolutions,
+        velocity=fixed("velocity_unit", drive.velocity_unit, 1),
+        acceleration=fixed("acceleration_unit", drive.acceleration_unit, 2),
+    )
 
 
 CIA402 = Protocol(
@@ -32,6 +49,7 @@ CIA402 = Protocol(
     check=checks.check,
     traffic=frames.TRAFFIC,
     simulated_drive=_simulated_drive,
+    inspect=inspect,
     fault_frames={
         "nmt": Frames(True, frames.NMT),
         "sync": Frames(True, frames.SYNC),

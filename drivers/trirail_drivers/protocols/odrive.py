@@ -37,6 +37,7 @@ ODRIVE = Protocol(
     check=checks.check,
     traffic=frames.TRAFFIC,
     simulated_drive=_simulated_drive,
+    inspect=None,
     fault_frames={  # named as in the manual
         "set_axis_state": Frames(True, frames.SET_AXIS_STATE, _NODE),
         "set_controller_mode": Frames(True, frames.SET_CONTROLLER_MODE, _NODE),

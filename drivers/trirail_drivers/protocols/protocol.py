@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import can
 
@@ -30,5 +31,8 @@ class Protocol:
     """What drives and service put on the bus."""
     simulated_drive: Callable[[config.Simulated, config.Drives, config.Drive, float], SimulatedDevice]
     """Makes one simulated drive, its slider at rest at a position [m]."""
+    inspect: Callable[..., list[dict[str, Any]]] | None
+    """Tells what each drive is and what its set-up would change, from the bus, section [drives], the period [s] and
+    the clock, and whether to `apply` that; None where drives have nothing to tell."""
     fault_frames: Mapping[str, Frames]
     """The frames that faults on demand can name."""

@@ -10,7 +10,15 @@ import msgspec
 from cyclopts import App, CycloptsError
 
 from trirail import __version__
-from trirail.cli import config_commands, math_commands, recording_commands, robot_commands, terminal, workspace_command
+from trirail.cli import (
+    config_commands,
+    drives_command,
+    math_commands,
+    recording_commands,
+    robot_commands,
+    terminal,
+    workspace_command,
+)
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
 from trirail.wire.vocabulary import Command
@@ -110,6 +118,7 @@ def view(
     return viewer.run(file, service.robot, service.connect, web=web, records=records, say=say)
 
 
+app.command(drives_command.drives)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)

@@ -127,11 +127,16 @@ def toml(tables: _Tables, other: _Tables, path: str = "") -> Iterator[str]:
 
 def shipped_files() -> dict[str, str]:
     """Return the names of the shipped files, each with the line that says what it is for."""
-    return {path.name: _purpose(path) for path in _shipped()}
+    return {_name(path): _purpose(path) for path in _shipped()}
 
 
 def _shipped() -> list[Path]:
-    return sorted([*FOLDER.glob("*.toml"), *FOLDER.glob("*.service")])
+    return sorted([*FOLDER.glob("*.toml"), *FOLDER.glob("*.service")]) + sorted(FOLDER.glob("drives/*.toml"))
+
+
+def _name(path: Path) -> str:
+    """Return how a file is called: from the folder of shipped ones on."""
+    return path.relative_to(FOLDER).as_posix()
 
 
 def _purpose(path: Path) -> str:
@@ -142,9 +147,9 @@ def _purpose(path: Path) -> str:
 
 def _find(name: str) -> Path:
     for path in _shipped():
-        if name in (path.name, path.stem if path.suffix == ".toml" else path.name):
+        if name in (_name(path), _name(path).removesuffix(".toml")):
             return path
-    raise ConfigError(f"no configuration {name!r} is shipped: there are {', '.join(path.name for path in _shipped())}")
+    raise ConfigError(f"no configuration {name!r} is shipped: there are {', '.join(map(_name, _shipped()))}")
 
 
 def _tables(path: Path) -> _Tables:

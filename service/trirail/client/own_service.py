@@ -31,9 +31,10 @@ Process = subprocess.Popen[bytes]
 
 @contextlib.contextmanager
 def service(config: Path, recording: Path) -> Iterator[Process]:
-    """Run a service that is up; end it in any case, and show what it said if it fails.
+    """Run a service of a configuration file that is up, and records to a file; end it when the context ends.
 
-    Raises ServiceError if it cannot start.
+    Raises ServiceError if it cannot start. Where the context ends with an error that is no refusal, what the service
+    said goes to standard error first.
     """
     with tempfile.TemporaryFile() as log:
         process = None
@@ -52,9 +53,11 @@ def service(config: Path, recording: Path) -> Iterator[Process]:
 
 
 def start(config: Path, log: IO[bytes], *arguments: str, **environment: str) -> Process:
-    """Start a service, and wait until it is up; what it says goes to `log`. Raises ServiceError if it cannot start.
+    """Start a service, and wait until it is up; the caller has to `end` it.
 
-    It is up when it says so, as to systemd. Asking on its port instead could find another service, and move that.
+    `arguments` are more of `trirail run`, `environment` more variables; what it says goes to `log`. It is up when it
+    says so, as to systemd: asking on its port instead could find another service, and move that. Raises ServiceError
+    if it ends before it is up, or is not within START_WITHIN seconds; then it has been ended.
     """
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
         ready.bind(f"{folder}/ready")
@@ -75,7 +78,10 @@ def start(config: Path, log: IO[bytes], *arguments: str, **environment: str) -> 
 
 
 def end(process: Process) -> int:
-    """Tell a service to end, and return its exit code."""
+    """Tell a service to stop the robot and end, and return its exit code: 0 where it did so in order.
+
+    Raises subprocess.TimeoutExpired if it has not ended within END_WITHIN seconds.
+    """
     process.send_signal(signal.SIGTERM)
     return process.wait(END_WITHIN)
 

@@ -112,6 +112,7 @@ class Control:
         self.measured.start(feedback)
         self.setpoints.start()
         self._follow_measured()
+        self._planner.warm_up()
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Protocol
 
+import numpy as np
 from trirail_drivers.interface import Triple
 
 from trirail.config import Config, geometry
@@ -18,9 +19,10 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
 from trirail.motion.packing import pack_run, unpack_path, unpack_run
+from trirail.motion.paths import Path, constant
 from trirail.motion.planning import revision
 from trirail.motion.rate_change import RateChange
-from trirail.motion.runs import MotionState, Run, nominal, rest
+from trirail.motion.runs import STILL, MotionState, Run, nominal, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import SHARES, TimeScaling
 from trirail.wire.messages import Goal
@@ -87,6 +89,13 @@ class PlanRequests:
     def busy(self) -> bool:
         """Whether a goal is being planned."""
         return self._goal is not None
+
+    def warm_up(self) -> None:
+        """Take a motion and stop it, on a schedule that nobody runs: what runs for the first time is slow."""
+        nowhere = Schedule(rest(STILL), self._period)
+        path = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
+        nowhere.take(deque([unpack_run(self._legs, pack_run(Run(self._legs, path, constant(1.0), 1.0)))]))
+        RateChange(self._scaling, nowhere, 0.0, self._period).step()
 
     def plan(self, goal: Goal, blend: float | None = None) -> None:
         """Have a goal planned: to preempt the motion under way, or to follow it from within `blend` [m] of its end."""

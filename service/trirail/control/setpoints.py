@@ -65,10 +65,9 @@ class Setpoints:
         refused = cycle.refusal(code)
         if refused == 0:
             return None
-        violation = self._bounds.violation(refused - 3)
-        if violation is None:
+        if refused <= len(NAMES):
             return f"slider {NAMES[refused - 1]}: no setpoint, the commanded pose is singular or not a number"
-        return f"setpoint refused: {violation}"
+        return f"setpoint refused: {self._bounds.violation(refused - len(NAMES))}"
 
     def follow(self, schedule: Schedule, *, held: bool, stopped_now: bool) -> None:
         """Command the pose that is measured, and every drive that holds none the position that it measures.

@@ -86,7 +86,7 @@ def beyond(what: str, value: float, limit: float, unit: str) -> str:
 def told_apart(value: float, other: float) -> tuple[str, str]:
     """Return two numbers with six significant digits, or as many more as it takes to tell them apart."""
     for digits in range(6, 18):
-        shown = f"{value:.{digits}g}", f"{other:.{digits}g}"
+        shown = f"{value + 0.0:.{digits}g}", f"{other + 0.0:.{digits}g}"  # 0 and -0 are one number
         if shown[0] != shown[1]:
             break
     return shown

@@ -37,6 +37,12 @@ class Path(NamedTuple):
         """Time from the first knot, at zero, to the last [s]."""
         return float(self.knots[-1])
 
+    @property
+    def end(self) -> Array:
+        """Where it ends, (d,)."""
+        end: Array = self.pieces[-1] @ (self.knots[-1] - self.knots[-2]) ** np.arange(6.0)
+        return end
+
 
 @compiled()
 def _piece(knots: Array, time: float) -> int:

@@ -11,7 +11,6 @@ from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Tr
 
 from trirail.config import PlatformLimits, SliderLimits
 from trirail.errors import RefusalCode, RefusedError
-from trirail.kinematics.algebra import Array
 from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.feasibility import Checker, excess, fastest
@@ -20,6 +19,7 @@ from trirail.motion.paths import Path, constant
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.ruckig_call import solved
 from trirail.motion.runs import STILL, MotionState, from_ruckig, joined, stretched
+from trirail.motion.straight_lines import time_optimal
 
 GENTLEST = 0.1
 """Share of any limit below which no plan from motion is tried."""
@@ -81,6 +81,7 @@ class Planner:
         self._legs = geometry.packed()
         self._platform = Kinodynamic(platform.velocity, platform.acceleration, platform.jerk)
         self._sliders = Kinodynamic(*([ROOM * limit] * 3 for limit in checker.slider_limits.tolist()))
+        self._checked_sliders = Kinodynamic(*([limit] * 3 for limit in checker.slider_limits.tolist()))
         self._travel = slider.position
         self._bounds = bounds
         self._checker = checker
@@ -130,8 +131,9 @@ class Planner:
     ) -> Plan:
         """Plan to rest at a pose, straight in pose space from rest; at `speed` 0.5 it takes twice as long.
 
-        A path that is too fast for a slider or the platform is slowed. Raises RefusedError with slider or coordinate,
-        value and limit where it leaves the workspace, or where it cannot be slowed since it starts in motion.
+        A path that is too fast for a slider or the platform gives way to the time-optimal one on the same line, or is
+        slowed as a whole where that is not quicker. Raises RefusedError with slider or coordinate, value and limit
+        where it leaves the workspace, or where it cannot be slowed since it starts in motion.
         """
         self.check_pose(target)
         return self._to_rest(start, start, target, limits or self._platform, speed)
@@ -215,6 +217,10 @@ class Planner:
         if start.at_rest:
             path = self._solve(begin, limits, in_sliders, target=target)
             slower = max(1.0 / speed, excess(self._checker.whole(path, start.pose)))
+            if slower * speed > 1.0:
+                quickest = self._quickest(path, limits, path.duration / speed, start.pose)
+                if quickest is not None and quickest.duration < slower * path.duration:
+                    return Plan(quickest, max(1.0, quickest.duration / path.duration * speed))
             if slower > 1.0:
                 path, slower = self._slowed(path, slower, start.pose)
             return Plan(path, slower * speed)
@@ -227,6 +233,21 @@ class Planner:
                 return Plan(path, speed / float(shares.min()))
             shares = shares * np.clip(ROOM / worst.max(axis=0), GENTLEST, 1.0)
         raise TOO_FAST_IN_MOTION
+
+    def _quickest(self, path: Path, limits: Kinodynamic, asked: float, pose: Sequence[float]) -> Path | None:
+        """Return the time-optimal path from rest in the place of one that is too fast, no shorter than asked for [s].
+
+        None where there is none, or none that fits.
+        """
+        others = self._platform if path.in_sliders else self._checked_sliders
+        quickest = time_optimal(self._legs, path, limits, others, pose)
+        if quickest is None:
+            return None
+        try:
+            path, _ = self._slowed(quickest, max(1.0, asked / quickest.duration), pose)
+        except RefusedError:
+            return None
+        return path
 
     def _slowed(self, path: Path, factor: float, pose: Sequence[float]) -> tuple[Path, float]:
         """Return a path, so many times slower or as many more as it takes to fit, and how many that is.
@@ -246,7 +267,7 @@ class Planner:
         ramp = self._to_velocity(start, velocity, self._platform)
         if not any(velocity):
             return ramp.duration, 0.0, ramp
-        pose = _end(ramp)
+        pose = ramp.end
         held = np.zeros((1, 3, 6))
         held[0, :, 0], held[0, :, 1] = pose, velocity
         hold = max(hold, self._period)
@@ -310,9 +331,3 @@ def _check_ends(points: Sequence[Point], start: MotionState) -> None:
             if abs(value) > STANDS:
                 text = f"the trajectory {does} with {value:.6g} {unit} in {name}: {remedy}"
                 raise RefusedError(code, text, value=value, limit=0.0)
-
-
-def _end(path: Path) -> Array:
-    """Return where a path ends."""
-    last: Array = path.pieces[-1] @ (path.knots[-1] - path.knots[-2]) ** np.arange(6.0)
-    return last

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import select
-import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +17,6 @@ from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
 
 def main(config: Config, path: Path, heart: Heart, ready: Callable[[object], None]) -> int:
     """Answer what the loop asks until the loop has gone. It keeps nothing, so it may be killed at any time."""
-    signal.signal(signal.SIGTERM, _end)
     planner = MotionPlanner(config)
     planner.warm_up()
     lacking = realtime.stay_beside(config.loop)
@@ -39,7 +36,3 @@ def main(config: Config, path: Path, heart: Heart, ready: Callable[[object], Non
     except Closed:
         heart.rest()
     return 0
-
-
-def _end(_signal: int, _frame: object) -> None:
-    sys.exit(0)

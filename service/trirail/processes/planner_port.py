@@ -19,7 +19,7 @@ class PlannerLink:
 
     def __init__(self, port: Port) -> None:
         self._port = port
-        self._awaiting = False
+        self._awaited: int | None = None
         self._unsent: str | None = None
 
     def ask(self, request: PlanRequest) -> None:
@@ -29,14 +29,14 @@ class PlannerLink:
         elif not self._port.send(encode(request)):
             self._unsent = "the planner cannot be asked, it takes no more"
         else:
-            self._awaiting = True
+            self._awaited = request.number
 
     def answers(self) -> Iterator[PlanAnswer | PlannerLost]:
         """Yield what there is to be given to the control in this cycle; nothing is read that was not asked for."""
         if self._unsent is not None:
             unsent, self._unsent = self._unsent, None
             yield PlannerLost(unsent)
-        for _ in range(ANSWERS_A_CYCLE if self._awaiting else 0):
+        for _ in range(0 if self._awaited is None else ANSWERS_A_CYCLE):
             packet = self._port.receive()
             if packet is None:
                 break
@@ -44,17 +44,18 @@ class PlannerLink:
                 answer = decode_plan_answer(packet)
             except msgspec.DecodeError as error:  # one that says such things is started again
                 self._port.hang_up()
-                self._awaiting = False
+                self._awaited = None
                 yield PlannerLost(f"the planner has said something unreadable, {error}")
                 return
-            self._awaiting = False
+            if answer.number == self._awaited:
+                self._awaited = None
             yield answer
-        if self._port.take_lost() and self._awaiting:
-            self._awaiting = False
+        if self._port.take_lost() and self._awaited is not None:
+            self._awaited = None
             yield PlannerLost("the planner has died")
 
     def accept(self) -> None:
         """Notice a planner that has gone, and take one that comes anew."""
-        if self._port.connected and not self._awaiting:
+        if self._port.connected and self._awaited is None:
             self._port.receive()
         self._port.accept()

@@ -251,13 +251,17 @@ class Supervisor:
         del self._children[child.name]
 
     def _end(self) -> None:
-        """End the loop first, so that the others can tell of it; then those."""
+        """End the loop first, so that the others can tell of it; then those. The planner has nothing to tell."""
         notify("STOPPING=1")
         if loop := self._children.get("loop"):
             loop.process.send_signal(signal.SIGTERM)
             if not loop.wait(time.monotonic() + END_WITHIN):
                 self._kill(loop)
             self._turned = self._turned or loop.ready_with is not None
+        if planner := self._children.get("planner"):  # it keeps nothing, and may be frozen or in its start
+            planner.process.kill()
+            planner.process.wait()
+            self._forget(planner)
         # The others end by themselves once the loop has gone and what it said is published and on disk; one that has
         # never turned has said nothing.
         by_itself = time.monotonic() + (END_WITHIN if self._turned else 0.0)

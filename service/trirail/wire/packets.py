@@ -26,10 +26,13 @@ class GoalRequest(Struct, frozen=True, tag=True):
     """Gateway to loop: a goal that was decoded and found well-formed."""
 
     ticket: int
+    """By which the gateway knows the answer."""
     user: str
     id: str
+    """As it was sent, or made by the gateway."""
     goal: Goal
     received_ns: int
+    """When it came, by the monotonic clock."""
     withdrawn: str | None = None
     """Why it must not begin any more, for a goal that waited when the robot was told to stop."""
 
@@ -41,7 +44,7 @@ class CommandRequest(Struct, frozen=True, tag=True):
     user: str
     name: Command
     value: float | None = None
-    """The rate, for override."""
+    """The rate, for override: 1 is full speed."""
     goal: str | None = None
     """The one goal that is to be stopped, for stop."""
 
@@ -59,7 +62,9 @@ class Accepted(Struct, frozen=True, tag=True):
     ticket: int
     id: str
     duration: float
+    """Expected time from now to arrival [s]; infinite at override 0."""
     slowed: float
+    """As in trirail.wire.messages.GoalReply, and the two below."""
     stops_first: bool
     queued: bool
 
@@ -87,7 +92,9 @@ class Welcome(Struct, frozen=True, tag=True):
     """Loop to a peer that has just connected."""
 
     lacking: tuple[str, ...]
+    """What the loop runs without: real-time rights and the like, each with its remedy."""
     bus_load: float
+    """Worst-case share of the bus that the cycle takes; 1 is full."""
     epoch: float
     """Wall clock of nominal time zero [s since 1970]."""
 
@@ -106,8 +113,11 @@ class Status(Struct, frozen=True, tag=True):
     """Loop to both: what records do not say and the state needs; sent when it changes."""
 
     goal: str | None
+    """The id of the goal under way."""
     override: float
+    """The rate at which motions are to run, 0 to 2."""
     fault: str | None
+    """Why the robot is in fault."""
     target: Triple | None = None
     """The pose that the goal leads to; None for a jog."""
     bus_load: float = 0.0

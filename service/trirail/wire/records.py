@@ -36,7 +36,7 @@ FIELDS: tuple[tuple[str, str, int], ...] = (
     ("lateness_ns", "q", 1),  # how much later it began
     ("overruns", "q", 1),  # ticks missed since the start
     ("parts_ns", "i", len(Part)),  # time spent in each part; "record" is that of the cycle before
-    ("mode", "B", 1),  # index into trirail.control.modes.MODES
+    ("mode", "B", 1),  # index into trirail.wire.vocabulary.MODES
     ("drive_state", "B", 3),  # trirail_drivers.interface.PowerState of A, B, C
     ("age", "B", 3),  # how many SYNCs ago the positions of A, B, C were sampled; 255 for any more
     ("follows", "B", 3),  # whether A, B, C follow setpoints: not while they are being homed

@@ -1,0 +1,121 @@
+"""What one drive has and should have: reads first, notes the differences, and writes only those, if it is to write."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from trirail_drivers.cia402.objects import USES, Key, Need, title, use
+from trirail_drivers.cia402.sdo import Remote, SdoRefused, same, shown
+from trirail_drivers.errors import ConfigurationRefused, DriveError
+
+
+class Difference(NamedTuple):
+    """A value that a drive is to be given."""
+
+    object: str
+    """Index and subindex, as 6085:00."""
+    name: str
+    found: str
+    """What it holds; "" where it cannot be read."""
+    wanted: str
+    why: str
+
+
+class Differences:
+    """Brings one drive's objects to what is wanted; with `apply` false it only looks."""
+
+    def __init__(self, remote: Remote, *, apply: bool) -> None:
+        self.remote = remote
+        self.apply = apply
+        self.found: list[Difference] = []
+        self.notes: list[str] = []
+        """What is done otherwise, and is told once."""
+        self.lacking: dict[str, str] = {}
+        """Protections that the drive lacks, as USES names them, and why each is said to lack."""
+
+    def give(self, index: int, subindex: int, value: int, also: Sequence[int] = ()) -> int | None:
+        """See that an object holds a value, or one that will do `also`; return what it holds, None where it lacks.
+
+        Raises SdoRefused for one that is needed and is not taken, ConfigurationRefused for one that reads back
+        differently from what the drive took.
+        """
+        key = index, subindex
+        if not self.remote.has(*key):
+            self.lack(key, "it has no such object")
+            return None
+        found = self.remote.look(*key)
+        if found is not None and same(index, subindex, found, value):
+            return value
+        self.note(key, found, value)
+        if not self.apply:
+            return value
+        refusal: SdoRefused | None = None
+        for candidate in (value, *also):
+            if found == candidate:
+                return candidate
+            try:
+                self.remote.write(index, subindex, candidate)
+            except SdoRefused as error:
+                refusal = error
+                continue
+            self.confirm(key, candidate)
+            return candidate
+        if refusal is None:
+            return found
+        self.lack(key, f"it keeps {shown(*key, found) if found is not None else 'what it has'}", refusal)
+        return None
+
+    def confirm(self, key: Key, value: int) -> None:
+        """Read back what was written; ConfigurationRefused where it differs, nothing where the drive does not tell."""
+        read = self.remote.look(*key)
+        if read is not None and not same(*key, read, value):
+            name = self.remote.name_of(key)
+            raise ConfigurationRefused(self.remote.name, name, *key, shown(*key, value), shown(*key, read))
+
+    def note(self, key: Key, found: int | None, wanted: int, why: str = "") -> None:
+        """Note that an object is to be given a value."""
+        named = use(key)
+        self.found.append(
+            Difference(
+                f"{key[0]:04X}:{key[1]:02X}",
+                named[1].name if named else self.remote.name_of(key),
+                "" if found is None else shown(*key, found),
+                shown(*key, wanted),
+                why or (named[1].purpose if named else ""),
+            )
+        )
+
+    def lack(self, key: Key, reason: str, refusal: SdoRefused | None = None) -> None:
+        """The drive lacks an object, or keeps another value: refuse it, do it otherwise, or note the protection."""
+        named = use(key)
+        if named is None or named[1].need is Need.NEEDED:
+            if refusal is not None:
+                raise refusal
+            purpose = f", needed for {named[1].purpose}" if named else ""
+            raise DriveError(f"drive {self.remote.name}: lacks {title(key)}{purpose}")
+        name, used = named
+        if refusal is not None:
+            reason = f"{reason}: {str(refusal).partition(': ')[2]}"
+        if used.need is Need.PROTECTION:
+            self.lacking[name] = reason
+        else:
+            self.tell(f"{title(key)}, for {used.purpose}: {reason}; instead: {used.without}")
+
+    def tell(self, text: str) -> None:
+        """Note what is done otherwise."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def check_accepted(self, accepted: Sequence[str]) -> None:
+        """Refuse the drive where it lacks a protection that the configuration does not name; tell of the others."""
+        refused = [name for name in self.lacking if name not in accepted]
+        if refused:
+            what = "; ".join(f"{name}, {USES[name].purpose}: {self.lacking[name]}" for name in refused)
+            listed = ", ".join(f'"{name}"' for name in sorted({*refused, *accepted}))
+            raise DriveError(
+                f"drive {self.remote.name} lacks protections: {what}. To drive it all the same say "
+                f"drives.{self.remote.name}.accept_without = [{listed}]"
+            )
+        for name, reason in self.lacking.items():
+            self.tell(f"lacks {name} ({USES[name].purpose}): {reason}; accepted, so {USES[name].without}")

@@ -1,0 +1,61 @@
+"""Who is on the bus and what its set-up would change, as plain values: what `trirail drives` prints."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import can
+
+from trirail_drivers.cia402 import frames, setup
+from trirail_drivers.cia402.sdo import Clock
+from trirail_drivers.config import Drives
+from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import NAMES
+from trirail_drivers.scaling import scale_of
+
+
+def inspect(bus: can.BusABC, drives: Drives, period: float, clock: Clock, *, apply: bool) -> list[dict[str, Any]]:
+    """What each drive is, and the differences between what it holds and what the cycle needs.
+
+    With `apply` the differences are written, to all three or none of them, without power and never stored in a drive;
+    else nothing is written. A drive that does not answer, or is refused, is told of in "refused". Raises DriveError
+    where `apply` fails.
+    """
+    scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
+    if apply:
+        done = setup.configure(bus, drives, scales, period, clock)
+        for drive in drives.each:
+            bus.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node).message())
+        return [_told(made) for made, _ in done]
+    found = []
+    for name, drive, scale in zip(NAMES, drives.each, scales, strict=True):
+        try:
+            made = setup.look(bus, name, drives, scale, period, clock)
+        except DriveError as error:
+            found.append({"name": name, "node": drive.node, "refused": str(error)})
+            continue
+        lacking = [each for each in made.lacking if each not in drive.accept_without]
+        refused = f"accept_without lacks {', '.join(lacking)}" if lacking else ""
+        found.append({**_told(made), "refused": refused})
+    return found
+
+
+def _told(made: setup.SetUp) -> dict[str, Any]:
+    who = made.identity
+    return {
+        "name": made.name,
+        "node": made.node,
+        "device_type": f"{who.device_type:08X}",
+        "vendor": who.vendor,
+        "product": who.product,
+        "revision": who.revision,
+        "serial": who.serial,
+        "modes": None if who.modes is None else f"{who.modes & 0xFFFF_FFFF:08X}",
+        "way": made.way.name,
+        "velocity_unit": made.units.velocity_name,
+        "acceleration_unit": made.units.acceleration_name,
+        "differences": [difference._asdict() for difference in made.differences],
+        "notes": list(made.notes),
+        "lacking": list(made.lacking),
+        "refused": "",
+    }

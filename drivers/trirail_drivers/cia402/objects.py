@@ -1,0 +1,138 @@
+"""The objects that the driver uses of a CiA 402 drive: type, what each is for, and what is done where one is missing.
+
+Makers leave out what CiA 301 and CiA 402-2 leave optional. An object is one of three: without one that is NEEDED a
+drive is refused; what a REPLACEABLE one does is done otherwise, and told; without one that is a PROTECTION the drive
+would go on where this service promises that it stops, so it is refused unless `accept_without` names the object.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Final, NamedTuple
+
+Key = tuple[int, int]
+"""Index and subindex of an object."""
+
+
+class Need(StrEnum):
+    """What it means that a drive lacks an object."""
+
+    NEEDED = "needed"
+    REPLACEABLE = "replaceable"
+    PROTECTION = "protection"
+
+
+class Use(NamedTuple):
+    """What an object is used for."""
+
+    need: Need
+    name: str
+    purpose: str
+    without: str
+    """What is so where a drive lacks it."""
+    section: str
+    """Of the standard."""
+
+
+_N, _R, _P = Need.NEEDED, Need.REPLACEABLE, Need.PROTECTION
+
+USES: Final = {
+    "1000": Use(_N, "Device type", "that it is a CiA 402 drive", "refused", "CiA 301, 1000h"),
+    "1001": Use(_R, "Error register", "whether an EMCY is still in force", "EMCY 00xxh alone tells", "CiA 301, 1001h"),
+    "1005": Use(_R, "COB-ID SYNC", "that it hears SYNC 080h", "080h, the predefined one", "CiA 301, 1005h"),
+    "1006": Use(_P, "Communication cycle period", "its watch on SYNC", "it goes on without SYNC", "CiA 301, 1006h"),
+    "100C": Use(_R, "Guard time", "node guarding, for want of 1016", "heartbeats", "CiA 301, 100Ch"),
+    "100D": Use(_R, "Life time factor", "node guarding, for want of 1016", "heartbeats", "CiA 301, 100Dh"),
+    "1014": Use(_R, "COB-ID EMCY", "its EMCY", "080h + node, the predefined one", "CiA 301, 1014h"),
+    "1015": Use(_R, "Inhibit time EMCY", "that an EMCY comes at once", "none is taken to be there", "CiA 301, 1015h"),
+    "1016": Use(
+        _P, "Consumer heartbeat time", "its watch on this service", "node guarding 100Ch, or none", "CiA 301, 1016h"
+    ),
+    "1017": Use(
+        _R, "Producer heartbeat time", "this service's watch on it", "its answers to SYNC alone", "CiA 301, 1017h"
+    ),
+    "1029": Use(
+        _R,
+        "Error behaviour",
+        "pre-operational when it hears nobody",
+        "the standard's default is that",
+        "CiA 301, 1029h",
+    ),
+    "1800:03": Use(_R, "Inhibit time", "that a statusword comes at once", "there is none", "CiA 301, 1800h"),
+    "1800:05": Use(
+        _R, "Event timer", "that statuswords come also unchanged", "beside the position, or polled", "CiA 301, 1800h"
+    ),
+    "6007": Use(_P, "Abort connection option code", "its stop when it hears nobody", "its own way", "CiA 402-2, 6007h"),
+    "603F": Use(_R, "Error code", "why it was in fault at the start", "its EMCY alone tells", "CiA 402-2, 603Fh"),
+    "6040": Use(_N, "Controlword", "power, stop, reset", "refused", "CiA 402-2, 6040h"),
+    "6041": Use(_N, "Statusword", "its state", "refused", "CiA 402-2, 6041h"),
+    "605A": Use(_P, "Quick stop option code", "its quick-stop ramp", "its own way to stop", "CiA 402-2, 605Ah"),
+    "605E": Use(_P, "Fault reaction option code", "the ramp of its faults", "its own way to stop", "CiA 402-2, 605Eh"),
+    "6060": Use(_N, "Modes of operation", "the mode", "refused", "CiA 402-2, 6060h"),
+    "6061": Use(_N, "Modes of operation display", "the mode", "refused", "CiA 402-2, 6061h"),
+    "6064": Use(_N, "Position actual value", "its position", "refused", "CiA 402-2, 6064h"),
+    "6065": Use(
+        _P, "Following error window", "its own watch on its following error", "this service's alone", "CiA 402-2, 6065h"
+    ),
+    "607A": Use(_N, "Target position", "setpoints of mode 8", "refused", "CiA 402-2, 607Ah"),
+    "607C": Use(_R, "Home offset", "that home is at `offset`", "0, the standard's default", "CiA 402-2, 607Ch"),
+    "6085": Use(_P, "Quick stop deceleration", "its quick-stop ramp", "its own ramp", "CiA 402-2, 6085h"),
+    "6098": Use(_N, "Homing method", "homing, where configured", "refused", "CiA 402-2, 6098h"),
+    "6099": Use(_N, "Homing speeds", "homing, where configured", "refused", "CiA 402-2, 6099h"),
+    "609A": Use(_R, "Homing acceleration", "homing, where configured", "its own", "CiA 402-2, 609Ah"),
+    "60B1": Use(
+        _R, "Velocity offset", "the velocity feed-forward", "it follows with a lag of its own", "CiA 402-2, 60B1h"
+    ),
+    "60C0": Use(_R, "Interpolation sub mode select", "linear interpolation", "its own", "CiA 402-2, 60C0h"),
+    "60C1": Use(_N, "Interpolation data record", "setpoints of mode 7", "refused", "CiA 402-2, 60C1h"),
+    "60C2": Use(_R, "Interpolation time period", "its interpolation", "the time from SYNC to SYNC", "CiA 402-2, 60C2h"),
+    "60C4": Use(_R, "Interpolation data configuration", "an empty buffer", "its own", "CiA 402-2, 60C4h"),
+    "6502": Use(_R, "Supported drive modes", "mode 8 or 7", "mode 8 is tried", "CiA 402-2, 6502h"),
+}
+"""By index, or index and subindex. 605B (shutdown) and 605C (disable operation) are not used: power is taken off by
+"disable voltage" and "quick stop", which they do not bear on."""
+
+_WIDTHS: Final = {
+    **dict.fromkeys((0x1001, 0x1029, 0x6060, 0x6061, 0x6098, 0x60C2), 1),
+    **dict.fromkeys((0x100C, 0x1015, 0x1017, 0x603F, 0x6040, 0x6041), 2),
+    **dict.fromkeys((0x6007, 0x605A, 0x605E, 0x60C0), 2),
+    0x100D: 1,
+}
+"""Bytes of each object's value, where it is not four (CiA 301, CiA 402-2)."""
+_SIGNED: Final = frozenset(
+    (0x6007, 0x605A, 0x605E, 0x6060, 0x6061, 0x6064, 0x607A, 0x607C, 0x6098, 0x60B1, 0x60C0, 0x60C1)
+)
+
+
+def width(key: Key) -> int:
+    """Bytes of an object's value as the standards have it."""
+    index, subindex = key
+    if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
+        return {1: 4, 3: 2, 5: 2}.get(subindex, 1)
+    if subindex == 0 and (0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00):
+        return 1
+    if index == 0x60C4:
+        return {1: 4, 2: 4, 4: 2}.get(subindex, 1)
+    return _WIDTHS.get(index, 4)
+
+
+def signed(key: Key) -> bool:
+    """Whether an object's value has a sign."""
+    return key[0] in _SIGNED or key == (0x60C2, 2)
+
+
+def use(key: Key) -> tuple[str, Use] | None:
+    """What an object is used for, and as what USES names it; None for what is not asked of drives."""
+    index, subindex = key
+    if 0x1800 <= index < 0x1A00:
+        index = 0x1800
+    for name in (f"{index:04X}:{subindex:02X}", f"{index:04X}"):
+        if name in USES:
+            return name, USES[name]
+    return None
+
+
+def title(key: Key) -> str:
+    """An object as messages name it."""
+    found = use(key)
+    return f"object {key[0]:04X}:{key[1]:02X}" + (f" ({found[1].name})" if found else "")

@@ -1,0 +1,67 @@
+"""Frames that only this service may send: who else sends them is another master, and the robot stops (CiA 301)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402.axis import Axis
+from trirail_drivers.interface import DriveFault
+from trirail_drivers.wire import Handler, Wire
+
+_COMMANDS: Final = {
+    0x01: "start",
+    0x02: "stop",
+    0x80: "enter pre-operational",
+    0x81: "reset node",
+    0x82: "reset communication",
+}
+_STARTS: Final = 0x01
+_STOPS: Final = 0x02
+
+
+class Strangers:
+    """Hears on the bus what other masters send to the drives: NMT commands, SYNC, PDOs, this service's heartbeat."""
+
+    def __init__(self, wire: Wire, axes: Sequence[Axis], master_node: int) -> None:
+        self._wire = wire
+        self._axes = {axis.node: axis for axis in axes}
+        self._master_node = master_node
+        wire.listen(frames.NMT, self, self._on_nmt)
+        wire.listen(frames.SYNC, self, self._sends("sends SYNC"))
+        wire.listen(frames.HEARTBEAT + master_node, self, self._on_heartbeat)
+        for axis in axes:
+            self.listen_to(axis)
+
+    def listen_to(self, axis: Axis) -> None:
+        """Hear who else sends an axis its setpoints and controlwords."""
+        for identifier in {axis.way.setpoints.identifier, axis.way.controlword} - {None}:
+            self._wire.listen(identifier or 0, self, self._sends(f"sends drive {axis.name} PDOs ({identifier:03X})"))
+
+    def tell(self, cause: str, code: int, text: str) -> None:
+        """A frame of a stranger's that is malformed is a stranger's all the same."""
+        self._wire.fail(DriveFault("", "bus", code, f"CAN bus: another master is on it: {text} ({cause})"))
+
+    def _sends(self, text: str) -> Handler:
+        return lambda data, now: self._told(text)  # noqa: ARG005  one signature for all
+
+    def _told(self, text: str) -> None:
+        self._wire.fail(DriveFault("", "bus", 0, f"CAN bus: another master is on it: it {text}; only one may be"))
+
+    def _on_nmt(self, data: bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
+        command, node = frames.NMT_COMMAND.unpack(data)
+        meant = [axis for each, axis in self._axes.items() if node in (0, each)]
+        if not meant:
+            return
+        if command != _STARTS:
+            for axis in meant:
+                axis.leave_operational()
+                axis.stopped = command == _STOPS
+        name = _COMMANDS.get(command, f"{command:02X}h")
+        whom = "all nodes" if node == 0 else f"drive {meant[0].name}"
+        self._told(f'commands {whom} by NMT "{name}"')
+
+    def _on_heartbeat(self, data: bytearray, now: float) -> None:  # noqa: ARG002
+        frames.NMT_STATE.unpack(data)
+        self._told(f"has this service's node id {self._master_node}")

@@ -1,0 +1,157 @@
+"""How setpoints and feedback go between this service and one drive: mode, PDOs, statusword, watchdog."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from struct import Struct
+from typing import Final
+
+from trirail_drivers.cia402 import frames
+from trirail_drivers.frames import Frame, frame_bits
+from trirail_drivers.load import Traffic
+
+INTERPOLATED_POSITION: Final = 7
+CYCLIC_SYNCHRONOUS_POSITION: Final = 8
+
+CONTROLWORD: Final = 0x6040_00_10
+STATUSWORD: Final = 0x6041_00_10
+ACTUAL_POSITION: Final = 0x6064_00_20
+TARGET_POSITION: Final = 0x607A_00_20
+VELOCITY_OFFSET: Final = 0x60B1_00_20
+INTERPOLATION_DATA: Final = 0x60C1_01_20
+"""Entries of PDO mappings: index, subindex, bits (CiA 301, 1600h)."""
+
+POSITIONS: Final = {CYCLIC_SYNCHRONOUS_POSITION: TARGET_POSITION, INTERPOLATED_POSITION: INTERPOLATION_DATA}
+"""What takes the setpoint in each mode."""
+
+_FORMATS: Final = {8: "b", 16: "h", 32: "i", 64: "q"}
+
+
+class Setpoints:
+    """The RPDO that takes setpoints: an identifier, and its bytes of position, velocity and controlword."""
+
+    __slots__ = ("_layout", "_order", "entries", "identifier", "size")
+
+    def __init__(self, identifier: int, entries: tuple[int, ...]) -> None:
+        self.identifier = identifier
+        self.entries = entries
+        fields = {
+            TARGET_POSITION: (0, "i"),
+            INTERPOLATION_DATA: (0, "i"),
+            VELOCITY_OFFSET: (1, "i"),
+            CONTROLWORD: (2, "H"),
+        }
+        self._order = tuple(fields[entry][0] for entry in entries)
+        self._layout = Struct("<" + "".join(fields[entry][1] for entry in entries))
+        self.size = self._layout.size
+
+    def frame(self) -> Frame:
+        """A frame to be filled in each cycle."""
+        return Frame(self.identifier, bytes(self.size))
+
+    def fill(self, frame: Frame, counts: int, velocity: int, controlword: int) -> None:
+        """Fill in a frame; struct.error where a number is too large."""
+        given = counts, velocity, controlword
+        frame.fill(self._layout, *[given[field] for field in self._order])
+
+    @property
+    def has_velocity(self) -> bool:
+        """Whether the drive is told the velocity beside the position."""
+        return VELOCITY_OFFSET in self.entries
+
+    @property
+    def has_controlword(self) -> bool:
+        """Whether the controlword goes with the setpoint, for want of a PDO of its own."""
+        return CONTROLWORD in self.entries
+
+
+class Feedback:
+    """The TPDO that brings the position, and the statusword where it has one beside it."""
+
+    __slots__ = ("_layout", "_position", "_status", "entries", "has_status", "identifier", "size")
+
+    def __init__(self, identifier: int, entries: tuple[int, ...]) -> None:
+        self.identifier = identifier
+        self.entries = entries
+        self._position = entries.index(ACTUAL_POSITION)
+        self.has_status = STATUSWORD in entries
+        self._status = entries.index(STATUSWORD) if self.has_status else -1
+        formats = ("H" if entry == STATUSWORD else _FORMATS[entry & 0xFF] for entry in entries)
+        self._layout = Struct("<" + "".join(formats))
+        self.size = self._layout.size
+
+    def unpack(self, data: bytes | bytearray) -> tuple[int, int | None]:
+        """Position [counts] and statusword; struct.error where the length is wrong."""
+        values = self._layout.unpack(data)
+        return values[self._position], values[self._status] if self.has_status else None
+
+
+def fits_setpoints(entries: tuple[int, ...], mode: int) -> bool:
+    """Whether a mapping that cannot be changed takes setpoints, and nothing that this service would write over."""
+    known = {POSITIONS[mode], VELOCITY_OFFSET, CONTROLWORD}
+    return POSITIONS[mode] in entries and set(entries) <= known
+
+
+def fits_feedback(entries: tuple[int, ...]) -> bool:
+    """Whether a mapping that cannot be changed brings the position."""
+    return ACTUAL_POSITION in entries and all(entry & 0xFF in _FORMATS for entry in entries)
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How one drive is driven."""
+
+    mode: int
+    """6060h: cyclic synchronous position, or interpolated position."""
+    setpoints: Setpoints
+    controlword: int | None
+    """Identifier of the RPDO that has the controlword; None where it goes with the setpoint."""
+    feedback: Feedback
+    status: int | None
+    """Identifier of the TPDO that has the statusword when it changes; None where that comes with the position."""
+    polled: bool = False
+    """The statusword is asked for by SDO: no PDO repeats it."""
+    guarded: bool = False
+    """Node guarding, for want of a heartbeat consumer."""
+    heard: bool = True
+    """It tells that it lives, by heartbeat or node guarding, beside its positions."""
+    emergency: int = 0
+    """Identifier of its EMCY."""
+    tells_following: bool = True
+    """Bit 12 of its statusword is to say that it follows setpoints."""
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        mode = "interpolated position" if self.mode == INTERPOLATED_POSITION else "cyclic synchronous position"
+        offset = " with velocity offset" if self.setpoints.has_velocity else ""
+        status = "with the position" if self.feedback.has_status else "event-driven" if self.status else ""
+        polled = " and polled" if self.polled and status else "polled" if self.polled else ""
+        return f"{mode}{offset}, statusword {status}{polled}, {'node guarding' if self.guarded else 'heartbeat'}"
+
+
+def usual(node: int) -> Way:
+    """The way of a drive that has all that CiA 301 and CiA 402-2 leave optional."""
+    return Way(
+        CYCLIC_SYNCHRONOUS_POSITION,
+        Setpoints(frames.RPDO2 + node, (TARGET_POSITION, VELOCITY_OFFSET)),
+        frames.RPDO1 + node,
+        Feedback(frames.TPDO2 + node, (ACTUAL_POSITION,)),
+        frames.TPDO1 + node,
+        emergency=frames.EMCY + node,
+    )
+
+
+def traffic(ways: Iterable[Way]) -> Traffic:
+    """What drives that go these ways put on the bus, and the service with them."""
+    ways = tuple(ways)
+    cycle = frame_bits(0) + sum(frame_bits(way.setpoints.size) + frame_bits(way.feedback.size) for way in ways)
+    status = sum(frame_bits(2) for way in ways if way.status) / frames.STATUS_PERIOD
+    polls = sum(2 * frame_bits(8) for way in ways if way.polled) / frames.POLL_PERIOD
+    lives = frame_bits(1) * (1 + sum(1 + way.guarded for way in ways))
+    return Traffic(
+        cycle_bits=cycle,
+        background=lambda heartbeat: status + polls + lives / heartbeat,
+        most_sent=8 + sum(way.guarded + way.polled for way in ways),
+    )

@@ -1,0 +1,70 @@
+"""`trirail drives`: who is on the bus, and what its set-up would change."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+from trirail.cli import terminal
+from trirail.cli.options import Flag
+
+
+def drives(
+    config: Path | None = None, /, *, apply: Annotated[bool, Flag] = False, json: Annotated[bool, Flag] = False
+) -> int:
+    """Show each drive: who it says it is, its modes and units, and what its set-up would change, and why.
+
+    Reads only, unless told to apply; no drive gets power, and nothing is stored in one. Not while the service runs.
+
+    Parameters
+    ----------
+    config
+        Configuration file; the simulated robot if absent.
+    apply
+        Write the differences, and read them back.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail_drivers.bus import open_bus
+    from trirail_drivers.errors import DriveError
+    from trirail_drivers.protocols import PROTOCOLS
+
+    from trirail.config import SIM, load
+
+    settings = load(config or SIM)
+    inspect = PROTOCOLS[settings.drives.protocol].inspect
+    if inspect is None:
+        raise DriveError(f"drives of protocol {settings.drives.protocol} have no objects to be shown")
+    with open_bus(settings.can, settings.drives) as bus:
+        found = inspect(bus, settings.drives, settings.period, time.monotonic, apply=apply)
+    fit = not any(each["refused"] for each in found)
+    if json:
+        terminal.json({"ok": fit, "applied": apply, "drives": found})
+    else:
+        for each in found:
+            for line in _lines(each, applied=apply):
+                terminal.say(line)
+    return 0 if fit else 1
+
+
+def _lines(drive: dict[str, Any], *, applied: bool) -> list[str]:
+    lines = [f"drive {drive['name']}, node {drive['node']}"]
+    if "device_type" in drive:
+        who = ", ".join(f"{key} {drive[key]}" for key in ("vendor", "product", "revision", "serial"))
+        modes = drive["modes"] or "not told"
+        lines += [
+            f"  device type {drive['device_type']}h, {who}",
+            f"  modes {modes}: {drive['way']}",
+            f"  velocities in {drive['velocity_unit'] or '?'}, accelerations in {drive['acceleration_unit'] or '?'}",
+        ]
+        verb = "written" if applied else "would be written"
+        lines += [
+            f"  {verb}: {each['object']} {each['name']}: {each['found'] or '?'} -> {each['wanted']}, for {each['why']}"
+            for each in drive["differences"]
+        ] or ["  nothing differs"]
+        lines += [f"  lacks {each}" for each in drive["lacking"]]
+        lines += [f"  {note}" for note in drive["notes"]]
+    if drive["refused"]:
+        lines.append(f"  refused: {drive['refused']}")
+    return lines

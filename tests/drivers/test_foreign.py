@@ -1,0 +1,265 @@
+"""Drives that others made come into motion by configuration alone: canopen's SDO server, makers' dictionaries."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from drivers.foreign import ForeignDrive, Habits, Truth, three
+from trirail_drivers.cia402.drives import Cia402
+from trirail_drivers.cia402.objects import USES
+from trirail_drivers.config import Drive, Drives
+from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import Feedback, PowerState, Triple
+
+PERIOD = 0.002
+COUNTS = 819_200.0
+TURNS = 200.0
+"""Per metre: a screw of 5 mm lead and an encoder of 4096 counts."""
+RPM = 60.0 * TURNS
+IN_COUNTS = Truth(COUNTS, COUNTS, COUNTS)
+IN_RPM = Truth(COUNTS, RPM, RPM)
+
+
+class Make(msgspec.Struct):
+    """What one has to say of a make to drive it, and what is true of it."""
+
+    truth: Truth
+    keys: dict[str, Any] = {}
+    mode: int = 8
+    offset: bool = False
+    """It takes a velocity offset, so that it follows without a lag."""
+
+
+MAKES = {
+    "elmo_gold": Make(IN_COUNTS, offset=True),
+    "maxon_epos4_compact50_5": Make(IN_RPM, {"revolutions_per_metre": TURNS, "accept_without": ("1006",)}, offset=True),
+    "nanotec_pd4n": Make(
+        IN_COUNTS,
+        {"acceleration_unit": "counts/s2", "accept_without": ("1006", "6007", "605E")},
+        7,
+    ),
+    "pilz_prbt": Make(IN_COUNTS, {"accept_without": ("1006", "6007", "605A", "605E", "6085")}, 7),
+    "ros2_cia402_slave": Make(IN_COUNTS, {"acceleration_unit": "counts/s2", "accept_without": ("1006", "6007")}),
+    "technosoft_ipos": Make(IN_COUNTS, {"acceleration_unit": "counts/s2"}, 7),
+}
+
+
+class Rig:
+    """Three drives of a make, the driver under test, and a loop that turns the clock."""
+
+    def __init__(
+        self, name: str, habits: Habits | None = None, truth: Truth | None = None, *, rebased: bool = True, **keys: Any
+    ) -> None:
+        make = MAKES[name]
+        drive = {"counts_per_metre": COUNTS, **make.keys, **keys}
+        a, b, c = (Drive(node=node, **drive) for node in (1, 2, 3))
+        self.config = Drives("cia402", a, b, c, sdo_timeout=0.05, quick_stop_deceleration=2.0)
+        self.wires, self.clock = three(
+            name, dict.fromkeys((1, 2, 3), truth or make.truth), habits=habits, rebased=rebased
+        )
+        self.drives = Cia402(self.wires, 1_000_000, self.config, self.clock)
+        self.warnings: list[str] = []
+
+    @property
+    def nodes(self) -> list[ForeignDrive]:
+        return self.wires.nodes
+
+    def cycle(self, position: Triple | None = None, velocity: Triple = (0.0, 0.0, 0.0)) -> Feedback:
+        self.clock.now += PERIOD
+        self.drives.sync()
+        feedback = self.drives.read()
+        self.warnings += feedback.warnings
+        self.drives.write(feedback.position if position is None else position, velocity)
+        return feedback
+
+    def ready(self) -> None:
+        self.drives.configure(PERIOD)
+        self.feedback = self.cycle()
+
+    def enable(self) -> None:
+        self.drives.enable()
+        for _ in range(40):
+            self.feedback = self.cycle(self.feedback.position)
+            assert self.feedback.fault is None, self.feedback.fault
+            if set(self.feedback.state) == {PowerState.OPERATION_ENABLED}:
+                self.commanded = self.feedback.position
+                return
+        raise AssertionError(f"not enabled: {self.feedback}")
+
+    def move(self, speed: float, cycles: int) -> None:
+        """Setpoints at a constant speed, from where the sliders were sent last."""
+        for _ in range(cycles):
+            a, b, c = (place + speed * PERIOD for place in self.commanded)
+            self.commanded = a, b, c
+            self.feedback = self.cycle(self.commanded, (speed, speed, speed))
+            assert self.feedback.fault is None, self.feedback.fault
+
+
+@pytest.fixture
+def rigs() -> Iterator[list[Rig]]:
+    made: list[Rig] = []
+    yield made
+    for rig in made:
+        rig.drives.close()
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_a_drive_moves_as_fast_as_it_is_told(rigs: list[Rig], name: str) -> None:
+    rig = Rig(name)
+    rigs.append(rig)
+    rig.ready()
+    assert {node.mode for node in rig.nodes} == {MAKES[name].mode}
+    rig.enable()
+    rig.move(0.1, 100)
+    start = [node.servo.position for node in rig.nodes]
+    rig.move(0.1, 100)
+    for node, place in zip(rig.nodes, start, strict=True):
+        assert (node.servo.position - place) / (100 * PERIOD) == pytest.approx(0.1, rel=0.01)
+    lag = 0.0 if MAKES[name].offset else rig.nodes[0].servo.LAG
+    for node, commanded in zip(rig.nodes, rig.commanded, strict=True):
+        # What is written now is taken up a SYNC later, and reached by the one after that.
+        assert commanded - node.servo.position == pytest.approx(0.1 * (lag + 2 * PERIOD), abs=0.1 * PERIOD)
+    assert rig.feedback.position == pytest.approx([node.servo.position for node in rig.nodes], abs=2e-3)
+
+
+def test_the_table_of_objects_is_that_of_the_guide() -> None:
+    guide = (Path(__file__).parents[2] / "drivers" / "README.md").read_text()
+    rows = re.findall(r"^\| ([0-9A-F]{4}(?::\d\d)?) \| (\w+) \| (.+?): (.+) \| (.+) \| (.+) \|$", guide, re.MULTILINE)
+    assert rows == [(key, use.need, use.name, use.purpose, use.without, use.section) for key, use in USES.items()]
+
+
+@pytest.mark.parametrize(
+    ("name", "keys", "said"),
+    [
+        ("maxon_epos4_compact50_5", {"accept_without": ()}, r"drive A lacks protections: 1006, its watch on SYNC"),
+        (
+            "nanotec_pd4n",
+            {"accept_without": ("1006",)},
+            r'6007, .*605E, .*accept_without = \["1006", "6007", "605E"\]',
+        ),
+        ("technosoft_ipos", {"acceleration_unit": None}, r"its unit of acceleration \(object 60AA\)"),
+        ("elmo_gold", {"velocity_unit": "rpm"}, r'A.velocity_unit = "rpm" contradicts the drive: object 6096'),
+        (
+            "maxon_epos4_compact50_5",
+            {"velocity_unit": "counts/s"},
+            r"contradicts the drive: object 60A9 = 00B44700h is rev/min",
+        ),
+        (
+            "nanotec_pd4n",
+            {"revolutions_per_metre": 100.0},
+            r"revolutions_per_metre = 100 contradicts .* 409.6 \(object 6092",
+        ),
+    ],
+)
+def test_what_a_drive_lacks_or_contradicts_is_refused_by_name(
+    rigs: list[Rig], name: str, keys: dict[str, Any], said: str
+) -> None:
+    rig = Rig(name, **keys)
+    rigs.append(rig)
+    with pytest.raises(DriveError, match=said):
+        rig.ready()
+    assert all(index == 0x6040 for node in rig.nodes for index, *_ in node.written)
+
+
+def test_a_drive_with_neither_mode_is_refused_by_6502(rigs: list[Rig]) -> None:
+    rig = Rig("elmo_gold", Habits(values={(0x6502, 0): 0x2D}))
+    rigs.append(rig)
+    with pytest.raises(DriveError, match=r"6502:00 \(supported drive modes\) is 0000002D: neither"):
+        rig.ready()
+
+
+# 60A8h, 60A9h, 60AAh (CiA 303-2), and what they are of a metre: 819 200 counts and 200 revolutions.
+UNITS = [
+    (0x00B5_0000, 0x00B5_0300, 0x00B5_5700, Truth(COUNTS, COUNTS, COUNTS)),
+    (0x00B5_0000, 0x00B4_4700, 0x00C0_0300, Truth(COUNTS, 60 * TURNS, 60 * TURNS)),
+    (0x00B5_0000, 0xFDB4_4700, 0x00B4_5700, Truth(COUNTS, 60e3 * TURNS, TURNS)),
+    (0xFF41_0000, 0x0041_0300, 0xFF41_5700, Truth(3600 * TURNS, 360 * TURNS, 3600 * TURNS)),
+    (0xFD10_0000, 0xFD10_0300, 0x0010_5700, Truth(1e3 * math.tau * TURNS, 1e3 * math.tau * TURNS, math.tau * TURNS)),
+    (0xFA01_0000, 0xFD01_0300, 0xFD01_5700, Truth(1e6, 1e3, 1e3)),
+    (0xFB01_0000, 0xFD01_4700, 0x0001_5700, Truth(1e5, 60e3, 1.0)),
+    (0xFCB4_0000, 0x00B4_0300, 0x00B4_0300, Truth(1e4 * TURNS, TURNS, TURNS)),
+]
+
+
+@pytest.mark.parametrize(("position", "velocity", "acceleration", "truth"), UNITS)
+def test_a_tenth_of_a_metre_a_second_is_that_in_every_unit(
+    rigs: list[Rig], position: int, velocity: int, acceleration: int, truth: Truth
+) -> None:
+    values = {(0x60A8, 0): position, (0x60A9, 0): velocity, (0x60AA, 0): acceleration}
+    turns = TURNS if truth.position == COUNTS else None
+    rig = Rig(
+        "maxon_epos4_compact50_5",
+        Habits(values=values),
+        truth,
+        counts_per_metre=truth.position,
+        revolutions_per_metre=turns,
+    )
+    rigs.append(rig)
+    rig.ready()
+    rig.enable()
+    rig.move(0.1, 150)
+    for node, commanded in zip(rig.nodes, rig.commanded, strict=True):
+        # A velocity offset of 1 rpm is a step of 0.08 mm/s; in the wrong unit the lag would be millimetres.
+        assert commanded - node.servo.position == pytest.approx(0.1 * PERIOD, abs=5e-5)
+        assert node.value(0x6085) / truth.acceleration == pytest.approx(
+            2.0, rel=0.3 if truth.acceleration == 1.0 else 0.01
+        )
+        assert node.value(0x6065) / truth.position == pytest.approx(0.005, rel=1e-3)
+    rig.drives.quick_stop()
+    at = [node.servo.position for node in rig.nodes]
+    for _ in range(60):
+        rig.cycle()
+    for node, place in zip(rig.nodes, at, strict=True):
+        # v²/2a, and what is left of the lag.
+        assert node.servo.velocity == 0.0
+        assert node.servo.position - place == pytest.approx(0.1**2 / 2 / 2.0, abs=1e-3)
+
+
+def test_a_unit_that_nobody_says_of_a_metre_is_set_to_counts(rigs: list[Rig]) -> None:
+    rig = Rig("maxon_epos4_compact50_5", None, IN_COUNTS, revolutions_per_metre=None)
+    rigs.append(rig)
+    rig.ready()
+    assert [(node.value(0x60A9), node.value(0x60AA)) for node in rig.nodes] == [(0x00B5_0300, 0x00B5_5700)] * 3
+    assert rig.nodes[0].value(0x6085) == round(2.0 * COUNTS)
+
+
+def test_a_unit_that_cannot_be_set_and_that_nobody_says_is_refused(rigs: list[Rig]) -> None:
+    refuses = {(0x60A9, 0): lambda value: value & 0xFFFFFF != 0xB44700}
+    rig = Rig("maxon_epos4_compact50_5", Habits(refuses=refuses), revolutions_per_metre=None)
+    rigs.append(rig)
+    with pytest.raises(DriveError, match=r"object 60A9 is rev/min and cannot be set .*say drives.A.rev"):
+        rig.ready()
+
+
+def test_drives_whose_fixed_identifiers_are_the_same_are_refused(rigs: list[Rig]) -> None:
+    """All three as node 1 has them by default: one setpoint would move them all."""
+    values = {
+        (0x1600, 0): 1,
+        (0x1601, 0): 1,
+        (0x1601, 1): 0x607A_0020,
+        (0x1A00, 0): 1,
+        (0x1A01, 0): 1,
+        (0x1A01, 1): 0x6064_0020,
+    }
+    rig = Rig("elmo_gold", Habits(fixed_pdos=True, values=values), rebased=False)
+    rigs.append(rig)
+    with pytest.raises(
+        DriveError, match=r"drives A and B: both have a PDO with identifier \d+h that cannot be changed"
+    ):
+        rig.ready()
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_dictionaries_whose_identifiers_are_those_of_node_1(rigs: list[Rig], name: str) -> None:
+    """They can be written; an EMCY that cannot is taken at the predefined identifier."""
+    rig = Rig(name, rebased=False)
+    rigs.append(rig)
+    rig.ready()
+    rig.enable()
+    rig.move(0.1, 20)

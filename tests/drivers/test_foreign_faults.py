@@ -1,0 +1,246 @@
+"""What must stop drives that others made, in each of the ways that they are driven: strangers, and their own faults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import can
+import pytest
+from drivers.foreign import DISABLED, ENABLED, OPERATIONAL, PRE_OPERATIONAL, STOPPED, ForeignDrive, Habits
+from drivers.test_foreign import PERIOD, Rig
+from trirail_drivers.interface import PowerState
+
+
+class Named(NamedTuple):
+    """One way to drive, by a make and how it differs from its dictionary."""
+
+    make: str
+    habits: Callable[[], Habits]
+    keys: dict[str, Any]
+
+
+WAYS = {
+    "csp with offset, statusword on change": Named("elmo_gold", Habits, {}),
+    "csp with offset, statusword beside the position": Named("maxon_epos4_compact50_5", Habits, {}),
+    "csp without offset": Named("ros2_cia402_slave", Habits, {}),
+    "interpolated position, two RPDOs, heartbeat": Named("pilz_prbt", Habits, {}),
+    "interpolated position, node guarding": Named("technosoft_ipos", Habits, {}),
+    "statusword polled": Named(
+        "elmo_gold",
+        lambda: Habits(
+            values={(0x1800, 1): 0x8000_0181, (0x1A01, 0): 1, (0x1A01, 1): 0x6064_0020, (0x1801, 2): 1},
+            access=dict.fromkeys(
+                [(0x1800, 1), *((0x1A00, n) for n in range(9)), *((0x1A01, n) for n in range(9))], "ro"
+            ),
+        ),
+        {},
+    ),
+    "mappings that are fixed, controlword beside the setpoint": Named(
+        "elmo_gold",
+        lambda: Habits(
+            fixed_pdos=True,
+            values={
+                (0x1400, 1): 0x8000_0201,
+                (0x1600, 0): 0,
+                (0x1601, 0): 2,
+                (0x1601, 1): 0x6040_0010,
+                (0x1601, 2): 0x607A_0020,
+                (0x1A00, 0): 1,
+                (0x1A01, 0): 2,
+                (0x1A01, 1): 0x6041_0010,
+                (0x1A01, 2): 0x6064_0020,
+            },
+        ),
+        {},
+    ),
+}
+
+
+@pytest.fixture(params=WAYS)
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    """Drives in motion."""
+    way = WAYS[request.param]
+    rig = Rig(way.make, way.habits(), **way.keys)
+    rig.ready()
+    rig.enable()
+    rig.move(0.05, 60)
+    yield rig
+    rig.drives.close()
+
+
+def stranger(rig: Rig) -> can.BusABC:
+    """Another master's place on the bus."""
+    return can.Bus(rig.nodes[0].bus.channel_info.removeprefix("Virtual bus channel "), interface="virtual")
+
+
+def stopped_within(rig: Rig, cycles: int) -> str:
+    """Cycle with setpoints that go on, until there is a fault; all three drives must stop, whatever they hear."""
+    for _ in range(cycles):
+        rig.wires.sent.clear()
+        feedback = rig.cycle(rig.commanded, (0.0, 0.0, 0.0))
+        if feedback.fault is not None:
+            break
+    else:
+        raise AssertionError(f"no fault within {cycles} cycles")
+    for _ in range(120):
+        rig.cycle(rig.commanded)
+    assert [node.state for node in rig.nodes if node.state == ENABLED] == []
+    assert [node.servo.velocity for node in rig.nodes] == [0.0] * 3
+    return feedback.fault.message
+
+
+def deaf(node: ForeignDrive, state: int) -> None:
+    """Thrown out of operational, with nothing that would stop it: 6007h is not obeyed."""
+    node.put(0x6007, 0)
+    node.leave(state)
+
+
+@pytest.mark.parametrize("state", [PRE_OPERATIONAL, STOPPED])
+def test_a_drive_thrown_out_of_operational_is_told_by_sdo(rig: Rig, state: int) -> None:
+    deaf(rig.nodes[1], state)
+    # Its positions do not come: three SYNCs; its heartbeat tells within 0.1 s. Stopped, that alone says why it is deaf.
+    said = stopped_within(rig, round(0.15 / PERIOD))
+    assert said.startswith("drive B: ")
+
+
+@pytest.mark.parametrize("command", [0x80, 0x02])
+@pytest.mark.parametrize("node", [0, 2])
+def test_nmt_by_a_stranger_stops_all_in_the_same_cycle(rig: Rig, command: int, node: int) -> None:
+    for each in rig.nodes:
+        each.put(0x6007, 0)
+    with stranger(rig) as bus:
+        bus.send(can.Message(arbitration_id=0, data=[command, node], is_extended_id=False))
+        said = stopped_within(rig, 1)
+    assert said.startswith("CAN bus: another master is on it: it commands ")
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data", "said"),
+    [
+        (0x080, b"", "sends SYNC"),
+        (0x77E, b"\x05", "has this service's node id 126"),
+        (None, bytes(8), "sends drive B PDOs"),
+    ],
+)
+def test_two_masters_are_noticed(rig: Rig, identifier: int | None, data: bytes, said: str) -> None:
+    way = rig.drives._axes[1].way
+    with stranger(rig) as bus:
+        if identifier is None:
+            identifier, data = way.setpoints.identifier, bytes(way.setpoints.size)
+            rig.nodes[1].bus.recv(0)
+        bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+        assert said in stopped_within(rig, 1)
+
+
+def test_a_second_node_with_the_same_id_is_noticed(rig: Rig) -> None:
+    with stranger(rig) as bus:
+        way = rig.drives._axes[2].way
+        for n in range(8):
+            data = bytes(way.feedback.size - 1) + bytes([n])
+            bus.send(can.Message(arbitration_id=way.feedback.identifier, data=data, is_extended_id=False))
+            feedback = rig.cycle(rig.commanded)
+            if feedback.fault is not None:
+                break
+    assert feedback.fault is not None
+    assert feedback.fault.drive == "C"
+
+
+def test_a_restart_is_noticed(rig: Rig) -> None:
+    rig.nodes[0].boot()
+    assert "drive A: has restarted" in stopped_within(rig, 1)
+
+
+def test_a_drives_own_fault_stops_all(rig: Rig) -> None:
+    rig.nodes[2].fail(0x4310)
+    assert "drive C: emergency 4310" in stopped_within(rig, 2)
+    rig.drives.reset()
+    for _ in range(100):
+        feedback = rig.cycle()
+    assert feedback.fault is None
+    assert [node.state for node in rig.nodes] == [DISABLED] * 3
+
+
+def test_an_emcy_that_is_never_taken_back_does_not_block_reset(rig: Rig) -> None:
+    rig.nodes[0].emergency(0x8210, register=0)
+    assert "drive A: emergency 8210" in stopped_within(rig, 2)
+    rig.drives.reset()
+    for _ in range(10):
+        feedback = rig.cycle()
+    assert feedback.fault is None
+    rig.feedback = feedback
+    rig.enable()
+
+
+def test_an_emcy_that_is_still_in_force_does(rig: Rig) -> None:
+    rig.nodes[0].register = 0x10
+    rig.nodes[0].emergency(0x8130)
+    stopped_within(rig, 2)
+    rig.drives.reset()
+    for _ in range(round(0.6 / PERIOD)):
+        feedback = rig.cycle()
+    assert feedback.fault is not None
+    assert feedback.fault.message == "drive A: emergency 8130 is still in force"
+
+
+def test_setpoints_that_are_not_followed_are_noticed(rig: Rig) -> None:
+    rig.nodes[1].habits.has_bit_12 = False
+    assert "drive B: does not follow setpoints" in stopped_within(rig, round(0.05 / PERIOD))
+
+
+def test_a_silent_drive_stops_the_others(rig: Rig) -> None:
+    rig.wires.nodes.remove(node := rig.nodes[1])
+    for _ in range(5):
+        feedback = rig.cycle(rig.commanded)
+    assert feedback.fault is not None
+    assert feedback.fault.message.startswith("drive B: no position for 3 cycles")
+    for _ in range(100):
+        rig.cycle()
+    assert all(each.state != ENABLED for each in rig.nodes)
+    node.shutdown()
+
+
+def test_drives_stop_by_themselves_when_the_service_is_gone(rig: Rig) -> None:
+    """Those that have 6007h and a watch on the service: no frame comes any more."""
+    for _ in range(400):
+        rig.clock.now += PERIOD
+        rig.wires.pump()
+    for node in rig.nodes:
+        assert node.nmt != OPERATIONAL or not node.has(0x6007)
+        if node.has(0x6007):
+            assert node.state == DISABLED
+
+
+def test_a_drive_that_never_follows_is_not_enabled() -> None:
+    rig = Rig("elmo_gold", Habits(has_bit_12=False))
+    rig.ready()
+    rig.drives.enable()
+    for _ in range(round(0.4 / PERIOD)):
+        feedback = rig.cycle(rig.feedback.position)
+        assert PowerState.OPERATION_ENABLED not in feedback.state
+    assert feedback.fault is not None
+    assert feedback.fault.message.endswith('if it never sets that, say accept_without = ["6041"]')
+    rig.drives.close()
+    rig = Rig("elmo_gold", Habits(has_bit_12=False), accept_without=("6041",))
+    rig.ready()
+    rig.enable()
+    rig.move(0.05, 20)
+    rig.drives.close()
+
+
+def test_each_way_is_what_its_name_says() -> None:
+    names = []
+    for way in WAYS.values():
+        rig = Rig(way.make, way.habits(), **way.keys)
+        rig.ready()
+        names.append(rig.drives._axes[0].way.name)
+        rig.drives.close()
+    assert names == [
+        "cyclic synchronous position with velocity offset, statusword event-driven, heartbeat",
+        "cyclic synchronous position with velocity offset, statusword with the position, heartbeat",
+        "cyclic synchronous position, statusword event-driven, heartbeat",
+        "interpolated position, statusword event-driven, heartbeat",
+        "interpolated position, statusword event-driven, node guarding",
+        "cyclic synchronous position with velocity offset, statusword polled, heartbeat",
+        "cyclic synchronous position, statusword with the position, heartbeat",
+    ]
