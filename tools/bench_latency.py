@@ -13,7 +13,7 @@ import random
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -100,6 +100,10 @@ def listener(path: str) -> Iterator[Listener]:
         made.close()
 
 
+Measured = Callable[[Robot, Listener, random.Random], float | None]
+"""What measures one goal: seconds, None where it changed nothing."""
+
+
 def measure(goals: int, rate: int = 1000) -> dict[str, Any]:
     """Send so many goals at rest, and as many in motion; return milliseconds at QUANTILES."""
     chance = random.Random(3)
@@ -107,10 +111,8 @@ def measure(goals: int, rate: int = 1000) -> dict[str, Any]:
         if made.bus is None:
             raise SystemExit("the drives are inside: there is no bus to look at")
         with listener(made.bus) as heard:
-            made.robot.move_to(x=-END, y=0.0, phi=0.0).wait(10.0)
-            at_rest = [_at_rest(made.robot, heard, chance) for _ in range(goals)]
-            made.robot.move_to(x=-END, y=0.0, phi=0.0).wait(10.0)
-            in_motion = [_in_motion(made.robot, heard, chance) for _ in range(goals)]
+            at_rest = _each(goals, made.robot, heard, chance, _at_rest)
+            in_motion = _each(goals, made.robot, heard, chance, _in_motion)
     return {
         "rate_hz": rate,
         "quantiles": QUANTILES,
@@ -119,6 +121,25 @@ def measure(goals: int, rate: int = 1000) -> dict[str, Any]:
         "goals": goals,
         "without_effect": at_rest.count(None) + in_motion.count(None),
     }
+
+
+def _each(goals: int, robot: Robot, heard: Listener, chance: random.Random, measured: Measured) -> list[float | None]:
+    """Measure so many goals; one in which the machine has stalled the drives into a fault counts as without effect."""
+    found: list[float | None] = []
+    ready = False
+    for _ in range(goals):
+        try:
+            if not ready:
+                if robot.state().mode == "fault":
+                    robot.reset()
+                    robot.enable()
+                robot.move_to(x=-END, y=0.0, phi=0.0).wait(10.0)
+                ready = True
+            found.append(measured(robot, heard, chance))
+        except TrirailError:
+            found.append(None)
+            ready = False
+    return found
 
 
 def _at_rest(robot: Robot, heard: Listener, chance: random.Random) -> float | None:
@@ -179,4 +200,7 @@ def main(goals: int, json: bool = False) -> None:
     for name, key in (("at rest", "at_rest_ms"), ("in motion", "in_motion_ms")):
         print(f"{name:12}" + "".join(f"{value:8.2f}" for value in measured[key]))
     if measured["without_effect"]:
-        print(f"{measured['without_effect']} goals changed nothing within {WITHIN:g} s, and are left out")
+        print(
+            f"{measured['without_effect']} goals are left out: they changed nothing within {WITHIN:g} s, "
+            f"or the machine stalled the drives into a fault"
+        )
