@@ -15,6 +15,8 @@ FOLLOW_TIME = MISSED_STATUSES * frames.STATUS_PERIOD
 """How long an enabled drive may take to say that it follows setpoints [s]."""
 REGISTER_TIME = 0.5
 """How long a drive may take to tell its error register after a reset [s]."""
+APART = 0.005
+"""Positions that answer one SYNC and are so far apart [m] are those of two sliders."""
 SECOND_ANSWERS = 3
 """So many SYNCs in a row that are answered twice are answered by two nodes."""
 RESET_TIME = 2 * frames.STATUS_PERIOD
@@ -121,7 +123,8 @@ class Axis(axis.Axis):
     def on_position(self, data: bytes | bytearray, now: float) -> None:
         """TPDO2: the position sampled at a SYNC, and the statusword where the drive's way has it here."""
         counts, statusword = self.way.feedback.unpack(data)
-        self._came += not self._came or counts != self.actual  # the same again is one frame that came twice
+        apart = abs(counts - self.actual) > abs(self.scale.counts_per_metre) * APART
+        self._came += not self._came or apart  # about the same again is a frame, or a SYNC, that came twice
         self.take_position(counts)
         self.answers.come()
         if statusword is not None:
