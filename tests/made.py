@@ -18,6 +18,11 @@ MONOTONIC_NS = 5_000_000_000_000
 """The monotonic clock at cycle 0."""
 
 
+def bits(records: NDArray[np.void]) -> list[bytes]:
+    """Return what records hold to the last bit, field by field: what is between the fields means nothing."""
+    return [records[name].tobytes() for name in records.dtype.names or ()]
+
+
 def records(
     seconds: float, geometry: Geometry | None = None, seed: int = 0, mode: Mode = Mode.MOVING
 ) -> NDArray[np.void]:

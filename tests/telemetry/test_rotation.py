@@ -21,6 +21,7 @@ from trirail.processes.loop import BATCHES_PER_SECOND
 from trirail.processes.recording import GATHER
 from trirail.telemetry import blackbox, provenance, retention
 from trirail.telemetry.blackbox import AFTER, BEFORE, BlackBox
+from trirail.telemetry.columns import SOFTWARE
 from trirail.telemetry.reading import Recording, join, read
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.messages import Event, PoseGoal
@@ -94,8 +95,8 @@ def test_the_fingerprint_is_that_of_the_source_of_both_packages() -> None:
 
 
 def test_software_of_another_version_is_unknown_software() -> None:
-    assert provenance.recorded_by({provenance.SOFTWARE: '{"trirail": "9.0", "build": 7}'}) is None
-    assert provenance.recorded_by({provenance.SOFTWARE: "no JSON"}) is None
+    assert provenance.recorded_by({SOFTWARE: '{"trirail": "9.0", "build": 7}'}) is None
+    assert provenance.recorded_by({SOFTWARE: "no JSON"}) is None
 
 
 # ---------------------------------------------------------------------- rotation
@@ -114,7 +115,7 @@ def test_a_recording_goes_on_in_another_file_after_its_time(tmp_path: Path) -> N
     assert [path.stem.partition("-part")[2] for path in files] == ["", "2", "3"]
     read_back = [read(path) for path in files]
     assert [len(part.records) for part in read_back] == pytest.approx([1000] * 3, abs=2 * BATCH)
-    assert join(read_back).records.tobytes() == sent.tobytes()
+    assert made.bits(join(read_back).records) == made.bits(sent)
 
 
 def test_every_file_is_complete_in_itself(tmp_path: Path) -> None:
@@ -141,7 +142,7 @@ def test_a_recording_goes_on_in_another_file_beyond_its_size(tmp_path: Path) -> 
     sizes = [path.stat().st_size for path in parts(tmp_path)]
     assert len(sizes) > 2
     assert all(1e6 < size < 2e6 for size in sizes[:-1])
-    assert join([read(path) for path in parts(tmp_path)]).records.tobytes() == sent.tobytes()
+    assert made.bits(join([read(path) for path in parts(tmp_path)]).records) == made.bits(sent)
 
 
 # ---------------------------------------------------------------------- the folder
@@ -247,7 +248,7 @@ def test_a_killed_recorder_leaves_all_that_was_saved(tmp_path: Path) -> None:
     assert subprocess.run(command, cwd=Path(__file__).parents[1], check=False).returncode == -9
     (path,) = parts(tmp_path)
     records = read(path).records
-    assert records.tobytes() == made.records(1.98)[:1940].tobytes()
+    assert made.bits(records) == made.bits(made.records(1.98)[:1940])
 
 
 def test_what_is_not_saved_yet_is_younger_than_a_fifth_of_a_second() -> None:

@@ -14,8 +14,8 @@ import msgspec
 import trirail_drivers
 
 from trirail.config import Config, parse
+from trirail.telemetry.columns import CONFIGURATION, SOFTWARE
 
-CONFIGURATION, SOFTWARE = "/configuration", "/software"
 LIBRARIES = ("eclipse-zenoh", "ruckig", "rerun-sdk", "python-can", "canopen", "numpy", "numba")
 _PACKAGES = (Path(__file__).parents[1], Path(trirail_drivers.__path__[0]))
 
