@@ -26,8 +26,8 @@ from trirail.motion.runs import MotionState
 from trirail.wire.messages import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers.bus import simulated_bus
 from trirail_drivers.cia402 import frames
+from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import Feedback, Triple
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedDrive

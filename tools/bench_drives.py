@@ -16,8 +16,8 @@ from pathlib import Path
 from types import FrameType
 
 from trirail.config import load
-from trirail_drivers.bus import simulated_bus
-from trirail_drivers.unixbus import UnixBus
+from trirail_drivers.bus.unixbus import UnixBus
+from trirail_drivers.connection.opening import simulated_bus
 
 PRIORITY = 70
 """SCHED_FIFO, below the loop's 80."""

@@ -18,9 +18,9 @@ from typing import Any
 import can
 import numpy as np
 from can.interfaces.socketcan import SocketcanBus
+from trirail_drivers.bus.frame_io import FrameIO, PythonCanFrames, SocketFrames
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames as layout
-from trirail_drivers.frame_io import FrameIO, PythonCanFrames, SocketFrames
-from trirail_drivers.frames import Frame
 from trirail_drivers.interface import NAMES
 
 CYCLES = 3000

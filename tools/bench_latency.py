@@ -20,12 +20,12 @@ import numpy as np
 from bench_rig import rig
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
-from trirail_drivers.capture import FRAME, Capture
+from trirail_drivers.bus.capture import FRAME, Capture
+from trirail_drivers.bus.frame_io import SocketFrames
+from trirail_drivers.bus.frames import CAN_FRAME
+from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import frames as layout
-from trirail_drivers.frame_io import SocketFrames
-from trirail_drivers.frames import CAN_FRAME
 from trirail_drivers.interface import NAMES
-from trirail_drivers.unixbus import UnixBus
 
 QUANTILES = (50.0, 99.0, 100.0)
 SETPOINTS = {layout.RPDO2 + node for node in range(1, 1 + len(NAMES))}

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from trirail.config import SIM, load
 from trirail.errors import TrirailError
 from trirail.wire.records import PARTS, unpack
-from trirail_drivers.bus import simulated_bus
 from trirail_drivers.cia402.drives import Cia402
+from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.simulated import SimulatedBus
 
 QUANTILES = (50.0, 99.0, 99.9, 100.0)

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from bench_latency import listener
 from bench_rig import configured, drives, rig, without_pause
+from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import frames as layout
-from trirail_drivers.unixbus import UnixBus
 
 RATE = 1000
 QUANTILES = (50.0, 99.0, 99.9, 100.0)

@@ -24,8 +24,8 @@ from trirail.processes.interpreter import child
 from trirail.telemetry.reading import Recording, read
 from trirail.telemetry.sinks import HOST, free_port
 from trirail.wire.state import State
+from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import frames
-from trirail_drivers.unixbus import UnixBus
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 20.0

@@ -43,7 +43,7 @@ BOUNDS = (
     Bound("A drive's answer while it is set up", ("drives.sdo_timeout",), "the service does not start"),
     Bound("Heartbeats of drives and service", ("drives.heartbeat",), "fault or the drive's own stop, after three"),
     Bound("Homing of one drive", ("drives.A.homing.timeout",), "fault"),
-    Bound("The bus takes no frames", ("trirail_drivers.wire:UNSENT_CYCLES cycles",), "fault"),
+    Bound("The bus takes no frames", ("trirail_drivers.bus.wire:UNSENT_CYCLES cycles",), "fault"),
     Bound("Ticks missed in a row", ("watchdogs.max_overruns",), "controlled stop"),
     Bound("No sign of life from the gateway", ("watchdogs.gateway_timeout",), "controlled stop"),
     Bound("No sign of life from a process", ("trirail.processes.supervisor:SILENT s",),

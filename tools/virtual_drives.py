@@ -22,12 +22,12 @@ import can
 import msgspec
 from trirail.config import Config, load
 from trirail.errors import TrirailError
-from trirail_drivers.bus import open_bus, simulated_bus
+from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.config import Drives
+from trirail_drivers.connection.opening import open_bus, simulated_bus
 from trirail_drivers.interface import NAMES
 from trirail_drivers.simulated import SimulatedBus
 from trirail_drivers.simulated.faultlines import HELP, FaultSyntaxError
-from trirail_drivers.unixbus import UnixBus
 
 _POLLS = 5
 """So many times a cycle the drives' own timers are looked at, if no frame comes."""

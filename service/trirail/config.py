@@ -295,8 +295,8 @@ def _type_at(path: str) -> Any:
 
 def _check(config: Config) -> None:
     """Refuse what is well-formed but impossible."""
-    from trirail_drivers import config_checks
-    from trirail_drivers.requirements import Requirements
+    from trirail_drivers.connection import checks
+    from trirail_drivers.driver.requirements import Requirements
 
     robot = geometry(config.geometry)
     platform, slider = config.limits.platform, config.limits.slider
@@ -334,7 +334,7 @@ def _check(config: Config) -> None:
     places = (*slider.position, *(config.can.simulated.start if config.can.interface == "simulated" else ()))
     required = Requirements(config.period, min(places), max(places), slider.velocity, slider.following_error)
     try:
-        config_checks.check_bus(config.can)
-        config_checks.check(config.drives, required)
+        checks.check_bus(config.can)
+        checks.check(config.drives, required)
     except DriveError as error:
         raise ConfigError(str(error)) from error

@@ -18,7 +18,7 @@ from trirail.cli.doctor import Check, Machine
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
 from trirail.processes.clock import Tick
-from trirail_drivers.bus import simulated_bus
+from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.errors import BusError
 from trirail_drivers.protocols import PROTOCOLS
 

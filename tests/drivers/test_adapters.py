@@ -19,8 +19,8 @@ import can
 import msgspec
 import pytest
 from trirail.config import SIM, load
-from trirail_drivers import bus
 from trirail_drivers.config import Can, Simulated
+from trirail_drivers.connection import opening
 from trirail_drivers.errors import BusError
 from trirail_drivers.interface import Drives, Feedback, PowerState
 
@@ -65,7 +65,7 @@ def test_options_reach_python_can_as_they_are(
 
     monkeypatch.setattr(can, "Bus", opened)
     with pytest.raises(BusError):
-        bus.open_bus(section, SIMULATED.drives)
+        opening.open_bus(section, SIMULATED.drives)
     assert calls == [given | {"ignore_config": True}]
 
 
@@ -88,7 +88,7 @@ def test_socketcand_by_host_and_port() -> None:
     section = Can(
         interface="socketcand", channel="can7", options={"host": "127.0.0.1", "port": listening.getsockname()[1]}
     )
-    opened = bus.open_bus(section, SIMULATED.drives)
+    opened = opening.open_bus(section, SIMULATED.drives)
     try:
         opened.send(can.Message(arbitration_id=0x602, data=b"\x40", is_extended_id=False))
         answer = opened.recv(5.0)
@@ -104,7 +104,7 @@ def test_socketcand_by_host_and_port() -> None:
 def test_an_interface_that_this_machine_does_not_have_is_one_line(interface: str) -> None:
     """Whatever python-can or the maker's library raises: NameError, AttributeError, ImportError, OSError."""
     with pytest.raises(BusError) as refused:
-        bus.open_bus(Can(interface=interface, channel="no-such-adapter"), SIMULATED.drives)
+        opening.open_bus(Can(interface=interface, channel="no-such-adapter"), SIMULATED.drives)
     assert interface in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -139,7 +139,7 @@ def test_a_missing_library_is_named_with_its_package(
     for module in modules:
         monkeypatch.setitem(sys.modules, module, None)
     with imported_anew(interface), pytest.raises(BusError) as refused:
-        bus.open_bus(Can(interface=interface, channel="0"), SIMULATED.drives)
+        opening.open_bus(Can(interface=interface, channel="0"), SIMULATED.drives)
     assert remedy in str(refused.value)
 
 
@@ -188,7 +188,7 @@ def test_drives_of_another_process_by_udp_multicast(tmp_path: Path) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as served:
         assert served.stdout is not None
         assert "switch on disabled" in served.stdout.readline()
-        drives = bus.connect(config.can, config.drives, slowly)
+        drives = opening.connect(config.can, config.drives, slowly)
         try:
             drives.configure(config.period)
             cycle(drives)
@@ -214,7 +214,7 @@ class SerialLineAdapter:
         self._told, self._tell = socket.socketpair()
         self._typed = bytearray()
         section = msgspec.structs.replace(SIMULATED.can, simulated=Simulated(missed_syncs=10_000))
-        self._drives = bus.simulated_bus(section, DRIVES)
+        self._drives = opening.simulated_bus(section, DRIVES)
         self._thread = threading.Thread(target=self._serve)
 
     def __enter__(self) -> SerialLineAdapter:
@@ -259,7 +259,7 @@ def test_slcan_whose_adapter_acknowledges_every_frame(taken: bytes) -> None:
     with SerialLineAdapter(taken) as adapter:
         options: dict[str, bool | int | float | str] = {"tty_baudrate": 921_600, "sleep_after_open": 0, "timeout": 0}
         section = Can(interface="slcan", channel=adapter.channel, options=options)
-        drives = bus.connect(section, DRIVES, slowly)
+        drives = opening.connect(section, DRIVES, slowly)
         try:
             drives.configure(0.01)
             cycle(drives)
@@ -276,7 +276,7 @@ def test_slcan_whose_adapter_acknowledges_every_frame(taken: bytes) -> None:
 def test_a_virtual_bus_ends_with_its_process() -> None:
     """python-can's "virtual" joins buses of one process, as drives and driver of one script."""
     section = Can(interface="virtual", channel="one-process", options={"preserve_timestamps": True})
-    here, there = bus.open_bus(section, SIMULATED.drives), bus.open_bus(section, SIMULATED.drives)
+    here, there = opening.open_bus(section, SIMULATED.drives), opening.open_bus(section, SIMULATED.drives)
     try:
         here.send(can.Message(arbitration_id=0x080, is_extended_id=False))
         heard = there.recv(1.0)

@@ -7,8 +7,8 @@ import math
 import pytest
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.axis import REGISTER_TIME, Axis
+from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
-from trirail_drivers.scaling import Scale
 
 P = PowerState
 ENABLED, READY, FAULT = b"\x37\x02", b"\x31\x02", b"\x18\x02"

@@ -8,9 +8,9 @@ from pathlib import Path
 import can
 import msgspec
 import pytest
-from trirail_drivers import bus
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Can, Drive, Drives
+from trirail_drivers.connection import opening
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.odrive.drives import Odrive
 
@@ -35,7 +35,7 @@ class StandInBus(can.BusABC):
 
 def refusal(section: Can) -> str:
     with pytest.raises(BusError) as caught:
-        bus.open_bus(section, DRIVES)
+        opening.open_bus(section, DRIVES)
     text = str(caught.value)
     assert "\n" not in text
     return text
@@ -49,7 +49,7 @@ def failing_with(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_simulated_drives_answer() -> None:
-    opened = bus.open_bus(Can(interface="simulated"), DRIVES)
+    opened = opening.open_bus(Can(interface="simulated"), DRIVES)
     try:
         opened.send(can.Message(arbitration_id=0x602, data=b"\x40\0\x10\0\0\0\0\0", is_extended_id=False))
         answers = []
@@ -61,7 +61,7 @@ def test_simulated_drives_answer() -> None:
 
 
 def test_connect_gives_drives_that_can_be_configured() -> None:
-    drives = bus.connect(Can(interface="simulated"), DRIVES)
+    drives = opening.connect(Can(interface="simulated"), DRIVES)
     assert isinstance(drives, Cia402)
     try:
         drives.configure(0.001)
@@ -72,7 +72,7 @@ def test_connect_gives_drives_that_can_be_configured() -> None:
 
 def test_connect_gives_the_drives_of_the_protocol() -> None:
     section = msgspec.structs.replace(DRIVES, protocol="odrive")
-    drives = bus.connect(Can(interface="simulated"), section)
+    drives = opening.connect(Can(interface="simulated"), section)
     assert isinstance(drives, Odrive)
     try:
         drives.configure(0.001)
@@ -83,15 +83,15 @@ def test_connect_gives_the_drives_of_the_protocol() -> None:
 
 def test_connect_leaves_no_bus_open_where_the_drives_are_impossible(monkeypatch: pytest.MonkeyPatch) -> None:
     opened = StandInBus()
-    monkeypatch.setattr(bus, "open_bus", lambda *given: opened)
+    monkeypatch.setattr(opening, "open_bus", lambda *given: opened)
     far = Drive(node=1, counts_per_metre=1e6, offset=1e6)
     with pytest.raises(DriveError, match="drive A"):
-        bus.connect(Can(interface="virtual"), Drives(protocol="cia402", A=far, B=DRIVES.B, C=DRIVES.C))
+        opening.connect(Can(interface="virtual"), Drives(protocol="cia402", A=far, B=DRIVES.B, C=DRIVES.C))
     assert opened._is_shutdown
 
 
 def test_any_python_can_interface_opens() -> None:
-    opened = bus.open_bus(Can(interface="virtual", channel="test-bus"), DRIVES)
+    opened = opening.open_bus(Can(interface="virtual", channel="test-bus"), DRIVES)
     assert opened.recv(0) is None
     opened.shutdown()
 
@@ -131,11 +131,11 @@ def test_missing_virtual_can_interface(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_can_interface_that_is_down(up: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "can0").mkdir()
     (tmp_path / "can0" / "flags").write_text("0x40081\n" if up else "0x40080\n")
-    monkeypatch.setattr(bus, "NETWORK_INTERFACES", tmp_path)
+    monkeypatch.setattr(opening, "NETWORK_INTERFACES", tmp_path)
     monkeypatch.setattr(can, "Bus", lambda **kwargs: StandInBus())
     section = Can(interface="socketcan", channel="can0")
     if up:
-        bus.open_bus(section, DRIVES).shutdown()
+        opening.open_bus(section, DRIVES).shutdown()
     else:
         assert '"can0" is down; bring it up with: ip link set can0 up' in refusal(section)
 

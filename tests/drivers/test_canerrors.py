@@ -7,7 +7,7 @@ import re
 
 import can
 import pytest
-from trirail_drivers.canerrors import Gravity, cannot_send, error_number, queue_is_full, report
+from trirail_drivers.bus.canerrors import Gravity, cannot_send, error_number, queue_is_full, report
 
 
 @pytest.mark.parametrize(

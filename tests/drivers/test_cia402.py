@@ -17,9 +17,9 @@ from trirail_drivers.cia402.drives import REPEAT_AFTER, Cia402
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.settings import interpolation_periods
 from trirail_drivers.config import Drive, Drives, Homing
+from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 from trirail_drivers.interface import PowerState
-from trirail_drivers.scaling import scale_of
 from trirail_drivers.simulated import SimulatedDrive
 from trirail_drivers.simulated.dictionary import Entry
 

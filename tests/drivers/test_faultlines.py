@@ -12,6 +12,7 @@ from pathlib import Path
 
 import can
 import pytest
+from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import frames
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
@@ -19,7 +20,6 @@ from trirail_drivers.protocols import CIA402, ODRIVE, PROTOCOLS
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from trirail_drivers.simulated.faultlines import HELP, Condition, FaultSyntaxError, parse
 from trirail_drivers.simulated.faults import Faults
-from trirail_drivers.unixbus import UnixBus
 
 ROOT = Path(__file__).parents[2]
 WAIT = 20.0

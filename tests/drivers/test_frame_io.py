@@ -14,10 +14,10 @@ import pytest
 from carriers import FarEnd, over
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail_drivers.capture import FRAME, Capture
-from trirail_drivers.frame_io import FrameIO, PythonCanFrames
-from trirail_drivers.frames import CAN_FRAME, ERROR, EXTENDED, REMOTE, Frame
-from trirail_drivers.wire import Wire
+from trirail_drivers.bus.capture import FRAME, Capture
+from trirail_drivers.bus.frame_io import FrameIO, PythonCanFrames
+from trirail_drivers.bus.frames import CAN_FRAME, ERROR, EXTENDED, REMOTE, Frame
+from trirail_drivers.bus.wire import Wire
 
 BUSES = [
     pytest.param(kind, way, id=f"{kind}, {way}", marks=marks)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from trirail_drivers.bus.frames import frame_bits
 from trirail_drivers.cia402 import frames
-from trirail_drivers.frames import frame_bits
 from trirail_drivers.interface import PowerState
 
 P = PowerState

@@ -10,7 +10,7 @@ import pytest
 from edsfiles import MAKES, eds, make_eds, rows
 from rigs import DeviceRig
 from trirail_drivers import config
-from trirail_drivers.bus import connect, simulated_bus
+from trirail_drivers.connection.opening import connect, simulated_bus
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Machine, Servo, SimulatedDrive

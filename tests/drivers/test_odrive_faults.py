@@ -27,13 +27,13 @@ from drivers.test_odrive import odrives
 from trirail.config import Config
 from trirail.wire.packets import Confirmed, Refused, Request
 from trirail.wire.vocabulary import Mode
+from trirail_drivers.bus.wire import UNSENT_CYCLES
+from trirail_drivers.driver.ramp import braked
 from trirail_drivers.interface import PowerState
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.frames import AxisState
 from trirail_drivers.odrive.setpoints import SETTLING
-from trirail_drivers.ramp import braked
 from trirail_drivers.simulated import SimulatedOdrive
-from trirail_drivers.wire import UNSENT_CYCLES
 
 ODRIVES = odrives(REAL)
 PERIOD = ODRIVES.period

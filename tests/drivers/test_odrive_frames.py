@@ -12,7 +12,7 @@ import pytest
 from cantools.database.can import Database
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail_drivers.frames import frame_bits
+from trirail_drivers.bus.frames import frame_bits
 from trirail_drivers.odrive import frames
 
 LOADED = cantools.database.load_file(Path(__file__).parents[1] / "data" / "odrive-cansimple.dbc")

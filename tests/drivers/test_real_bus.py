@@ -17,15 +17,15 @@ import can
 import carriers
 import pytest
 from carriers import NAME, ip, on_vcan
-from trirail_drivers import bus
-from trirail_drivers import wire as wires
-from trirail_drivers.bus import simulated_bus
+from trirail_drivers.bus import wire as wires
+from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Can, Drive, Drives, Simulated
+from trirail_drivers.connection import opening
+from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.errors import BusError
-from trirail_drivers.frames import Frame
 from trirail_drivers.interface import Feedback, PowerState
-from trirail_drivers.unixbus import UnixBus
 
 SIMULATED = Simulated(missed_syncs=1000)
 VCAN = Can(interface="socketcan", channel=NAME, simulated=SIMULATED)
@@ -69,7 +69,7 @@ def drives(section: Can) -> Iterator[None]:
     """The simulated drives on it."""
     over, running = socket.socketpair()
     simulated = simulated_bus(section, DRIVES)
-    wire = UnixBus(section.channel, listen=True) if section.interface == "unix" else bus.open_bus(section, DRIVES)
+    wire = UnixBus(section.channel, listen=True) if section.interface == "unix" else opening.open_bus(section, DRIVES)
 
     def serve() -> None:
         with selectors.DefaultSelector() as selector:
@@ -98,7 +98,7 @@ def driver(
 ) -> Iterator[Cia402]:
     """The driver, whose frames go by python-can, and on the bus's own socket."""
     monkeypatch.setattr(wires, "frame_io", carriers.WAYS[request.param])
-    connected = bus.connect(section, DRIVES)
+    connected = opening.connect(section, DRIVES)
     assert isinstance(connected, Cia402)
     yield connected
     connected.close()
@@ -127,7 +127,7 @@ def until(driver: Cia402, condition: Callable[[Feedback], bool], position: float
 
 @on_vcan
 def test_frames_pass_between_two_sockets(interface: str) -> None:
-    with bus.open_bus(VCAN, DRIVES) as one, bus.open_bus(VCAN, DRIVES) as other:
+    with opening.open_bus(VCAN, DRIVES) as one, opening.open_bus(VCAN, DRIVES) as other:
         one.send(Frame(0x123, b"\x01\x02").message())
         arrived = other.recv(WITHIN)
         assert arrived is not None
@@ -138,14 +138,14 @@ def test_frames_pass_between_two_sockets(interface: str) -> None:
 @on_vcan
 def test_an_interface_that_is_not_there_is_named_with_its_remedy() -> None:
     with pytest.raises(BusError, match=f"ip link add {NAME} type vcan"):
-        bus.open_bus(VCAN, DRIVES)
+        opening.open_bus(VCAN, DRIVES)
 
 
 @on_vcan
 def test_an_interface_that_is_down_is_named_with_its_remedy(interface: str) -> None:
     ip("link", "set", NAME, "down")
     with pytest.raises(BusError, match="is down"):
-        bus.open_bus(VCAN, DRIVES)
+        opening.open_bus(VCAN, DRIVES)
 
 
 def test_drives_are_set_up_powered_moved_and_left_without_power(driver: Cia402) -> None:

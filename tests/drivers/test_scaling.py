@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drive
+from trirail_drivers.driver.scaling import INT32_MAX, UINT32_MAX, Scale, scale_of
 from trirail_drivers.errors import DriveError
-from trirail_drivers.scaling import INT32_MAX, UINT32_MAX, Scale, scale_of
 
 drives = st.builds(
     Drive,

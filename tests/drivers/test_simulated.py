@@ -9,7 +9,7 @@ import can
 import pytest
 from rigs import DeviceRig
 from trirail_drivers import config
-from trirail_drivers.bus import simulated_bus
+from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from trirail_drivers.simulated.drive import EDS

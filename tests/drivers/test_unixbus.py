@@ -11,8 +11,8 @@ from pathlib import Path
 
 import can
 import pytest
+from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.errors import BusError
-from trirail_drivers.unixbus import UnixBus
 
 ROOT = Path(__file__).parents[2]
 WAIT = 5.0

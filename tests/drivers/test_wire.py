@@ -15,11 +15,11 @@ from collections.abc import Iterator
 import carriers
 import pytest
 from carriers import FarEnd
-from trirail_drivers import wire as wires
-from trirail_drivers.frames import ERROR, EXTENDED, REMOTE, Frame, frame_bits
+from trirail_drivers.bus import wire as wires
+from trirail_drivers.bus.frames import ERROR, EXTENDED, REMOTE, Frame, frame_bits
+from trirail_drivers.bus.unixbus import UnixBus
+from trirail_drivers.bus.wire import Wire
 from trirail_drivers.interface import DriveFault
-from trirail_drivers.unixbus import UnixBus
-from trirail_drivers.wire import Wire
 
 
 class Listener:

@@ -25,9 +25,9 @@ from trirail.telemetry.sinks import BACKLOG, Archive, Relay, free_port
 from trirail.telemetry.streams import Streams
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
-from trirail_drivers.capture import FRAME
+from trirail_drivers.bus.capture import FRAME
+from trirail_drivers.bus.frames import Frame, packed
 from trirail_drivers.errors import FileError
-from trirail_drivers.frames import Frame, packed
 
 WALL_NS = 1_795_245_300_000_000_000
 

@@ -12,8 +12,8 @@ from chaos import CASES, HARM, MODES
 from chaos_rig import NODES, PROCESSES, Failed, Rig
 from trirail.config import SIM, load
 from trirail.wire import vocabulary
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames
-from trirail_drivers.frames import Frame
 
 
 def test_it_has_every_mode_process_and_harm() -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from trirail_drivers import axis
 from trirail_drivers.cia402 import frames, ways
 from trirail_drivers.cia402.units import Units
+from trirail_drivers.driver import axis
+from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
-from trirail_drivers.scaling import Scale
 
 MISSED_STATUSES = 3
 FOLLOW_TIME = MISSED_STATUSES * frames.STATUS_PERIOD

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from trirail_drivers.cia402 import settings, units
 from trirail_drivers.config import Drive, Drives
+from trirail_drivers.driver.requirements import Requirements, check_resolution
+from trirail_drivers.driver.scaling import INT32_MAX, Scale, scale_of
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
-from trirail_drivers.requirements import Requirements, check_resolution
-from trirail_drivers.scaling import INT32_MAX, Scale, scale_of
 
 
 def check(drives: Drives, required: Requirements) -> None:

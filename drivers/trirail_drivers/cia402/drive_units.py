@@ -10,8 +10,8 @@ from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.sdo import Remote, SdoRefused
 from trirail_drivers.cia402.units import Of, Unit, Units, acceleration_unit, position_unit, velocity_unit, written
 from trirail_drivers.config import Drive
+from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveError
-from trirail_drivers.scaling import Scale
 
 TOLERANCE: Final = 0.01
 """By so much a measured number of counts or revolutions per metre may differ from the drive's own."""

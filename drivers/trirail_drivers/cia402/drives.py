@@ -13,12 +13,12 @@ import time
 import can
 
 from trirail_drivers import config
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames, setup, ways
 from trirail_drivers.cia402.axis import Axis
 from trirail_drivers.cia402.homing import Homing
 from trirail_drivers.cia402.strangers import Strangers
-from trirail_drivers.driver import Clock, Driver
-from trirail_drivers.frames import Frame
+from trirail_drivers.driver.driver import Clock, Driver
 from trirail_drivers.interface import Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3

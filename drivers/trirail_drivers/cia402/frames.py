@@ -5,9 +5,9 @@ from __future__ import annotations
 from struct import Struct
 from typing import Final, Literal
 
-from trirail_drivers.frames import Frame, frame_bits
+from trirail_drivers.bus.frames import Frame, frame_bits
+from trirail_drivers.bus.load import Traffic
 from trirail_drivers.interface import PowerState
-from trirail_drivers.load import Traffic
 
 # Identifiers of the predefined connection set (CiA 301); all but the first two are bases for a node id.
 NMT: Final = 0x000

@@ -6,10 +6,10 @@ from typing import Final, NamedTuple
 
 import can
 
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.config import Drives
-from trirail_drivers.frames import Frame
 
 MISSED: Final = 3
 """So many heartbeats, or guardings, in a row that do not come are a loss."""

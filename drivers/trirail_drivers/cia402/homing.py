@@ -16,9 +16,9 @@ from struct import Struct
 from typing import Final
 
 from trirail_drivers import config
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.axis import Axis
-from trirail_drivers.frames import Frame
 from trirail_drivers.interface import DriveFault
 
 HOMING = 6

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import can
 
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import eds, frames
 from trirail_drivers.cia402.differences import Difference, Differences
 from trirail_drivers.cia402.drive_units import read_units
@@ -26,10 +27,9 @@ from trirail_drivers.cia402.settings import (
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.cia402.ways import Way
 from trirail_drivers.config import Drive, Drives
+from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import BusError, DriveError
-from trirail_drivers.frames import Frame
 from trirail_drivers.interface import NAMES, PowerState
-from trirail_drivers.scaling import Scale
 
 HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 """States in which a drive may have current in its motor."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from trirail_drivers.bus.wire import Handler, Wire
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.axis import Axis
 from trirail_drivers.interface import DriveFault
-from trirail_drivers.wire import Handler, Wire
 
 _COMMANDS: Final = {
     0x01: "start",

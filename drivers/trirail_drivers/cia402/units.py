@@ -16,8 +16,8 @@ from enum import StrEnum
 from typing import Final
 
 from trirail_drivers.config import Drive
+from trirail_drivers.driver.scaling import UINT32_MAX, Scale
 from trirail_drivers.errors import DriveError
-from trirail_drivers.scaling import UINT32_MAX, Scale
 
 
 class Of(StrEnum):

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import Final
 
+from trirail_drivers.bus.frames import Frame, frame_bits
+from trirail_drivers.bus.load import Traffic
 from trirail_drivers.cia402 import frames
-from trirail_drivers.frames import Frame, frame_bits
-from trirail_drivers.load import Traffic
 
 INTERPOLATED_POSITION: Final = 7
 CYCLIC_SYNCHRONOUS_POSITION: Final = 8

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from trirail_drivers.axis import Axis
+from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.frames import AxisState, Result
-from trirail_drivers.scaling import Scale
 
 RESET_TIME = 3 * 3 * frames.ERROR_PERIOD
 """How long errors may be told of after they were cleared, in which each drive is asked three times [s]."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 from trirail_drivers.config import Drive, Drives
+from trirail_drivers.driver.requirements import Requirements, check_resolution
+from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
 from trirail_drivers.odrive import setup
 from trirail_drivers.odrive.frames import MAX_FEED_FORWARD
-from trirail_drivers.requirements import Requirements, check_resolution
-from trirail_drivers.scaling import scale_of
 
 _FLOAT_DIGITS: Final = 23
 """Binary digits of an ODrive's position after the first, a 32-bit float."""

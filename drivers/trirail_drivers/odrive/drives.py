@@ -19,8 +19,8 @@ from collections import deque
 import can
 
 from trirail_drivers import config
-from trirail_drivers.axis import MISSED_ANSWERS
-from trirail_drivers.driver import Clock, Driver
+from trirail_drivers.driver.axis import MISSED_ANSWERS
+from trirail_drivers.driver.driver import Clock, Driver
 from trirail_drivers.interface import DriveFault, Feedback, Triple
 from trirail_drivers.odrive import frames, setup
 from trirail_drivers.odrive.axis import OdriveAxis

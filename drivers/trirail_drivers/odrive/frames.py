@@ -10,8 +10,8 @@ from enum import IntEnum, IntFlag
 from struct import Struct
 from typing import Final
 
-from trirail_drivers.frames import Frame, frame_bits
-from trirail_drivers.load import Traffic
+from trirail_drivers.bus.frames import Frame, frame_bits
+from trirail_drivers.bus.load import Traffic
 
 # Commands: the lower five bits of an identifier, under the node id.
 GET_VERSION: Final = 0x00

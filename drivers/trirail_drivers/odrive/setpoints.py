@@ -7,11 +7,11 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
+from trirail_drivers.bus.wire import Wire
+from trirail_drivers.driver.ramp import braked
 from trirail_drivers.interface import Triple
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.axis import OdriveAxis
-from trirail_drivers.ramp import braked
-from trirail_drivers.wire import Wire
 
 SETTLING: Final = 0.05
 """How long a drive holds at the end of a quick stop before its power is taken off, for its servo to catch up [s]."""

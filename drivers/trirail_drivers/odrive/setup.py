@@ -17,14 +17,14 @@ from collections.abc import Callable, Sequence
 
 import can
 
-from trirail_drivers.axis import MISSED_HEARTBEATS
+from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.wire import Wire
 from trirail_drivers.config import Drives
+from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout
-from trirail_drivers.frames import Frame
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
-from trirail_drivers.wire import Wire
 
 Clock = Callable[[], float]
 

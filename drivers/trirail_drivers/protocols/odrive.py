@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from trirail_drivers import config
-from trirail_drivers.axis import MISSED_HEARTBEATS
+from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.odrive import checks, frames
 from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.protocols.protocol import Protocol

@@ -9,9 +9,9 @@ from typing import Any
 import can
 
 from trirail_drivers import config
+from trirail_drivers.bus.load import Traffic
+from trirail_drivers.driver.requirements import Requirements
 from trirail_drivers.interface import Drives
-from trirail_drivers.load import Traffic
-from trirail_drivers.requirements import Requirements
 from trirail_drivers.simulated import Frames, SimulatedDevice
 
 Clock = Callable[[], float]

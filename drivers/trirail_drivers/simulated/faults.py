@@ -11,7 +11,8 @@ from typing import Final
 
 import can
 
-from trirail_drivers import canerrors, files
+from trirail_drivers import files
+from trirail_drivers.bus import canerrors
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES, PowerState
 from trirail_drivers.simulated.devices import SimulatedDevice

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from trirail_drivers import config
-from trirail_drivers.ramp import braked
+from trirail_drivers.driver.ramp import braked
 
 
 class Servo:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from trirail_drivers.bus import connect
+from trirail_drivers.connection.opening import connect
 from trirail_drivers.interface import DriveFault, Drives, Feedback, PowerState, Triple
 
 from trirail.config import Config

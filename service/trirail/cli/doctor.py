@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from msgspec import Struct
-from trirail_drivers.load import HIGH
+from trirail_drivers.bus.load import HIGH
 from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.config import Config

@@ -26,7 +26,7 @@ def drives(
     json
         Print one JSON object instead of words.
     """
-    from trirail_drivers.bus import open_bus
+    from trirail_drivers.connection.opening import open_bus
     from trirail_drivers.errors import DriveError
     from trirail_drivers.protocols import PROTOCOLS
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from msgspec import structs
-from trirail_drivers import adapters
+from trirail_drivers.bus import adapters
 
 from trirail.cli.doctor import Machine
 from trirail.config import Config, LoopTable

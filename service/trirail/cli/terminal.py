@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
-from trirail_drivers import load
+from trirail_drivers.bus import load
 from trirail_drivers.errors import shortened
 
 from trirail.client.client import GoalHandle, Jog, Result, Robot

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from trirail_drivers.bus import connect
-from trirail_drivers.capture import Capture
+from trirail_drivers.bus.capture import Capture
+from trirail_drivers.connection.opening import connect
 from trirail_drivers.interface import DriveFault, Drives
 
 from trirail.config import Config

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trirail_drivers.capture import FRAME
-from trirail_drivers.frames import CAN_FRAME, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
+from trirail_drivers.bus.capture import FRAME
+from trirail_drivers.bus.frames import CAN_FRAME, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
 
 
 class CandumpLog:

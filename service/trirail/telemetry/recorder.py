@@ -152,7 +152,7 @@ class Recorder:
         self._streams.bus_load(share)
 
     def frames(self, batch: bytes) -> None:
-        """Take captured CAN frames, packed as trirail_drivers.capture.FRAME."""
+        """Take captured CAN frames, packed as trirail_drivers.bus.capture.FRAME."""
         if self._frames:
             self._frames.write(batch)
 

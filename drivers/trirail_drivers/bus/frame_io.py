@@ -19,9 +19,9 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 
-from trirail_drivers.capture import Capture, CapturedBus
-from trirail_drivers.frames import CAN_FRAME, DATA_AT, HEAD, REMOTE, STANDARD_BITS, Frame, can_id
-from trirail_drivers.unixbus import UnixBus
+from trirail_drivers.bus.capture import Capture, CapturedBus
+from trirail_drivers.bus.frames import CAN_FRAME, DATA_AT, HEAD, REMOTE, STANDARD_BITS, Frame, can_id
+from trirail_drivers.bus.unixbus import UnixBus
 
 MOST_NOTHINGS = 64
 """Times in a row at most that an interface is read on though it has given no frame: more than a cycle's answers."""

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import can
 
+from trirail_drivers.bus.frames import CAN_FRAME, packed, unpacked
 from trirail_drivers.errors import BusError
-from trirail_drivers.frames import CAN_FRAME, packed, unpacked
 
 
 class UnixBus(can.BusABC):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from trirail_drivers.config import Can, Drives
+from trirail_drivers.driver.requirements import Requirements
 from trirail_drivers.errors import DriveError
 from trirail_drivers.protocols import PROTOCOLS
-from trirail_drivers.requirements import Requirements
 
 _OWN = ("simulated", "unix")
 """Interfaces that are not python-can's."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 
-from trirail_drivers.answers import Answers
+from trirail_drivers.driver.answers import Answers
+from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import Counts, DriveFault
-from trirail_drivers.scaling import Scale
 
 MISSED_ANSWERS = 3
 MISSED_HEARTBEATS = 3

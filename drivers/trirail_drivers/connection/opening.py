@@ -11,14 +11,15 @@ from typing import Any
 
 import can
 
-from trirail_drivers import adapters, canerrors, config
-from trirail_drivers.capture import Capture, CapturedBus
+from trirail_drivers import config
+from trirail_drivers.bus import adapters, canerrors
+from trirail_drivers.bus.capture import Capture, CapturedBus
+from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import Drives
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus
 from trirail_drivers.simulated.faults import Faults
-from trirail_drivers.unixbus import UnixBus
 
 # What python-can would say of a failure is in the BusError; standard error is for that one line.
 logging.getLogger("can").addHandler(logging.NullHandler())

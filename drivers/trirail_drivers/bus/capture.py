@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import can
 
-from trirail_drivers.frames import CAN_FRAME, packed
+from trirail_drivers.bus.frames import CAN_FRAME, packed
 
 FRAME = struct.Struct(f"<d{CAN_FRAME.size}s")
 """A captured frame: seconds since 1970, `struct can_frame`."""

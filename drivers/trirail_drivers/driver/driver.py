@@ -10,11 +10,12 @@ from typing import Generic, TypeVar
 
 import can
 
-from trirail_drivers import config, load
-from trirail_drivers.axis import Axis
+from trirail_drivers import config
+from trirail_drivers.bus import load
+from trirail_drivers.bus.wire import Wire
+from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.scaling import Scale, scale_of
 from trirail_drivers.interface import NAMES, DriveFault
-from trirail_drivers.scaling import Scale, scale_of
-from trirail_drivers.wire import Wire
 
 Clock = Callable[[], float]
 AnyAxis = TypeVar("AnyAxis", bound=Axis)

@@ -8,9 +8,9 @@ from typing import Protocol
 
 import can
 
-from trirail_drivers import canerrors
-from trirail_drivers.frame_io import frame_io
-from trirail_drivers.frames import BITS, ERROR, EXTENDED_BITS, Frame
+from trirail_drivers.bus import canerrors
+from trirail_drivers.bus.frame_io import frame_io
+from trirail_drivers.bus.frames import BITS, ERROR, EXTENDED_BITS, Frame
 from trirail_drivers.interface import DriveFault
 
 MOST_FRAMES = 1000
