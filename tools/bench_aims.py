@@ -17,9 +17,9 @@ COMMANDS = {
     "kinematics": (),
     "planning": (),
     "latency": ("--goals", "80"),
-    "loop": ("--rates", "1000", "--rates", "2000", "--rates", "4000", "--seconds", "60", "--runs", "5"),
-    "peers": ("--seconds", "10"),
-    "recorder": ("--seconds", "30"),
+    "loop": ("--rates", "1000", "--rates", "4000", "--seconds", "60", "--runs", "5"),
+    "peers": ("--seconds", "5"),
+    "recorder": ("--seconds", "15"),
 }
 """The measurements, with what they take: together under ten minutes."""
 BRIEF = {
