@@ -11,7 +11,7 @@ from typing import Final, Generic, TypeVar
 
 import can
 from trirail_drivers import config
-from trirail_drivers.interface import Drives, Feedback, PowerState, Triple
+from trirail_drivers.interface import DriveGroup, Feedback, PowerState, Triple
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import Frames, Servo, SimulatedBus, SimulatedDevice
 from trirail_drivers.simulated.faults import Faults
@@ -25,7 +25,7 @@ SYNC: Final = 0x080
 ENABLED: Final = (PowerState.OPERATION_ENABLED,) * 3
 
 AnyDevice = TypeVar("AnyDevice", bound=SimulatedDevice)
-AnyDriver = TypeVar("AnyDriver", bound=Drives)
+AnyDriver = TypeVar("AnyDriver", bound=DriveGroup)
 
 
 # ---------------------------------------------------------------------- one drive

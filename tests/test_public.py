@@ -5,10 +5,13 @@ import importlib
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import trirail
+import trirail_drivers
 
 HEAVY = ("numba", "numpy", "zenoh", "rerun", "can", "canopen", "ruckig", "rich", "cyclopts")
 
@@ -18,6 +21,13 @@ def loaded_by(statement: str) -> set[str]:
     code = f"import sys\n{statement}\nprint(*(name for name in {HEAVY} if name in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(done.stdout.split())
+
+
+def top_level(*packages: ModuleType) -> Iterator[ast.stmt]:
+    """Yield what stands at the top of each module of packages."""
+    for package in packages:
+        for file in Path(str(package.__file__)).parent.rglob("*.py"):
+            yield from ast.parse(file.read_text(encoding="utf-8")).body
 
 
 @pytest.mark.parametrize(
@@ -41,11 +51,15 @@ def test_every_public_name_is_there_and_is_the_one_at_its_home() -> None:
         assert getattr(trirail, name) is getattr(importlib.import_module(home), name)
 
 
-def test_no_two_classes_of_the_service_share_a_name() -> None:
-    files = Path(trirail.__file__).parent.rglob("*.py")
-    trees = (ast.parse(file.read_text(encoding="utf-8")) for file in files)
-    names = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
+def test_no_two_classes_of_the_packages_share_a_name() -> None:
+    names = Counter(node.name for node in top_level(trirail, trirail_drivers) if isinstance(node, ast.ClassDef))
     assert [name for name, count in names.items() if count > 1] == []
+
+
+def test_no_two_type_aliases_of_the_drivers_share_a_name() -> None:
+    assigned = (node.targets[0] for node in top_level(trirail_drivers) if isinstance(node, ast.Assign))
+    names = Counter(target.id for target in assigned if isinstance(target, ast.Name) and target.id[0] != "_")
+    assert [name for name, count in names.items() if count > 1 and not name.isupper()] == []
 
 
 def test_what_is_not_there_is_said_as_python_does() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
@@ -9,6 +10,9 @@ NAMES = ("A", "B", "C")
 """The drives are named as the sliders they move."""
 
 Triple = tuple[float, float, float]
+
+Clock = Callable[[], float]
+"""Tells the time [s]: monotonic, or that of a simulation."""
 
 
 class PowerState(IntEnum):
@@ -75,7 +79,7 @@ class Feedback(NamedTuple):
     """Whether each position is counted from a known place: always with absolute encoders, else after homing."""
 
 
-class Drives(Protocol):
+class DriveGroup(Protocol):
     """Three drives that follow a position setpoint every cycle.
 
     `configure` and `close` may block and raise DriveError. All else is for the cycle: it never blocks and never

@@ -22,7 +22,7 @@ from trirail.motion.runs import Run, Seam, rest
 from trirail.motion.schedule import Schedule
 from trirail.wire.messages import PoseGoal, SlidersGoal
 from trirail.wire.vocabulary import Mode
-from trirail_drivers.interface import Drives, Feedback, PowerState
+from trirail_drivers.interface import DriveGroup, Feedback, PowerState
 
 ROBOT = geometry(CONFIG.geometry)
 LEGS = ROBOT.packed()
@@ -166,7 +166,7 @@ def test_a_cycle_that_changes_nothing_takes_no_memory(rig: Rig, goal: Any) -> No
     mode = control.state.mode
     assert mode is (Mode.MOVING if goal else Mode.HOLDING)
     drives = Followers(control.measured.feedback)
-    control._drives = cast(Drives, drives)
+    control._drives = cast(DriveGroup, drives)
 
     def cycle() -> None:
         drives.sync()

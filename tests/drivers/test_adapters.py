@@ -22,7 +22,7 @@ from trirail.config import SIM, load
 from trirail_drivers.config import Can, Simulated
 from trirail_drivers.connection import opening
 from trirail_drivers.errors import BusError
-from trirail_drivers.interface import Drives, Feedback, PowerState
+from trirail_drivers.interface import DriveGroup, Feedback, PowerState
 
 ROOT = Path(__file__).parents[2]
 SIMULATED = load(SIM)
@@ -148,7 +148,7 @@ def slowly() -> float:
     return 0.1 * time.monotonic()
 
 
-def cycle(drives: Drives, position: float = 0.0) -> Feedback:
+def cycle(drives: DriveGroup, position: float = 0.0) -> Feedback:
     """One cycle, as slow as the answers to its SYNC."""
     drives.sync()
     deadline = time.monotonic() + WITHIN
@@ -160,7 +160,7 @@ def cycle(drives: Drives, position: float = 0.0) -> Feedback:
         os.sched_yield()
 
 
-def until(drives: Drives, condition: Callable[[Feedback], bool], position: float = 0.0) -> None:
+def until(drives: DriveGroup, condition: Callable[[Feedback], bool], position: float = 0.0) -> None:
     deadline = time.monotonic() + WITHIN
     while not condition(feedback := cycle(drives, position)):
         assert feedback.fault is None, feedback.fault

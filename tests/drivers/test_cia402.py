@@ -21,7 +21,7 @@ from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import SimulatedDrive
-from trirail_drivers.simulated.dictionary import Entry
+from trirail_drivers.simulated.dictionary import ObjectEntry
 
 P = PowerState
 PERIOD = STEP
@@ -186,7 +186,7 @@ class TestConfigure:
     def test_refusal_names_object_wanted_and_found(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Of every object that is set: a drive that says it took the value and did not."""
         objects = canopen.import_od(str(SERVO))
-        told, take = Entry.encode, Entry.write
+        told, take = ObjectEntry.encode, ObjectEntry.write
         other = Rig()
         other.drives.configure(PERIOD)
         writes = [
@@ -200,18 +200,18 @@ class TestConfigure:
         for index, subindex in settings:
             rig = Rig()
             lying = rig.devices[0].objects[index, subindex]
-            written: list[Entry] = []
+            written: list[ObjectEntry] = []
 
-            def encode(entry: Entry, lying: Entry = lying, written: list[Entry] = written) -> bytes:
+            def encode(entry: ObjectEntry, lying: ObjectEntry = lying, written: list[ObjectEntry] = written) -> bytes:
                 truth = told(entry)
                 return bytes([truth[0] ^ 1]) + truth[1:] if entry is lying and lying in written else truth
 
-            def write(entry: Entry, value: int, written: list[Entry] = written) -> None:
+            def write(entry: ObjectEntry, value: int, written: list[ObjectEntry] = written) -> None:
                 written.append(entry)
                 take(entry, value)
 
-            monkeypatch.setattr(Entry, "encode", encode)
-            monkeypatch.setattr(Entry, "write", write)
+            monkeypatch.setattr(ObjectEntry, "encode", encode)
+            monkeypatch.setattr(ObjectEntry, "write", write)
             with pytest.raises(ConfigurationRefused) as refused:
                 rig.drives.configure(PERIOD)
             variable = objects.get_variable(index, subindex)

@@ -13,7 +13,7 @@ from trirail_drivers import config
 from trirail_drivers.connection.opening import connect, simulated_bus
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
-from trirail_drivers.simulated import Machine, Servo, SimulatedDrive
+from trirail_drivers.simulated import Mechanics, Servo, SimulatedDrive
 
 NODE = 5
 PERIOD = 0.001
@@ -23,16 +23,16 @@ VELOCITY = 0.1 * COUNTS_PER_METRE
 """0.1 m/s [counts/s]."""
 DECELERATION = 2.0 * COUNTS_PER_METRE
 """2 m/s² [counts/s²]."""
-MACHINE = Machine(COUNTS_PER_METRE, COUNTS_PER_REVOLUTION)
+MECHANICS = Mechanics(COUNTS_PER_METRE, COUNTS_PER_REVOLUTION)
 Values = Mapping[tuple[int, int], int]
 
 
 class Rig(DeviceRig[SimulatedDrive]):
     """A drive of some make, whose motor lags 10 ms behind what feed-forward leaves."""
 
-    def __init__(self, path: Path, machine: Machine = MACHINE, start: float = 20_000) -> None:
+    def __init__(self, path: Path, mechanics: Mechanics = MECHANICS, start: float = 20_000) -> None:
         servo = Servo(start, time_constant=0.01, max_velocity=2e6, max_acceleration=1e8)
-        super().__init__(SimulatedDrive(NODE, servo, eds=path, machine=machine))
+        super().__init__(SimulatedDrive(NODE, servo, eds=path, mechanics=mechanics))
 
     def put(self, index: int, value: int, subindex: int = 0) -> None:
         """Write an object as the bus would."""
@@ -69,24 +69,24 @@ class Rig(DeviceRig[SimulatedDrive]):
 # ---------------------------------------------------------------------- units
 
 RPM = COUNTS_PER_REVOLUTION / 60.0
-UNITS: tuple[tuple[str, Values, Machine, float, float], ...] = (
+UNITS: tuple[tuple[str, Values, Mechanics, float, float], ...] = (
     # make, what its dictionary says, its axis, and units of velocity [counts/s] and acceleration [counts/s²] by hand
-    ("elmo_gold", {}, MACHINE, 1.0, 1.0),
-    ("elmo_gold", {(0x6096, 1): 60, (0x6096, 2): 4000}, MACHINE, RPM, RPM),
-    ("maxon_epos4_compact50_5", {}, MACHINE, RPM, RPM),
-    ("maxon_epos4_compact50_5", {(0x60A9, 0): 0xFDB44700}, MACHINE, 1e-3 * RPM, RPM),
-    ("maxon_epos4_compact50_5", {(0x60A9, 0): 0xFD010300, (0x60AA, 0): 0xFD015700}, MACHINE, 1e3, 1e3),
-    ("maxon_epos4_compact50_5", {(0x60A9, 0): 0x00410300, (0x60AA, 0): 0x00410300}, MACHINE, 4000 / 360, 4000 / 360),
-    ("technosoft_ipos", {}, Machine(COUNTS_PER_METRE, velocity=0.1, acceleration=25.0), 0.1, 25.0),
+    ("elmo_gold", {}, MECHANICS, 1.0, 1.0),
+    ("elmo_gold", {(0x6096, 1): 60, (0x6096, 2): 4000}, MECHANICS, RPM, RPM),
+    ("maxon_epos4_compact50_5", {}, MECHANICS, RPM, RPM),
+    ("maxon_epos4_compact50_5", {(0x60A9, 0): 0xFDB44700}, MECHANICS, 1e-3 * RPM, RPM),
+    ("maxon_epos4_compact50_5", {(0x60A9, 0): 0xFD010300, (0x60AA, 0): 0xFD015700}, MECHANICS, 1e3, 1e3),
+    ("maxon_epos4_compact50_5", {(0x60A9, 0): 0x00410300, (0x60AA, 0): 0x00410300}, MECHANICS, 4000 / 360, 4000 / 360),
+    ("technosoft_ipos", {}, Mechanics(COUNTS_PER_METRE, velocity=0.1, acceleration=25.0), 0.1, 25.0),
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(("make", "values", "machine", "velocity", "acceleration"), UNITS)
+@pytest.mark.parametrize(("make", "values", "mechanics", "velocity", "acceleration"), UNITS)
 def test_the_servo_believes_the_units_of_its_dictionary(
-    make: str, values: Values, machine: Machine, velocity: float, acceleration: float, tmp_path: Path
+    make: str, values: Values, mechanics: Mechanics, velocity: float, acceleration: float, tmp_path: Path
 ) -> None:
     """0.1 m/s in its own units is told as 0.1 m/s; the quick-stop ramp is as long as the one that was asked for."""
-    rig = Rig(make_eds(tmp_path, make, {(0x6502, 0): 0x3ED, **values}), machine)
+    rig = Rig(make_eds(tmp_path, make, {(0x6502, 0): 0x3ED, **values}), mechanics)
     rig.put(0x6085, round(DECELERATION / acceleration))
     rig.put(0x6065, 100_000)
     rig.enabled(8)
@@ -124,8 +124,8 @@ def test_a_wrong_unit_is_a_wrong_motion(tmp_path: Path) -> None:
 
 def test_units_of_position_that_are_set_anew(tmp_path: Path) -> None:
     """60A8h from increments to µm, with 2 counts a µm; and 6092h: 2000 units a revolution become 500."""
-    machine = Machine(2e6, COUNTS_PER_REVOLUTION)
-    rig = Rig(make_eds(tmp_path, "maxon_epos4_compact50_5"), machine)
+    mechanics = Mechanics(2e6, COUNTS_PER_REVOLUTION)
+    rig = Rig(make_eds(tmp_path, "maxon_epos4_compact50_5"), mechanics)
     assert rig.get(0x6064) == 20_000
     rig.put(0x60A8, 0xFA010000)
     rig.sync()

@@ -23,7 +23,7 @@ from trirail_drivers.errors import BusError, DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.drives import Odrive
-from trirail_drivers.odrive.frames import AxisState, Error, Result
+from trirail_drivers.odrive.frames import AxisState, Error, ProcedureResult
 from trirail_drivers.odrive.setpoints import SETTLING
 from trirail_drivers.simulated import SimulatedOdrive
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
@@ -220,7 +220,7 @@ class TestPower:
         ready.cycle()
         ready.drives.enable()
         ready.cycle()
-        on_its_way = frames.BEAT.pack(0, AxisState.IDLE, Result.NOT_CALIBRATED, 0)
+        on_its_way = frames.BEAT.pack(0, AxisState.IDLE, ProcedureResult.NOT_CALIBRATED, 0)
         ready.bus.inject(frames.identifier(62, frames.HEARTBEAT), on_its_way)
         for _ in range(250):
             feedback = ready.cycle()
@@ -399,7 +399,7 @@ class TestFaults:
         assert fault.message == "drive C: left closed loop control unasked: idle"
 
     def test_somebody_else_calibrates(self, ready: Rig) -> None:
-        ready.bus.inject(frames.identifier(7, frames.HEARTBEAT), frames.BEAT.pack(0, 4, Result.BUSY, 0))
+        ready.bus.inject(frames.identifier(7, frames.HEARTBEAT), frames.BEAT.pack(0, 4, ProcedureResult.BUSY, 0))
         feedback = ready.found("state", within=1)
         assert feedback.state[1] is P.SWITCHED_ON
         assert feedback.fault is not None

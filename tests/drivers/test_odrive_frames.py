@@ -94,7 +94,7 @@ def test_answers(active: int, reason: int, position: float, velocity: float, ver
     ("signal", "names"),
     [
         ("Axis_Error", {int(error): error.name for error in frames.Error}),
-        ("Procedure_Result", {int(result): result.name for result in frames.Result}),
+        ("Procedure_Result", {int(result): result.name for result in frames.ProcedureResult}),
         (
             "Axis_State",
             {

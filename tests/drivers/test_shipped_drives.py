@@ -10,7 +10,7 @@ import rigs
 from edsfiles import make_eds
 from trirail.config import SIM, Config, load
 from trirail_drivers.errors import DriveError
-from trirail_drivers.interface import Drives, Feedback, PowerState
+from trirail_drivers.interface import DriveGroup, Feedback, PowerState
 from trirail_drivers.protocols import PROTOCOLS
 
 FOLDER = SIM.parent / "drives"
@@ -48,7 +48,7 @@ class Run:
         starts = zip(config.drives.each, rigs.START, strict=True)
         devices = [protocol.simulated_drive(config.can.simulated, config.drives, axis, start) for axis, start in starts]
         self.bus = rigs.Bus(devices, self.clock, protocol.fault_frames)
-        self.drives: Drives = protocol.driver(self.bus, config.can.bitrate, config.drives, self.clock)
+        self.drives: DriveGroup = protocol.driver(self.bus, config.can.bitrate, config.drives, self.clock)
         self.drives.configure(config.period)
 
     def cycle(self, ahead: float = 0.0, velocity: float = 0.0, start: tuple[float, ...] | None = None) -> Feedback:

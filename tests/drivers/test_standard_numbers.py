@@ -212,7 +212,7 @@ def test_odrive_states_and_errors() -> None:
     }
     assert {error.name: int(error) for error in cansimple.Error} == {error.name: int(error) for error in Errors}
     # ProcedureResult: consecutive from 0.
-    assert [int(result) for result in cansimple.Result] == list(range(16))
+    assert [int(result) for result in cansimple.ProcedureResult] == list(range(16))
     assert cansimple.identifier(3, 0x0C) == 0x06C
 
 

@@ -34,7 +34,7 @@ from trirail.wire.packets import (
 from trirail.wire.planning import MAX_PLANNING, Planned, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers.interface import Drives
+from trirail_drivers.interface import DriveGroup
 
 
 class Shell:
@@ -131,7 +131,7 @@ def test_a_cycle_that_changes_nothing_takes_no_memory(shell: Shell, in_motion: b
         shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.1, 0.02, 0.1, speed=0.02), now)))
         beating(shell, 50)
     drives = Followers(shell.loop.control.measured.feedback)
-    shell.loop._drives = shell.loop.control._drives = cast(Drives, drives)
+    shell.loop._drives = shell.loop.control._drives = cast(DriveGroup, drives)
     heart, tick = shell.heartbeats.of("gateway"), Tick(round(shell.rig.now * 1e9), 0, 0)
 
     def cycle() -> None:

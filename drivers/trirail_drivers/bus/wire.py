@@ -11,7 +11,7 @@ import can
 from trirail_drivers.bus import canerrors
 from trirail_drivers.bus.frame_io import frame_io
 from trirail_drivers.bus.frames import BITS, ERROR, EXTENDED_BITS, Frame
-from trirail_drivers.interface import DriveFault
+from trirail_drivers.interface import Clock, DriveFault
 
 MOST_FRAMES = 1000
 """Frames taken in by one `receive` at most, so that a chattering bus cannot hold it."""
@@ -111,7 +111,7 @@ class Wire:
         except (can.CanError, OSError) as error:
             self.fail(DriveFault("", "bus", 0, f"CAN bus: cannot receive: {error}"))
 
-    def wait(self, seconds: float, clock: Callable[[], float]) -> None:
+    def wait(self, seconds: float, clock: Clock) -> None:
         """Wait for a frame, at most so long [s], and take it in; not for the cycle. Raises can.CanError, OSError."""
         received = self._frames.receive(seconds)
         if received is not None:

@@ -6,7 +6,7 @@ import math
 
 from trirail_drivers.cia402 import frames, ways
 from trirail_drivers.cia402.units import Units
-from trirail_drivers.driver import axis
+from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
@@ -31,7 +31,7 @@ _CAN_MOVE_OR_SOON = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, Powe
 """States in which no drive stays that has been told to stop or to lose power."""
 
 
-class Axis(axis.Axis):
+class Cia402Axis(Axis):
     """One drive's newest feedback; the `on_` methods take a frame's data or raise struct.error."""
 
     __slots__ = (

@@ -1,4 +1,4 @@
-"""Three CiA 402 drives on CANopen that follow positions, and homing: trirail_drivers.interface.Drives.
+"""Three CiA 402 drives on CANopen that follow positions, and homing: trirail_drivers.interface.DriveGroup.
 
 The identifiers give the priorities on the bus: SYNC, emergencies, statuswords, controlwords, positions,
 setpoints, heartbeats. So the controlword of a quick stop goes before setpoints that still wait.
@@ -15,25 +15,25 @@ import can
 from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames, setup, ways
-from trirail_drivers.cia402.axis import Axis
-from trirail_drivers.cia402.homing import Homing
+from trirail_drivers.cia402.axis import Cia402Axis
+from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.cia402.strangers import Strangers
-from trirail_drivers.driver.driver import Clock, Driver
-from trirail_drivers.interface import Feedback, PowerState, Triple
+from trirail_drivers.driver.driver import Driver
+from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3
 """A controlword that a drive does not follow is sent again after so many SYNCs: the frame may be lost."""
 
 
-class Cia402(Driver[Axis]):
+class Cia402(Driver[Cia402Axis]):
     """Three CiA 402 drives on one CAN bus."""
 
     def __init__(self, bus: can.BusABC, bitrate: int, drives: config.Drives, clock: Clock = time.monotonic) -> None:
-        super().__init__(bus, bitrate, drives, clock, Axis)
+        super().__init__(bus, bitrate, drives, clock, Cia402Axis)
         self._strangers = Strangers(self._wire, self._axes, drives.master_node)
         for axis in self._axes:
             self._listen(axis)
-        self._homing = Homing(self._axes, drives, self._wire.send)
+        self._homing = HomingSequence(self._axes, drives, self._wire.send)
         self._sync = Frame(frames.SYNC)
         self._heartbeat = Frame(frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL))
         self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
@@ -61,7 +61,7 @@ class Cia402(Driver[Axis]):
         for line in setup.told(made for made, _ in done):
             self._wire.warn(line)
 
-    def _listen(self, axis: Axis) -> None:
+    def _listen(self, axis: Cia402Axis) -> None:
         listen, way = self._wire.listen, axis.way
         listen(way.feedback.identifier, axis, axis.on_position)
         if way.status is not None:
@@ -219,7 +219,7 @@ class Cia402(Driver[Axis]):
         for axis in self._axes:
             self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
 
-    def _ask(self, axis: Axis, now: float) -> None:
+    def _ask(self, axis: Cia402Axis, now: float) -> None:
         """Ask for what no PDO tells, without waiting: one request at a time."""
         if axis.sdo_asked is not None:
             return
@@ -244,7 +244,7 @@ class Cia402(Driver[Axis]):
                 axis.controlword = word
                 axis.command_age = 0
 
-    def _send_word(self, axis: Axis, word: int) -> bool:
+    def _send_word(self, axis: Cia402Axis, word: int) -> bool:
         """Send a controlword by PDO; where it goes with the setpoint, with the last one or with where the drive is."""
         if axis.way.controlword is not None:
             return self._wire.send(Frame(axis.way.controlword, frames.CONTROLWORD.pack(word)))
@@ -252,7 +252,7 @@ class Cia402(Driver[Axis]):
         axis.way.setpoints.fill(frame, *(axis.setpoint or (axis.actual, 0)), word)
         return self._wire.send(frame)
 
-    def _send_word_by_sdo(self, axis: Axis, word: int) -> None:
+    def _send_word_by_sdo(self, axis: Cia402Axis, word: int) -> None:
         """Send a controlword by SDO, which is heard in pre-operational too; a stopped node is first brought there."""
         if axis.stopped:
             self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))

@@ -18,7 +18,7 @@ from typing import Final
 from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames
-from trirail_drivers.cia402.axis import Axis
+from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.interface import DriveFault
 
 HOMING = 6
@@ -49,10 +49,10 @@ class HomingFailedError(Exception):
     """Homing cannot go on; the text says why."""
 
 
-class Homing:
+class HomingSequence:
     """Homes the drives that have a homing method, one step at each `step`."""
 
-    def __init__(self, axes: tuple[Axis, ...], drives: config.Drives, send: Callable[[Frame], object]) -> None:
+    def __init__(self, axes: tuple[Cia402Axis, ...], drives: config.Drives, send: Callable[[Frame], object]) -> None:
         self._plan = [
             (axis, drive.homing.timeout)
             for axis, drive in zip(axes, drives.each, strict=True)
@@ -62,7 +62,7 @@ class Homing:
         self._stop_timeout = drives.stop_timeout
         self._send = send
         self._steps: Steps | None = None
-        self._axis: Axis | None = None
+        self._axis: Cia402Axis | None = None
         self._stopping = False
         self._now = 0.0
         self.under_way = False
@@ -131,7 +131,7 @@ class Homing:
             self._axis = axis
             yield from self._follow_setpoints(axis)
 
-    def _home(self, axis: Axis, timeout: float) -> Steps:
+    def _home(self, axis: Cia402Axis, timeout: float) -> Steps:
         axis.cyclic = False
         yield from self._change_mode(axis, HOMING)
         axis.follows = False
@@ -148,7 +148,7 @@ class Homing:
         yield from self._follow_setpoints(axis)
         axis.homed = attained
 
-    def _halt(self, axis: Axis) -> Steps:
+    def _halt(self, axis: Cia402Axis) -> Steps:
         axis.mode_bits = frames.HALT
         answered = axis.answers.sampled + FRESH
         yield from self._until(
@@ -157,7 +157,7 @@ class Homing:
             "the slider did not stand still",
         )
 
-    def _follow_setpoints(self, axis: Axis) -> Steps:
+    def _follow_setpoints(self, axis: Cia402Axis) -> Steps:
         """Back to the mode of setpoints, when the drive's setpoint is where it stands."""
         answered = axis.answers.sampled + FRESH
         yield from self._until(lambda: axis.answers.sampled >= answered, self._sdo_timeout, "there was no new position")
@@ -172,14 +172,14 @@ class Homing:
         axis.cyclic = True
         axis.held = None
 
-    def _change_mode(self, axis: Axis, mode: int) -> Steps:
+    def _change_mode(self, axis: Cia402Axis, mode: int) -> Steps:
         yield from self._ask(axis, _WRITE_BYTE, _MODE, mode)
         deadline = self._now + self._sdo_timeout
         while (found := (yield from self._ask(axis, _READ, _MODE_DISPLAY))[4]) != mode:
             if self._now >= deadline:
                 raise HomingFailedError(f"object 6061:00 (Modes of operation display): wanted {mode}, found {found}")
 
-    def _ask(self, axis: Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
+    def _ask(self, axis: Cia402Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
         """One SDO, without waiting: the cycle goes on, and a later one has the answer."""
         axis.sdo_answer, axis.sdo_asked = None, index.to_bytes(2, "little")
         self._send(Frame(frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value]))))
@@ -202,7 +202,7 @@ class Homing:
             yield
 
 
-def _attained(axis: Axis) -> bool:
+def _attained(axis: Cia402Axis) -> bool:
     """Whether home is attained: bit 12 may still be set by an earlier homing, so it must have been clear since."""
     if axis.statusword & _ERROR:
         raise HomingFailedError(f"the drive reports a homing error (statusword {axis.statusword:04X})")

@@ -7,11 +7,10 @@ from typing import Any
 import can
 
 from trirail_drivers.cia402 import frames, setup
-from trirail_drivers.cia402.sdo import Clock
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
-from trirail_drivers.interface import NAMES
+from trirail_drivers.interface import NAMES, Clock
 
 
 def inspect(bus: can.BusABC, drives: Drives, period: float, clock: Clock, *, apply: bool) -> list[dict[str, Any]]:

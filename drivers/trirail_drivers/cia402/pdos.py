@@ -16,8 +16,8 @@ from trirail_drivers.cia402.ways import (
     POSITIONS,
     STATUSWORD,
     VELOCITY_OFFSET,
-    Feedback,
-    Setpoints,
+    FeedbackPdo,
+    SetpointPdo,
     fits_feedback,
     fits_setpoints,
 )
@@ -35,7 +35,7 @@ ON_CHANGE: Final = 255
 """Transmission types."""
 
 
-class Pdo(NamedTuple):
+class PdoParameters(NamedTuple):
     """A PDO as a drive has it."""
 
     at: int
@@ -72,7 +72,7 @@ class Pdos:
         self._node = node
         self._used: set[int] = set()
 
-    def setpoints(self, mode: int) -> tuple[Setpoints, int | None]:
+    def setpoints(self, mode: int) -> tuple[SetpointPdo, int | None]:
         """The RPDO of the setpoints, at every SYNC, and the identifier of the controlword's, at once.
 
         DriveError names what the drive lacks where neither can be mapped and nothing fixed fits.
@@ -84,7 +84,7 @@ class Pdos:
         control = self._map(RPDO, frames.RPDO1 + self._node, ON_CHANGE, (CONTROLWORD,))
         for entries in wanted:
             if (identifier := self._map(RPDO + 1, frames.RPDO2 + self._node, EVERY_SYNC, entries)) is not None:
-                found = Setpoints(identifier, entries)
+                found = SetpointPdo(identifier, entries)
                 break
         else:
             found = self._fixed_setpoints(mode)
@@ -96,18 +96,18 @@ class Pdos:
             self._drive.lack((0x60B1, 0), "it cannot be mapped into the setpoint's PDO")
         return found, control
 
-    def feedback(self) -> tuple[Feedback, int | None, bool]:
+    def feedback(self) -> tuple[FeedbackPdo, int | None, bool]:
         """The TPDO of the position, at every SYNC; the identifier of the statusword's, or None; and whether to poll."""
         timed = self._remote.has(TPDO, 5) and self._can_be_prompt(TPDO)
         wanted = [(ACTUAL_POSITION,)] if timed else [(ACTUAL_POSITION, STATUSWORD), (ACTUAL_POSITION,)]
         for entries in wanted:
             identifier = self._map(TPDO + 1, frames.TPDO2 + self._node, EVERY_SYNC, entries)
             if identifier is not None:
-                found = Feedback(identifier, entries)
+                found = FeedbackPdo(identifier, entries)
                 break
         else:
             pdo = self._fixed(TPDO, fits_feedback, "actual position 6064", EVERY_SYNC)
-            found = Feedback(pdo.identifier, pdo.entries or ())
+            found = FeedbackPdo(pdo.identifier, pdo.entries or ())
         if found.has_status:
             if not timed:
                 self._drive.tell(
@@ -162,7 +162,7 @@ class Pdos:
 
     def _try_to_map(
         self,
-        found: Pdo,
+        found: PdoParameters,
         cob_id: int,
         kind: int,
         entries: tuple[int, ...],
@@ -211,7 +211,7 @@ class Pdos:
 
     def _note(
         self,
-        found: Pdo,
+        found: PdoParameters,
         cob_id: int,
         kind: int,
         entries: tuple[int, ...],
@@ -237,12 +237,12 @@ class Pdos:
 
     # ------------------------------------------------------------------ PDOs that cannot be changed
 
-    def _fixed_setpoints(self, mode: int) -> Setpoints:
+    def _fixed_setpoints(self, mode: int) -> SetpointPdo:
         name = f"setpoints {POSITIONS[mode] >> 16:04X}"
         pdo = self._fixed(RPDO, lambda entries: fits_setpoints(entries, mode), name, EVERY_SYNC)
-        return Setpoints(pdo.identifier, pdo.entries or ())
+        return SetpointPdo(pdo.identifier, pdo.entries or ())
 
-    def _fixed(self, base: int, fits: Callable[[tuple[int, ...]], bool], name: str, kind: int) -> Pdo:
+    def _fixed(self, base: int, fits: Callable[[tuple[int, ...]], bool], name: str, kind: int) -> PdoParameters:
         """A PDO as it is that will do; DriveError where there is none."""
         seen = []
         for index in self._all(base):
@@ -259,7 +259,7 @@ class Pdos:
             f"drive {self._remote.name}: object {mapping:04X} cannot be mapped, and no PDO fits {name}{mapped}"
         )
 
-    def _has_kind(self, pdo: Pdo, kind: int) -> bool:
+    def _has_kind(self, pdo: PdoParameters, kind: int) -> bool:
         if pdo.kind == kind or (kind == ON_CHANGE and (pdo.kind or 0) >= ON_CHANGE - 1):
             return True
         try:
@@ -321,10 +321,10 @@ class Pdos:
             index += 1
         return sorted(index for index in named if self._remote.has(index, 1))
 
-    def _pdo(self, index: int) -> Pdo:
+    def _pdo(self, index: int) -> PdoParameters:
         look = self._remote.look
         number = look(index + 0x200)
         entries = None if number is None else [look(index + 0x200, n + 1) for n in range(min(number, 64))]
         # Some have a number of entries that are all empty.
         told = None if entries is None else tuple(entry & 0xFFFF_FFFF for entry in entries if entry)
-        return Pdo(index, look(index, 1), look(index, 2), told, number)
+        return PdoParameters(index, look(index, 1), look(index, 2), told, number)

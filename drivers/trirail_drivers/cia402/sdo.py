@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
@@ -16,11 +16,11 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.objects import Key, signed, use, width
 from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
+from trirail_drivers.interface import Clock
 
 # What canopen would say of a failed transfer is in the DriveError; standard error is for that one line.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
-Clock = Callable[[], float]
 
 NO_SUCH_OBJECT: Final = (0x0602_0000, 0x0609_0011)
 """SDO abort codes: object does not exist, subindex does not exist (CiA 301)."""

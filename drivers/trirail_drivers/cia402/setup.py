@@ -15,7 +15,7 @@ from trirail_drivers.cia402.drive_units import read_units
 from trirail_drivers.cia402.guarding import give_watchdogs
 from trirail_drivers.cia402.modes import choose_mode, give_mode
 from trirail_drivers.cia402.pdos import Pdos
-from trirail_drivers.cia402.sdo import Client, Clock, Remote, SdoRefused
+from trirail_drivers.cia402.sdo import Client, Remote, SdoRefused
 from trirail_drivers.cia402.settings import (
     check_nodes,
     give_cycle,
@@ -25,11 +25,11 @@ from trirail_drivers.cia402.settings import (
     interpolation_periods,
 )
 from trirail_drivers.cia402.units import Units
-from trirail_drivers.cia402.ways import Way
+from trirail_drivers.cia402.ways import Exchange
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import BusError, DriveError
-from trirail_drivers.interface import NAMES, PowerState
+from trirail_drivers.interface import NAMES, Clock, PowerState
 
 HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 """States in which a drive may have current in its motor."""
@@ -55,7 +55,7 @@ class SetUp(NamedTuple):
     name: str
     node: int
     identity: Identity
-    way: Way
+    way: Exchange
     units: Units
     differences: tuple[Difference, ...]
     """What was written, or would be."""
@@ -170,7 +170,7 @@ def _bring(
     for key in ((0x603F, 0), (0x1001, 0)):
         if not remote.has(*key):
             differences.lack(key, "it has no such object")
-    way = Way(
+    way = Exchange(
         mode,
         setpoints,
         controlword,

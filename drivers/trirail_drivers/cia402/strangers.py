@@ -7,7 +7,7 @@ from typing import Final
 
 from trirail_drivers.bus.wire import Handler, Wire
 from trirail_drivers.cia402 import frames
-from trirail_drivers.cia402.axis import Axis
+from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.interface import DriveFault
 
 _COMMANDS: Final = {
@@ -24,7 +24,7 @@ _STOPS: Final = 0x02
 class Strangers:
     """Hears on the bus what other masters send to the drives: NMT commands, SYNC, PDOs, this service's heartbeat."""
 
-    def __init__(self, wire: Wire, axes: Sequence[Axis], master_node: int) -> None:
+    def __init__(self, wire: Wire, axes: Sequence[Cia402Axis], master_node: int) -> None:
         self._wire = wire
         self._axes = {axis.node: axis for axis in axes}
         self._master_node = master_node
@@ -34,7 +34,7 @@ class Strangers:
         for axis in axes:
             self.listen_to(axis)
 
-    def listen_to(self, axis: Axis) -> None:
+    def listen_to(self, axis: Cia402Axis) -> None:
         """Hear who else sends an axis its setpoints and controlwords."""
         for identifier in {axis.way.setpoints.identifier, axis.way.controlword} - {None}:
             self._wire.listen(identifier or 0, self, self._sends(f"sends drive {axis.name} PDOs ({identifier:03X})"))

@@ -28,7 +28,7 @@ POSITIONS: Final = {CYCLIC_SYNCHRONOUS_POSITION: TARGET_POSITION, INTERPOLATED_P
 _FORMATS: Final = {8: "b", 16: "h", 32: "i", 64: "q"}
 
 
-class Setpoints:
+class SetpointPdo:
     """The RPDO that takes setpoints: an identifier, and its bytes of position, velocity and controlword."""
 
     __slots__ = ("_layout", "_order", "entries", "identifier", "size")
@@ -66,7 +66,7 @@ class Setpoints:
         return CONTROLWORD in self.entries
 
 
-class Feedback:
+class FeedbackPdo:
     """The TPDO that brings the position, and the statusword where it has one beside it."""
 
     __slots__ = ("_layout", "_position", "_status", "entries", "has_status", "identifier", "size")
@@ -99,15 +99,15 @@ def fits_feedback(entries: tuple[int, ...]) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """How one drive is driven."""
+class Exchange:
+    """How setpoints and feedback are exchanged with one drive."""
 
     mode: int
     """6060h: cyclic synchronous position, or interpolated position."""
-    setpoints: Setpoints
+    setpoints: SetpointPdo
     controlword: int | None
     """Identifier of the RPDO that has the controlword; None where it goes with the setpoint."""
-    feedback: Feedback
+    feedback: FeedbackPdo
     status: int | None
     """Identifier of the TPDO that has the statusword when it changes; None where that comes with the position."""
     polled: bool = False
@@ -131,19 +131,19 @@ class Way:
         return f"{mode}{offset}, statusword {status}{polled}, {'node guarding' if self.guarded else 'heartbeat'}"
 
 
-def usual(node: int) -> Way:
+def usual(node: int) -> Exchange:
     """The way of a drive that has all that CiA 301 and CiA 402-2 leave optional."""
-    return Way(
+    return Exchange(
         CYCLIC_SYNCHRONOUS_POSITION,
-        Setpoints(frames.RPDO2 + node, (TARGET_POSITION, VELOCITY_OFFSET)),
+        SetpointPdo(frames.RPDO2 + node, (TARGET_POSITION, VELOCITY_OFFSET)),
         frames.RPDO1 + node,
-        Feedback(frames.TPDO2 + node, (ACTUAL_POSITION,)),
+        FeedbackPdo(frames.TPDO2 + node, (ACTUAL_POSITION,)),
         frames.TPDO1 + node,
         emergency=frames.EMCY + node,
     )
 
 
-def traffic(ways: Iterable[Way]) -> Traffic:
+def traffic(ways: Iterable[Exchange]) -> Traffic:
     """What drives that go these ways put on the bus, and the service with them."""
     ways = tuple(ways)
     cycle = frame_bits(0) + sum(frame_bits(way.setpoints.size) + frame_bits(way.feedback.size) for way in ways)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import logging
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from trirail_drivers.bus import adapters, canerrors
 from trirail_drivers.bus.capture import Capture, CapturedBus
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.errors import BusError, DriveError
-from trirail_drivers.interface import Drives
+from trirail_drivers.interface import Clock, DriveGroup
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus
 from trirail_drivers.simulated.faults import Faults
@@ -29,7 +28,7 @@ IFF_UP = 0x1
 """Flag of a network interface that is up (linux/if.h)."""
 
 
-def open_bus(section: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic) -> can.BusABC:
+def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.monotonic) -> can.BusABC:
     """The bus that section [can] names; BusError with the remedy if there is none.
 
     `drives` and `clock` make the simulated drives, where the bus is "simulated".
@@ -62,9 +61,9 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Callable[[], flo
 def connect(
     section: config.Can,
     drives: config.Drives,
-    clock: Callable[[], float] = time.monotonic,
+    clock: Clock = time.monotonic,
     capture: Capture | None = None,
-) -> Drives:
+) -> DriveGroup:
     """The three drives on their bus, not set up yet; DriveError if there is no bus. `capture` notes every frame."""
     bus = open_bus(section, drives, clock)
     if capture is not None:
@@ -76,9 +75,7 @@ def connect(
         raise
 
 
-def simulated_bus(
-    section: config.Can, drives: config.Drives, clock: Callable[[], float] = time.monotonic
-) -> SimulatedBus:
+def simulated_bus(section: config.Can, drives: config.Drives, clock: Clock = time.monotonic) -> SimulatedBus:
     """The three drives of a configuration on a bus of their own, at rest where `can.simulated.start` says."""
     protocol = PROTOCOLS[drives.protocol]
     starts = zip(drives.each, section.simulated.start, strict=True)

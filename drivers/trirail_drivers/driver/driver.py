@@ -15,14 +15,13 @@ from trirail_drivers.bus import load
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.scaling import Scale, scale_of
-from trirail_drivers.interface import NAMES, DriveFault
+from trirail_drivers.interface import NAMES, Clock, DriveFault
 
-Clock = Callable[[], float]
 AnyAxis = TypeVar("AnyAxis", bound=Axis)
 
 
 class Driver(ABC, Generic[AnyAxis]):
-    """Three drives on one CAN bus, whatever they speak; see trirail_drivers.interface.Drives.
+    """Three drives on one CAN bus, whatever they speak; see trirail_drivers.interface.DriveGroup.
 
     A fault of one drive is a fault of the robot: what is latched takes all three down their quick-stop ramps
     beginning in the same cycle, and `enable` does nothing until `reset`.

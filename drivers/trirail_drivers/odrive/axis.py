@@ -8,7 +8,7 @@ from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.odrive import frames
-from trirail_drivers.odrive.frames import AxisState, Result
+from trirail_drivers.odrive.frames import AxisState, ProcedureResult
 
 RESET_TIME = 3 * 3 * frames.ERROR_PERIOD
 """How long errors may be told of after they were cleared, in which each drive is asked three times [s]."""
@@ -49,7 +49,7 @@ class OdriveAxis(Axis):
         self._beats = 0
         self._initialised = False
         self._restarted = False
-        self._result: int = Result.SUCCESS
+        self._result: int = ProcedureResult.SUCCESS
 
     def on_version(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
         """Get_Version."""
@@ -159,10 +159,10 @@ class OdriveAxis(Axis):
             self.event = self.made("state", 0, "has restarted and may have lost its position; restart the service")
 
     def _watch_refusal(self) -> None:
-        if self._result in (Result.SUCCESS, Result.BUSY):
+        if self._result in (ProcedureResult.SUCCESS, ProcedureResult.BUSY):
             return
         try:
-            result = Result(self._result).name.lower().replace("_", " ")
+            result = ProcedureResult(self._result).name.lower().replace("_", " ")
         except ValueError:
             result = f"procedure result {self._result}"
         self.tell("state", 0, f"refuses closed loop control: {result}")

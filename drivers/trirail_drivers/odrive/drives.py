@@ -1,4 +1,4 @@
-"""Three ODrives on CANSimple in position control: trirail_drivers.interface.Drives.
+"""Three ODrives on CANSimple in position control: trirail_drivers.interface.DriveGroup.
 
 CANSimple has no SYNC. What stands for it is the beginning of the cycle, `sync`: there the setpoints of the cycle
 before are sent, one after the other, and then the positions are asked for. So a setpoint is in force from the same
@@ -20,12 +20,12 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.driver.axis import MISSED_ANSWERS
-from trirail_drivers.driver.driver import Clock, Driver
-from trirail_drivers.interface import DriveFault, Feedback, Triple
+from trirail_drivers.driver.driver import Driver
+from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import frames, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
-from trirail_drivers.odrive.setpoints import Setpoints
+from trirail_drivers.odrive.setpoints import SetpointSender
 
 
 class Odrive(Driver[OdriveAxis]):
@@ -54,7 +54,7 @@ class Odrive(Driver[OdriveAxis]):
         self._error_requests = itertools.cycle(frames.request(axis.node, frames.GET_ERROR) for axis in self._axes)
         self._errors_due: float | None = None
         self._enabled = False
-        self._setpoints = Setpoints(self._axes, self._wire, drives.quick_stop_deceleration)
+        self._setpoints = SetpointSender(self._axes, self._wire, drives.quick_stop_deceleration)
         self._due: deque[Triple | None] = deque([None] * MISSED_ANSWERS, maxlen=MISSED_ANSWERS)
         """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
 

@@ -81,7 +81,7 @@ PROCEDURES: Final = {
 """Axis states in which the drive moves or tries its motor by itself."""
 
 
-class Result(IntEnum):
+class ProcedureResult(IntEnum):
     """How the last procedure of an axis, or its way into closed loop control, ended."""
 
     SUCCESS = 0

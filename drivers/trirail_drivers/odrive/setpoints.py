@@ -17,7 +17,7 @@ SETTLING: Final = 0.05
 """How long a drive holds at the end of a quick stop before its power is taken off, for its servo to catch up [s]."""
 
 
-class Setpoints:
+class SetpointSender:
     """The setpoints [m], [m/s] that were written, those sent last, and the positions in force."""
 
     def __init__(self, axes: Sequence[OdriveAxis], wire: Wire, deceleration: float) -> None:

@@ -22,11 +22,10 @@ from trirail_drivers.bus.wire import Wire
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout
+from trirail_drivers.interface import Clock
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
-
-Clock = Callable[[], float]
 
 OLDEST_FIRMWARE = (0, 6, 0)
 """Since then errors and heartbeats are laid out as this driver reads them."""

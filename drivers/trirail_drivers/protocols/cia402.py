@@ -10,7 +10,7 @@ from trirail_drivers.cia402 import checks, frames, units
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.inspection import inspect
 from trirail_drivers.protocols.protocol import Protocol
-from trirail_drivers.simulated import EDS, Frames, Machine, Servo, SimulatedDevice, SimulatedDrive
+from trirail_drivers.simulated import EDS, Frames, Mechanics, Servo, SimulatedDevice, SimulatedDrive
 
 
 def _simulated_drive(
@@ -24,10 +24,10 @@ def _simulated_drive(
     switch = None if drive.homing is None else -counts
     servo = Servo.configured(simulated, drive, counts if switch is None else 0)
     eds = Path(drive.eds) if drive.eds is not None else EDS
-    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, machine_of(drive))
+    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, mechanics_of(drive))
 
 
-def machine_of(drive: config.Drive) -> Machine:
+def mechanics_of(drive: config.Drive) -> Mechanics:
     """The axis as it is configured: what of the drive's units its dictionary does not tell."""
     counts, revolutions = drive.counts_per_metre, drive.revolutions_per_metre
 
@@ -35,7 +35,7 @@ def machine_of(drive: config.Drive) -> Machine:
         per_metre = units.written(key, text, power).per_metre(counts, revolutions) if text is not None else None
         return counts / per_metre if per_metre is not None else 1.0
 
-    return Machine(
+    return Mechanics(
         counts_per_metre=counts,
         counts_per_revolution=math.nan if revolutions is None else counts / revolutions,
         velocity=fixed("velocity_unit", drive.velocity_unit, 1),

@@ -11,10 +11,8 @@ import can
 from trirail_drivers import config
 from trirail_drivers.bus.load import Traffic
 from trirail_drivers.driver.requirements import Requirements
-from trirail_drivers.interface import Drives
+from trirail_drivers.interface import Clock, DriveGroup
 from trirail_drivers.simulated import Frames, SimulatedDevice
-
-Clock = Callable[[], float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +21,7 @@ class Protocol:
 
     name: str
     """As `drives.protocol` of the configuration names it."""
-    driver: Callable[[can.BusABC, int, config.Drives, Clock], Drives]
+    driver: Callable[[can.BusABC, int, config.Drives, Clock], DriveGroup]
     """Makes the driver of three drives, from the bus, its bitrate, section [drives] and the clock."""
     check: Callable[[config.Drives, Requirements], None]
     """Refuses with DriveError what the drives could not carry out."""

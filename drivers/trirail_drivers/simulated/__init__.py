@@ -6,6 +6,15 @@ from trirail_drivers.simulated.drive import EDS, SimulatedDrive
 from trirail_drivers.simulated.faultlines import Frames
 from trirail_drivers.simulated.odrive import SimulatedOdrive
 from trirail_drivers.simulated.servo import Servo
-from trirail_drivers.simulated.units import Machine
+from trirail_drivers.simulated.units import Mechanics
 
-__all__ = ["EDS", "Frames", "Machine", "Servo", "SimulatedBus", "SimulatedDevice", "SimulatedDrive", "SimulatedOdrive"]
+__all__ = [
+    "EDS",
+    "Frames",
+    "Mechanics",
+    "Servo",
+    "SimulatedBus",
+    "SimulatedDevice",
+    "SimulatedDrive",
+    "SimulatedOdrive",
+]

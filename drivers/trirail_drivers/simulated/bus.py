@@ -5,11 +5,12 @@ from __future__ import annotations
 import errno
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import can
 
+from trirail_drivers.interface import Clock
 from trirail_drivers.simulated.devices import SimulatedDevice
 from trirail_drivers.simulated.faults import Faults
 
@@ -23,7 +24,7 @@ class SimulatedBus(can.BusABC):
     def __init__(
         self,
         drives: Sequence[SimulatedDevice],
-        clock: Callable[[], float],
+        clock: Clock,
         faults: Faults,
     ) -> None:
         """`faults` are those of the same drives."""

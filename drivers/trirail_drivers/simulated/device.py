@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from trirail_drivers.simulated.dictionary import Dictionary, Entry
+from trirail_drivers.simulated.dictionary import Dictionary, ObjectEntry
 from trirail_drivers.simulated.emergency import Emergencies
 from trirail_drivers.simulated.errorcontrol import ErrorControl
 from trirail_drivers.simulated.pdo import ReceivePdo, TransmitPdo
@@ -237,7 +237,7 @@ class Device:
 
     # SYNC and PDO.
 
-    def _sync_written(self, _entry: Entry, _old: int) -> None:
+    def _sync_written(self, _entry: ObjectEntry, _old: int) -> None:
         self._route()
 
     def _sync(self, data: bytes) -> None:

@@ -46,7 +46,7 @@ class SdoAbort(Exception):
         self.code = code
 
 
-class Entry:
+class ObjectEntry:
     """One object or sub-object, which holds an integer or, of other data types, its bytes.
 
     `value` is the integer it holds; the device's own code sets it directly.
@@ -74,7 +74,7 @@ class Entry:
         self.subindex: int = variable.subindex
         self.readable: bool = variable.readable
         self.mappable: bool = variable.pdo_mappable
-        self.on_write: Callable[[Entry, int], None] | None = None
+        self.on_write: Callable[[ObjectEntry, int], None] | None = None
         kind = variable.data_type or 0
         self.integer = kind in _UNSIGNED or kind in _SIGNED
         self._signed = kind in _SIGNED
@@ -174,22 +174,22 @@ class Dictionary:
     """The object dictionary of one node."""
 
     def __init__(self, eds: Path, node: int) -> None:
-        self._entries: dict[tuple[int, int], Entry] = {}
+        self._entries: dict[tuple[int, int], ObjectEntry] = {}
         self._indices: set[int] = set()
-        self._hidden: dict[tuple[int, int], Entry] = {}
+        self._hidden: dict[tuple[int, int], ObjectEntry] = {}
         objects = read(eds, node)
         compact = compact_arrays(eds)
         for index, item in objects.items():
             self._indices.add(index)
             variables = [item] if isinstance(item, ODVariable) else list(item.subindices.values())
             for variable in variables:
-                self._entries[index, variable.subindex] = Entry(variable)
+                self._entries[index, variable.subindex] = ObjectEntry(variable)
             for subindex in range(1, compact.get(index, 0) + 1):
-                self._entries.setdefault((index, subindex), Entry(item[subindex]))
+                self._entries.setdefault((index, subindex), ObjectEntry(item[subindex]))
             if compact.get(index):
                 self._entries[index, 0].default = self._entries[index, 0].value = compact[index]
 
-    def __getitem__(self, key: tuple[int, int]) -> Entry:
+    def __getitem__(self, key: tuple[int, int]) -> ObjectEntry:
         """The entry at (index, subindex); raises SdoAbort where there is none."""
         try:
             return self._entries[key]
@@ -200,7 +200,7 @@ class Dictionary:
         """Whether the device has the object."""
         return key in self._entries
 
-    def internal(self, index: int, subindex: int, initial: int = 0) -> Entry:
+    def internal(self, index: int, subindex: int, initial: int = 0) -> ObjectEntry:
         """The entry at (index, subindex); where the device has none, one that the bus does not see.
 
         `initial` is its power-on value where the EDS gives none.
@@ -209,13 +209,13 @@ class Dictionary:
         if entry is None:
             variable = ODVariable("", index, subindex)
             variable.data_type, variable.access_type = 0x15, ""
-            entry = self._hidden[index, subindex] = Entry(variable)
+            entry = self._hidden[index, subindex] = ObjectEntry(variable)
         if entry.unset:
             entry.unset = False
             entry.default = entry.value = initial
         return entry
 
-    def on_write(self, index: int, action: Callable[[Entry, int], None]) -> None:
+    def on_write(self, index: int, action: Callable[[ObjectEntry, int], None]) -> None:
         """Call `action(entry, old value)` after each write to `index`; it may refuse by raising SdoAbort."""
         for entry in self._entries.values():
             if entry.index == index:

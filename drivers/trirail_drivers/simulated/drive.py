@@ -8,14 +8,14 @@ from typing import Final
 
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated.device import Device, Nmt
-from trirail_drivers.simulated.dictionary import Entry
-from trirail_drivers.simulated.homing import Homing
+from trirail_drivers.simulated.dictionary import ObjectEntry
+from trirail_drivers.simulated.homing import HomingMode
 from trirail_drivers.simulated.power import FAULT_RESET, STATUS, commanded
 from trirail_drivers.simulated.profile import HOMING, Profile
 from trirail_drivers.simulated.servo import Servo
-from trirail_drivers.simulated.units import Machine
+from trirail_drivers.simulated.units import Mechanics
 
-MACHINE: Final = Machine()
+MECHANICS: Final = Mechanics()
 EDS: Final = Path(__file__).parents[1] / "cia402" / "servo.eds"
 
 FOLLOWING_ERROR = 0x8611
@@ -55,13 +55,13 @@ class SimulatedDrive(Device):
         missed_syncs: int = 3,
         home_switch: float | None = None,
         eds: Path = EDS,
-        machine: Machine = MACHINE,
+        mechanics: Mechanics = MECHANICS,
     ) -> None:
         """`eds` says which objects it has and in which units; it does without the others."""
         super().__init__(node, eds)
         self._missed_syncs = missed_syncs
         self.servo = servo
-        self.homing = Homing(servo, home_switch)
+        self.homing = HomingMode(servo, home_switch)
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self._synchronised = False
         self._moved_at = 0.0
@@ -69,7 +69,7 @@ class SimulatedDrive(Device):
         """Between the last two SYNCs [s]."""
         self._setpoint_given = False
         self._beyond_window: float | None = None
-        self._profile = Profile(self.objects, machine, self._mode_changed)
+        self._profile = Profile(self.objects, mechanics, self._mode_changed)
         self.objects.on_write(0x6040, self._control)
         self.objects.on_write(0x607A, self._setpoint_written)
         self.objects.on_write(0x60C1, self._setpoint_written)
@@ -145,7 +145,7 @@ class SimulatedDrive(Device):
 
     # The power state machine.
 
-    def _control(self, entry: Entry, old: int) -> None:
+    def _control(self, entry: ObjectEntry, old: int) -> None:
         if self.state is PowerState.FAULT:
             if entry.value & ~old & FAULT_RESET:  # transition 15
                 fault, self.fault = self.fault, 0
@@ -250,5 +250,5 @@ class SimulatedDrive(Device):
         self.homing.forget()
         self._publish()
 
-    def _setpoint_written(self, _entry: Entry, _old: int) -> None:
+    def _setpoint_written(self, _entry: ObjectEntry, _old: int) -> None:
         self._setpoint_given = True

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from struct import Struct
 from typing import Final
 
-from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, Entry, SdoAbort
+from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, ObjectEntry, SdoAbort
 
 _EMERGENCY: Final = Struct("<HBH3x")
 
@@ -84,7 +84,7 @@ class Emergencies:
         else:
             self._send(emergency)
 
-    def _history_written(self, entry: Entry, _old: int) -> None:
+    def _history_written(self, entry: ObjectEntry, _old: int) -> None:
         if entry.value:  # CiA 301, 1003h: only 0, which empties it
             raise SdoAbort(INVALID_VALUE)
 

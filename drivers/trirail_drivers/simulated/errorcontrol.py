@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from trirail_drivers.simulated.dictionary import Dictionary, Entry
+from trirail_drivers.simulated.dictionary import Dictionary, ObjectEntry
 
 _TOGGLE: Final = 0x80
 
@@ -66,9 +66,9 @@ class ErrorControl:
             self._heartbeat_due = now + period
         return True
 
-    def _producer_written(self, entry: Entry, _old: int) -> None:
+    def _producer_written(self, entry: ObjectEntry, _old: int) -> None:
         self._heartbeat_due = self._now if entry.value else math.inf
 
-    def _consumer_written(self, _entry: Entry, _old: int) -> None:
+    def _consumer_written(self, _entry: ObjectEntry, _old: int) -> None:
         self._consumer_due = math.inf
         self._changed()

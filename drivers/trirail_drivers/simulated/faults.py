@@ -14,7 +14,7 @@ import can
 from trirail_drivers import files
 from trirail_drivers.bus import canerrors
 from trirail_drivers.errors import DriveError, FileError
-from trirail_drivers.interface import NAMES, PowerState
+from trirail_drivers.interface import NAMES, Clock, PowerState
 from trirail_drivers.simulated.devices import SimulatedDevice
 from trirail_drivers.simulated.emergency import Emergencies
 from trirail_drivers.simulated.faultlines import Condition, Fault, FaultSyntaxError, Frames, parse
@@ -79,11 +79,11 @@ class Faults:
         self._active: list[_Active] = []
         self._held: list[tuple[float, int, Deliver, bytes]] = []
         self._order = itertools.count()
-        self._clock: Callable[[], float] = lambda: 0.0
+        self._clock: Clock = lambda: 0.0
         self._now = 0.0
         self._emit: Callable[[can.Message], None] = _to_nobody
 
-    def connect(self, emit: Callable[[can.Message], None], clock: Callable[[], float]) -> None:
+    def connect(self, emit: Callable[[can.Message], None], clock: Clock) -> None:
         """Tell where frames go that no drive sent, and what tells the time [s]."""
         self._emit = emit
         self._clock = clock

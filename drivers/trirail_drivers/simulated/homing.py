@@ -27,7 +27,7 @@ class Phase(Enum):
     """Braking behind the edge."""
 
 
-class Homing:
+class HomingMode:
     """Finds home with one servo; velocities in counts/s, accelerations in counts/s²."""
 
     def __init__(self, servo: Servo, switch: float | None) -> None:

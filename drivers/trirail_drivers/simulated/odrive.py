@@ -10,7 +10,7 @@ from typing import Final
 
 from trirail_drivers.interface import PowerState
 from trirail_drivers.odrive import frames
-from trirail_drivers.odrive.frames import AxisState, Error, Result
+from trirail_drivers.odrive.frames import AxisState, Error, ProcedureResult
 from trirail_drivers.simulated.servo import Servo
 
 FIRMWARE: Final = (0, 6, 10)
@@ -41,7 +41,7 @@ class SimulatedOdrive:
         self.errors = Error(0)
         """Active errors."""
         self.disarm_reason = Error(0)
-        self.result = Result.SUCCESS
+        self.result = ProcedureResult.SUCCESS
         self.calibrated = True
         """Without calibration it refuses closed loop control."""
         self.silent = False
@@ -126,13 +126,13 @@ class SimulatedOdrive:
         self.errors |= Error(errors)
         if self._armed:
             self.disarm_reason |= Error(errors)
-            self.result = Result.DISARMED
+            self.result = ProcedureResult.DISARMED
             self.axis_state = AxisState.IDLE
 
     def restart(self, now: float) -> None:
         """Lose power for a moment: it comes back idle, without what it had not saved."""
         self.axis_state, self.modes = AxisState.UNDEFINED, (VELOCITY_CONTROL, frames.PASSTHROUGH)
-        self.errors, self.disarm_reason, self.result = Error.INITIALIZING, Error(0), Result.SUCCESS
+        self.errors, self.disarm_reason, self.result = Error.INITIALIZING, Error(0), ProcedureResult.SUCCESS
         self._booted = now + BOOT
 
     @property
@@ -169,11 +169,11 @@ class SimulatedOdrive:
             self.axis_state = AxisState.IDLE
         elif state == AxisState.CLOSED_LOOP_CONTROL and not self._armed:
             if self.errors:
-                self.result = Result.DISARMED
+                self.result = ProcedureResult.DISARMED
             elif not self.calibrated:
-                self.result = Result.NOT_CALIBRATED
+                self.result = ProcedureResult.NOT_CALIBRATED
             else:
-                self.result, self.axis_state = Result.SUCCESS, AxisState.CLOSED_LOOP_CONTROL
+                self.result, self.axis_state = ProcedureResult.SUCCESS, AxisState.CLOSED_LOOP_CONTROL
                 self.disarm_reason = Error(0)
                 # It begins where it stands (axis.cpp of the firmware's published source).
                 self._input = self.servo.position, 0.0

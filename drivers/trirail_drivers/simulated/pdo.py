@@ -14,7 +14,7 @@ from trirail_drivers.simulated.dictionary import (
     UNSUPPORTED_ACCESS,
     WRONG_STATE,
     Dictionary,
-    Entry,
+    ObjectEntry,
     SdoAbort,
 )
 
@@ -51,7 +51,7 @@ class Pdo(ABC):
         given = [objects.internal(mapping, n).default for n in range(1, self._most + 1)]
         self._count = objects.internal(mapping, 0, (*given, 0).index(0))
         self._changed = changed
-        self.entries: tuple[Entry, ...] = ()
+        self.entries: tuple[ObjectEntry, ...] = ()
         self.layout = Struct("<")
         self._plain = True
         objects.on_write(communication, self._communication_written)
@@ -92,7 +92,7 @@ class Pdo(ABC):
             self.entries, self.layout, self._plain = (), Struct("<"), True
 
     @abstractmethod
-    def permits(self, entry: Entry) -> bool:
+    def permits(self, entry: ObjectEntry) -> bool:
         """Whether `entry` may travel in this direction."""
 
     @abstractmethod
@@ -104,7 +104,7 @@ class Pdo(ABC):
         values = [self._objects[self._mapping, n].value for n in range(1, min(self._count.value, self._most) + 1)]
         return values[: (*values, 0).index(0)]
 
-    def _mapped(self, value: int) -> Entry:
+    def _mapped(self, value: int) -> ObjectEntry:
         """The entry that a mapping parameter names: index, subindex, length in bits."""
         index, subindex, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
         if not value:
@@ -114,7 +114,7 @@ class Pdo(ABC):
             raise SdoAbort(NOT_MAPPABLE)
         return entry
 
-    def _mapping_written(self, entry: Entry, old: int) -> None:
+    def _mapping_written(self, entry: ObjectEntry, old: int) -> None:
         """CiA 301, 1600h and 1A00h: first no PDO, then no entries, then the entries, then how many."""
         count = old if entry.subindex == 0 else self._count.value
         if self.valid or (entry.subindex and count):
@@ -130,7 +130,7 @@ class Pdo(ABC):
             raise SdoAbort(PDO_TOO_LONG)
         self.refresh()
 
-    def _communication_written(self, entry: Entry, old: int) -> None:
+    def _communication_written(self, entry: ObjectEntry, old: int) -> None:
         match entry.subindex:
             case 1:
                 restricted = self.valid and any(self.can_id in ids for ids in _RESTRICTED)
@@ -153,7 +153,7 @@ class ReceivePdo(Pdo):
 
     _latched: tuple[int | bytes, ...] | None = None
 
-    def permits(self, entry: Entry) -> bool:
+    def permits(self, entry: ObjectEntry) -> bool:
         """Only what the bus may write."""
         return entry.writable
 
@@ -191,7 +191,7 @@ class TransmitPdo(Pdo):
         self._event_timer = objects.internal(communication, 5)
         self.reset()
 
-    def permits(self, entry: Entry) -> bool:
+    def permits(self, entry: ObjectEntry) -> bool:
         """Only what the bus may read."""
         return entry.readable
 

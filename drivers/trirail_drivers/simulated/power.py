@@ -31,7 +31,7 @@ STATUS: Final = {
 """Bits 0 to 3, 5 and 6 of the statusword (CiA 402-2, 6041h, state coding)."""
 
 
-class Command(Enum):
+class ControlwordCommand(Enum):
     """What a controlword asks for (CiA 402-2, 6040h, command coding)."""
 
     SHUTDOWN = auto()
@@ -43,35 +43,35 @@ class Command(Enum):
 
 
 _CODING: Final = (
-    (0x82, 0x00, Command.DISABLE_VOLTAGE),
-    (0x86, 0x02, Command.QUICK_STOP),
-    (0x87, 0x06, Command.SHUTDOWN),
-    (0x8F, 0x07, Command.SWITCH_ON),
-    (0x8F, 0x0F, Command.ENABLE_OPERATION),
+    (0x82, 0x00, ControlwordCommand.DISABLE_VOLTAGE),
+    (0x86, 0x02, ControlwordCommand.QUICK_STOP),
+    (0x87, 0x06, ControlwordCommand.SHUTDOWN),
+    (0x8F, 0x07, ControlwordCommand.SWITCH_ON),
+    (0x8F, 0x0F, ControlwordCommand.ENABLE_OPERATION),
 )
 """Mask, value under the mask, command; bits outside the mask do not matter."""
 
 _TRANSITIONS: Final = {
-    (SWITCH_ON_DISABLED, Command.SHUTDOWN): READY_TO_SWITCH_ON,  # 2
-    (READY_TO_SWITCH_ON, Command.SWITCH_ON): SWITCHED_ON,  # 3
-    (READY_TO_SWITCH_ON, Command.ENABLE_OPERATION): OPERATION_ENABLED,  # 3 and at once 4
-    (SWITCHED_ON, Command.ENABLE_OPERATION): OPERATION_ENABLED,  # 4
-    (OPERATION_ENABLED, Command.SWITCH_ON): SWITCHED_ON,  # 5
-    (SWITCHED_ON, Command.SHUTDOWN): READY_TO_SWITCH_ON,  # 6
-    (READY_TO_SWITCH_ON, Command.QUICK_STOP): SWITCH_ON_DISABLED,  # 7
-    (READY_TO_SWITCH_ON, Command.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 7
-    (OPERATION_ENABLED, Command.SHUTDOWN): READY_TO_SWITCH_ON,  # 8
-    (OPERATION_ENABLED, Command.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 9
-    (SWITCHED_ON, Command.QUICK_STOP): SWITCH_ON_DISABLED,  # 10
-    (SWITCHED_ON, Command.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 10
-    (OPERATION_ENABLED, Command.QUICK_STOP): QUICK_STOP_ACTIVE,  # 11
-    (QUICK_STOP_ACTIVE, Command.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 12
-    (QUICK_STOP_ACTIVE, Command.ENABLE_OPERATION): OPERATION_ENABLED,  # 16
+    (SWITCH_ON_DISABLED, ControlwordCommand.SHUTDOWN): READY_TO_SWITCH_ON,  # 2
+    (READY_TO_SWITCH_ON, ControlwordCommand.SWITCH_ON): SWITCHED_ON,  # 3
+    (READY_TO_SWITCH_ON, ControlwordCommand.ENABLE_OPERATION): OPERATION_ENABLED,  # 3 and at once 4
+    (SWITCHED_ON, ControlwordCommand.ENABLE_OPERATION): OPERATION_ENABLED,  # 4
+    (OPERATION_ENABLED, ControlwordCommand.SWITCH_ON): SWITCHED_ON,  # 5
+    (SWITCHED_ON, ControlwordCommand.SHUTDOWN): READY_TO_SWITCH_ON,  # 6
+    (READY_TO_SWITCH_ON, ControlwordCommand.QUICK_STOP): SWITCH_ON_DISABLED,  # 7
+    (READY_TO_SWITCH_ON, ControlwordCommand.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 7
+    (OPERATION_ENABLED, ControlwordCommand.SHUTDOWN): READY_TO_SWITCH_ON,  # 8
+    (OPERATION_ENABLED, ControlwordCommand.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 9
+    (SWITCHED_ON, ControlwordCommand.QUICK_STOP): SWITCH_ON_DISABLED,  # 10
+    (SWITCHED_ON, ControlwordCommand.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 10
+    (OPERATION_ENABLED, ControlwordCommand.QUICK_STOP): QUICK_STOP_ACTIVE,  # 11
+    (QUICK_STOP_ACTIVE, ControlwordCommand.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 12
+    (QUICK_STOP_ACTIVE, ControlwordCommand.ENABLE_OPERATION): OPERATION_ENABLED,  # 16
 }
 """By command; transitions 0, 1, 13, 14 are the drive's own and 15 is the fault reset."""
 
 
-def command(controlword: int) -> Command | None:
+def command(controlword: int) -> ControlwordCommand | None:
     """The command in `controlword`, None where its bits are none."""
     for mask, value, meaning in _CODING:
         if controlword & mask == value:
@@ -82,6 +82,6 @@ def command(controlword: int) -> Command | None:
 def commanded(state: PowerState, controlword: int, resumes: bool) -> PowerState:
     """The state after `controlword`; whether a quick stop `resumes` (transition 16) is for 605Ah to say."""
     order = command(controlword)
-    if order is None or (state, order, resumes) == (QUICK_STOP_ACTIVE, Command.ENABLE_OPERATION, False):
+    if order is None or (state, order, resumes) == (QUICK_STOP_ACTIVE, ControlwordCommand.ENABLE_OPERATION, False):
         return state
     return _TRANSITIONS.get((state, order), state)

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, Entry, SdoAbort
+from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, ObjectEntry, SdoAbort
 from trirail_drivers.simulated.homing import EDGES, STANDING
 from trirail_drivers.simulated.servo import Servo
-from trirail_drivers.simulated.units import Machine, Units
+from trirail_drivers.simulated.units import FactorGroup, Mechanics
 
 DEVICE_TYPE: Final = 0x0002_0192
 """1000h: a servo drive of CiA profile 402."""
@@ -34,11 +34,11 @@ _WINDOW_OFF: Final = 0xFFFFFFFF
 class Profile:
     """What its dictionary lacks, the drive does without: 6007h as 0, 605Ah as 2, 6065h as no window, 60B1h as none."""
 
-    def __init__(self, objects: Dictionary, machine: Machine, mode_changed: Callable[[], None]) -> None:
+    def __init__(self, objects: Dictionary, mechanics: Mechanics, mode_changed: Callable[[], None]) -> None:
         self._mode_changed = mode_changed
         o = objects
         o.internal(0x1000, 0, DEVICE_TYPE)
-        self.units = Units(o, machine)
+        self.units = FactorGroup(o, mechanics)
         self.abort_option = o.internal(0x6007, 0)
         self.error_code = o.internal(0x603F, 0)
         self.controlword = o.internal(0x6040, 0)
@@ -130,7 +130,7 @@ class Profile:
         self._velocity.store(servo.velocity / units.velocity)
         self._following_error.store(servo.following_error / units.position)
 
-    def _mode_written(self, entry: Entry, old: int) -> None:
+    def _mode_written(self, entry: ObjectEntry, old: int) -> None:
         mode = entry.value
         if mode != NO_MODE and not (mode in _MODES and self._supported.value >> (mode - 1) & 1):
             raise SdoAbort(INVALID_VALUE)
@@ -138,10 +138,10 @@ class Profile:
         if mode != old:
             self._mode_changed()
 
-    def _quick_stop_option_written(self, entry: Entry, _old: int) -> None:
+    def _quick_stop_option_written(self, entry: ObjectEntry, _old: int) -> None:
         if entry.value not in (_STOP_AND_DISABLE, _STOP_AND_STAY):
             raise SdoAbort(INVALID_VALUE)
 
-    def _method_written(self, entry: Entry, _old: int) -> None:
+    def _method_written(self, entry: ObjectEntry, _old: int) -> None:
         if entry.value not in (NO_MODE, *EDGES, *STANDING):
             raise SdoAbort(INVALID_VALUE)

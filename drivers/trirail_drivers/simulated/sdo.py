@@ -14,7 +14,7 @@ from trirail_drivers.simulated.dictionary import (
     WRITE_ONLY,
     WRONG_LENGTH,
     Dictionary,
-    Entry,
+    ObjectEntry,
     SdoAbort,
 )
 from trirail_drivers.simulated.sdo_block import CRC_WANTED, BlockDownload, BlockUpload
@@ -76,7 +76,7 @@ class SdoServer:
         self._start(data)
         raise SdoAbort(UNKNOWN_COMMAND)
 
-    def _start(self, data: bytes) -> tuple[Entry, bytes]:
+    def _start(self, data: bytes) -> tuple[ObjectEntry, bytes]:
         self.reset()
         _, index, subindex, payload = _HEADER.unpack(data)
         self._key = index, subindex
@@ -91,7 +91,7 @@ class SdoServer:
             raise SdoAbort(NO_DATA)  # CiA 301, 1003h: no such error in the history
         return entry.encode()
 
-    def _writable(self, data: bytes) -> tuple[Entry, bytes]:
+    def _writable(self, data: bytes) -> tuple[ObjectEntry, bytes]:
         entry, payload = self._start(data)
         if not entry.writable:
             raise SdoAbort(READ_ONLY)

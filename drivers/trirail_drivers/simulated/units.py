@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from trirail_drivers.simulated.dictionary import Dictionary, Entry
+from trirail_drivers.simulated.dictionary import Dictionary, ObjectEntry
 
 _METRES: Final = {0x01: 1.0, 0xC1: 0.0254, 0xC2: 0.3048}
 _PER_REVOLUTION: Final = {0x10: math.tau, 0x40: 400.0, 0x41: 360.0, 0x42: 21_600.0, 0x43: 1_296_000.0, 0xB4: 1.0}
@@ -23,7 +23,7 @@ _SECOND_SQUARED: Final = 0x57
 
 
 @dataclass(frozen=True, slots=True)
-class Machine:
+class Mechanics:
     """What no object tells: the axis behind the drive, and units that the maker has fixed."""
 
     counts_per_metre: float = math.nan
@@ -35,17 +35,17 @@ class Machine:
     """The fixed unit of acceleration [counts/s²]."""
 
 
-class Units:
+class FactorGroup:
     """The drive's units as its objects have them now."""
 
-    def __init__(self, objects: Dictionary, machine: Machine) -> None:
+    def __init__(self, objects: Dictionary, mechanics: Mechanics) -> None:
         self.position = 1.0
         """Unit of 607Ah, 6064h and other positions [counts]."""
         self.velocity = 1.0
         """Unit of 60B1h, 606Ch, 6099h [counts/s]."""
         self.acceleration = 1.0
         """Unit of 6084h, 6085h, 609Ah [counts/s²]."""
-        self._machine = machine
+        self._mechanics = mechanics
         self._codes = [objects.internal(index, 0) for index in (0x60A8, 0x60A9, 0x60AA)]
         ratios = [(objects.internal(index, 1), objects.internal(index, 2)) for index in _RATIOS]
         self._ratios = dict(zip(_RATIOS, ratios, strict=True))
@@ -61,11 +61,11 @@ class Units:
         _, velocity, acceleration = (entry.value for entry in self._codes)
         by_factor, of_factor = self._ratio(0x6096), self._ratio(0x6097)
         told = self._told(velocity, 1) or (self.position / by_factor if by_factor else None)
-        self.velocity = told or self._machine.velocity
+        self.velocity = told or self._mechanics.velocity
         told = self._told(acceleration, 2) or (self.velocity / of_factor if of_factor else None)
-        self.acceleration = told or self._machine.acceleration
+        self.acceleration = told or self._mechanics.acceleration
 
-    def _written(self, _entry: Entry, _old: int) -> None:
+    def _written(self, _entry: ObjectEntry, _old: int) -> None:
         self.refresh()
 
     def _position(self) -> float:
@@ -93,12 +93,12 @@ class Units:
         prefix, numerator, denominator = code >> 24 & 0xFF, code >> 16 & 0xFF, code >> 8 & 0xFF
         factor = 10.0 ** (prefix - 256 if prefix > 127 else prefix)
         if numerator == _RPM and power:
-            rpm = factor * self._machine.counts_per_revolution / 60.0
+            rpm = factor * self._mechanics.counts_per_revolution / 60.0
             return rpm if power == 1 else rpm / _SECONDS.get(denominator, math.nan)
         if numerator in _METRES:
-            size = _METRES[numerator] * self._machine.counts_per_metre
+            size = _METRES[numerator] * self._mechanics.counts_per_metre
         elif numerator in _PER_REVOLUTION:
-            size = self._machine.counts_per_revolution / _PER_REVOLUTION[numerator]
+            size = self._mechanics.counts_per_revolution / _PER_REVOLUTION[numerator]
         elif numerator in _COUNTS:
             size = 1.0
         else:

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from trirail_drivers.connection.opening import connect
-from trirail_drivers.interface import DriveFault, Drives, Feedback, PowerState, Triple
+from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, PowerState, Triple
 
 from trirail.config import Config
 from trirail.control.control import Control, Given
@@ -99,7 +99,7 @@ def again(recording: Recording, config: Config, *, simulated: bool) -> Compariso
 
 def _run(
     control: Control,
-    drives: Drives,
+    drives: DriveGroup,
     planner: _RecordedPlanner | LocalPlanner,
     clock: _Clock,
     records: NDArray[np.void],
@@ -123,7 +123,7 @@ def _run(
 
 
 def _cycle(
-    control: Control, drives: Drives, planner: _RecordedPlanner | LocalPlanner, given: Sequence[ControlInput]
+    control: Control, drives: DriveGroup, planner: _RecordedPlanner | LocalPlanner, given: Sequence[ControlInput]
 ) -> None:
     """Do what the loop does in a cycle after its SYNC."""
     inputs: list[Given] = [(what.given, what.now_ns) for what in given if not isinstance(what.given, DrivesFault)]
@@ -200,7 +200,7 @@ class _RecordedPlanner:
 
 
 class _Recorded:
-    """Drives that say what they said in the recording, and take anything: trirail_drivers.interface.Drives."""
+    """Drives that say what they said in the recording, and take anything: trirail_drivers.interface.DriveGroup."""
 
     bus_load = 0.0
     traffic = 0
@@ -230,31 +230,31 @@ class _Recorded:
         return self._said[max(0, self._row - 1)]._replace(fault=self._fault)
 
     def configure(self, period: float) -> None:
-        """See trirail_drivers.interface.Drives."""
+        """See trirail_drivers.interface.DriveGroup."""
 
     def write(self, position: Triple, velocity: Triple) -> None:
-        """See trirail_drivers.interface.Drives."""
+        """See trirail_drivers.interface.DriveGroup."""
 
     def enable(self) -> None:
-        """See trirail_drivers.interface.Drives."""
+        """See trirail_drivers.interface.DriveGroup."""
 
     def home(self) -> None:
-        """See trirail_drivers.interface.Drives."""
+        """See trirail_drivers.interface.DriveGroup."""
 
     def stop_homing(self) -> None:
-        """See trirail_drivers.interface.Drives."""
+        """See trirail_drivers.interface.DriveGroup."""
 
     def disable(self) -> None:
-        """See trirail_drivers.interface.Drives."""
+        """See trirail_drivers.interface.DriveGroup."""
 
     def quick_stop(self) -> None:
-        """See trirail_drivers.interface.Drives."""
+        """See trirail_drivers.interface.DriveGroup."""
 
     def reset(self) -> None:
-        """See trirail_drivers.interface.Drives."""
+        """See trirail_drivers.interface.DriveGroup."""
 
     def close(self) -> None:
-        """See trirail_drivers.interface.Drives."""
+        """See trirail_drivers.interface.DriveGroup."""
 
 
 class _Clock:
@@ -277,7 +277,7 @@ class _Clock:
         self._over = time.monotonic()
 
 
-def _simulated(records: NDArray[np.void], config: Config, clock: _Clock) -> Drives:
+def _simulated(records: NDArray[np.void], config: Config, clock: _Clock) -> DriveGroup:
     """Return simulated drives that stand where the recorded ones stood."""
     start: Any = tuple(records["position"][0].tolist())
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)

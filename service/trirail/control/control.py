@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from trirail_drivers.interface import NAMES, Drives, Feedback, PowerState, Triple
+from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
 
 from trirail.config import Config, geometry
 from trirail.control.completion import still_powered, verdict
@@ -55,7 +55,7 @@ _GO_ON = (
 class Control:
     """Modes, motion, kinematics and limits of one robot over one set of drives."""
 
-    def __init__(self, config: Config, drives: Drives, planner: PlannerPort) -> None:
+    def __init__(self, config: Config, drives: DriveGroup, planner: PlannerPort) -> None:
         robot = geometry(config.geometry)
         self._drives = drives
         self._period = config.period

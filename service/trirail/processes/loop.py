@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from trirail_drivers.bus.capture import Capture
 from trirail_drivers.connection.opening import connect
-from trirail_drivers.interface import DriveFault, Drives
+from trirail_drivers.interface import DriveFault, DriveGroup
 
 from trirail.config import Config
 from trirail.control.control import Control, Given
@@ -73,7 +73,7 @@ class Loop:
     def __init__(
         self,
         config: Config,
-        drives: Drives,
+        drives: DriveGroup,
         ports: Ports,
         heartbeats: Heartbeats,
         *,
@@ -328,7 +328,7 @@ class Loop:
 
 def main(config: Config, ports: Ports, heartbeats: Heartbeats, ready: Callable[[object], None]) -> int:
     """Run the loop's process; `ready` is called with what the loop runs without once it turns."""
-    drives: Drives | None = None
+    drives: DriveGroup | None = None
     ended_as_told = False
     try:
         warm_up()
