@@ -55,3 +55,28 @@ def test_an_edit_of_inlined_code_is_noticed(tmp_path: Path) -> None:
     assert run(code, tmp_path) == "2.0 0"
     (room / "recursion.py").write_text(inner.format(3.0))
     assert run(code, tmp_path) == "3.0 1"
+
+
+def test_kept_code_that_names_a_class_which_is_no_more_is_compiled_anew(tmp_path: Path) -> None:
+    """As after an update of the service, over what the version before has kept."""
+    room = tmp_path / "trirail" / "kinematics"
+    room.mkdir(parents=True)
+    (tmp_path / "trirail" / "__init__.py").write_text("")
+    (room / "__init__.py").write_text("")
+    (room / "compiled.py").write_text(Path(compiled.__file__).read_text())
+    source = (
+        "from typing import NamedTuple\n"
+        "from trirail.kinematics.compiled import compiled\n"
+        "class {0}(NamedTuple):\n"
+        "    x: float\n"
+        "@compiled()\n"
+        "def doubled(value):\n"
+        "    return 2.0 * value.x\n"
+        "def twice(x):\n"
+        "    return doubled({0}(x))\n"
+    )
+    code = "from trirail.kinematics.closure import doubled, twice; print(twice(1.0), len(doubled.stats.cache_misses))"
+    for name in ("Before", "After"):
+        (room / "closure.py").write_text(source.format(name))
+        assert run(code, tmp_path) == "2.0 1"
+        assert run(code, tmp_path) == "2.0 0"

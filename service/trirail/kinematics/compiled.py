@@ -37,9 +37,10 @@ def compiled(*signatures: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         dispatcher: Any = njit(function, error_model="numpy", forceinline=True, cache=True)
         # To see whether kept code is out of date numba looks at the file of the function alone; what was
-        # inlined into it from other files would live on after an edit there.
+        # inlined into it from other files would live on after an edit there. The version is read before
+        # anything else is unpickled: of older code that may name classes that are no more.
         kept = dispatcher._cache._cache_file
-        kept._source_stamp = (kept._source_stamp, FINGERPRINT)
+        kept._version = (kept._version, FINGERPRINT)
         for signature in signatures:
             dispatcher.compile(signature)
         if signatures:
