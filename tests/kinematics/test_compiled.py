@@ -80,3 +80,19 @@ def test_kept_code_that_names_a_class_which_is_no_more_is_compiled_anew(tmp_path
         (room / "closure.py").write_text(source.format(name))
         assert run(code, tmp_path) == "2.0 1"
         assert run(code, tmp_path) == "2.0 0"
+
+
+def test_processes_that_start_together_compile_once(tmp_path: Path) -> None:
+    room = tmp_path / "trirail" / "kinematics"
+    room.mkdir(parents=True)
+    (tmp_path / "trirail" / "__init__.py").write_text("")
+    (room / "__init__.py").write_text("")
+    (room / "compiled.py").write_text(Path(compiled.__file__).read_text())
+    (room / "closure.py").write_text(
+        "from trirail.kinematics.compiled import compiled\n@compiled('f8(f8)')\ndef doubled(x):\n    return 2.0 * x\n"
+    )
+    code = "from trirail.kinematics.closure import doubled; print(len(doubled.stats.cache_misses))"
+    command = [sys.executable, "-c", code]
+    together = [subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    misses = [int(process.communicate(timeout=100)[0]) for process in together]
+    assert sum(misses) == 1

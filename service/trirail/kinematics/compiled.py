@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -27,6 +29,17 @@ def _fingerprint() -> str:
 FINGERPRINT = _fingerprint()
 
 
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold the lock of a cache folder; the kernel takes it from a process that dies."""
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError):  # somebody else's folder: then each compiles for itself
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = held.enter_context((folder / "compiling.lock").open("w"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
 def compiled(*signatures: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorate a function to run compiled: now, for these signatures; without any, at its first call.
 
@@ -41,9 +54,11 @@ def compiled(*signatures: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
         # anything else is unpickled: of older code that may name classes that are no more.
         kept = dispatcher._cache._cache_file
         kept._version = (kept._version, FINGERPRINT)
-        for signature in signatures:
-            dispatcher.compile(signature)
         if signatures:
+            # Processes that start together compile each function once: who comes second loads what the first has kept.
+            with _alone(Path(kept._cache_path)):
+                for signature in signatures:
+                    dispatcher.compile(signature)
             dispatcher.disable_compile()
         return dispatcher  # type: ignore[no-any-return]
 
