@@ -328,7 +328,8 @@ def test_a_live_view_is_drawn_for_only_while_somebody_watches(tmp_path: Path, mo
 def test_captured_frames_are_a_log_that_python_can_reads(tmp_path: Path) -> None:
     recording = recorder(tmp_path, configured(capture_can=True))
     foreign = can.Message(arbitration_id=0x1ABCDEF0, data=b"\x07", is_extended_id=True)
-    passive = can.Message(arbitration_id=0x204, data=b"\0\x30" + bytes(6), is_extended_id=False, is_error_frame=True)
+    # Of error frames python-can reads those of the class "bus error", 80h.
+    passive = can.Message(arbitration_id=0x284, data=b"\0\x30" + bytes(6), is_extended_id=False, is_error_frame=True)
     seen = [
         Frame(0x201, bytes([1, 2, 3, 4, 5, 255])).packed,
         Frame(0x080).packed,

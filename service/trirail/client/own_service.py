@@ -21,7 +21,7 @@ from trirail.processes.interpreter import python
 
 PATIENT = {"max_overruns": "1000", "missed_syncs": "2000", "heartbeat": "1.0"}
 """Keys of a configuration with which neither the loop nor the drives give up on a machine that stalls for a second."""
-START_WITHIN = 120.0
+START_WITHIN = 300.0
 """How long it may take to come up; the very first start compiles the kinematics [s]."""
 END_WITHIN = 20.0
 """How long it may take to stop the robot and end [s]."""

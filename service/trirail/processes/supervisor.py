@@ -35,7 +35,7 @@ CONSEQUENCES = {
     "recorder": "the robot is not affected",
 }
 """What the death of a process means for the robot."""
-START_WITHIN = 120.0
+START_WITHIN = 300.0
 """How long the processes may take to come up; the very first start compiles the kinematics [s]."""
 END_WITHIN = 6.0
 """How long they may take to end before they are killed [s]."""
