@@ -37,22 +37,8 @@ CHANGES = {
     "live_port = 9876": "live_port = 0",
 }
 """What the machine's configuration has that differs from configs/socketcan.toml."""
-HOMING = {
-    "rate_hz = 20 ": "rate_hz = 10 ",
-    "following_error = 0.03 ": "following_error = 0.06 ",
-    "following_error = 0.04": "following_error = 0.08",
-}
-"""What the second configuration has that differs from the first, besides homing: another rate."""
-LOGS = ("service", "drives", "homing-service", "homing-drives")
+LOGS = ("service", "drives")
 """What is shown of a run that failed."""
-INCREMENTAL = """
-[drives.{}.homing]
-method = 19
-speed_switch = 0.02
-speed_zero = 0.005
-acceleration = 0.5
-timeout = 120.0
-"""
 
 
 def main() -> int:
@@ -137,7 +123,7 @@ def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict
 
 
 def configure(folder: Path) -> Config:
-    """Write two configurations: configs/socketcan.toml with CHANGES, which is returned, and then with HOMING."""
+    """Write the machine's configuration: configs/socketcan.toml with CHANGES."""
     text = (ROOT / "configs/socketcan.toml").read_text()
     memory = "/dev/shm"
     changes = CHANGES | {
@@ -146,19 +132,12 @@ def configure(folder: Path) -> Config:
         # A stalled host stalls the drives with the loop: that is no loss of SYNC.
         "[drives]\n": "[can.simulated]\nmissed_syncs = 40\n\n[drives]\nsdo_timeout = 10.0\n",
     }
-    text = _changed(text, changes)
-    (folder / "robot.toml").write_text(text)
-    (folder / "homing.toml").write_text(_changed(text, HOMING) + "".join(map(INCREMENTAL.format, "ABC")))
-    load(folder / "homing.toml")
-    return load(folder / "robot.toml")
-
-
-def _changed(text: str, changes: dict[str, str]) -> str:
     for before, after in changes.items():
         if text.count(before) != 1:
             raise Failed(f"configs/socketcan.toml: {before!r} is not there once; CHANGES of tools/hil.py needs it")
         text = text.replace(before, after)
-    return text
+    (folder / "robot.toml").write_text(text)
+    return load(folder / "robot.toml")
 
 
 def _result(folder: Path) -> dict[str, Any]:

@@ -19,9 +19,10 @@ BUFFER = 8_000_000
 """Of candump's socket [bytes]: it shall see every frame, however busy the machine is."""
 PATIENT = (
     "from trirail.cli import commands; from trirail.processes import supervisor; "
-    f"supervisor.START_WITHIN = {WITHIN}; commands.main()"
+    f"supervisor.START_WITHIN = supervisor.END_WITHIN = {WITHIN}; commands.main()"
 )
-"""`trirail`, with more patience: the interpreters alone take a minute to start here."""
+"""`trirail`, with more patience: the interpreters alone take a minute to start here, and a black
+box for each fault some seconds to be written."""
 
 
 class Failed(Exception):

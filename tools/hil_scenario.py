@@ -53,31 +53,6 @@ def disturbed(machine: Machine, config: Config, held: Held, result: dict[str, An
     held("end", "exit code 0 after SIGTERM")
 
 
-def homed(machine: Machine, config: Config, held: Held, result: dict[str, Any]) -> None:
-    """Home drives that have incremental encoders, and move, at another rate than before."""
-    run("ip", "link", "set", "can0", "up")
-    drives = machine.drives("homing.toml", "homing-drives")
-    service = machine.service("homing.toml", "homing-service")
-    with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
-        try:
-            robot.enable()
-            robot.move_to(x=0.01, y=0.0, phi=0.0)
-        except RefusedError as refused:
-            if refused.code != "not_homed":
-                raise
-        else:
-            raise Failed("a goal was accepted of a robot that is not homed")
-        robot.home()
-        state = robot.state()
-        held("homing", f"at {config.loop.rate_hz} Hz, all three, then {state.mode}")
-        moved = robot.move_to(x=0.01, y=0.005, phi=-0.05).wait(WITHIN)
-        expect(moved, "done", robot)
-        held("goal after homing", moved.message)
-        result["loops"] |= {f"{config.loop.rate_hz} Hz": _loop(robot.state())}
-    machine.end(service, "the service")
-    drives.terminate()
-
-
 def _refused(robot: Robot, held: Held) -> None:
     try:
         robot.move_to(x=0.5, y=0.0, phi=0.0)

@@ -9,7 +9,6 @@ import hil_machine
 import hil_needs
 import pytest
 from hil_needs import Failed
-from trirail.config import load
 
 
 def test_the_newest_kernel_with_the_cards_driver_is_taken(tmp_path: Path) -> None:
@@ -43,9 +42,6 @@ def test_the_machines_configuration_is_that_of_real_drives_but_slower(tmp_path: 
     assert config.loop.rate_hz == 20
     assert config.telemetry.capture_can
     assert config.limits.slider.following_error < config.drives.following_error
-    homing = load(tmp_path / "homing.toml")
-    assert homing.loop.rate_hz != config.loop.rate_hz
-    assert all(drive.homing is not None for drive in homing.drives.each)
 
 
 def test_the_time_limit_says_what_was_heard_last() -> None:
