@@ -132,6 +132,8 @@ class PythonCanFrames:
         """`heard_by_itself`: the bus brings back, unmarked and in order, what is sent on it."""
         self._bus = bus
         self._own: deque[tuple[int, bytes]] | None = deque(maxlen=MOST_NOTHINGS) if heard_by_itself else None
+        # SocketCAN's mark is on whatever comes from this machine, be it another program's.
+        self._marks_own = not isinstance(bus, SocketcanBus)
         self._poll: select.poll | None = None
         self._unanswered = 0
         """Frames sent that the interface may still answer with nothing."""
@@ -163,7 +165,7 @@ class PythonCanFrames:
     def _is_own(self, message: can.Message) -> bool:
         """Whether this end has sent it; those sent before it that have not come back are lost."""
         if self._own is None:
-            return not message.is_rx
+            return self._marks_own and not message.is_rx
         sent = can_id(message), bytes(message.data)
         if sent not in self._own:
             return False
