@@ -25,7 +25,7 @@ PORTABLE = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 TESTS = ("tests/drivers/test_real_bus.py", "tests/drivers/test_frame_io.py")
 """What has tests marked vcan."""
 
-COMPILE = "from trirail.processes import gateway, loop, recording; from trirail.client import client"
+COMPILE = "from trirail.processes import gateway, loop, planner, recording; from trirail.client import client"
 
 
 def prepare(folder: Path) -> None:
