@@ -108,8 +108,8 @@ def test_a_capture_has_every_frame_with_its_time(kind: str, way: str) -> None:
         arriving(frames, len(KINDS))
     ended = time.time()
     noted = [line for chunk in capture.take() for line in FRAME.iter_unpack(chunk)]
-    assert [t for t, _ in noted] == sorted(t for t, _ in noted)
-    assert began <= noted[0][0] <= noted[-1][0] <= ended
+    # Linux turns stamping on a moment after it is asked to: until then a frame has the time at which it is read.
+    assert all(began <= t <= ended for t, _ in noted)
     seen = [CAN_FRAME.unpack(frame) for _, frame in noted]
     assert seen == [(one, len(data), data.ljust(8, b"\0")) for one, data in ((0x201, b"\x06\x00"), *KINDS)]
 
