@@ -60,8 +60,13 @@ def dissect(log: Path) -> list[Dissected]:
 
 
 def problems(frames: Sequence[Dissected], until: float) -> list[str]:
-    """Return what is wrong, a line each; nodes are to stay operational and without errors before the time `until`."""
-    return [*_unreadable(frames), *_unanswered(frames), *_fallen([frame for frame in frames if frame.t < until])]
+    """Return what is wrong, a line each.
+
+    All frames are to be readable. Before the time `until`, when nobody disturbs them, nodes are to be asked one thing
+    at a time, and to stay operational and without errors; later a deaf node is told to stop without waiting for it.
+    """
+    calm = [frame for frame in frames if frame.t < until]
+    return [*_unreadable(frames), *_unanswered(calm), *_fallen(calm)]
 
 
 def statistics(frames: Sequence[Dissected]) -> dict[str, int]:

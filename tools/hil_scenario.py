@@ -41,10 +41,10 @@ def disturbed(machine: Machine, config: Config, held: Held, result: dict[str, An
         _stopped(robot, held)
         robot.disable()
         held("disable", "confirmed, no drive has power")
-        robot.enable()
-        _quick_stopped(robot, held)
         result["loops"] |= {f"{config.loop.rate_hz} Hz": _loop(robot.state())}
         result["cut"] = time.time()
+        robot.enable()
+        _quick_stopped(robot, held)
         _flooded(robot, held)
         _thrown_out(robot, held)
         _drives_link_down(robot, machine, held)
