@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from trirail.kinematics import compiled
 
 COUNT = """
@@ -28,19 +29,25 @@ def run(code: str, directory: Path) -> str:
     return done.stdout.strip()
 
 
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    """A folder trirail/kinematics with nothing in it but the decorator."""
+    room = tmp_path / "trirail" / "kinematics"
+    room.mkdir(parents=True)
+    (tmp_path / "trirail" / "__init__.py").write_text("")
+    (room / "__init__.py").write_text("")
+    (room / "compiled.py").write_text(Path(compiled.__file__).read_text())
+    return room
+
+
 def test_a_second_start_compiles_nothing() -> None:
     root = Path(__file__).parents[2]
     run(COUNT, root)  # the first start, if there was none before
     assert run(COUNT, root) == "0 0 0 0"
 
 
-def test_an_edit_of_inlined_code_is_noticed(tmp_path: Path) -> None:
+def test_an_edit_of_inlined_code_is_noticed(room: Path, tmp_path: Path) -> None:
     """The constant is in one file, the function that is kept on disk in another, which does not change."""
-    room = tmp_path / "trirail" / "kinematics"
-    room.mkdir(parents=True)
-    (tmp_path / "trirail" / "__init__.py").write_text("")
-    (room / "__init__.py").write_text("")
-    (room / "compiled.py").write_text(Path(compiled.__file__).read_text())
     (room / "closure.py").write_text(
         "from trirail.kinematics.compiled import compiled\n"
         "from trirail.kinematics.recursion import inner\n"
@@ -57,13 +64,8 @@ def test_an_edit_of_inlined_code_is_noticed(tmp_path: Path) -> None:
     assert run(code, tmp_path) == "3.0 1"
 
 
-def test_kept_code_that_names_a_class_which_is_no_more_is_compiled_anew(tmp_path: Path) -> None:
+def test_kept_code_that_names_a_class_which_is_no_more_is_compiled_anew(room: Path, tmp_path: Path) -> None:
     """As after an update of the service, over what the version before has kept."""
-    room = tmp_path / "trirail" / "kinematics"
-    room.mkdir(parents=True)
-    (tmp_path / "trirail" / "__init__.py").write_text("")
-    (room / "__init__.py").write_text("")
-    (room / "compiled.py").write_text(Path(compiled.__file__).read_text())
     source = (
         "from typing import NamedTuple\n"
         "from trirail.kinematics.compiled import compiled\n"
@@ -82,12 +84,7 @@ def test_kept_code_that_names_a_class_which_is_no_more_is_compiled_anew(tmp_path
         assert run(code, tmp_path) == "2.0 0"
 
 
-def test_processes_that_start_together_compile_once(tmp_path: Path) -> None:
-    room = tmp_path / "trirail" / "kinematics"
-    room.mkdir(parents=True)
-    (tmp_path / "trirail" / "__init__.py").write_text("")
-    (room / "__init__.py").write_text("")
-    (room / "compiled.py").write_text(Path(compiled.__file__).read_text())
+def test_processes_that_start_together_compile_once(room: Path, tmp_path: Path) -> None:
     (room / "closure.py").write_text(
         "from trirail.kinematics.compiled import compiled\n@compiled('f8(f8)')\ndef doubled(x):\n    return 2.0 * x\n"
     )
