@@ -235,7 +235,7 @@ class _Recorded:
     def write(self, position: Triple, velocity: Triple) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
-    def enable(self) -> None:
+    def enable(self, alone: str | None = None) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
     def home(self) -> None:
