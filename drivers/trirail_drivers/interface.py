@@ -93,6 +93,10 @@ class DriveGroup(Protocol):
     def traffic(self) -> int:
         """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
 
+    @property
+    def told(self) -> tuple[DriveFault | None, ...]:
+        """Of each drive the first fault that it has told of by itself since the last reset, whichever came first."""
+
     def configure(self, period: float) -> None:
         """Set the drives up for a cycle of `period` seconds, check what can be read back, start them without power."""
 

@@ -11,6 +11,7 @@ from cyclopts import App, CycloptsError
 
 from trirail import __version__
 from trirail.cli import (
+    commission,
     config_commands,
     drives_command,
     math_commands,
@@ -119,6 +120,7 @@ def view(
 
 
 app.command(drives_command.drives)
+app.command(commission.commission)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)
