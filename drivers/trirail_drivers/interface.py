@@ -41,7 +41,7 @@ class DriveFault(NamedTuple):
     code: int
     """The EMCY or 603Fh error code, or an ODrive's error bits; 0 where there is none."""
     message: str
-    """One line for people, with drive, cause and code in it."""
+    """One line for people, of bounded length, with drive, cause and code in words."""
 
 
 class Counts(NamedTuple):

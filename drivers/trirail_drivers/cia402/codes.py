@@ -134,29 +134,40 @@ _CLASSES = {
     0x87: "SYNC",
     0x90: "external error",
     0xF0: "additional function",
-    0xFF: "the maker's own: see the drive's manual",
+    0xFF: "the maker's own",
 }
 """By the code's upper byte, or by its first digit where the byte is not listed."""
 
+_UNKNOWN = "of no class of CiA 301"
+
+_LATE = "was the service stopped or too slow? cable, terminators; trirail doctor"
 _REMEDIES = {
     0x2: "look at motor, cable and load",
     0x3: "look at the supply; braking feeds back into it",
     0x4: "let it cool down; look at load and air",
+    0x7121: "look for what blocks the slider",
     0x73: "look at the encoder and its cable",
-    0x8130: "the service was stopped or too slow: trirail doctor",
+    0x8130: _LATE,
     0x8150: "give each node an identifier of its own",
     0x81: "look at cable, terminators and bitrate: trirail doctor",
-    0x8611: "look for what blocks the slider, or at limits and tuning",
-    0x8700: "the service was stopped or too slow: trirail doctor",
+    0x8250: _LATE,
+    0x82: "look for another node that sends with this drive's identifiers",
+    0x84: "look at load, limits and tuning",
+    0x85: "look at load, limits and tuning",
+    0x8611: "look at load, tuning, limits and counts_per_metre, and for what blocks the slider",
+    0x86: "look at load, limits and tuning",
+    0x8700: _LATE,
+    0x9: "look at what is wired to the drive's inputs",
 }
 """What to do, by code, upper byte or first digit."""
+_MANUAL = "see the drive's manual"
 
 
-def words(code: int) -> str:
-    """Return an error code [0, FFFFh] as hexadecimal number with what it means, and a remedy where there is one."""
-    meaning = _CODES.get(code) or _by_class(_CLASSES, code)
-    remedy = _REMEDIES.get(code) or _by_class(_REMEDIES, code)
-    return "".join((f"0x{code:04X}", f" ({meaning})" if meaning else "", f"; {remedy}" if remedy else ""))
+def words(code: int, also: str = "") -> str:
+    """Return an error code [0, FFFFh] as hexadecimal number, its meaning, `also` what else is so, and a remedy."""
+    meaning = _CODES.get(code) or _by_class(_CLASSES, code) or _UNKNOWN
+    remedy = _REMEDIES.get(code) or _by_class(_REMEDIES, code) or _MANUAL
+    return f"0x{code:04X} ({meaning}){also}; {remedy}"
 
 
 def _by_class(table: dict[int, str], code: int) -> str:
