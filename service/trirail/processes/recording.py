@@ -13,6 +13,7 @@ from pathlib import Path
 from trirail.config import Config
 from trirail.processes.last_words import LastWords
 from trirail.telemetry.blackbox import BlackBox
+from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.links import Closed, PacketLink
 from trirail.wire.messages import Level
@@ -75,8 +76,9 @@ class Intake:
                 recorder.given(said)
                 box.given(said)
             case Status():
-                recorder.target(said.target)
-                box.stands("target", said.target)
+                standing = Standing(said.goal, said.target, said.override, said.fault)
+                recorder.stands(standing)
+                box.stands("stands", standing)
             case Welcome():
                 recorder.bus_load(said.bus_load)
                 box.stands("bus_load", said.bus_load)
