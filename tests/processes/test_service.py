@@ -259,7 +259,7 @@ def test_the_commands(service: Service) -> None:
     assert out.returncode == 1
     assert "platform x: position 0.5 m is beyond its limit 0.15 m" in out.stderr
     assert call("reset").returncode == 1
-    assert call("goto", "nan", 0, 0).returncode == 1
+    assert call("goto", "nan", 0, 0).returncode == 2
     assert call("goto", 1, 2).returncode == 2
     assert call("quick-stop").returncode == 0
     failed = call("enable")
