@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-from cyclopts import App, CycloptsError
+from cyclopts import App, CoercionError, CycloptsError, UnknownOptionError
 
 from trirail import __version__
 from trirail.cli import (
@@ -17,6 +17,7 @@ from trirail.cli import (
     recording_commands,
     robot_commands,
     terminal,
+    units,
     workspace_command,
 )
 from trirail.cli.options import HERE, Flag, Service
@@ -135,10 +136,11 @@ app.command(recording_commands.report)
 
 def main() -> None:
     """Run a command and exit as it says."""
+    words = sys.argv[1:]
     try:
-        code = app(exit_on_error=False, print_error=False, result_action="return_value")
+        code = app(units.numbers(words), exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
-        terminal.complain(f"{str(error).strip()} (trirail --help tells the usage)")
+        terminal.complain(_wrong_usage(error, words))
         code = 2
     except TrirailError as error:
         terminal.complain(str(error))
@@ -149,3 +151,16 @@ def main() -> None:
         sys.stderr.close()
         code = 0
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
+    """Say what is wrong with a command line, of what, and where its usage is told."""
+    said = str(error).strip()
+    behind = words[words.index("--") :] if "--" in words else []
+    unknown = error.token.keyword if isinstance(error, UnknownOptionError) else None
+    if unknown and any(word.split("=")[0] == unknown for word in behind):
+        said = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
+    elif isinstance(error, CoercionError) and error.msg and error.argument and not said.startswith("Invalid value"):
+        said = f"Invalid value for {error.argument.name.strip('-')}: {said}"
+    command = " ".join(("trirail", *(error.command_chain or ())))
+    return f"{said} ({command} --help tells the usage)"

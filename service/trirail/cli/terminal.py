@@ -17,7 +17,9 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 from trirail_drivers.bus import load
 from trirail_drivers.errors import shortened
+from trirail_drivers.interface import MissingProtection
 
+from trirail.cli import units
 from trirail.client.client import GoalHandle, Jog, Result, Robot
 from trirail.errors import ServiceError
 from trirail.telemetry import palette
@@ -124,6 +126,16 @@ def show(state: State, robot: str) -> None:
     out.print(_table(state, robot))
 
 
+def missing(protections: Sequence[MissingProtection]) -> None:
+    """Print what drives do without, a line for what is so of several."""
+    drives: dict[str, list[str]] = {}
+    for each in protections:
+        drives.setdefault(f"{each.object}, {each.means}", []).append(each.drive)
+    for what, names in drives.items():
+        whose = f"drive{'s' * (len(names) > 1)} {', '.join(names)}"
+        out.print(f"[yellow]lacking[/]   {whose}: {plain(what)}", soft_wrap=True)
+
+
 def watch(robot: Robot) -> None:
     """Show the state live until Ctrl-C or the service goes silent."""
     with (
@@ -151,20 +163,20 @@ def checks(found: Sequence[Check]) -> None:
 
 
 def _table(state: State, robot: str) -> Table:
-    x, y, phi = state.pose
     grid = Table.grid(padding=(0, 2))
     grid.add_row("robot", f"[bold]{robot}[/]  {_coloured(state.mode)}  t {state.t:.2f} s")
     for fault in state.faults:
         grid.add_row("fault", f"[bold red]{plain(fault)}[/]")
-    grid.add_row("pose", f"x {x * 1e3:9.3f} mm   y {y * 1e3:9.3f} mm   φ {math.degrees(phi):9.4f}°")
+    grid.add_row("pose", units.pose(state.pose, 9))
     if state.goal:
         grid.add_row("goal", f"{plain(state.goal.id)}  {state.goal.progress:4.0%}  {state.goal.remaining:.1f} s left")
     sliders = state.sliders
     for index, name in enumerate("ABC"):
         grid.add_row(
             f"slider {name}",
-            f"{sliders.position[index] * 1e3:9.3f} mm {sliders.velocity[index] * 1e3:8.2f} mm/s "
-            f"{sliders.following_error[index] * 1e6:7.1f} µm error  {sliders.status[index]}",
+            f"{units.written(sliders.position[index], 'mm', 3, 9)} "
+            f"{units.written(sliders.velocity[index], 'mm/s', 2, 8)} "
+            f"{units.written(sliders.following_error[index], 'µm', 1, 7)} error  {sliders.status[index]}",
         )
         if said := [
             f"{name.replace('_', ' ')} {n}" for name, n in msgspec.to_builtins(sliders.traffic[index]).items() if n
@@ -197,8 +209,3 @@ def table(first: str, *others: str) -> Table:
     for name in others:
         made.add_column(name, justify="right" if name else "left")
     return made
-
-
-def number(value: float, digits: int) -> str:
-    """Write a number without the sign of a rounded zero."""
-    return f"{round(value, digits) + 0.0:.{digits}f}"
