@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import msgspec
 
 from trirail.errors import RefusalCode, RefusedError, TrirailError
-from trirail.wire.messages import GoalReply, Stop, VelocityGoal
+from trirail.wire.messages import GoalReply, Residual, Stop, VelocityGoal
 from trirail.wire.vocabulary import Command
 
 if TYPE_CHECKING:
@@ -24,9 +24,17 @@ class Result(NamedTuple):
 
     id: str
     outcome: str
-    """done, rejected, preempted, stopped, expired or faulted."""
+    """done, rejected, preempted, stopped, expired, faulted or unsettled."""
     message: str
     """One line for people: why."""
+    settle: float | None = None
+    """Where it is done: time from the end of its path until the robot was in position, to the first cycle of the dwell
+    [s]. None, as the two below, where it was not to settle: a jog, a goal that was passed on the way to the next, a
+    trajectory with `settle` False."""
+    residual: Residual | None = None
+    """How far the robot was from the target when it ended, done or unsettled: `sliders` [m], and `pose` [m, m, rad]."""
+    overshoot: tuple[float, float, float] | None = None
+    """How far the sliders A, B, C were beyond their targets at most since the end of the path [m]."""
 
 
 class GoalHandle:
@@ -47,7 +55,8 @@ class GoalHandle:
 
     @property
     def duration(self) -> float | None:
-        """Expected time from acceptance to arrival [s]; None while the override is zero."""
+        """Expected time from acceptance to the end of its path [s], to which settling adds; None while the override is
+        zero."""
         return self.reply.duration
 
     @property
