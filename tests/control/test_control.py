@@ -394,7 +394,9 @@ def test_a_drive_fault(rig: Rig) -> None:
     moving(rig)
     rig.drives[1].fail(0x4310)
     rig.until(lambda: rig.mode is Mode.FAULT, 2)
-    assert_tripped(rig, "drive B: emergency 4310")
+    said = "drive B: emergency 0x4310 (drive too hot), error register 0x09; let it cool down; look at load and air"
+    assert_tripped(rig, said)
+    assert [notice.message for notice in rig.notices if notice.kind == "fault"] == [said]
     assert refusal(rig.goal("g2", 0.0, 0.0, 0.0)).code == "fault"
     answer = rig.command("reset")
     assert isinstance(answer, Confirmed)

@@ -173,11 +173,12 @@ def status(*, service: Service = HERE) -> int:
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
-        state = robot.state()
+        state, missing = robot.state(), robot.info().missing_protections
     if service.json:
-        terminal.json(msgspec.to_builtins(state))
+        terminal.json(msgspec.to_builtins(state) | {"missing_protections": msgspec.to_builtins(missing)})
     else:
         terminal.show(state, service.robot)
+        terminal.missing(missing)
     return 0
 
 

@@ -18,6 +18,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 from trirail_drivers.bus import load
 from trirail_drivers.errors import shortened
+from trirail_drivers.interface import MissingProtection
 
 from trirail.cli import units
 from trirail.cli.options import HERE
@@ -166,6 +167,16 @@ def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True)
 def show(state: State, robot: str) -> None:
     """Print a state."""
     out.print(_table(state, robot))
+
+
+def missing(protections: Sequence[MissingProtection]) -> None:
+    """Print what drives do without, a line for what is so of several."""
+    drives: dict[str, list[str]] = {}
+    for each in protections:
+        drives.setdefault(f"{each.object}, {each.means}", []).append(each.drive)
+    for what, names in drives.items():
+        whose = f"drive{'s' * (len(names) > 1)} {', '.join(names)}"
+        out.print(f"[yellow]lacking[/]   {whose}: {plain(what)}", soft_wrap=True)
 
 
 def watch(robot: Robot, *, json_lines: bool) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import msgspec
 from msgspec import Struct
-from trirail_drivers.interface import Triple
+from trirail_drivers.interface import MissingProtection, Triple
 
 
 class Commanded(Struct, frozen=True):
@@ -155,3 +155,5 @@ class Info(Struct, frozen=True):
     """Where a Rerun viewer on the service's machine finds the live view; "" for nowhere."""
     versions: dict[str, str] = msgspec.field(default_factory=dict)
     """Of Python and the libraries that matter, by name."""
+    missing_protections: tuple[MissingProtection, ...] = ()
+    """What the drives do without; none where they have all."""
