@@ -13,6 +13,7 @@ from trirail import __version__
 from trirail.cli import (
     config_commands,
     drives_command,
+    help_pages,
     math_commands,
     recording_commands,
     robot_commands,
@@ -20,6 +21,7 @@ from trirail.cli import (
     units,
     workspace_command,
 )
+from trirail.cli.completion import Shell, script
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
 from trirail.wire.vocabulary import Command
@@ -134,6 +136,23 @@ app.command(recording_commands.replay)
 app.command(recording_commands.report)
 
 
+@app.command
+def completion(shell: Shell | None = None, /, *, install: Annotated[bool, Flag] = False) -> int:
+    """Print a script for tab completion, of the robots that answer too, or install it for this user.
+
+    Parameters
+    ----------
+    shell
+        The shell: bash, zsh or fish; the one in use if absent.
+    install
+        Write it where the shell finds it, and load it from the shell's start file where that is needed.
+    """
+    return script(app, shell, install=install)
+
+
+help_pages.arrange(app)
+
+
 def main() -> None:
     """Run a command and exit as it says."""
     words = sys.argv[1:]
@@ -143,7 +162,10 @@ def main() -> None:
         terminal.complain(_wrong_usage(error, words))
         code = 2
     except TrirailError as error:
-        terminal.complain(str(error))
+        if "--json" in words:
+            terminal.failed(error)
+        else:
+            terminal.complain(str(error))
         code = 1
     except KeyboardInterrupt:
         code = 130

@@ -153,7 +153,13 @@ def follow(
 
 
 def override(percent: units.Percentage, /, *, service: Service = HERE) -> int:
-    """Send the one command that takes a number; its help is the command's, as of the others below."""
+    """Send the one command that takes a number.
+
+    Parameters
+    ----------
+    percent
+        Share of full speed, 50 or 50%.
+    """
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
@@ -181,11 +187,8 @@ def watch(*, service: Service = HERE) -> int:
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
-        if service.json:
-            for state in robot.states():
-                terminal.json(msgspec.to_builtins(state))
-        else:
-            terminal.watch(robot)
+        robot.state()  # so that a missing service is said, not waited for
+        terminal.watch(robot, json_lines=service.json)
     return 0
 
 
