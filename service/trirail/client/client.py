@@ -149,7 +149,7 @@ class Robot:
         with robot.jog(x=0.01):
             wait_for_the_key_to_be_released()
         """
-        return Jog(self, (x, y, phi), timeout)
+        return Jog(self.send, (x, y, phi), timeout)
 
     def send(self, make: Callable[[str], Goal], id: str | None = None) -> GoalHandle:  # noqa: A002
         """Send the goal that `make` makes for an id, any of trirail.wire.messages.Goal; return once it is accepted."""
@@ -158,7 +158,7 @@ class Robot:
             message = make(goal_id)
         except ValueError as error:
             raise RefusedError(RefusalCode.MALFORMED, f"not a goal: {error}") from error
-        goal = GoalHandle(goal_id, self)
+        goal = GoalHandle(goal_id, self.command)
         with self._goals_lock:
             goal = self._goals.setdefault(goal_id, goal)
         try:
