@@ -6,6 +6,8 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
+from msgspec import Struct
+
 NAMES = ("A", "B", "C")
 """The drives are named as the sliders they move."""
 
@@ -41,7 +43,18 @@ class DriveFault(NamedTuple):
     code: int
     """The EMCY or 603Fh error code, or an ODrive's error bits; 0 where there is none."""
     message: str
-    """One line for people, with drive, cause and code in it."""
+    """One line for people, of bounded length, with drive, cause and code in words."""
+
+
+class MissingProtection(Struct, frozen=True):
+    """What would stop a drive where the service cannot, and what it does without, as its configuration accepts."""
+
+    drive: str
+    """Name of the drive."""
+    object: str
+    """As `accept_without` names it: the object's index, as 1006."""
+    means: str
+    """One line for people: what it is for, and what is so without."""
 
 
 class Counts(NamedTuple):
@@ -88,6 +101,8 @@ class DriveGroup(Protocol):
 
     bus_load: float
     """Worst-case share of the bus that the cyclic traffic takes, with stuffing; 1.0 is full."""
+    missing_protections: tuple[MissingProtection, ...]
+    """What the drives do without; known once they are set up."""
 
     @property
     def traffic(self) -> int:

@@ -98,11 +98,29 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """Setpoint less measured position beyond which everything stops [m]."""
 
 
+Window = Annotated[float, Meta(ge=1e-9, le=1.0)]
+"""How far from where it is to be, to either side [m] or [rad]."""
+
+
+class InPosition(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [limits.in_position]: a goal is `done` when all that is measured has been in these for the dwell."""
+
+    sliders: tuple[Window, Window, Window] = (1e-4, 1e-4, 1e-4)
+    """How far the sliders A, B, C may be from where they are to be [m]; three steps of their drives at least."""
+    pose: tuple[Window, Window, Window] = (1e-4, 1e-4, 1e-3)
+    """How far the measured pose may be from the goal's, in x, y [m] and phi [rad]."""
+    dwell: Annotated[float, Meta(ge=0.001, le=10.0)] = 0.02
+    """How long all of it must stay inside without leaving [s]."""
+    timeout: Annotated[float, Meta(ge=0.01, le=60.0)] = 2.0
+    """How long after the end of its path a goal may take for that, dwell and all [s]; then it ends `unsettled`."""
+
+
 class Limits(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [limits]."""
 
     platform: PlatformLimits
     slider: SliderLimits
+    in_position: InPosition = InPosition()
     singularity_margin: Annotated[float, Meta(ge=0.001, le=1.5)] = 0.1
     """How near phi may come to a singular angle [rad]."""
 
@@ -320,6 +338,11 @@ def _check(config: Config) -> None:
                 f"to the singular angle {angle:.4f}: keep {'below ' if angle > 0 else 'above '}"
                 f"{angle - math.copysign(margin, angle):.4f}"
             )
+    settling = config.limits.in_position
+    if settling.timeout <= settling.dwell:
+        raise ConfigError(
+            f"limits.in_position.timeout = {settling.timeout:g}: it must be longer than the dwell, {settling.dwell:g} s"
+        )
     nodes = [config.drives.master_node, *(drive.node for drive in config.drives.each)]
     if len(set(nodes)) < len(nodes):
         raise ConfigError(

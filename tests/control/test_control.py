@@ -102,6 +102,14 @@ def test_a_drive_that_does_not_power_up_is_named(rig: Rig, monkeypatch: pytest.M
     assert "2 s after enable" in answer.message
 
 
+def test_enabled_drives_whose_sliders_belong_to_no_pose_are_stopped(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They did when enable was sent, and were moved while the drives powered up."""
+    rig.order("enable")
+    monkeypatch.setattr(rig.control.measured, "pose_of", lambda sliders: None)
+    rig.until(lambda: rig.mode is Mode.FAULT, 100)
+    assert rig.control.fault == "the measured sliders belong to no pose"
+
+
 @pytest.mark.parametrize("name", ["disable", "quick_stop"])
 def test_a_drive_that_keeps_its_power_is_named_with_its_state(rig: Rig, name: str) -> None:
     rig.enable()
@@ -394,7 +402,9 @@ def test_a_drive_fault(rig: Rig) -> None:
     moving(rig)
     rig.drives[1].fail(0x4310)
     rig.until(lambda: rig.mode is Mode.FAULT, 2)
-    assert_tripped(rig, "drive B: emergency 4310")
+    said = "drive B: emergency 0x4310 (drive too hot), error register 0x09; let it cool down; look at load and air"
+    assert_tripped(rig, said)
+    assert [notice.message for notice in rig.notices if notice.kind == "fault"] == [said]
     assert refusal(rig.goal("g2", 0.0, 0.0, 0.0)).code == "fault"
     answer = rig.command("reset")
     assert isinstance(answer, Confirmed)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import edsfiles
 import msgspec
 import numpy as np
 import pytest
@@ -37,6 +38,7 @@ from trirail.wire.state import State
 from trirail.wire.vocabulary import MODES, Mode
 from trirail.wire.zenoh_session import open_client
 from trirail_drivers.cia402 import frames
+from trirail_drivers.interface import MissingProtection
 from trirail_drivers.odrive import frames as odrive_frames
 
 pytestmark = pytest.mark.slow
@@ -222,6 +224,26 @@ def test_a_session_with_odrives(tmp_path: Path) -> None:
         assert [state for state, _ in itertools.groupby(states)] == [1, 8, 1]
 
 
+def test_what_a_drive_does_without_stands_in_every_place_where_one_looks(tmp_path: Path) -> None:
+    """Announced at the start, listed by the doctor, in info and in status: drives B and C of a make without 1006."""
+    eds = tmp_path / "without.eds"
+    eds.write_text(edsfiles.eds(edsfiles.rows("elmo_gold"), lacks=[0x1006]))
+    lines = f'\neds = "{eds}"\naccept_without = ["1006"]\n'
+    service = Service(tmp_path, **{f"[drives.{name}]\n": f"[drives.{name}]{lines}" for name in "BC"})
+    service.wait_up()
+    words = "its watch on SYNC; without: it goes on without SYNC"
+    said = trirail("doctor", tmp_path / "robot.toml").stdout
+    assert f"drives B, C may lack 1006, {words}" in said
+    assert f"drives B, C: 1006, {words}" in trirail("status", locator=service.locator).stdout
+    missing = json.loads(trirail("status", "--json", locator=service.locator).stdout)["missing_protections"]
+    assert missing == [{"drive": name, "object": "1006", "means": words} for name in "BC"]
+    with service.robot() as robot:
+        told = [event.message for event in itertools.islice(robot.events(history=True), 1)]
+        assert robot.info().missing_protections == tuple(MissingProtection(**each) for each in missing)
+    assert any("drives B, C: lacks 1006" in message for message in told), told
+    assert service.end() == 0
+
+
 def test_the_commands(service: Service) -> None:
     def call(*arguments: object) -> subprocess.CompletedProcess[str]:
         return trirail(*arguments, locator=service.locator)
@@ -237,7 +259,7 @@ def test_the_commands(service: Service) -> None:
     assert out.returncode == 1
     assert "platform x: position 0.5 m is beyond its limit 0.15 m" in out.stderr
     assert call("reset").returncode == 1
-    assert call("goto", "nan", 0, 0).returncode == 1
+    assert call("goto", "nan", 0, 0).returncode == 2
     assert call("goto", 1, 2).returncode == 2
     assert call("quick-stop").returncode == 0
     failed = call("enable")

@@ -113,21 +113,27 @@ def test_a_frozen_loop_ends_the_service(told: list[str], tmp_path: Path) -> None
     )
 
 
-def test_a_hung_planner_is_killed_and_started_again(told: list[str], tmp_path: Path) -> None:
-    code = run(
-        told,
-        tmp_path,
-        loop_1="ready(); beat_until(lambda: begun('planner-2')); heartbeats.of('loop').rest()",
-        gateway_1=SERVING,
-        planner_1="ready(); heartbeats.of(name).beat(); freeze()",
-        planner_2="ready()",
-        recorder_1=RECORDING,
-    )
-    assert code == 1
+@pytest.mark.parametrize(
+    ("name", "silent", "consequence"),
+    [
+        ("planner", 0.7, "the motion under way goes on, new goals are refused"),
+        ("recorder", 5, "the robot is not affected"),
+    ],
+)
+def test_what_hangs_beside_the_loop_is_killed_and_started_again(
+    name: str, silent: float, consequence: str, told: list[str], tmp_path: Path
+) -> None:
+    children = {
+        "loop_1": f"ready(); beat_until(lambda: begun('{name}-2')); heartbeats.of('loop').rest()",
+        "gateway_1": SERVING,
+        "recorder_1": RECORDING,
+        f"{name}_1": "ready(); heartbeats.of(name).beat(); freeze()",
+        f"{name}_2": "ready()",
+    }
+    assert run(told, tmp_path, **children) == 1
     assert told[:2] == [
         "up",
-        "the planner has died (no sign of life for 0.7 s, so it was killed): the motion under way goes on, "
-        "new goals are refused; starting it again",
+        f"the {name} has died (no sign of life for {silent} s, so it was killed): {consequence}; starting it again",
     ]
 
 

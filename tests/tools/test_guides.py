@@ -14,6 +14,7 @@ import pytest
 import trirail
 import trirail_drivers
 from trirail.cli.commands import app
+from trirail.cli.units import numbers
 from trirail.config import Config
 from trirail.errors import TrirailError
 from trirail.wire.messages import Goal
@@ -94,7 +95,7 @@ def test_every_command_can_be_typed_as_it_is_shown(guide: Path) -> None:
             program, *words = shlex.split(command) or [""]
             if program == "trirail":
                 words = [{"FILE": "file.rrd", "NAME": "demo"}.get(word, word) for word in words]
-                app.parse_args(words, exit_on_error=False, print_error=False)
+                app.parse_args(numbers(words), exit_on_error=False, print_error=False)
             elif program == "make":
                 assert f"\n{words[0]}:" in (ROOT / "Makefile").read_text(encoding="utf-8"), command
             elif program == "python" and words[0].startswith("tools/"):

@@ -17,9 +17,10 @@ from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames, setup, ways
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.homing import HomingSequence
+from trirail_drivers.cia402.objects import means
 from trirail_drivers.cia402.strangers import Strangers
 from trirail_drivers.driver.driver import Driver
-from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
+from trirail_drivers.interface import Clock, Feedback, MissingProtection, PowerState, Triple
 
 REPEAT_AFTER = 3
 """A controlword that a drive does not follow is sent again after so many SYNCs: the frame may be lost."""
@@ -60,6 +61,9 @@ class Cia402(Driver[Cia402Axis]):
         self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
         for line in setup.told(made for made, _ in done):
             self._wire.warn(line)
+        self.missing_protections = tuple(
+            MissingProtection(made.name, name, means(name)) for made, _ in done for name in made.lacking
+        )
 
     def _listen(self, axis: Cia402Axis) -> None:
         listen, way = self._wire.listen, axis.way

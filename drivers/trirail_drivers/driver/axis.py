@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 
 from trirail_drivers.driver.answers import Answers
 from trirail_drivers.driver.scaling import Scale
+from trirail_drivers.errors import shortened
 from trirail_drivers.interface import Counts, DriveFault
 
 MISSED_ANSWERS = 3
@@ -63,7 +64,7 @@ class Axis(ABC):
 
     def made(self, cause: str, code: int, text: str) -> DriveFault:
         """A fault of this drive."""
-        return DriveFault(self.name, cause, code, f"drive {self.name}: {text}")
+        return DriveFault(self.name, cause, code, shortened(f"drive {self.name}: {text}"))
 
     @abstractmethod
     def late_for(self, wanted: str, seconds: float) -> DriveFault | None:

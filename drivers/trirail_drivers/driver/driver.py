@@ -15,7 +15,7 @@ from trirail_drivers.bus import load
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.scaling import Scale, scale_of
-from trirail_drivers.interface import NAMES, Clock, DriveFault
+from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection
 
 AnyAxis = TypeVar("AnyAxis", bound=Axis)
 
@@ -36,6 +36,7 @@ class Driver(ABC, Generic[AnyAxis]):
         axis: Callable[[str, int, Scale, float], AnyAxis],
     ) -> None:
         self.bus_load = 0.0
+        self.missing_protections: tuple[MissingProtection, ...] = ()
         self._wire = Wire(bus, self._stop)
         self._bitrate = bitrate
         self._drives = drives

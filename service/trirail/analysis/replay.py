@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from trirail_drivers.connection.opening import connect
-from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, PowerState, Triple
+from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, MissingProtection, PowerState, Triple
 
 from trirail.config import Config
 from trirail.control.control import Control, Given
@@ -203,6 +203,7 @@ class _Recorded:
     """Drives that say what they said in the recording, and take anything: trirail_drivers.interface.DriveGroup."""
 
     bus_load = 0.0
+    missing_protections: tuple[MissingProtection, ...] = ()
     traffic = 0
 
     def __init__(self, records: NDArray[np.void]) -> None:

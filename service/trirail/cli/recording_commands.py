@@ -20,11 +20,12 @@ if TYPE_CHECKING:
     from trirail.telemetry.provenance import Software
     from trirail.telemetry.reading import Recording
 
-Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")]
+Recordings = Annotated[Path, Parameter(required=True)]
+"""One recording at least."""
 
 
 def replay(
-    *file: Path,
+    *file: Recordings,
     config: Path | None = None,
     to: str | None = None,
     robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT")] = "demo",
@@ -70,7 +71,7 @@ def replay(
     return 1 if differs and by == here and config is None else 0
 
 
-def report(*file: Path, plot: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
+def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
     """Sum a recorded session up: goals and outcomes, tracking error, timing, faults, and what is missing.
 
     Parameters
@@ -119,8 +120,6 @@ def _resend(recording: Recording, name: str, locator: str, json: bool) -> int:
 def _read(files: tuple[Path, ...]) -> Recording:
     from trirail.telemetry.reading import join, read
 
-    if not files:
-        raise ServiceError("name a recording, or all files of one that was rotated")
     return join([read(path) for path in files])
 
 

@@ -52,7 +52,7 @@ def _main(name: str, runtime: Path, heartbeats: Heartbeats, ready: Callable[[obj
         return gate.main(config, link, heartbeats.of("gateway").beat, ready)
     from trirail.processes import recording
 
-    return recording.main(config, order.record, link, ready)
+    return recording.main(config, order.record, link, heartbeats.of(name), ready)
 
 
 def main() -> int:

@@ -45,6 +45,8 @@ TURN = 0.1
 """How often the supervisor looks whether the others are alive [s]."""
 SILENT = 0.7
 """A process that should give signs of life and gives none for so long is hung, and is killed [s]."""
+RECORDER_SILENT = 5.0
+"""The same of the recorder, which may wait for a disk: nothing that moves depends on it [s]."""
 LEAST_CYCLES = 3
 """So many cycles the loop may take for a sign of life, however long they are."""
 RETRY = 10.0
@@ -117,6 +119,7 @@ class Supervisor:
             "loop": loop_silent,
             "gateway": max(SILENT, config.watchdogs.gateway_timeout),
             "planner": SILENT,
+            "recorder": RECORDER_SILENT,
         }
         self._watches = {
             name: Watch(self._heartbeats.of(name), round(seconds / TURN)) for name, seconds in self._patience.items()
