@@ -281,8 +281,8 @@ def test_every_step_can_be_refused_and_nothing_moves(tmp_path: Path) -> None:
     assert {entry.verdict for entry in run.keeper.report.steps} == {"ok", "skipped"}
     assert (run.keeper.report.ok, run.keeper.report.complete) == (True, False)
     assert {"push A", "power B", "square"} <= set(run.keeper.report.left)
-    assert run.steps._place.rules is not None
-    assert run.steps._place.rules.read() == (0.0, 0.0, 0.0)
+    assert run.steps.session.place.rules is not None
+    assert run.steps.session.place.rules.read() == (0.0, 0.0, 0.0)
 
 
 def test_only_the_drive_of_the_step_ever_has_power(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -314,6 +314,22 @@ def test_the_sliders_never_go_faster_than_5_mm_a_second(tmp_path: Path, monkeypa
     assert 0.0049 < fastest[0] < 0.0051
 
 
+def test_a_drive_that_keeps_its_power_when_stopped_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = []
+
+    def deaf(self: SimulatedDrive, state: PowerState) -> None:
+        if self.node == 1 and self.state is PowerState.OPERATION_ENABLED:
+            taken.append(state)
+            return
+        change(self, state)
+
+    change = SimulatedDrive._change
+    monkeypatch.setattr(SimulatedDrive, "_change", deaf)
+    run = Run(tmp_path, faults=["when A enabled B fault 4310"], person=Beside(only("A")))
+    assert taken
+    assert "drive A STILL HAS POWER: press the emergency stop" in run.of("power", "A").words[0]
+
+
 def noted(name: str, do: Callable[[], None], told: list[str]) -> Callable[[], None]:
     """Return the same call, that notes its name."""
 
@@ -328,8 +344,8 @@ def test_ctrl_c_stops_in_that_cycle_and_ends_without_power(monkeypatch: pytest.M
     pressed = [False]
     told: list[str] = []
     with opened(CONFIG, [], Beside(), lambda: pressed[0], sleep=lambda _: None) as steps:
-        steps.set_up()
-        bench = steps._ready()
+        steps.session.set_up()
+        bench = steps.session.bench()
         for name in ("sync", "quick_stop"):
             do = getattr(bench._drives, name)
             monkeypatch.setattr(bench._drives, name, noted(name, do, told))

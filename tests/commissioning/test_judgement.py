@@ -9,19 +9,8 @@ import pytest
 from conftest import CONFIG
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from trirail.commissioning.judgement import (
-    COARSE,
-    SCALE,
-    Judged,
-    MoveSeen,
-    PushSeen,
-    judge_move,
-    judge_push,
-    judge_square,
-    judge_switches,
-    judge_watchdog,
-    merged,
-)
+from trirail.commissioning.coupling import COARSE, SCALE, MoveSeen, PushSeen, judge_move, judge_push, merged
+from trirail.commissioning.judgement import Judged, judge_square, judge_switches, judge_watchdog
 from trirail.commissioning.moves import DISTANCE
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES

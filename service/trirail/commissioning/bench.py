@@ -19,6 +19,7 @@ FOLLOWING: Final = 0.0003
 velocity feed-forward and with a position loop of 20 /s lags 0.25 mm."""
 SETTLE: Final = 0.3
 """How long a slider is given to come to rest after a motion [s]."""
+INTERRUPTED: Final = "stopped by Ctrl-C"
 LAST_WORDS: Final = 0.05
 """How long drives that missed the same heartbeat may take to tell of it, one after the other [s]."""
 REST: Final = 0.05
@@ -191,7 +192,7 @@ class Bench:
             if feedback.fault is not None or state is not PowerState.OPERATION_ENABLED:
                 return self._last_words(index, number * self.period)
             if self._interrupted():
-                self._halt("interrupted")
+                self._halt(INTERRUPTED)
         # A drive that tells its state in answer to SYNC alone has had nobody to tell it to.
         self._drives.sync()
         state = self._listen().state[index]
@@ -234,7 +235,7 @@ class Bench:
         if feedback.fault is not None:
             return feedback.fault.message
         if self._interrupted():
-            return "interrupted"
+            return INTERRUPTED
         if missed > self.config.watchdogs.max_overruns:
             return f"{missed} cycles missed in a row: the machine is too busy; see trirail doctor"
         for index, name in enumerate(NAMES):
@@ -252,8 +253,10 @@ class Bench:
 
     def _halt(self, reason: str) -> None:
         self._stop()
+        if kept := [name for name, state in zip(NAMES, self.feedback.state, strict=True) if state in _POWERED]:
+            reason += f"; drive {', '.join(kept)} STILL HAS POWER: press the emergency stop"
         if self._interrupted():
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt(reason)
         raise Stopped(reason)
 
     def _stop(self) -> None:

@@ -10,10 +10,13 @@ from typing import NamedTuple
 from trirail_drivers.interface import NAMES
 
 from trirail.commissioning import configuration
-from trirail.commissioning.judgement import Judged, merged
+from trirail.commissioning.bench import INTERRUPTED
+from trirail.commissioning.coupling import merged
+from trirail.commissioning.judgement import Judged
 from trirail.commissioning.person import Person, Question, choose
 from trirail.commissioning.report import Keeper
-from trirail.commissioning.steps import Done, Steps
+from trirail.commissioning.session import Done
+from trirail.commissioning.steps import Steps
 from trirail.config import Config
 
 
@@ -36,14 +39,18 @@ def plan(steps: Steps, config: Config) -> list[Step]:
     """Return the steps in their order."""
     made = [
         Step(
-            "bus", "", "Who is on the bus", "Reads who each drive is. Writes nothing, no drive gets power.", steps.bus
+            "bus",
+            "",
+            "Who is on the bus",
+            "Reads who each drive is. Writes nothing, no drive gets power.",
+            steps.session.bus,
         ),
         Step(
             "setup",
             "",
             "Set-up",
             "Writes what differs into the drives' memory, reads it back, stores nothing. No drive gets power.",
-            steps.set_up,
+            steps.session.set_up,
             (("bus", ""),),
         ),
     ]
@@ -92,7 +99,7 @@ def plan(steps: Steps, config: Config) -> list[Step]:
             (("setup", ""),),
         )
         for name in NAMES
-        if steps.tells_inputs
+        if steps.session.tells_inputs
     ]
     made += [
         Step(
@@ -164,7 +171,7 @@ class Guide:
                 continue
             self._person.tell(f"  {step.what}")
             if step.name == "setup":
-                for line in self._steps.changes_of_set_up():
+                for line in self._steps.session.changes_of_set_up():
                     self._person.tell(f"  {line}")
             at = self._done(step, at)
 
@@ -200,8 +207,8 @@ class Guide:
         while choice == "y":
             try:
                 judged, measured = step.run()
-            except KeyboardInterrupt:
-                self._keep(step, Judged("failed", ("stopped by Ctrl-C; no drive has power",)))
+            except KeyboardInterrupt as stopped:
+                self._keep(step, Judged("failed", (str(stopped) or INTERRUPTED,)))
                 raise
             self._keep(step, judged, measured)
             if judged.verdict == "ok":
@@ -211,7 +218,7 @@ class Guide:
         return at + 1 if choice == "s" else max(0, at - 1)
 
     def _choice(self, text: str, default: str, choices: dict[str, str]) -> str:
-        return choose(self._person, self._steps.idle, Question(text, default), choices)
+        return choose(self._person, self._steps.session.idle, Question(text, default), choices)
 
     def _keep(
         self, step: Step, judged: Judged, measured: dict[str, float | int | str | bool | None] | None = None

@@ -13,7 +13,8 @@ from trirail_drivers.simulated import SimulatedBus
 
 from trirail.commissioning.bench import Bench
 from trirail.commissioning.person import Person
-from trirail.commissioning.steps import Place, Steps
+from trirail.commissioning.session import Place, Session
+from trirail.commissioning.steps import Steps
 from trirail.config import Config
 from trirail.kinematics.robot import warm_up
 from trirail.processes import realtime
@@ -84,7 +85,7 @@ def opened(
         read = None if inputs is None else inputs(bus, config.drives, clock)
         press = bus.press if isinstance(bus, SimulatedBus) else None
         try:
-            yield Steps(Place(config, bus, make_bench, rules, person, interrupted, read, press))
+            yield Steps(Session(Place(config, bus, make_bench, rules, person, interrupted, read, press)))
         finally:
             simulated.free()
             if driver is not None:

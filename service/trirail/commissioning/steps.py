@@ -2,36 +2,28 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import NamedTuple
 
-import can
 import numpy as np
-from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
-from trirail_drivers.protocols import PROTOCOLS
-from trirail_drivers.simulated import Carriages
 
-from trirail.commissioning import drives_told, moves
-from trirail.commissioning.bench import Bench, Stopped
+from trirail.commissioning import moves
+from trirail.commissioning.bench import Stopped
+from trirail.commissioning.coupling import MoveSeen, PushSeen, judge_move, judge_push
 from trirail.commissioning.judgement import (
     SWITCHES,
     Judged,
-    MoveSeen,
-    PushSeen,
     judge_homing,
-    judge_move,
     judge_power,
-    judge_push,
     judge_square,
     judge_switches,
     judge_watchdog,
 )
 from trirail.commissioning.observer import Observer
-from trirail.commissioning.person import Person, Question, choose
+from trirail.commissioning.person import Question, choose
 from trirail.commissioning.report import Number
-from trirail.config import Config, geometry
+from trirail.commissioning.session import Done, Session
+from trirail.config import geometry
 from trirail.errors import KinematicsError
 from trirail.kinematics.robot import forward
 
@@ -41,101 +33,23 @@ PUSH = 0.010
 """How far a slider is best pushed by hand [m]."""
 LOOK = 0.05
 """How often digital inputs are read while switches are pressed [s]."""
-IDLE = 0.01
-"""How often it is looked for an answer while no drive has been set up [s]."""
-
-Done = tuple[Judged, dict[str, Number]]
-"""What is to be thought of a step, and what was measured in it."""
-
-
-class Place(NamedTuple):
-    """Where all this happens."""
-
-    config: Config
-    bus: can.BusABC
-    make_bench: Callable[[], Bench]
-    """Sets the drives up and begins their cycle."""
-    rules: Carriages | None
-    """Where the sliders really are, of simulated drives."""
-    person: Person
-    interrupted: Callable[[], bool]
-    """Tells of Ctrl-C."""
-    inputs: Callable[[str], int | None] | None = None
-    """Reads a drive's digital inputs, object 60FDh: None where it has none to tell; None for drives without."""
-    press: Callable[[int, int], None] | None = None
-    """Presses switches of a simulated drive: its index, and bits of 60FDh."""
 
 
 class Steps:
-    """What can be done with the drives, in whatever order."""
+    """What can be done with drives that have been set up, in whatever order."""
 
-    def __init__(self, place: Place) -> None:
-        self._config = place.config
-        self._place = place
-        self._person = place.person
-        self._see = Observer(place.person, place.rules, self.idle)
-        self._bench: Bench | None = None
-        self._told: list[dict[str, object]] = []
-
-    @property
-    def tells_inputs(self) -> bool:
-        """Whether drives of this protocol tell which of their switches are pressed."""
-        return self._place.inputs is not None
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self._config = session.place.config
+        self._place = session.place
+        self._person = session.place.person
+        self._see = Observer(session.place.person, session.place.rules, session.idle)
 
     # Without power.
 
-    def bus(self) -> Done:
-        """Ask every drive who it is."""
-        drives = self._config.drives
-        inspect = PROTOCOLS[drives.protocol].inspect
-        if inspect is None:
-            words = (f"drives of protocol {drives.protocol} have no objects to be shown; the next step finds them",)
-            return Judged("ok", words), {}
-        self._told = inspect(self._place.bus, drives, self._config.period, time.monotonic, apply=False)
-        lines = tuple(line for each in self._told for line in drives_told.identity(each))
-        refused = tuple(f"drive {each['name']}: {each['refused']}" for each in self._told if each["refused"])
-        measured: dict[str, Number] = {}
-        for each in self._told:
-            for key in ("node", "device_type", "vendor", "product", "revision", "serial", "modes", "way"):
-                if (value := each.get(key)) is not None:
-                    measured[f"{each['name']}.{key}"] = value if isinstance(value, int | str) else str(value)
-        if refused:
-            remedy = (
-                "no answer: supply, wiring, 60 Ω across the unpowered bus, the same bitrate everywhere, node ids; "
-                "else what the line says"
-            )
-            return Judged("wrong", (*lines, *refused), remedy), measured
-        return Judged("ok", lines), measured
-
-    def set_up(self) -> Done:
-        """Set all drives up, without power, and begin their cycle."""
-        self._bench = None
-        try:
-            self._bench = self._place.make_bench()
-        except DriveError as error:
-            return Judged("failed", (str(error),), "what the line says; no drive has power"), {}
-        self._bench.wait(HOLD / 2.0)
-        if (fault := self._bench.feedback.fault) is not None:
-            try:
-                self._bench.clear()
-            except Stopped as stopped:
-                return Judged("failed", (str(stopped),), "remove the cause, then repeat this step"), {}
-            return Judged("ok", (f"was in fault, and could be reset: {fault.message}",)), {}
-        written = sum(len(_differences(each)) for each in self._told)
-        words = (f"set up, {written} values written, nothing stored; SYNC runs at {self._config.loop.rate_hz} Hz",)
-        return Judged("ok", words), {"written": written}
-
-    def changes_of_set_up(self) -> list[str]:
-        """Return what the set-up would change, as lines: what is so of several drives once."""
-        of: dict[str, list[str]] = {}
-        for each in self._told:
-            for line in drives_told.differences(each, applied=False):
-                of.setdefault(line.strip().removeprefix("would be written: "), []).append(str(each["name"]))
-        return [f"{', '.join(names)}: {line}" for line, names in of.items()]
-
     def push(self, name: str) -> Done:
         """Have a slider pushed by hand, without power."""
-        bench, index = self._ready(), NAMES.index(name)
+        bench, index = self.session.bench(), NAMES.index(name)
         read_to = self._see.read_to()
         angle = np.degrees(geometry(self._config.geometry).legs[index].rail_angle)
         self._person.tell(
@@ -155,7 +69,7 @@ class Steps:
 
     def switches(self, name: str) -> Done:
         """Have the switches of a slider pressed by hand, without power."""
-        bench, read = self._ready(), self._place.inputs
+        bench, read = self.session.bench(), self._place.inputs
         rest = read(name) if read is not None else None
         if read is None or rest is None:
             told = f"drive {name} does not tell its digital inputs (60FDh): look at them with its maker's tool"
@@ -164,7 +78,7 @@ class Steps:
 
         def look() -> None:
             nonlocal changed, turned
-            self.idle()
+            self.session.idle()
             turned += 1
             if turned % max(1, round(LOOK / bench.period)) == 0:
                 changed |= (read(name) or 0) ^ rest
@@ -186,7 +100,7 @@ class Steps:
 
     def power(self, name: str) -> Done:
         """Give one drive power, let it hold its slider, and take it off."""
-        bench, stopped = self._ready(), ""
+        bench, stopped = self.session.bench(), ""
         try:
             with bench.power(name):
                 bench.wait(HOLD)
@@ -235,7 +149,11 @@ class Steps:
 
     def home(self, name: str) -> Done:
         """Home one drive, which alone has power."""
-        bench, index, homing = self._ready(), NAMES.index(name), self._config.drives.each[NAMES.index(name)].homing
+        bench, index, homing = (
+            self.session.bench(),
+            NAMES.index(name),
+            self._config.drives.each[NAMES.index(name)].homing,
+        )
         if homing is None:
             return Judged("ok", ("its encoder is absolute: nothing to home",)), {}
         began, stopped, rules = bench.position[index], "", self._see.rules()
@@ -254,7 +172,7 @@ class Steps:
 
     def watchdog(self, name: str) -> Done:
         """Let one powered drive hear nothing any more, and see whether it lets go."""
-        bench, heartbeat = self._ready(), self._config.drives.heartbeat
+        bench, heartbeat = self.session.bench(), self._config.drives.heartbeat
         try:
             with bench.power(name):
                 bench.wait(HOLD / 2.0)
@@ -268,7 +186,7 @@ class Steps:
 
     def square(self) -> Done:
         """Move the platform around a small square."""
-        bench, stopped, deviation = self._ready(), "", 0.0
+        bench, stopped, deviation = self.session.bench(), "", 0.0
         robot = geometry(self._config.geometry)
         try:
             way, path = moves.square(self._config, bench.position)
@@ -294,25 +212,9 @@ class Steps:
         judged = judge_square(deviation, bench.worst, seen, stopped)
         return judged, {"deviation": deviation, "missed_cycles": bench.missed, **following}
 
-    # What they share.
-
-    def _ready(self) -> Bench:
-        if self._bench is None:
-            raise RuntimeError("the drives have not been set up")
-        return self._bench
-
-    def idle(self) -> None:
-        """Wait a little, and keep the drives alive."""
-        if self._bench is not None:
-            self._bench.cycle()
-        elif self._place.interrupted():
-            raise KeyboardInterrupt
-        else:
-            time.sleep(IDLE)
-
     def _moved(self, index: int, way: float) -> _Moved:
         """Move one slider, its drive alone with power; it has none afterwards."""
-        bench, stopped = self._ready(), ""
+        bench, stopped = self.session.bench(), ""
         before = bench.position[index]
         try:
             with bench.power(NAMES[index]):
@@ -324,7 +226,7 @@ class Steps:
 
     def _way(self, index: int) -> float:
         """Return how far to move a slider [m]: away from the limit of its travel, where it is known where it is."""
-        bench = self._ready()
+        bench = self.session.bench()
         beyond = bench.position[index] + 2.0 * moves.DISTANCE > self._config.limits.slider.position[1]
         return -moves.DISTANCE if beyond and bench.feedback.homed[index] else moves.DISTANCE
 
@@ -338,8 +240,3 @@ class _Moved(NamedTuple):
     way: float
     following: float
     stopped: str
-
-
-def _differences(told: dict[str, object]) -> list[object]:
-    found = told.get("differences")
-    return found if isinstance(found, list) else []
