@@ -27,7 +27,7 @@ from trirail.motion.runs import MotionState
 from trirail.wire.messages import Goal, PoseGoal, SlidersGoal
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers.interface import Feedback, PowerState, Triple
+from trirail_drivers.interface import Feedback, MissingProtection, PowerState, Triple
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +78,7 @@ class Sliders:
 
     bus_load = 0.0
     traffic = 0
+    missing_protections: tuple[MissingProtection, ...] = ()
 
     def __init__(self, chance: random.Random) -> None:
         self._chance = chance
