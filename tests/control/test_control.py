@@ -102,6 +102,14 @@ def test_a_drive_that_does_not_power_up_is_named(rig: Rig, monkeypatch: pytest.M
     assert "2 s after enable" in answer.message
 
 
+def test_enabled_drives_whose_sliders_belong_to_no_pose_are_stopped(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They did when enable was sent, and were moved while the drives powered up."""
+    rig.order("enable")
+    monkeypatch.setattr(rig.control.measured, "pose_of", lambda sliders: None)
+    rig.until(lambda: rig.mode is Mode.FAULT, 100)
+    assert rig.control.fault == "the measured sliders belong to no pose"
+
+
 @pytest.mark.parametrize("name", ["disable", "quick_stop"])
 def test_a_drive_that_keeps_its_power_is_named_with_its_state(rig: Rig, name: str) -> None:
     rig.enable()

@@ -161,16 +161,25 @@ def test_slowed_is_said(rig: Rig) -> None:
 # ---------------------------------------------------------------------- a goal's own limits
 
 
-def test_own_limits_are_kept(rig: Rig) -> None:
+@pytest.mark.parametrize(
+    ("own", "most"),
+    [
+        (OwnLimits(velocity=(0.02, 0.02, 0.1)), (0.02, math.inf, math.inf)),
+        (OwnLimits(acceleration=(0.1, 0.1, 1.0)), (math.inf, 0.1, math.inf)),
+        (OwnLimits(jerk=(2.0, 2.0, 20.0)), (math.inf, math.inf, 2.0)),
+        (OwnLimits((0.02, 0.02, 0.1), (0.1, 0.1, 1.0), (2.0, 2.0, 20.0)), (0.02, 0.1, 2.0)),
+    ],
+)
+def test_own_limits_are_kept_and_made_use_of(rig: Rig, own: OwnLimits, most: tuple[float, float, float]) -> None:
     rig.enable()
-    own = OwnLimits(velocity=(0.02, 0.02, 0.1), acceleration=(0.1, 0.1, 1.0))
     accepted(rig.send("g1", PoseGoal(0.05, 0.0, 0.0, limits=own)))
-    speeds = []
+    motion = []
     while rig.mode is Mode.MOVING:
-        speeds.append(rig.control.commanded.velocity[0])
+        motion.append((rig.control.commanded.velocity[0], rig.control.commanded.acceleration[0]))
         rig.cycle()
-    assert max(speeds) == pytest.approx(0.02, rel=1e-6)
-    assert np.abs(np.diff(speeds)).max() <= 0.1 * PERIOD * 1.001
+    velocity, acceleration = np.transpose(motion)
+    used = np.array([np.abs(row).max() for row in (velocity, acceleration, np.diff(acceleration) / PERIOD)]) / most
+    assert used.max() == pytest.approx(1.0, rel=1e-3)
 
 
 def test_own_limits_above_the_robots_are_refused(rig: Rig) -> None:
@@ -216,6 +225,46 @@ def test_a_wider_blend_is_quicker() -> None:
         taken.append(square(rig, blend))
         rig.bus.shutdown()
     assert taken[0] > taken[1] > taken[2]
+
+
+@pytest.mark.parametrize("valid_for", [0.1, 0.25])
+def test_a_waiting_goal_is_valid_for_its_time_and_not_a_cycle_longer(rig: Rig, valid_for: float) -> None:
+    rig.enable()
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0, speed=0.2, blend=0.01))
+    goal = PoseGoal(0.05, 0.05, 0.0, valid_for=valid_for)
+    rig.cycle(GoalRequest(99, "ann", "g2", goal, round((rig.now + PERIOD) * 1e9)))  # it comes as it is sent
+    sent = rig.control.cycles
+    rig.until(lambda: ("g2", "expired") in rig.outcomes())
+    assert rig.control.cycles - sent == round(valid_for / PERIOD) + 1
+
+
+def test_what_waits_no_more_slows_nothing(rig: Rig) -> None:
+    """An override may take back a goal's own slowness, as far as what waits behind it can be taken so."""
+    rig.enable()
+    rig.send("slow", PoseGoal(0.1, 0.0, 0.0, speed=0.5, blend=0.0))
+    rig.send("fast", PoseGoal(0.0, 0.0, 0.0))
+    rig.cycles(100)
+    rig.command("override", 2.0)
+    rig.cycles(50)
+    assert rig.control._schedule.runs[0].target == pytest.approx(1.0, rel=1e-3)
+    rig.cycle(CommandRequest(99, "ann", Command.STOP, goal="fast"))
+    rig.until(lambda: rig.control._schedule.runs[0].target > 1.9, 50)
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("fast", "stopped"), ("slow", "done")]
+    assert_within_limits(rig)
+
+
+def test_what_is_over_slows_nothing(rig: Rig) -> None:
+    """How fast the rest of a path can be taken is what the rest of it says, not what lies behind."""
+    rig.enable()
+    rig.send("fast", PoseGoal(0.05, 0.0, 0.0, blend=0.0))
+    rig.send("slow", PoseGoal(0.0, 0.0, 0.0, speed=0.5))
+    rig.until(lambda: ("fast", "done") in rig.outcomes())
+    rig.cycles(50)
+    rig.command("override", 2.0)
+    rig.until(lambda: rig.control._schedule.runs[0].target > 1.2, 50)
+    rig.until(rig.holds)
+    assert_within_limits(rig)
 
 
 def test_without_blend_the_next_goal_preempts(rig: Rig) -> None:

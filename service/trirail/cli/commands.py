@@ -11,6 +11,7 @@ from cyclopts import App, CoercionError, CycloptsError, UnknownOptionError
 
 from trirail import __version__
 from trirail.cli import (
+    commission,
     config_commands,
     drives_command,
     help_pages,
@@ -122,6 +123,7 @@ def view(
 
 
 app.command(drives_command.drives)
+app.command(commission.commission)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)
