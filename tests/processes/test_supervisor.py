@@ -23,7 +23,7 @@ number = len(list(folder.glob(f"{{name}}-*.begun"))) + 1
 (folder / f"{{name}}-{{number}}.begun").touch()
 
 def ready():
-    os.write(int(ready_on), b"{{}}")
+    os.write(int(ready_on), b"{{}}\\n")
 
 def begun(other):
     return (folder / f"{{other}}.begun").exists()
@@ -63,7 +63,7 @@ def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def run(told: list[str], folder: Path, **children: str) -> int:
     for name, does in ({"planner_1": RECORDING} | children).items():
         (folder / name.replace("_", "-")).write_text(does)
-    return supervisor.Supervisor(load(SIM), None, told.append).run(lambda _: told.append("up"))
+    return supervisor.Supervisor(load(SIM), None, lambda words, _: told.append(words)).run(lambda _: told.append("up"))
 
 
 def test_a_hung_gateway_is_killed_and_started_again(told: list[str], tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from trirail.cli import terminal, units
+from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Flag, Service
 from trirail.wire.vocabulary import Command
 
@@ -114,7 +114,7 @@ def jog(
     with Robot(service.robot, service.connect) as robot:
         try:
             with robot.jog(x=vx, y=vy, phi=w) as jogging:
-                terminal.jogging(robot, jogging, seconds, show=not service.json)
+                live.jogging(robot, jogging, seconds, show=not service.json)
         except KeyboardInterrupt:
             pass
         if jogging.error is not None:
@@ -173,12 +173,12 @@ def status(*, service: Service = HERE) -> int:
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
-        state, missing = robot.state(), robot.info().missing_protections
+        state, info = robot.state(), robot.info()
     if service.json:
-        terminal.json(msgspec.to_builtins(state) | {"missing_protections": msgspec.to_builtins(missing)})
+        missing = msgspec.to_builtins(info.missing_protections)
+        terminal.json(msgspec.to_builtins(state) | {"missing_protections": missing})
     else:
-        terminal.show(state, service.robot)
-        terminal.missing(missing)
+        live.show(state, info)
     return 0
 
 
@@ -187,8 +187,7 @@ def watch(*, service: Service = HERE) -> int:
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
-        robot.state()  # so that a missing service is said, not waited for
-        terminal.watch(robot, json_lines=service.json)
+        live.watch(robot, json_lines=service.json)
     return 0
 
 
