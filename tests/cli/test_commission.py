@@ -135,7 +135,7 @@ def test_lines_are_answers_and_the_end_is_none(typed: int, written: bytes, answe
 
 def test_the_drives_are_kept_alive_while_somebody_thinks(typed: int) -> None:
     person = commission.Console(by_itself=False, quiet=True)
-    turned = []
+    turned: list[int] = []
 
     def idle() -> None:
         turned.append(len(turned))

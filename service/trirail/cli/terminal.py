@@ -149,7 +149,7 @@ def _cancel(goal: GoalHandle) -> None:
 
 def left(goal: GoalState) -> str:
     """Say how long the path of a goal still takes, or that it has ended and the robot settles."""
-    return f"{units.written(goal.remaining, 's', 1)} left" if goal.progress < 1.0 else "settling"
+    return f"{goal.remaining:.1f} s left" if goal.progress < 1.0 else "settling"
 
 
 def event(happened: Event) -> None:
