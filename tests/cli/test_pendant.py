@@ -107,7 +107,7 @@ def test_another_key_ends_what_is_held(operator: Operator) -> None:
         operator.sent(1)
         operator.press(other)
         assert operator.sent(2)[1] == (0.0, 0.0, 0.0)
-        until(lambda: operator.robot.goal is None)
+        until(lambda: operator.robot.state().goal is None)
     assert operator.pendant.over
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import http.client
+import logging
 import re
 import socket
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -169,3 +172,29 @@ def test_what_is_no_message_is_refused_and_the_tab_goes_on(panel: Panel, message
         while not said or "done" not in said[-1]:
             said.append(str(opened.recv(10.0)))
     assert any("not a message of this page" in text for text in said)
+
+
+@pytest.mark.parametrize("end", ["cut off", "too large", "closed"])
+def test_a_tab_that_goes_in_whatever_way_is_no_error(panel: Panel, end: str, caplog: pytest.LogCaptureFixture) -> None:
+    before = set(threading.enumerate())
+    opened = connect(socket_of(panel), legacy=True)
+    opened.recv(10.0)
+    serving = [thread for thread in threading.enumerate() if thread not in before and "sock_handler" in thread.name]
+    assert serving
+    if end == "cut off":
+        opened.socket.shutdown(socket.SHUT_RDWR)
+    elif end == "too large":
+        opened.send("x" * 10_000)
+    else:
+        opened.close()
+    for thread in serving:
+        thread.join(20.0)
+        assert not thread.is_alive()
+    assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+def test_a_service_of_another_version_is_told_in_one_line() -> None:
+    robot = FakeRobot()
+    robot.told = msgspec.structs.replace(robot.told, limits={"platform": {}})
+    with pytest.raises(ServiceError, match="another version"):
+        Panel(robot.robot(), 0)

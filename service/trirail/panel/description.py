@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from trirail.client.held_jog import SPEEDS
+from trirail.errors import ServiceError
 from trirail.telemetry import palette
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.state import Info
@@ -14,8 +16,11 @@ from trirail.workspace.mechanism import Mechanism
 
 
 def describe(info: Info, user: str) -> dict[str, Any]:
-    """Return it, ready to be encoded. msgspec.ValidationError where the service is of another version."""
-    robot = ShownRobot.told(info)
+    """Return it, ready to be encoded. Raises ServiceError where the service is of another version."""
+    try:
+        robot = ShownRobot.told(info)
+    except msgspec.ValidationError as error:
+        raise ServiceError(f"the service is of another version, {info.version}: {error}") from error
     parts = Mechanism.of(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform
     return {

@@ -67,7 +67,7 @@ class Feed:
         """Ask again what robot it is: a service that was silent may have been started anew."""
         try:
             content = msgspec.json.encode(describe(self._robot.info(), self._robot.user))
-        except (TrirailError, msgspec.ValidationError):
+        except TrirailError:
             return  # the old description stands until it answers
         with self.changed:
             self.robot = content

@@ -35,11 +35,11 @@ class Tell(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag=
     """The command, one without content."""
 
 
-class Rate(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="override"):
+class SetOverride(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="override"):
     """The override's slider has been moved."""
 
     percent: float
     """Share of full speed [%]."""
 
 
-FromPage = Seen | Hold | Release | Tell | Rate
+FromPage = Seen | Hold | Release | Tell | SetOverride

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from trirail.client.client import Robot
 from trirail.client.held_jog import HeldJog
 from trirail.errors import TrirailError
 from trirail.panel.feed import Feed, now
-from trirail.panel.messages import FromPage, Hold, Rate, Release, Seen, Tell
+from trirail.panel.messages import FromPage, Hold, Release, Seen, SetOverride, Tell
 from trirail.wire.vocabulary import Command
 
 AHEAD = 3
@@ -47,8 +48,9 @@ class Tab:
         sender = threading.Thread(target=self._send, name="tab", daemon=True)
         sender.start()
         try:
-            for text in self._socket:
-                self._take(text)
+            with contextlib.suppress(ConnectionClosed):  # a tab that is killed, or says too much, is gone like another
+                for text in self._socket:
+                    self._take(text)
         finally:
             self._jog.close()
             with self._feed.changed:
@@ -74,7 +76,7 @@ class Tab:
                 self._jog.release()
             case Tell(name):
                 self._tell(name)
-            case Rate(percent):
+            case SetOverride(percent):
                 self._begin(lambda: self._robot.override(percent), Command.OVERRIDE)
 
     # ------------------------------------------------------------------ doing
