@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from trirail.config import SIM, load
+from trirail.kinematics.compiled import FUNCTIONS
 from trirail.processes import supervisor
 
 CHILD = """
@@ -157,3 +158,19 @@ def test_a_loop_that_has_not_begun_has_stopped_nothing(told: list[str], tmp_path
     code = run(told, tmp_path, loop_1="os.kill(os.getpid(), 15)", gateway_1="freeze()", recorder_1="freeze()")
     assert code == 1
     assert told == ["the loop is dead (killed by SIGTERM): it had not begun; ending"]
+
+
+def test_a_first_start_is_waited_for_as_long_as_it_compiles(
+    told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "START_WITHIN", 3.0)
+    compiling = f"""
+for number in range({FUNCTIONS}):
+    os.write(int(ready_on), b'{{"compiling": "f%d"}}\\n' % number)
+    time.sleep(4.0 / {FUNCTIONS})
+"""
+    end = "ready(); beat_until(lambda: begun('gateway-1')); heartbeats.of('loop').rest()"
+    assert run(told, tmp_path, loop_1=compiling + end, gateway_1=SERVING, recorder_1=RECORDING) == 1
+    assert told[0] == f"the first start compiles the mathematics, {FUNCTIONS} functions; once, a minute or two"
+    assert told[1:4] == [f"compiling: {-(-FUNCTIONS * part // 4)} of {FUNCTIONS} functions" for part in (1, 2, 3)]
+    assert told[4:6] == [f"compiling: {FUNCTIONS} of {FUNCTIONS} functions", "up"]

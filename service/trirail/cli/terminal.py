@@ -26,7 +26,7 @@ from trirail.client.client import GoalHandle, Jog, Result, Robot
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.telemetry import palette
 from trirail.wire.messages import Event, GoalReply
-from trirail.wire.state import Percentiles, State
+from trirail.wire.state import GoalState, Percentiles, State
 from trirail.wire.text import json_printable, printable
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
                 if goal.result is not None:
                     return goal.result
                 if state.goal is not None and state.goal.id == goal.id:
-                    progress.update(task, completed=state.goal.progress, left=f"{state.goal.remaining:.1f} s left")
+                    progress.update(task, completed=state.goal.progress, left=left(state.goal))
             if goal.result is not None:
                 return goal.result
             raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
@@ -150,6 +150,11 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
 def _cancel(goal: GoalHandle) -> None:
     with contextlib.suppress(TrirailError):  # it has ended; or nobody answers, and then its end is not heard either
         goal.cancel()
+
+
+def left(goal: GoalState) -> str:
+    """Say how long the path of a goal still takes, or that it has ended and the robot settles."""
+    return f"{goal.remaining:.1f} s left" if goal.progress < 1.0 else "settling"
 
 
 def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
@@ -214,7 +219,7 @@ def _table(state: State, robot: str) -> Table:
         grid.add_row("fault", f"[bold red]{plain(fault)}[/]")
     grid.add_row("pose", units.pose(state.pose, 9))
     if state.goal:
-        grid.add_row("goal", f"{plain(state.goal.id)}  {state.goal.progress:4.0%}  {state.goal.remaining:.1f} s left")
+        grid.add_row("goal", f"{plain(state.goal.id)}  {state.goal.progress:4.0%}  {left(state.goal)}")
     sliders = state.sliders
     for index, name in enumerate("ABC"):
         grid.add_row(
