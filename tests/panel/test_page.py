@@ -446,5 +446,10 @@ def test_every_control_is_reached_by_tab_named_and_seen_to_have_the_focus(enable
 
 
 def test_mode_and_answers_are_told_to_those_who_hear_the_page(page: Page) -> None:
-    roles = page.evaluate("['mode', 'alarm', 'answer'].map((id) => document.getElementById(id).role)")
+    roles = page.evaluate("['mode-name', 'alarm', 'answer'].map((id) => document.getElementById(id).role)")
     assert roles == ["status", "alert", "status"]
+    for busy in ("#doing", "#pose", "#sliders", "#mechanism"):  # what changes all the time would be said all the time
+        assert (
+            page.evaluate(f"document.querySelector('{busy}').closest('[role=status], [role=alert], [aria-live]')")
+            is None
+        )
