@@ -16,6 +16,7 @@ from trirail.cli import (
     drives_command,
     help_pages,
     math_commands,
+    panel_command,
     recording_commands,
     robot_commands,
     terminal,
@@ -138,6 +139,7 @@ def view(
 
 app.command(drives_command.drives)
 app.command(commission.commission)
+app.command(panel_command.panel)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
+from cyclopts import CycloptsError
 
 from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Flag, Service
@@ -88,15 +89,15 @@ def sliders(
 
 
 def jog(
-    vx: units.Velocity,
-    vy: units.Velocity,
-    w: units.AngularVelocity,
+    vx: units.Velocity | None = None,
+    vy: units.Velocity | None = None,
+    w: units.AngularVelocity | None = None,
     /,
     *,
     seconds: units.Time | None = None,
     service: Service = HERE,
 ) -> int:
-    """Move at a velocity while the command lasts: until Ctrl-C, or for some seconds.
+    """Move at a velocity while the command lasts: until Ctrl-C, or for some seconds. Without one, while a key is held.
 
     Parameters
     ----------
@@ -111,6 +112,13 @@ def jog(
     """
     from trirail.client.client import Robot
 
+    if vx is None:
+        from trirail.cli import pendant
+
+        with Robot(service.robot, service.connect) as robot:
+            return pendant.run(robot)
+    if vy is None or w is None:
+        raise CycloptsError(msg="jog takes VX, VY and W, or none of them: then keys move the robot while they are held")
     with Robot(service.robot, service.connect) as robot:
         try:
             with robot.jog(x=vx, y=vy, phi=w) as jogging:
