@@ -13,6 +13,7 @@ from types import UnionType
 from typing import Annotated, Any, Literal, get_args
 
 import msgspec
+import numpy as np
 from msgspec import Meta, Struct
 from trirail_drivers import files
 from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
@@ -20,7 +21,7 @@ from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES
 
 from trirail.errors import ConfigError
-from trirail.kinematics.geometry import Geometry, Leg, singular_angles
+from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles
 
 _PACKAGED = Path(__file__).parent / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[2] / "configs") / "sim.toml"
@@ -155,6 +156,8 @@ class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
 class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [telemetry]."""
 
+    log: Literal["text", "json"] = "text"
+    """How the service writes what happens to its own output, a line each: for people, or JSON."""
     directory: Name = "recordings"
     """Where recordings go, relative to where the service was started."""
     state_hz: Annotated[int, Meta(ge=1, le=200)] = 50
@@ -311,10 +314,17 @@ def _type_at(path: str) -> Any:
     return kind
 
 
+_WINDOWS = (
+    *((f"sliders[{i}]", "m") for i in range(3)),
+    *((f"pose[{i}]", unit) for i, unit in enumerate(("m", "m", "rad"))),
+)
+"""The windows of [limits.in_position], each with its unit."""
+
+
 def _check(config: Config) -> None:
     """Refuse what is well-formed but impossible."""
     from trirail_drivers.connection import checks
-    from trirail_drivers.driver.requirements import Requirements
+    from trirail_drivers.driver.requirements import Requirements, Window
 
     robot = geometry(config.geometry)
     platform, slider = config.limits.platform, config.limits.slider
@@ -355,7 +365,14 @@ def _check(config: Config) -> None:
             "as with 100, 200, 250, 400, 500, 800, 1000"
         )
     places = (*slider.position, *(config.can.simulated.start if config.can.interface == "simulated" else ()))
-    required = Requirements(config.period, min(places), max(places), slider.velocity, slider.following_error)
+    corners = list(itertools.product(platform.x, platform.y, platform.phi))
+    most = np.abs([gains(robot, corner) for corner in corners]).max(axis=0).tolist()
+    widths = zip((*np.eye(3).tolist(), *most), (*settling.sliders, *settling.pose), strict=True)
+    windows = tuple(
+        Window(f"limits.in_position.{key}", width, unit, (a, b, c))
+        for (key, unit), ((a, b, c), width) in zip(_WINDOWS, widths, strict=True)
+    )
+    required = Requirements(config.period, min(places), max(places), slider.velocity, slider.following_error, windows)
     try:
         checks.check_bus(config.can)
         checks.check(config.drives, required)
