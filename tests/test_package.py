@@ -61,7 +61,10 @@ def test_the_wheel_holds_the_packages_the_configurations_and_nothing_of_the_work
     shipped = {f"trirail/configs/{path.relative_to(configs)}" for path in configs.rglob("*") if path.is_file()}
     typed = {"trirail/py.typed", "trirail_drivers/py.typed"}
     data = {f"trirail_drivers/{path.relative_to(ROOT / 'drivers/trirail_drivers')}" for path in ROOT.rglob("*.eds")}
-    assert shipped | typed | data <= names
+    package = ROOT / "service"
+    page = {str(path.relative_to(package)) for path in (package / "trirail/panel/page").iterdir()}
+    assert len(page) > 3
+    assert shipped | typed | data | page <= names
     links = re.findall(r"\]\(([^)]*)\)", metadata)
     assert any(link.endswith("/service/README.md") for link in links)
     assert all(link.startswith("https://") for link in links), "an index has no files beside the page"

@@ -177,6 +177,28 @@ def test_two_tabs_both_work_and_either_stops(service: Service, robot: Robot, bro
     other.close()
 
 
+@pytest.mark.viewer
+@needs_chromium
+@pytest.mark.timeout(300)
+def test_the_page_comes_back_with_the_service(browser: Page, tmp_path: Path) -> None:
+    first = Service(tmp_path)
+    first.wait_up()
+    with served(first) as (url, _):
+        page = browser.another()
+        page.open(url)
+        page.until("document.querySelector('#mode-name').textContent === 'disabled'")
+        assert first.end() == 0
+        page.until("document.querySelector('#mode-name').textContent === 'no contact'")
+        second = Service(tmp_path)
+        second.wait_up()
+        page.until("document.querySelector('#mode-name').textContent === 'disabled'")
+        page.click("[data-command=enable]")
+        page.until("document.querySelector('#mode-name').textContent === 'holding'")
+        page.until("document.querySelector('#events li').innerText.includes('enabled')")
+        page.close()
+    assert second.end() == 0
+
+
 # ---------------------------------------------------------------------- the pendant
 
 
