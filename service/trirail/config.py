@@ -168,6 +168,8 @@ class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
 class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [telemetry]."""
 
+    log: Literal["text", "json"] = "text"
+    """How the service writes what happens to its own output, a line each: for people, or JSON."""
     directory: Name = "recordings"
     """Where recordings go, relative to where the service was started."""
     state_hz: Annotated[int, Meta(ge=1, le=200)] = 50

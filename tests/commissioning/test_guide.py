@@ -121,8 +121,9 @@ def test_a_sound_robot_passes_every_step(robot: Config, tmp_path: Path) -> None:
     run = Run(tmp_path, robot)
     report = run.keeper.report
     assert [entry for entry in report.steps if entry.verdict != "ok"] == []
-    steps = ["bus", "setup", *(["push"] * 3), *(["power"] * 3), *(["move"] * 3), *(["watchdog"] * 3), "square"]
-    assert [entry.step for entry in report.steps] == steps
+    switches = [] if robot.drives.protocol == "odrive" else ["switches"]
+    each = [name for step in ("push", "power", "move", *switches, "watchdog") for name in [step] * 3]
+    assert [entry.step for entry in report.steps] == ["bus", "setup", *each, "square"]
     assert (report.ok, report.complete, report.changes, run.written) == (True, True, {}, None)
     for name in NAMES:
         assert run.of("move", name).measured["out"] == pytest.approx(0.001, abs=1e-6)
@@ -210,6 +211,29 @@ def test_a_motor_that_moves_nothing(tmp_path: Path) -> None:
     found(run, "move", "A", "coupling to the slider is loose", "coupling between motor A")
 
 
+def test_a_switch_that_is_pressed_at_rest_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    press = SimulatedDrive.press
+    monkeypatch.setattr(SimulatedDrive, "press", lambda self, switches: press(self, switches ^ 2))
+    person = Beside(["by hand", "Watchdog"])
+    boot = SimulatedDrive.restarted
+
+    def restarted(self: SimulatedDrive) -> None:
+        boot(self)
+        self.press(0)
+
+    monkeypatch.setattr(SimulatedDrive, "restarted", restarted)
+    run = Run(tmp_path, robot=with_drives(CONFIG, homing=HOMING), person=person)
+    found(run, "switches", "A", "takes its positive limit switch for pressed", "normally closed")
+    assert run.of("home", "A").verdict == "skipped"
+
+
+def test_switches_that_are_not_seen_are_asked_about(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SimulatedDrive, "press", lambda self, switches: None)
+    answers = {"Seen were: none": ["n", "y"]}
+    run = Run(tmp_path, person=Beside(["by hand", "Power"], answers))
+    assert [run.of("switches", name).verdict for name in NAMES] == ["wrong", "ok", "ok"]
+
+
 def test_a_drive_that_breaks_down_is_named_and_the_step_can_be_repeated(tmp_path: Path) -> None:
     answers = {"Go on with the next?": ["y"]}
     run = Run(tmp_path, faults=["when A enabled A fault 4310"], person=Beside(only("A"), answers))
@@ -256,6 +280,7 @@ def test_every_step_can_be_refused_and_nothing_moves(tmp_path: Path) -> None:
     run = Run(tmp_path, person=Beside(["by hand", "Power"]))
     assert {entry.verdict for entry in run.keeper.report.steps} == {"ok", "skipped"}
     assert (run.keeper.report.ok, run.keeper.report.complete) == (True, False)
+    assert {"push A", "power B", "square"} <= set(run.keeper.report.left)
     assert run.steps._place.rules is not None
     assert run.steps._place.rules.read() == (0.0, 0.0, 0.0)
 

@@ -18,6 +18,7 @@ from trirail.commissioning.judgement import (
     judge_move,
     judge_push,
     judge_square,
+    judge_switches,
     judge_watchdog,
     merged,
 )
@@ -183,6 +184,14 @@ def test_a_drive_that_keeps_its_power_never_passes(seconds: float | None, by: st
     judged = judge_watchdog("B", seconds, by, "said", heartbeat)
     assert (judged.verdict == "ok") is (seconds is not None)
     assert bool(judged.remedy) is (judged.verdict != "ok")
+
+
+@given(rest=st.integers(0, 7), changed=st.integers(0, 0xFFFF), seen=st.booleans())
+def test_switches_pass_where_all_were_seen_and_no_limit_is_pressed(rest: int, changed: int, seen: bool) -> None:
+    judged = judge_switches("A", rest, changed, seen)
+    assert (judged.verdict == "ok") is (seen and not rest & 3)
+    assert bool(judged.remedy) is (judged.verdict == "wrong")
+    assert said(judged).count("never changed") == 3 - (changed & 7).bit_count()
 
 
 def test_a_square_that_nobody_saw_is_wrong() -> None:

@@ -129,7 +129,7 @@ def test_a_goal_arrives_and_ends_once(rig: Rig) -> None:
     answer = rig.goal("g1", 0.05, -0.02, 0.3)
     assert isinstance(answer, Accepted)
     taken = rig.until(lambda: rig.mode is Mode.HOLDING)
-    assert taken <= math.ceil(answer.duration / PERIOD) + 2
+    assert taken <= math.ceil((answer.duration + CONFIG.limits.in_position.dwell) / PERIOD) + 2
     rig.cycles(50)
     assert rig.outcomes() == [("g1", "done")]
     assert rig.control.commanded.pose == pytest.approx((0.05, -0.02, 0.3), abs=1e-9)

@@ -80,6 +80,10 @@ class SimulatedDrive(Device):
         """Its state."""
         return self.state
 
+    def press(self, switches: int) -> None:
+        """Have these switches of its slider pressed: bits of the digital inputs 60FDh, where it has that."""
+        self._profile.inputs.value = switches
+
     def fail(self, code: int) -> None:
         """Break down with EMCY and 603Fh error `code`: transitions 13 and, at standstill, 14."""
         if self.state in _FAULTY:

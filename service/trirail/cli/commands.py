@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import msgspec
 from cyclopts import App, CoercionError, CycloptsError, UnknownOptionError
@@ -16,6 +16,7 @@ from trirail.cli import (
     drives_command,
     help_pages,
     math_commands,
+    panel_command,
     recording_commands,
     robot_commands,
     terminal,
@@ -35,7 +36,9 @@ app = App(
 
 
 @app.command
-def run(config: Path | None = None, /, *, record: Path | None = None) -> int:
+def run(
+    config: Path | None = None, /, *, record: Path | None = None, log: Literal["text", "json"] | None = None
+) -> int:
     """Run the service in the foreground until SIGTERM or Ctrl-C: then a controlled stop, drives disabled, exit 0.
 
     Parameters
@@ -44,12 +47,24 @@ def run(config: Path | None = None, /, *, record: Path | None = None) -> int:
         Configuration file; the simulated robot if absent.
     record
         Recording file to write, instead of one named by the time in the configured folder.
+    log
+        Write what happens as lines for people, or as JSON, instead of as [telemetry] log has it.
     """
     from trirail.config import SIM, load
+    from trirail.processes.log import Log
     from trirail.processes.supervisor import Supervisor
 
     settings = load(config or SIM)
-    return Supervisor(settings, record, terminal.say).run(lambda ready: terminal.up(settings, ready))
+    form = log or settings.telemetry.log
+    lines = Log(form)
+
+    def up(ready: dict[str, dict[str, Any]]) -> None:
+        if form == "json":
+            lines.say(f"up: robot {settings.robot.name}, goals {', '.join(settings.zenoh.listen)}")
+        else:
+            terminal.up(settings, ready)
+
+    return Supervisor(settings, record, lines.say, lines.event).run(up)
 
 
 @app.command
@@ -124,6 +139,7 @@ def view(
 
 app.command(drives_command.drives)
 app.command(commission.commission)
+app.command(panel_command.panel)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)

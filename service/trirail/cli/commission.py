@@ -7,6 +7,7 @@ import os
 import select
 import signal
 import sys
+import termios
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -78,10 +79,12 @@ def commission(
     person = Console(by_itself=yes, quiet=json)
     with interruption() as interrupted, opened(settings, fault, person, interrupted) as steps:
         guide = Guide(settings, config, steps, person, keeper)
-        with contextlib.suppress(Quit):
-            guide.run()
-        guide.write(out)
-    person.tell(f"Report: {keeper.path} (for people: {keeper.text.name})")
+        try:
+            with contextlib.suppress(Quit):
+                guide.run()
+            guide.write(out)
+        finally:
+            person.tell(f"Report: {keeper.path} (for people: {keeper.text.name})")
     if json:
         terminal.json(reports.content(made))
     return 0 if made.ok else 1
@@ -135,6 +138,10 @@ class Console:
         """Print a question and take the next line; at the end of the input the person has left."""
         from trirail.commissioning.person import Quit
 
+        if not self._echoes:
+            # What was typed before the question, as Enter once too often, is no answer to it: it may ask for motion.
+            termios.tcflush(sys.stdin, termios.TCIFLUSH)
+            self._typed = b""
         proposed = f" \\[{terminal.plain(question.default)}]" if question.default is not None else ""
         self._shown.print(f"  {terminal.plain(question.text.strip())}{proposed} ", end="", soft_wrap=True)
         while True:

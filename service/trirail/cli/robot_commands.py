@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
+from cyclopts import CycloptsError
 
-from trirail.cli import terminal, units
+from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Flag, Service
 from trirail.wire.vocabulary import Command
 
@@ -140,15 +141,15 @@ def sliders(
 
 
 def jog(
-    vx: units.Velocity,
-    vy: units.Velocity,
-    w: units.AngularVelocity,
+    vx: units.Velocity | None = None,
+    vy: units.Velocity | None = None,
+    w: units.AngularVelocity | None = None,
     /,
     *,
     seconds: units.Time | None = None,
     service: Service = HERE,
 ) -> int:
-    """Move at a velocity while the command lasts: until Ctrl-C, or for some seconds.
+    """Move at a velocity while the command lasts: until Ctrl-C, or for some seconds. Without one, while a key is held.
 
     Parameters
     ----------
@@ -163,10 +164,17 @@ def jog(
     """
     from trirail.client.client import Robot
 
+    if vx is None:
+        from trirail.cli import pendant
+
+        with Robot(service.robot, service.connect) as robot:
+            return pendant.run(robot)
+    if vy is None or w is None:
+        raise CycloptsError(msg="jog takes VX, VY and W, or none of them: then keys move the robot while they are held")
     with Robot(service.robot, service.connect) as robot:
         try:
             with robot.jog(x=vx, y=vy, phi=w) as jogging:
-                terminal.jogging(robot, jogging, seconds, show=not service.json)
+                live.jogging(robot, jogging, seconds, show=not service.json)
         except KeyboardInterrupt:
             pass
         if jogging.error is not None:
@@ -225,12 +233,12 @@ def status(*, service: Service = HERE) -> int:
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
-        state, missing = robot.state(), robot.info().missing_protections
+        state, info = robot.state(), robot.info()
     if service.json:
-        terminal.json(msgspec.to_builtins(state) | {"missing_protections": msgspec.to_builtins(missing)})
+        missing = msgspec.to_builtins(info.missing_protections)
+        terminal.json(msgspec.to_builtins(state) | {"missing_protections": missing})
     else:
-        terminal.show(state, service.robot)
-        terminal.missing(missing)
+        live.show(state, info)
     return 0
 
 
@@ -239,8 +247,7 @@ def watch(*, service: Service = HERE) -> int:
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
-        robot.state()  # so that a missing service is said, not waited for
-        terminal.watch(robot, json_lines=service.json)
+        live.watch(robot, json_lines=service.json)
     return 0
 
 

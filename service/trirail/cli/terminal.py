@@ -3,31 +3,26 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 from rich.console import Console
-from rich.live import Live
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 from trirail_drivers.bus import load
 from trirail_drivers.errors import shortened
-from trirail_drivers.interface import MissingProtection
 
-from trirail.cli import units
 from trirail.cli.options import HERE
-from trirail.client.client import GoalHandle, Jog, Result, Robot
+from trirail.client.client import GoalHandle, Result, Robot
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.telemetry import palette
 from trirail.wire.messages import Event, GoalReply
-from trirail.wire.state import Percentiles, State
-from trirail.wire.text import json_printable, printable
+from trirail.wire.state import GoalState, Percentiles
+from trirail.wire.text import json_printable, printable, wall_clock
 
 if TYPE_CHECKING:
     from trirail.cli.doctor import Check
@@ -128,7 +123,7 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
                 if goal.result is not None:
                     return goal.result
                 if state.goal is not None and state.goal.id == goal.id:
-                    progress.update(task, completed=state.goal.progress, left=f"{state.goal.remaining:.1f} s left")
+                    progress.update(task, completed=state.goal.progress, left=left(state.goal))
             if goal.result is not None:
                 return goal.result
             raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
@@ -152,50 +147,15 @@ def _cancel(goal: GoalHandle) -> None:
         goal.cancel()
 
 
-def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
-    """Show where a jog leads, until it ends or its time is over."""
-    ends = math.inf if seconds is None else time.monotonic() + seconds
-    with Live(console=out, refresh_per_second=10, transient=True) as live:
-        for state in robot.states(SILENT):
-            if show:
-                live.update(_table(state, robot.name))
-            if time.monotonic() >= ends or jog.error is not None or jog.result is not None:
-                return
-    raise ServiceError("the service has gone silent")
-
-
-def show(state: State, robot: str) -> None:
-    """Print a state."""
-    out.print(_table(state, robot))
-
-
-def missing(protections: Sequence[MissingProtection]) -> None:
-    """Print what drives do without, a line for what is so of several."""
-    drives: dict[str, list[str]] = {}
-    for each in protections:
-        drives.setdefault(f"{each.object}, {each.means}", []).append(each.drive)
-    for what, names in drives.items():
-        whose = f"drive{'s' * (len(names) > 1)} {', '.join(names)}"
-        out.print(f"[yellow]lacking[/]   {whose}: {plain(what)}", soft_wrap=True)
-
-
-def watch(robot: Robot, *, json_lines: bool) -> None:
-    """Show the state live, or as lines of JSON, until Ctrl-C; raises ServiceError when the service goes silent."""
-    with contextlib.suppress(KeyboardInterrupt):
-        if json_lines:
-            for state in robot.states(SILENT):
-                json(msgspec.to_builtins(state))
-        else:
-            with Live(console=out, refresh_per_second=10, transient=False) as live:
-                for state in robot.states(SILENT):
-                    live.update(_table(state, robot.name))
-        raise ServiceError("the service has gone silent")
+def left(goal: GoalState) -> str:
+    """Say how long the path of a goal still takes, or that it has ended and the robot settles."""
+    return f"{goal.remaining:.1f} s left" if goal.progress < 1.0 else "settling"
 
 
 def event(happened: Event) -> None:
-    """Print an event on a line."""
+    """Print an event on a line, with the time of the clock on the wall."""
     level = f"[{LEVELS[happened.level]}]{happened.level:7}[/]"
-    out.print(f"{happened.seq:5}  {happened.t:9.3f} s  {level}  {plain(happened.message)}", soft_wrap=True)
+    out.print(f"{happened.seq:5}  {wall_clock(happened.time)}  {level}  {plain(happened.message)}", soft_wrap=True)
 
 
 def checks(found: Sequence[Check]) -> None:
@@ -205,41 +165,6 @@ def checks(found: Sequence[Check]) -> None:
         out.print(f"{verdict} {check.name:13} {plain(check.found)}", soft_wrap=True)
         if check.remedy:
             out.print(f"{'':22} {plain(check.remedy)}", soft_wrap=True, style="dim")
-
-
-def _table(state: State, robot: str) -> Table:
-    grid = Table.grid(padding=(0, 2))
-    grid.add_row("robot", f"[bold]{robot}[/]  {_coloured(state.mode)}  t {state.t:.2f} s")
-    for fault in state.faults:
-        grid.add_row("fault", f"[bold red]{plain(fault)}[/]")
-    grid.add_row("pose", units.pose(state.pose, 9))
-    if state.goal:
-        grid.add_row("goal", f"{plain(state.goal.id)}  {state.goal.progress:4.0%}  {state.goal.remaining:.1f} s left")
-    sliders = state.sliders
-    for index, name in enumerate("ABC"):
-        grid.add_row(
-            f"slider {name}",
-            f"{units.written(sliders.position[index], 'mm', 3, 9)} "
-            f"{units.written(sliders.velocity[index], 'mm/s', 2, 8)} "
-            f"{units.written(sliders.following_error[index], 'µm', 1, 7)} error  {sliders.status[index]}",
-        )
-        if said := [
-            f"{name.replace('_', ' ')} {n}" for name, n in msgspec.to_builtins(sliders.traffic[index]).items() if n
-        ]:
-            grid.add_row("", f"[yellow]{', '.join(said)}[/]")
-    loop = state.loop
-    words = f"{loop.rate_hz} Hz, {loop.cycles} cycles, {loop.overruns} missed"
-    grid.add_row("loop", f"{words}, bus {loop.bus_load_measured:.0%} of at most {loop.bus_load:.0%}")
-    grid.add_row("lateness", percentiles(loop.lateness_us))
-    grid.add_row("cycle", percentiles(loop.cycle_us))
-    for lack in loop.lacking:
-        grid.add_row("[yellow]without[/]", plain(lack))
-    return grid
-
-
-def _coloured(mode: str) -> str:
-    colour = COLOURS.get(mode)
-    return f"[{colour}]{mode}[/]" if colour else plain(mode)
 
 
 def percentiles(values: Percentiles) -> str:

@@ -84,12 +84,25 @@ def plan(steps: Steps, config: Config) -> list[Step]:
     ]
     made += [
         Step(
+            "switches",
+            name,
+            f"Switches of slider {name}",
+            f"You press each limit switch and the home switch of slider {name} by hand; nothing has power.",
+            partial(steps.switches, name),
+            (("setup", ""),),
+        )
+        for name in NAMES
+        if steps.tells_inputs
+    ]
+    made += [
+        Step(
             "home",
             name,
             f"Home of slider {name}",
             f"MOTION: drive {name} alone searches its home switch, as [drives.{name}.homing] says. Ctrl-C stops.",
             partial(steps.home, name),
             (("move", name),),
+            (("switches", name),),
         )
         for name in NAMES
         if config.drives.each[NAMES.index(name)].homing is not None
@@ -135,6 +148,7 @@ class Guide:
     def run(self) -> None:
         """Go through all steps. Raises Quit where the person leaves."""
         made = plan(self._steps, self._config)
+        self._keeper.report.plan = tuple((step.name, step.drive) for step in made)
         if self._keeper.report.simulated:
             self._person.tell(
                 "Simulated drives: in brackets stands what a person beside them would answer; Enter takes it."
@@ -182,9 +196,13 @@ class Guide:
         choices = {"y": "do it", "s": "skip it", "b": "back to the step before"}
         choice = self._choice("  Do it? Enter or y, s skip, b back, q quit:", "y", choices)
         if choice == "s" and (step.name, step.drive) not in self._keeper.report.latest:
-            self._keep(step, Judged("skipped", ("refused",)))
+            self._keep(step, Judged("skipped", ("left out",)))
         while choice == "y":
-            judged, measured = step.run()
+            try:
+                judged, measured = step.run()
+            except KeyboardInterrupt:
+                self._keep(step, Judged("failed", ("stopped by Ctrl-C; no drive has power",)))
+                raise
             self._keep(step, judged, measured)
             if judged.verdict == "ok":
                 return at + 1

@@ -27,6 +27,9 @@ NOTHING: Final = 0.02
 AGAINST: Final = 0.05
 """Share of a way that an encoder has to count backwards for it to count against its motor."""
 
+SWITCHES: Final = {1: "negative limit switch", 2: "positive limit switch", 4: "home switch"}
+"""Bits of the digital inputs 60FDh (CiA 402-2)."""
+LIMITS: Final = (1, 2)
 LOOSE: Final = "fasten the encoder of drive {} on its shaft, and look at its cable; no power before that"
 
 
@@ -209,6 +212,27 @@ def judge_power(drive: str, drift: float, seconds: float, stopped: str) -> Judge
     return Judged(
         "ok", (f"drive {drive} held for {seconds:g} s, within {drift * 1e3:.4f} mm; the others had no power",)
     )
+
+
+def judge_switches(name: str, rest: int, changed: int, seen: bool) -> Judged:
+    """Judge a slider's switches: bits of 60FDh at rest and those that changed; whether these are all that there are."""
+    told = [f"{switch} {'changed' if changed & bit else 'never changed'}" for bit, switch in SWITCHES.items()]
+    words = (f"drive {name} told: {', '.join(told)}",)
+    pressed = [switch for bit, switch in SWITCHES.items() if rest & bit and bit in LIMITS]
+    if pressed:
+        return Judged(
+            "wrong",
+            (*words, f"at rest it takes its {' and its '.join(pressed)} for pressed"),
+            f"if slider {name} does not stand on it: turn the input's polarity in the drive (a normally closed "
+            "contact?), or look for a broken wire",
+        )
+    if not seen:
+        return Judged(
+            "wrong",
+            (*words, f"slider {name} has other switches than these"),
+            f"look at their wiring, and at which input drive {name} takes for which (its maker's tool)",
+        )
+    return Judged("ok", words)
 
 
 def judge_homing(drive: str, way: float, position: float, seen: bool, stopped: str) -> Judged:

@@ -80,8 +80,11 @@ def opened(
             tick = simulated.tick if clock is simulated else lambda: ticker.wait().missed
             return Bench(config, driver, tick, interrupted)
 
+        inputs = PROTOCOLS[config.drives.protocol].inputs
+        read = None if inputs is None else inputs(bus, config.drives, clock)
+        press = bus.press if isinstance(bus, SimulatedBus) else None
         try:
-            yield Steps(Place(config, bus, make_bench, rules, person))
+            yield Steps(Place(config, bus, make_bench, rules, person, interrupted, read, press))
         finally:
             simulated.free()
             if driver is not None:

@@ -40,6 +40,8 @@ class Report(Struct):
     began: str
     simulated: bool
     software: str
+    plan: tuple[tuple[str, str], ...] = ()
+    """The steps that there are, each with its drive."""
     steps: list[Entry] = []
     changes: dict[str, int | float] = {}
     """What the configuration should say otherwise, all steps together."""
@@ -59,7 +61,17 @@ class Report(Struct):
     @property
     def complete(self) -> bool:
         """Whether every step was done and is as it should be."""
-        return bool(self.steps) and all(entry.verdict == "ok" for entry in self.latest.values())
+        return bool(self.steps) and not self.left
+
+    @property
+    def left(self) -> list[str]:
+        """The steps that were not done, or are not as they should be."""
+        latest = self.latest
+        return [
+            f"{step} {drive}".rstrip()
+            for step, drive in self.plan or latest
+            if (step, drive) not in latest or latest[step, drive].verdict != "ok"
+        ]
 
 
 class Keeper:
@@ -117,8 +129,7 @@ def words(report: Report) -> list[str]:
     lines += [f"{key} should be {value:g}" for key, value in report.changes.items()]
     if report.written:
         lines.append(f"written to {report.written}")
-    left = [f"{step} {drive}".rstrip() for (step, drive), entry in report.latest.items() if entry.verdict != "ok"]
-    lines.append("everything is as it should be" if report.complete else f"not passed: {', '.join(left) or 'no step'}")
+    lines.append("everything is as it should be" if report.complete else f"not passed: {', '.join(report.left)}")
     return lines
 
 

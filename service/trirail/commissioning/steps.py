@@ -14,8 +14,9 @@ from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import Carriages
 
 from trirail.commissioning import drives_told, moves
-from trirail.commissioning.bench import FOLLOWING, Bench, Stopped
+from trirail.commissioning.bench import Bench, Stopped
 from trirail.commissioning.judgement import (
+    SWITCHES,
     Judged,
     MoveSeen,
     PushSeen,
@@ -24,21 +25,22 @@ from trirail.commissioning.judgement import (
     judge_power,
     judge_push,
     judge_square,
+    judge_switches,
     judge_watchdog,
 )
-from trirail.commissioning.person import Person, Question, choose, number
+from trirail.commissioning.observer import Observer
+from trirail.commissioning.person import Person, Question, choose
 from trirail.commissioning.report import Number
 from trirail.config import Config, geometry
 from trirail.errors import KinematicsError
-from trirail.kinematics.algebra import Array
 from trirail.kinematics.robot import forward
 
 HOLD = 1.0
 """How long a drive holds its slider when it gets power for the first time [s]."""
 PUSH = 0.010
 """How far a slider is best pushed by hand [m]."""
-SEEN = 0.00005
-"""How far a simulated slider must have gone for somebody to see it [m]."""
+LOOK = 0.05
+"""How often digital inputs are read while switches are pressed [s]."""
 IDLE = 0.01
 """How often it is looked for an answer while no drive has been set up [s]."""
 
@@ -56,6 +58,12 @@ class Place(NamedTuple):
     rules: Carriages | None
     """Where the sliders really are, of simulated drives."""
     person: Person
+    interrupted: Callable[[], bool]
+    """Tells of Ctrl-C."""
+    inputs: Callable[[str], int | None] | None = None
+    """Reads a drive's digital inputs, object 60FDh: None where it has none to tell; None for drives without."""
+    press: Callable[[int, int], None] | None = None
+    """Presses switches of a simulated drive: its index, and bits of 60FDh."""
 
 
 class Steps:
@@ -65,9 +73,14 @@ class Steps:
         self._config = place.config
         self._place = place
         self._person = place.person
+        self._see = Observer(place.person, place.rules, self.idle)
         self._bench: Bench | None = None
         self._told: list[dict[str, object]] = []
-        self._read_to: float | None = None
+
+    @property
+    def tells_inputs(self) -> bool:
+        """Whether drives of this protocol tell which of their switches are pressed."""
+        return self._place.inputs is not None
 
     # Without power.
 
@@ -117,28 +130,57 @@ class Steps:
         of: dict[str, list[str]] = {}
         for each in self._told:
             for line in drives_told.differences(each, applied=False):
-                of.setdefault(line.strip(), []).append(str(each["name"]))
+                of.setdefault(line.strip().removeprefix("would be written: "), []).append(str(each["name"]))
         return [f"{', '.join(names)}: {line}" for line, names in of.items()]
 
     def push(self, name: str) -> Done:
         """Have a slider pushed by hand, without power."""
         bench, index = self._ready(), NAMES.index(name)
-        read_to = self._ask_read_to()
+        read_to = self._see.read_to()
         angle = np.degrees(geometry(self._config.geometry).legs[index].rail_angle)
         self._person.tell(
             f"  Put the rule along rail {name}, its numbers rising towards {angle:.0f}° (0° is x, 90° is y)."
         )
-        before, counted = self._reading(index), bench.position
+        before, counted = self._see.reading(index), bench.position
         if self._place.rules is None:
             self._person.tell(f"  Push slider {name} by {PUSH * 1e3:g} mm or more, that way, and let it go.")
         else:
             self._place.rules.push(index, PUSH)
             bench.wait(HOLD / 10.0)
             self._person.tell(f"  A simulated hand has pushed slider {name} that way.")
-        after = self._reading(index)
+        after = self._see.reading(index)
         a, b, c = (now - was for now, was in zip(bench.position, counted, strict=True))
         seen = PushSeen(name, after - before, (a, b, c), read_to, self._step(name))
         return judge_push(seen, self._config.drives), {"rule": seen.rule, "A": a, "B": b, "C": c, "read_to": read_to}
+
+    def switches(self, name: str) -> Done:
+        """Have the switches of a slider pressed by hand, without power."""
+        bench, read = self._ready(), self._place.inputs
+        rest = read(name) if read is not None else None
+        if read is None or rest is None:
+            told = f"drive {name} does not tell its digital inputs (60FDh): look at them with its maker's tool"
+            return Judged("skipped", (told,)), {}
+        changed, turned = 0, 0
+
+        def look() -> None:
+            nonlocal changed, turned
+            self.idle()
+            turned += 1
+            if turned % max(1, round(LOOK / bench.period)) == 0:
+                changed |= (read(name) or 0) ^ rest
+
+        if (press := self._place.press) is None:
+            text = f"Press each limit switch and the home switch of slider {name} for a second; Enter when that is done"
+            choose(self._person, look, Question(text, "done"), {"done": "all were pressed"})
+        else:
+            self._person.tell(f"  A simulated hand presses the switches of slider {name}.")
+            for bits in (*SWITCHES, 0):
+                press(NAMES.index(name), bits)
+                for _ in range(round(2.0 * LOOK / bench.period)):
+                    look()
+        found = [switch for bit, switch in SWITCHES.items() if changed & bit]
+        seen = self._see.yes(f"Seen were: {', '.join(found) or 'none'}. Are those all that slider {name} has?")
+        return judge_switches(name, rest, changed, seen), {"at_rest": rest & 7, "changed": changed & 7}
 
     # With power, one drive alone.
 
@@ -156,26 +198,26 @@ class Steps:
     def move(self, name: str) -> Done:
         """Move one slider there and back, its drive alone with power; a person looks what has moved, and how far."""
         index, drives = NAMES.index(name), self._config.drives
-        read_to = self._ask_read_to()
+        read_to = self._see.read_to()
         asked = self._way(index)
-        before = self._reading(index)
-        before_all = self._rules()
+        before = self._see.reading(index)
+        before_all = self._see.rules()
         there = self._moved(index, asked)
-        rules = self._rules()
-        slider = self._which(before_all, rules)
+        rules = self._see.rules()
+        slider = self._see.which(before_all, rules)
         measured: dict[str, Number] = {"asked": asked, "out": there.way, "following": there.following, "slider": slider}
         if slider in (None, name):
-            rule_out = self._reading(index) - before if slider else 0.0
+            rule_out = self._see.reading(index) - before if slider else 0.0
         else:
             other = NAMES.index(slider)
             away = f"How far did slider {slider} go, in mm, above 0 in its positive direction?"
-            rule_out = self._number(away, rules[other] - before_all[other] if rules and before_all else None)
+            rule_out = self._see.number(away, rules[other] - before_all[other] if rules and before_all else None)
         rule_back = 0.0
         if slider is not None and not there.stopped:
             back = self._moved(index, -asked)
             there = there._replace(stopped=back.stopped, following=max(there.following, back.following))
             if slider == name:
-                rule_back = self._reading(index) - before
+                rule_back = self._see.reading(index) - before
         seen = MoveSeen(
             name,
             asked,
@@ -196,7 +238,7 @@ class Steps:
         bench, index, homing = self._ready(), NAMES.index(name), self._config.drives.each[NAMES.index(name)].homing
         if homing is None:
             return Judged("ok", ("its encoder is absolute: nothing to home",)), {}
-        began, stopped, rules = bench.position[index], "", self._rules()
+        began, stopped, rules = bench.position[index], "", self._see.rules()
         try:
             with bench.power(name):
                 bench.home(homing.timeout)
@@ -204,9 +246,9 @@ class Steps:
         except Stopped as why:
             stopped = str(why)
         position = bench.position[index]
-        now = self._rules()
+        now = self._see.rules()
         way = position - began if rules is None or now is None else now[index] - rules[index]
-        seen = stopped or self._yes(f"Did slider {name} stop at its home switch?")
+        seen = stopped or self._see.yes(f"Did slider {name} stop at its home switch?")
         judged = judge_homing(name, way, position, bool(seen), stopped)
         return judged, {"way": way, "position": position, "stopped": stopped}
 
@@ -234,12 +276,12 @@ class Steps:
             remedy = "move the sliders, by hand or by their homing, to where the platform is well within its limits"
             return Judged("failed", (str(error),), remedy), {}
         half = len(path) // 2
-        rules = self._rules()
+        rules = self._see.rules()
         corner = rules
         try:
             with bench.power():
                 first = bench.play(moves.Way(way.position[:half], way.velocity[:half]))
-                corner = self._rules()
+                corner = self._see.rules()
                 rest = moves.Way(way.position[half:] - way.position[half - 1], way.velocity[half:])
                 second = bench.play(rest)
             poses = forward(robot, np.concatenate([first.measured, second.measured]))[:, :2]
@@ -247,7 +289,7 @@ class Steps:
             deviation = float(apart.max())
         except Stopped as why:
             stopped = str(why)
-        seen = bool(stopped) or self._saw_square(way.position[half - 1], rules, corner)
+        seen = bool(stopped) or self._see.square(way.position[half - 1], rules, corner)
         following = dict(zip(NAMES, bench.worst, strict=True))
         judged = judge_square(deviation, bench.worst, seen, stopped)
         return judged, {"deviation": deviation, "missed_cycles": bench.missed, **following}
@@ -261,10 +303,12 @@ class Steps:
 
     def idle(self) -> None:
         """Wait a little, and keep the drives alive."""
-        if self._bench is None:
-            time.sleep(IDLE)
-        else:
+        if self._bench is not None:
             self._bench.cycle()
+        elif self._place.interrupted():
+            raise KeyboardInterrupt
+        else:
+            time.sleep(IDLE)
 
     def _moved(self, index: int, way: float) -> _Moved:
         """Move one slider, its drive alone with power; it has none afterwards."""
@@ -286,50 +330,6 @@ class Steps:
 
     def _step(self, name: str) -> float:
         return 1.0 / self._config.drives.each[NAMES.index(name)].counts_per_metre
-
-    def _rules(self) -> tuple[float, ...] | None:
-        return None if self._place.rules is None else self._place.rules.read()
-
-    def _ask_read_to(self) -> float:
-        """Return how finely the rule can be read [m]; asked once."""
-        if self._read_to is None:
-            text = "To how many mm can you read your rule or indicator? (a steel rule 0.5, a dial indicator 0.01)"
-            question = Question(text, None if self._place.rules is None else "0.01")
-            self._read_to = number(self._person, self.idle, question, 0.0001, 5.0) / 1e3
-        return self._read_to
-
-    def _reading(self, index: int) -> float:
-        rules = self._rules()
-        text = f"What does the rule at slider {NAMES[index]} read now, in mm?"
-        return self._number(text, None if rules is None else rules[index])
-
-    def _number(self, text: str, simulated: float | None) -> float:
-        default = None if simulated is None else f"{simulated * 1e3 + 0.0:.2f}"
-        return number(self._person, self.idle, Question(text, default)) / 1e3
-
-    def _which(self, before: tuple[float, ...] | None, now: tuple[float, ...] | None) -> str | None:
-        """Ask which slider has moved, from what rules read before to what they read now."""
-        default, text = None, "Which slider moved: A, B, C, or n for none?"
-        if before is not None and now is not None:
-            ways = [abs(here - was) for here, was in zip(now, before, strict=True)]
-            most = ways.index(max(ways))
-            default = NAMES[most] if ways[most] > SEEN else "n"
-        choices = {each: f"slider {each}" for each in NAMES} | {"n": "none of them"}
-        answer = choose(self._person, self.idle, Question(text, default), choices)
-        return None if answer == "n" else answer
-
-    def _yes(self, text: str) -> bool:
-        question = Question(f"{text} y/n", None if self._place.rules is None else "y")
-        return choose(self._person, self.idle, question, {"y": "yes", "n": "no"}) == "y"
-
-    def _saw_square(self, wanted: Array, began: tuple[float, ...] | None, corner: tuple[float, ...] | None) -> bool:
-        """Ask whether the platform went around the square; simulated sliders are compared at its far corner."""
-        text = f"Did the platform go {moves.DISTANCE * 1e3:g} mm along x, then along y, then back both? y/n"
-        default = None
-        if began is not None and corner is not None:
-            went = np.array(corner) - np.array(began)
-            default = "y" if np.abs(went - wanted).max() < FOLLOWING else "n"
-        return choose(self._person, self.idle, Question(text, default), {"y": "yes", "n": "no"}) == "y"
 
 
 class _Moved(NamedTuple):

@@ -157,6 +157,8 @@ class Info(Struct, frozen=True):
     """The folder of the service's recordings, on its machine."""
     live: str
     """Where a Rerun viewer on the service's machine finds the live view; "" for nowhere."""
+    homes: tuple[str, ...] = ()
+    """The sliders whose encoders are not absolute: they have no position until the command home."""
     versions: dict[str, str] = msgspec.field(default_factory=dict)
     """Of Python and the libraries that matter, by name."""
     missing_protections: tuple[MissingProtection, ...] = ()
