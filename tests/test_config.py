@@ -44,6 +44,32 @@ def test_shipped_configurations_load(path: Path) -> None:
         ("[watchdogs]", "[watchdog]", "watchdog: unknown section; did you mean watchdogs?"),
         ("[zenoh]", "[drives.zenoh]", "drives.zenoh: unknown key; allowed are protocol"),
         ("[loop]", "[loop", "not TOML"),
+        ("[loop]", "[frames]\ntools = 1\n[loop]", "frames.tools: unknown key; did you mean tool?"),
+        (
+            "[loop]",
+            "[frames.tool]\ncamera = [0.1, 'x']\n[loop]",
+            "frames.tool.camera[1] = 'x': expected float, got str",
+        ),
+        (
+            "[loop]",
+            "[frames.tool]\na = [0.1, 0.2]\ncamera = [0.1]\n[loop]",
+            "frames.tool.camera = [0.1]: expected array",
+        ),
+        (
+            "[loop]",
+            "[frames.work]\npart = [0.1, 0.0, 9.0]\n[loop]",
+            "frames.work.part[2] = 9.0: expected float <= 6.28",
+        ),
+        (
+            "[loop]",
+            "[frames.tool]\n'my camera' = [0.1, 0.0]\n[loop]",
+            "'my camera': [0.1, 0.0]}: expected str matching",
+        ),
+        (
+            "[loop]",
+            "[frames.work]\nbase = [0.1, 0.0, 0.0]\n[loop]",
+            "frames.work.base: every robot has a frame of that",
+        ),
         ("node = 3", "nod = 3", "drives.C.nod: unknown key; did you mean node?"),
         ("node = 2", "node = 1", "the node ids of master_node, A, B and C must differ, but are 126, 1, 1, 3"),
         ("node = 2", "node = 128", "drives.B.node = 128: expected int <= 127"),

@@ -16,7 +16,7 @@ from trirail.errors import RefusedError
 from trirail.motion.goals import Goals
 from trirail.motion.runs import rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, VelocityGoal
+from trirail.wire.messages import PlannedGoal, PoseGoal, SlidersGoal, VelocityGoal
 
 GOALS = 1500
 AIM = 5000.0
@@ -30,7 +30,7 @@ def main(json: bool) -> None:
     """Plan goals from rest and from motion, one after the other, and print what a step takes."""
     config = load(SIM)
     goals = Goals(geometry(config.geometry), config.limits, config.period)
-    kinds: dict[str, Callable[[random.Random], Goal]] = {
+    kinds: dict[str, Callable[[random.Random], PlannedGoal]] = {
         "pose": lambda rnd: PoseGoal(*_pose(rnd)),
         "sliders": lambda rnd: SlidersGoal((rnd.uniform(-0.1, 0.1), rnd.uniform(-0.1, 0.1), rnd.uniform(-0.1, 0.1))),
         "velocity": lambda rnd: VelocityGoal(
@@ -65,7 +65,7 @@ def _pose(rnd: random.Random) -> tuple[float, float, float]:
     return rnd.uniform(-0.06, 0.06), rnd.uniform(-0.06, 0.06), rnd.uniform(-0.5, 0.4)
 
 
-def _plan(goals: Goals, schedule: Schedule, goal: Goal) -> float:
+def _plan(goals: Goals, schedule: Schedule, goal: PlannedGoal) -> float:
     """Plan a goal, and begin with it where it is accepted; return how long planning took [s]."""
     began = time.thread_time()
     try:

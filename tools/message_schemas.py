@@ -51,8 +51,10 @@ def schemas() -> dict[str, str]:
                     {"const": code, "description": f"{code.meaning}; {code.remedy}"} for code in RefusalCode
                 ]
                 continue
-            for field, text in docstrings.fields(getattr(messages, struct, None) or getattr(state, struct)).items():
-                definition["properties"][field]["description"] = text
+            told = getattr(messages, struct, None) or getattr(state, struct)
+            on_the_wire = {field.name: field.encode_name for field in msgspec.structs.fields(told)}
+            for field, text in docstrings.fields(told).items():
+                definition["properties"][on_the_wire[field]]["description"] = text
         whole = {"$schema": DIALECT, "title": f"trirail: {name}", "description": where, **schema, "$defs": definitions}
         made[f"{name}.json"] = json.dumps(whole, indent=2, ensure_ascii=False) + "\n"
     return made

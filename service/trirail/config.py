@@ -31,6 +31,9 @@ Angle = Annotated[float, Meta(ge=-2.0 * math.pi, le=2.0 * math.pi)]
 """[rad]."""
 Jerk = Annotated[float, Meta(ge=1e-3, le=1e6)]
 """[m/s³] or [rad/s³]."""
+BASE, PLATFORM = "base", "platform"
+"""Frames that every robot has."""
+FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Point = tuple[Coordinate, Coordinate]
 Range = tuple[Coordinate, Coordinate]
 
@@ -133,6 +136,15 @@ class MotionTable(Struct, frozen=True, forbid_unknown_fields=True):
     """How many goals may wait for the one under way, where that has a `blend`."""
 
 
+class FramesTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [frames]: points and frames that goals may name."""
+
+    tool: dict[FrameName, Point] = msgspec.field(default_factory=dict)
+    """Points of the platform by name, x and y in its own frame, whose origin is the centre [m]."""
+    work: dict[FrameName, tuple[Coordinate, Coordinate, Angle]] = msgspec.field(default_factory=dict)
+    """Frames by name: x, y [m] of the origin and the angle [rad], in the base frame."""
+
+
 class LoopTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [loop]."""
 
@@ -200,6 +212,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     telemetry: Telemetry
     watchdogs: Watchdogs
     motion: MotionTable = MotionTable()
+    frames: FramesTable = FramesTable()
 
     @property
     def period(self) -> float:
@@ -273,7 +286,9 @@ def _leaves(value: object, key: str = "") -> Iterator[tuple[str, object]]:
         yield key, value
 
 
-_AT = re.compile(r"^(?P<what>.*?)(?: - at `\$(?P<path>[^`]*)`)?$", re.DOTALL)
+_AT = re.compile(r"^(?P<what>.*?)(?: - at (?:`key` in )?`\$(?P<path>[^`]*)`)?$", re.DOTALL)
+NAMED = "[...]"
+"""What msgspec says in the place of a key of a table whose keys are names."""
 _FIELD = re.compile(r"^Object (?P<how>contains unknown|missing required) field `(?P<name>[^`]*)`")
 
 
@@ -289,12 +304,31 @@ def _explain(error: str, raw: dict[str, Any]) -> str:
         close = difflib.get_close_matches(field["name"], allowed, n=1)
         hint = f"did you mean {close[0]}?" if close else f"allowed are {', '.join(allowed)}"
         return f"{key}: unknown {'key' if path else 'section'}; {hint}"
-    value: object = raw
-    for part in _parts(path):
-        value = value[int(part) if isinstance(value, list) else part]  # type: ignore[index]
+    if NAMED in path:
+        table = path.split(NAMED)[0]
+        path = path.replace(NAMED, f".{_culprit(_at(table, raw), get_args(_type_at(table))[1])}")
+    value = _at(path, raw)
     if what.startswith("Invalid enum value"):
         return f"{path} = {value!r}: allowed are {', '.join(map(repr, get_args(_type_at(path))))}"
     return f"{path} = {value!r}: {what[0].lower()}{what[1:].replace('`', '')}"
+
+
+def _at(path: str, raw: dict[str, Any]) -> object:
+    """The value that was given at a path."""
+    value: object = raw
+    for part in _parts(path):
+        value = value[int(part) if isinstance(value, list) else part]  # type: ignore[index]
+    return value
+
+
+def _culprit(table: Any, kind: Any) -> str:
+    """The name in a table of names whose value is not of a type."""
+    for name, value in table.items():
+        try:
+            msgspec.convert(value, kind)
+        except msgspec.ValidationError:
+            return str(name)
+    return NAMED
 
 
 def _parts(path: str) -> list[str]:
@@ -353,6 +387,9 @@ def _check(config: Config) -> None:
         raise ConfigError(
             f"limits.in_position.timeout = {settling.timeout:g}: it must be longer than the dwell, {settling.dwell:g} s"
         )
+    for name in config.frames.work:
+        if name in (BASE, PLATFORM):
+            raise ConfigError(f"frames.work.{name}: every robot has a frame of that name; give this one another")
     nodes = [config.drives.master_node, *(drive.node for drive in config.drives.each)]
     if len(set(nodes)) < len(nodes):
         raise ConfigError(

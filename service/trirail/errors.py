@@ -64,6 +64,7 @@ class RefusalCode(StrEnum):
     BAD_NAME = "bad_name", "a robot or user with other than letters, digits, - and _", "use another name"
     UNKNOWN_COMMAND = "unknown_command", "no such command", "send one of those that the message names"
     DUPLICATE_ID = "duplicate_id", "the goal's id has been used", "give every goal an id of its own, or none"
+    UNKNOWN_FRAME = "unknown_frame", "no tool or frame of that name in [frames]", "use one of those that info tells"
 
     # What the robot's mode allows.
     NOT_ENABLED = "not_enabled", "the drives have no power yet", "send enable, and wait for it"

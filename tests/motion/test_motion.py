@@ -22,7 +22,16 @@ from trirail.motion.goals import Goals, PlannedMotion
 from trirail.motion.planner import TOO_FAST_IN_MOTION
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import Goal, OwnLimits, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.messages import (
+    Goal,
+    OwnLimits,
+    PlannedGoal,
+    PoseGoal,
+    SlidersGoal,
+    TrajectoryGoal,
+    TrajectoryPoint,
+    VelocityGoal,
+)
 from trirail.wire.packets import Accepted, Answer, CommandRequest, GoalRequest
 from trirail.wire.vocabulary import Command, Mode
 
@@ -461,7 +470,7 @@ def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
 PLAIN_SET_OUT = Goals._set_out
 
 
-def only_from_rest(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
+def only_from_rest(goals: Goals, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
     """Plan from no motion, so that the robot stops first."""
     if not schedule.commanded.at_rest:
         raise TOO_FAST_IN_MOTION
@@ -482,7 +491,7 @@ def test_of_two_ways_the_sooner_is_taken(
     """From the same motion, with lower limits or after a stop: each where the other is not to be had, and then both."""
     plain_stop_first = Goals._stop_first
 
-    def no_stop(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
+    def no_stop(goals: Goals, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
         raise TOO_FAST_IN_MOTION
 
     def asked(wait: int, way: str) -> tuple[Rig, Answer]:

@@ -9,9 +9,10 @@ import made
 import msgspec
 import numpy as np
 import pytest
+import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
-from trirail.config import SIM, LegTable, load
+from trirail.config import SIM, FramesTable, LegTable, load
 from trirail.kinematics.geometry import Geometry, Leg
 from trirail.processes.info import info
 from trirail.telemetry.readout import Standing
@@ -213,3 +214,22 @@ def test_a_robot_is_the_same_by_its_configuration_and_by_its_services_words() ->
     told, configured = ShownRobot.told(answered), ShownRobot.configured(CONFIG)
     assert (told.name, told.limits, told.rate_hz) == (configured.name, configured.limits, configured.rate_hz)
     assert told.geometry.legs == configured.geometry.legs
+
+
+def test_tools_and_work_frames_are_drawn_with_their_names_as_a_service_tells_them() -> None:
+    frames = FramesTable(tool={"camera": (0.03, -0.02)}, work={"part": (0.05, 0.01, math.pi / 2.0)})
+    told = msgspec.json.decode(msgspec.json.encode(info(msgspec.structs.replace(CONFIG, frames=frames))), type=Info)
+    drawn = dict(Scene(ShownRobot.told(told), WALL_OFFSET_NS).still())
+    tools, part = drawn["/robot/platform/tools"], drawn["/robot/frames/part"]
+    assert isinstance(tools, rr.Points2D)
+    assert isinstance(part, rr.LineStrips2D)
+    assert tools.positions is not None
+    assert tools.labels is not None
+    assert tools.positions.as_arrow_array().to_pylist() == [pytest.approx((0.03, -0.02))]
+    assert tools.labels.as_arrow_array().to_pylist() == ["camera"]
+    assert part.strips is not None
+    (x, y) = np.array(part.strips.as_arrow_array().to_pylist())
+    assert [x[0], y[0]] == [pytest.approx((0.05, 0.01))] * 2
+    assert (x[1] - x[0])[0] == pytest.approx(0.0, abs=1e-6)
+    assert (x[1] - x[0])[1] > 0.0
+    assert (y[1] - y[0])[0] < 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from cyclopts import CycloptsError
@@ -26,6 +26,8 @@ def goto(
     wait: Annotated[bool, Flag] = False,
     speed: float = 1.0,
     blend: units.Length | None = None,
+    tool: tuple[units.Length, units.Length] | None = None,
+    frame: str = "base",
     deg: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
@@ -45,6 +47,10 @@ def goto(
         Fraction of full speed, up to 1.
     blend
         The next goto waits for this one, and begins that near to its end [m], instead of preempting it.
+    tool
+        The point of the platform that goes there instead of the centre, in the platform's own frame [m].
+    frame
+        A frame of [frames.work] in which the pose is given.
     deg
         An angle without a unit is in degrees.
     """
@@ -52,8 +58,54 @@ def goto(
 
     angle = units.radians(phi, deg)
     with Robot(service.robot, service.connect) as robot:
-        goal = robot.move_to(x=x, y=y, phi=angle, speed=speed, blend=blend)
+        goal = robot.move_to(x=x, y=y, phi=angle, speed=speed, blend=blend, tool=tool, frame=frame)
         return _follow(service, robot, goal, wait, units.pose((x, y, angle)))
+
+
+def move(
+    dx: units.Length,
+    dy: units.Length,
+    dphi: units.Angle,
+    /,
+    *,
+    wait: Annotated[bool, Flag] = False,
+    speed: float = 1.0,
+    tool: tuple[units.Length, units.Length] | None = None,
+    frame: str = "base",
+    measured: Annotated[bool, Flag] = False,
+    deg: Annotated[bool, Flag] = False,
+    service: Service = HERE,
+) -> int:
+    """Move the platform by so much.
+
+    Parameters
+    ----------
+    dx
+        How far along x [m], or with a unit: 5mm, -0.2in.
+    dy
+        Along y.
+    dphi
+        By what angle to turn, counterclockwise [rad], or with a unit: 1deg.
+    wait
+        Show the progress; exit 0 only when the robot has arrived.
+    speed
+        Fraction of full speed, up to 1.
+    tool
+        The point of the platform that moves so far, and about which it turns, in the platform's own frame [m].
+    frame
+        Along whose axes: base, platform, or a frame of [frames.work].
+    measured
+        From where the robot is measured to be, instead of where it was sent.
+    deg
+        An angle without a unit is in degrees.
+    """
+    from trirail.client.client import Robot
+
+    angle = units.radians(dphi, deg)
+    with Robot(service.robot, service.connect) as robot:
+        origin: Literal["commanded", "measured"] = "measured" if measured else "commanded"
+        goal = robot.move(x=dx, y=dy, phi=angle, speed=speed, tool=tool, frame=frame, origin=origin)
+        return _follow(service, robot, goal, wait, f"by {units.pose((dx, dy, angle))}")
 
 
 def sliders(
@@ -213,7 +265,7 @@ def events(*, service: Service = HERE) -> int:
     return 0
 
 
-COMMANDS = (goto, sliders, jog, follow, status, watch, events)
+COMMANDS = (goto, move, sliders, jog, follow, status, watch, events)
 """Those with parameters of their own, in the order in which the help lists them; the others are made by `telling`."""
 
 

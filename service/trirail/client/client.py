@@ -13,7 +13,7 @@ import threading
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
 import msgspec
 import zenoh
@@ -27,10 +27,12 @@ from trirail.wire.messages import (
     Event,
     Goal,
     GoalReply,
+    MoveGoal,
     Override,
     OwnLimits,
     PoseGoal,
     SlidersGoal,
+    Tool,
     TrajectoryGoal,
     TrajectoryPoint,
 )
@@ -92,6 +94,8 @@ class Robot:
         limits: OwnLimits | None = None,
         blend: float | None = None,
         valid_for: float | None = None,
+        tool: Tool | None = None,
+        frame: str = "base",
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> GoalHandle:
         """Send a pose goal, x, y [m] and phi [rad] in the base frame; return once it is accepted.
@@ -100,11 +104,61 @@ class Robot:
         0.5 takes twice as long over the same path. With `blend` [m] the next pose goal waits for this one, and begins
         when no point of the platform is farther than that from where it is to be; without it, the next goal preempts
         this one. `limits` are lower ones than the platform's. A goal that has not begun within `valid_for` [s] expires.
+        With a `tool`, a point of the platform in its own frame, (u, v) [m], or a name of [frames.tool], it is this
+        point that goes to x, y, straight and within the platform's limits, while the platform turns. `frame` is one of
+        [frames.work] in which x, y and phi are given.
         Its `id` must be new; one is made if absent. Raises RefusedError: out of reach, not enabled, stopping, ….
         """
         return self.send(
             lambda name: PoseGoal(
-                x=x, y=y, phi=phi, id=name, speed=speed, valid_for=valid_for, limits=limits, blend=blend
+                x=x,
+                y=y,
+                phi=phi,
+                id=name,
+                speed=speed,
+                valid_for=valid_for,
+                limits=limits,
+                blend=blend,
+                tool=tool,
+                frame=frame,
+            ),
+            id,
+        )
+
+    def move(
+        self,
+        *,
+        x: float = 0.0,
+        y: float = 0.0,
+        phi: float = 0.0,
+        frame: str = "base",
+        tool: Tool | None = None,
+        origin: Literal["commanded", "measured"] = "commanded",
+        speed: float = 1.0,
+        limits: OwnLimits | None = None,
+        blend: float | None = None,
+        valid_for: float | None = None,
+        id: str | None = None,  # noqa: A002 - the field's name on the wire
+    ) -> GoalHandle:
+        """Move the platform by x, y [m] and turn it by phi [rad] about its `tool`, or its centre; return when accepted.
+
+        x and y are along the axes of `frame`: base, platform (as it is then), or one of [frames.work]. `origin` says
+        from where: "commanded" is where the goals before it lead, so that moves add up whenever they are sent;
+        "measured" is where the robot is measured to be. All else as of move_to.
+        """
+        return self.send(
+            lambda name: MoveGoal(
+                x=x,
+                y=y,
+                phi=phi,
+                frame=frame,
+                tool=tool,
+                origin=origin,
+                id=name,
+                speed=speed,
+                valid_for=valid_for,
+                limits=limits,
+                blend=blend,
             ),
             id,
         )

@@ -7,7 +7,8 @@ and `write` the setpoints behind the last gate. What is to be said of it waits a
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Literal
 
 from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
 
@@ -20,6 +21,7 @@ from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeStat
 from trirail.control.plan_requests import PlannerPort, PlanRequests
 from trirail.control.setpoints import Setpoints
 from trirail.errors import RefusalCode, RefusedError
+from trirail.motion.frames import Frames
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
@@ -62,7 +64,8 @@ class Control:
         self._schedule = Schedule(rest(STILL), config.period)
         self._planner = PlanRequests(config, planner, self._schedule)
         self.ledger = Ledger()
-        self.goal_queue = GoalQueue(self.ledger, self._planner, self._schedule, config.motion.queue, config.period)
+        frames, queue = Frames(config.frames), config.motion.queue
+        self.goal_queue = GoalQueue(self.ledger, self._planner, self._schedule, frames, queue, config.period)
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
         self._following_error_limit = config.limits.slider.following_error
         self.measured = Measured(
@@ -167,7 +170,7 @@ class Control:
         released = self.ledger.release(self.cycles) if self.state.mode is Mode.MOVING else None
         if released is not None:
             self._go(ModeEvent.RELEASE, f"goal {released.id} of {released.user} is not renewed")
-        beginning = self.goal_queue.think(self.cycles, self._admit)
+        beginning = self.goal_queue.think(self.cycles, self._admit, self._place)
         if beginning is not None:
             self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
         self._run = self._schedule.begin_cycle()
@@ -245,6 +248,15 @@ class Control:
         if not self.measured.homed:
             raise RefusedError(RefusalCode.NOT_HOMED, "it is not known where the sliders are: send home first")
         return self.state.mode is Mode.MOVING
+
+    def _place(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
+        """Return the pose from which a move begins: where the goals before it lead, or where the robot is."""
+        if origin == "measured":
+            return self.measured.pose
+        last, goal = self._schedule.last, self.ledger.goal
+        if last is None or goal is None or goal.is_jog:
+            return self.commanded.pose
+        return last.end(self.commanded.pose)
 
     def _withdraw(self, event: ModeEvent, reason: str) -> None:
         """End what has been sent but not begun, where the robot is to stand: after the goals before it."""

@@ -144,7 +144,7 @@ def _solve(legs: Array, bounds: NDArray[np.void], motion: Array, sliders: Array,
 
 @compiled(
     i8(
-        *(_LEGS, _BOUNDS, _KNOTS, _PIECES, b1, _KNOTS, _PIECES),
+        *(_LEGS, _BOUNDS, _KNOTS, _PIECES, b1, f8[:, ::1], _KNOTS, _PIECES),
         *(f8, f8, f8, f8, f8, _MOTION, _SLIDERS, f8[::1], _RECORD),
     )
 )
@@ -154,6 +154,7 @@ def command(
     knots: Array,
     pieces: Array,
     in_sliders: bool,
+    tools: Array,
     law_knots: Array,
     law_pieces: Array,
     time: float,
@@ -175,7 +176,7 @@ def command(
     law = law_at(law_knots, law_pieces, time)
     s, rate, change = law
     motion[1] = motion[0]
-    if platform_at(legs, knots, pieces, in_sliders, law, motion[1, 0], motion[0]) != 0:
+    if platform_at(legs, knots, pieces, in_sliders, tools, law, motion[1, 0], motion[0]) != 0:
         motion[0] = math.nan
     refused = _solve(legs, bounds, motion, sliders, found)
     progress = max(0.0, min(1.0, (s - begun) / (end - begun))) if end > begun else 1.0

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from trirail.control.ledger import Ledger, Withdrawal
 from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
+from trirail.motion.frames import Frames, Place
 from trirail.motion.schedule import Schedule
 from trirail.wire.messages import Outcome, PoseGoal, VelocityGoal
 from trirail.wire.packets import GoalRequest
@@ -25,10 +26,13 @@ class _Sent(NamedTuple):
 class GoalQueue:
     """Takes goals in their order to the planner, and to the ledger what becomes of them."""
 
-    def __init__(self, ledger: Ledger, planner: PlanRequests, schedule: Schedule, queue: int, period: float) -> None:
+    def __init__(
+        self, ledger: Ledger, planner: PlanRequests, schedule: Schedule, frames: Frames, queue: int, period: float
+    ) -> None:
         self._ledger = ledger
         self._planner = planner
         self._schedule = schedule
+        self._frames = frames
         self._queue = queue
         self._period = period
         self._waiting: deque[_Sent] = deque()
@@ -46,15 +50,16 @@ class GoalQueue:
         self._waiting.append(sent)
         self._ledger.keep_alive(request, self._alive_until(sent))
 
-    def think(self, cycle: int, admit: Callable[[], bool]) -> GoalRequest | None:
+    def think(self, cycle: int, admit: Callable[[], bool], place: Place) -> GoalRequest | None:
         """Have the next goal planned if none is, and take what has been planned; return a goal that begins.
 
-        `admit` raises RefusedError where the robot takes no goal, and says whether it is moving to one.
+        `admit` raises RefusedError where the robot takes no goal, and says whether it is moving to one; `place` says
+        from where a move begins.
         """
         if not self._planner.busy and self._waiting:
             self._planned = self._waiting.popleft()
             try:
-                self._consider(self._planned, cycle, admit)
+                self._consider(self._planned, cycle, admit, place)
             except RefusedError as refusal:
                 self._ledger.refuse(self._planned.request, refusal)
         try:
@@ -113,7 +118,7 @@ class GoalQueue:
                 self._drop(number, goal.id, "expired", "it has not begun in time")
                 return
 
-    def _consider(self, sent: _Sent, cycle: int, admit: Callable[[], bool]) -> None:
+    def _consider(self, sent: _Sent, cycle: int, admit: Callable[[], bool], place: Place) -> None:
         """Begin to plan a goal, or refuse it."""
         ledger, request, goal = self._ledger, sent.request, sent.request.goal
         ledger.check_id(request)
@@ -126,11 +131,12 @@ class GoalQueue:
             )
         moving = admit()
         self._check_age(sent, cycle)
-        blend = ledger.goals[-1].blend if moving and ledger.goals and isinstance(goal, PoseGoal) else None
+        planned = self._frames.planned(goal, place)
+        blend = ledger.goals[-1].blend if moving and ledger.goals and isinstance(planned, PoseGoal) else None
         if blend is not None and len(ledger.goals) > self._queue:
             text = f"{self._queue} goals are waiting already (motion.queue): send it when one has ended"
             raise RefusedError(RefusalCode.QUEUE_FULL, text, value=len(ledger.goals), limit=self._queue)
-        self._planner.plan(goal, blend)
+        self._planner.plan(planned, blend)
 
     def _check_age(self, sent: _Sent, cycle: int) -> None:
         """Refuse what can no more begin in time."""

@@ -11,7 +11,7 @@ from trirail_drivers.interface import Triple
 from trirail.control.in_position import Settled
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.messages import Level, Outcome, PoseGoal, Residual, TrajectoryGoal, VelocityGoal
+from trirail.wire.messages import Level, MoveGoal, Outcome, PoseGoal, Residual, TrajectoryGoal, VelocityGoal
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -135,10 +135,10 @@ class Ledger:
             self.goals[0] = self.goals[0]._replace(bound=taken.bound)
             return
         goal, last = request.goal, self.goals[-1] if self.goals else None
-        passes = at_end and last is not None and last.blend is not None and isinstance(goal, PoseGoal)
+        passes = at_end and last is not None and last.blend is not None and isinstance(goal, PoseGoal | MoveGoal)
         if not taken.queued and not passes:
             self.end("preempted", f"preempted by goal {request.id}")
-        blend = goal.blend if isinstance(goal, PoseGoal) else None
+        blend = goal.blend if isinstance(goal, PoseGoal | MoveGoal) else None
         is_jog = isinstance(goal, VelocityGoal)
         settles = goal.settle if isinstance(goal, TrajectoryGoal) else not is_jog
         self.goals.append(

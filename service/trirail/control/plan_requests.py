@@ -25,7 +25,7 @@ from trirail.motion.rate_change import RateChange
 from trirail.motion.runs import STILL, MotionState, Run, nominal, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import SHARES, TimeScaling
-from trirail.wire.messages import Goal
+from trirail.wire.messages import PlannedGoal
 from trirail.wire.planning import Extended, NotPlanned, PlanAnswer, Planned, PlanRequest
 
 LEADS = (0.003, 0.012, 0.048)
@@ -75,7 +75,7 @@ class PlanRequests:
         self._schedule = schedule
         self._leads = [max(LEAST_LEAD, math.ceil(lead / self._period)) for lead in LEADS]
         self._patience = max(LEAST_LEAD, round(PATIENCE / self._period))
-        self._goal: Goal | None = None
+        self._goal: PlannedGoal | None = None
         self._blend: float | None = None
         self._number = 0
         self._asked: PlanRequest | None = None
@@ -97,7 +97,7 @@ class PlanRequests:
         nowhere.take(deque([unpack_run(self._legs, pack_run(Run(self._legs, path, constant(1.0), 1.0)))]))
         RateChange(self._scaling, nowhere, 0.0, self._period).step()
 
-    def plan(self, goal: Goal, blend: float | None = None) -> None:
+    def plan(self, goal: PlannedGoal, blend: float | None = None) -> None:
         """Have a goal planned: to preempt the motion under way, or to follow it from within `blend` [m] of its end."""
         self._goal, self._blend, self._times, self._since = goal, blend, 0, None
         self._asked = self._answer = self._lost = None
@@ -154,7 +154,7 @@ class PlanRequests:
         if change is not None and (self._asked is None or change.lowers) and change.step():
             self._change = None
 
-    def _ask(self, goal: Goal) -> None:
+    def _ask(self, goal: PlannedGoal) -> None:
         """Ask for the goal's motion from the one under way; RefusedError when that has been asked too often."""
         if self._times == len(self._leads):
             text = f"its motion came too late {self._times} times, or the motion under way changed: send the goal again"

@@ -56,7 +56,7 @@ class Setpoints:
             return cycle.hold(legs, bounds, motion, sliders, found, record)
         path, law, (begun, end, arrival) = run.path, run.law, run.course
         return cycle.command(
-            *(legs, bounds, path.knots, path.pieces, path.in_sliders, law.knots, law.pieces, run.time, run.target),
+            *(legs, bounds, *path, law.knots, law.pieces, run.time, run.target),
             *(begun, end, arrival, motion, sliders, found, record),
         )
 

@@ -28,6 +28,9 @@ PLATFORM_PLANNED = (1.0 + 1e-6,) * 3
 """Share of the platform's limits that plans make use of: all of it, but for rounding."""
 PLATFORM_LAWS = (1.0 + 1e-6, 1.01, 1.05)
 """Share of the same while a path's rate changes: none is planned with room for that, and the robot must stop."""
+SUBJECTS = ("a slider", *(f"the platform's {name}" for name in (*COORDINATES, "centre in x", "centre in y")))
+"""What the rows of Look.worst are of. The centre has its own where a path is that of another point: limits hold for
+both."""
 GAP = 0.02
 """Between moments at which a path is looked at, besides its knots [s]."""
 FEWEST, MOST = 16, 64
@@ -43,7 +46,7 @@ class Look(NamedTuple):
     """What was found along a path."""
 
     worst: Array
-    """Velocity, acceleration and jerk (4, 3) of the fastest slider, of x, y and phi, as shares of what plans use."""
+    """Velocity, acceleration and jerk (6, 3) of SUBJECTS, as shares of what plans use."""
     within_limits: bool
     """Whether sliders and platform can bear it, with what is kept for changes of rate."""
     leaves_at: float
@@ -70,8 +73,7 @@ def excess(worst: Array) -> float:
 
 def fastest(worst: Array) -> str:
     """Name what a motion is too fast for."""
-    row = int((worst**POWERS).max(axis=1).argmax())
-    return f"the platform's {COORDINATES[row - 1]}" if row else "a slider"
+    return SUBJECTS[int((worst**POWERS).max(axis=1).argmax())]
 
 
 def parts(path: Path, law: Path, first: float, until: float, knots: int) -> list[tuple[float, float]]:
@@ -91,12 +93,14 @@ class Checker:
 
     def __init__(self, geometry: Geometry, limits: Limits, bounds: Bounds, period: float) -> None:
         platform, slider = limits.platform, limits.slider
-        each = np.array([[slider.velocity, slider.acceleration, slider.jerk], [0.0] * 3, [0.0] * 3, [0.0] * 3])
-        each[1:] = np.array([platform.velocity, platform.acceleration, platform.jerk]).T
-        self._planned = each * [PLANNED, *[PLATFORM_PLANNED] * 3]
-        self._laws = each * [LAWS, *[PLATFORM_LAWS] * 3] / self._planned * (1.0 + ROUNDING)
+        x, y, phi = np.array([platform.velocity, platform.acceleration, platform.jerk]).T
+        each = np.array([[slider.velocity, slider.acceleration, slider.jerk], x, y, phi, x, y])
+        self._planned = each * [PLANNED, *[PLATFORM_PLANNED] * 5]
+        self._laws = each * [LAWS, *[PLATFORM_LAWS] * 5] / self._planned * (1.0 + ROUNDING)
         self.slider_limits = self._planned[0]
         """Velocity, acceleration and jerk that plans make use of."""
+        self.centre_limits = self._planned[4:]
+        """Likewise of the platform's centre in x and y, on a path of another point (2, 3)."""
         self._legs = geometry.packed()
         self._bounds = bounds
         self._period = period
@@ -109,7 +113,7 @@ class Checker:
         if first == 0.0 and law.pieces[0, 0, 0] == 0.0 and not path.pieces[0, :, 1].any():
             first = -self._period
         even = min(max(FEWEST, int((until - first) / GAP)), MOST)
-        worst, start = np.zeros((4, 3)), np.array(pose, dtype=np.float64)
+        worst, start = np.zeros((len(SUBJECTS), 3)), np.array(pose, dtype=np.float64)
         leaves_at = survey(self._legs, *path, *law[:2], first, until, even, self._period, start, self._box, worst)
         worst /= self._planned
         return Look(worst, math.isnan(leaves_at) and self.bears(worst), leaves_at)
@@ -120,7 +124,7 @@ class Checker:
 
     def whole(self, path: Path, pose: Sequence[float]) -> Array:
         """Return Look.worst of a whole path. Raises RefusedError where it leaves the workspace."""
-        law, worst = constant(1.0), np.zeros((4, 3))
+        law, worst = constant(1.0), np.zeros((len(SUBJECTS), 3))
         for first, until in parts(path, law, 0.0, path.duration, KNOTS_A_PART):
             found = self.look(path, law, first, until, pose)
             if not math.isnan(found.leaves_at):

@@ -11,12 +11,12 @@ from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
 from trirail.motion.paths import HALVINGS, Path, constant
-from trirail.motion.planner import TOO_FAST_IN_MOTION, Kinodynamic, Plan, Planner
+from trirail.motion.planner import NO_TOOL, TOO_FAST_IN_MOTION, Kinodynamic, Plan, Planner
 from trirail.motion.quintic import Point
 from trirail.motion.runs import MotionState, Run, nominal, rest, stretched
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import TimeScaling
-from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
+from trirail.wire.messages import PlannedGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 
 SLOWEST = 0.05
 """Where the time along a path runs slower than this, a new goal is planned from a standstill."""
@@ -66,7 +66,7 @@ class Goals:
         self._planner = Planner(geometry, limits.platform, limits.slider, bounds, checker, period)
         self.time_scaling = TimeScaling(geometry, limits.platform, checker, period)
 
-    def plan(self, goal: Goal, schedule: Schedule, rate: float, lead: int) -> PlannedMotion:
+    def plan(self, goal: PlannedGoal, schedule: Schedule, rate: float, lead: int) -> PlannedMotion:
         """Return the motion to a goal, its time to run at `rate`, from the commanded state of the motion under way.
 
         Where the robot moves, it begins so many cycles later: as asked for, or with a lower speed or after a stop on
@@ -117,15 +117,15 @@ class Goals:
             RefusalCode.NO_PLAN, "no motion follows at this override: send the goal again when it is lower"
         )
 
-    def _check(self, goal: Goal) -> None:
+    def _check(self, goal: PlannedGoal) -> None:
         """Refuse what can be reached from nowhere."""
         if isinstance(goal, PoseGoal):
-            self._planner.check_pose((goal.x, goal.y, goal.phi))
+            self._planner.check_pose((goal.x, goal.y, goal.phi), tool_of(goal))
             self._limits(goal)
         elif isinstance(goal, SlidersGoal):
             self._planner.check_sliders(goal.position)
 
-    def _set_out(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
+    def _set_out(self, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
         """Plan from the commanded motion."""
         start = schedule.commanded
         if start.at_rest:
@@ -146,7 +146,7 @@ class Goals:
                 return PlannedMotion(run, duration, plan.slowed, bound=plan.bound)
         raise TOO_FAST_IN_MOTION
 
-    def _stop_first(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
+    def _stop_first(self, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
         """Plan from where the motion under way can be stopped."""
         stop, law = schedule.runs[0].copy(), None
         if stop.target != 0.0:
@@ -160,7 +160,7 @@ class Goals:
         duration = left + run.ends if rate else math.inf
         return PlannedMotion(run, duration, plan.slowed, stops_first=True, stop=law, bound=plan.bound)
 
-    def _plan(self, goal: Goal, start: MotionState) -> Plan:
+    def _plan(self, goal: PlannedGoal, start: MotionState) -> Plan:
         planner = self._planner
         match goal:
             case PoseGoal():
@@ -175,7 +175,7 @@ class Goals:
 
     def _to_pose(self, goal: PoseGoal, start: MotionState) -> Plan:
         target = goal.x, goal.y, goal.phi
-        return self._planner.to_pose(start, target, goal.speed, self._limits(goal))
+        return self._planner.to_pose(start, target, goal.speed, self._limits(goal), tool_of(goal))
 
     def _limits(self, goal: PoseGoal) -> Kinodynamic | None:
         own = goal.limits
@@ -207,3 +207,10 @@ class Goals:
         if not math.isfinite(last):  # it is to stop before: it will go on at full speed at most, or be looked at anew
             law, first, last = constant(1.0), s, longer.path.duration
         return self._checker.look(longer.path, law, first, last, nominal(run.path, s).pose).within_limits
+
+
+def tool_of(goal: PoseGoal) -> tuple[float, float]:
+    """Return the point of the platform that a planned pose is of; its name is known where the goal came in."""
+    if isinstance(goal.tool, str):
+        raise TypeError(f"tool {goal.tool!r} of a planned goal is no point")
+    return goal.tool or NO_TOOL

@@ -15,7 +15,7 @@ POWERS = 6
 
 def pack_path(path: Path) -> PackedPath:
     """Return a path as it is sent."""
-    return PackedPath(path.knots.tobytes(), path.pieces.tobytes(), path.in_sliders)
+    return PackedPath(path.knots.tobytes(), path.pieces.tobytes(), path.in_sliders, path.tools.tobytes())
 
 
 def unpack_path(packed: PackedPath, degrees: int) -> Path:
@@ -28,9 +28,13 @@ def unpack_path(packed: PackedPath, degrees: int) -> Path:
     number = len(knots) - 1
     if number < 1 or len(pieces) != number * degrees * POWERS:
         raise ValueError(f"a path of {len(knots)} knots and {len(pieces)} coefficients in {degrees} coordinates")
-    if not (np.isfinite(knots).all() and np.isfinite(pieces).all() and (np.diff(knots) >= 0.0).all()):
+    tools = np.frombuffer(packed.tools).copy()
+    if len(tools) not in (0, 2 * number):
+        raise ValueError(f"a path of {number} pieces with {len(tools)} coordinates of tools")
+    finite = all(np.isfinite(numbers).all() for numbers in (knots, pieces, tools))
+    if not (finite and (np.diff(knots) >= 0.0).all()):
         raise ValueError("a path whose numbers are not finite, or whose knots do not ascend")
-    return Path(knots, pieces.reshape(number, degrees, POWERS), packed.in_sliders)
+    return Path(knots, pieces.reshape(number, degrees, POWERS), packed.in_sliders, tools.reshape(-1, 2))
 
 
 def pack_run(run: Run) -> PackedRun:

@@ -10,7 +10,7 @@ import numpy as np
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.closure import LEGS_TYPE, inverse_motion
 from trirail.kinematics.compiled import compiled
-from trirail.motion.paths import HALVINGS, ROUNDING, law_at, platform_at, reached
+from trirail.motion.paths import HALVINGS, ROUNDING, law_at, platform_at, reached, tool_at, transfer
 
 __all__ = ["survey"]
 
@@ -77,6 +77,7 @@ class Way(NamedTuple):
     knots: Array
     pieces: Array
     in_sliders: bool
+    tools: Array
     law_knots: Array
     law_pieces: Array
     box: Array
@@ -86,7 +87,7 @@ class Way(NamedTuple):
 def _look(way: Way, time: float, near: Array, motion: Array, sliders: Array) -> bool:
     """Write platform and sliders at a time of the law; whether they are within reach."""
     law = law_at(way.law_knots, way.law_pieces, time)
-    if platform_at(way.legs, way.knots, way.pieces, way.in_sliders, law, near, motion) != 0:
+    if platform_at(way.legs, way.knots, way.pieces, way.in_sliders, way.tools, law, near, motion) != 0:
         return False
     if way.in_sliders:
         near[:] = motion[0]
@@ -148,9 +149,27 @@ def _measure_rates(now: Array, then: Array, i: int, step: float, whole: bool, wo
 
 
 @compiled()
+def _measure_tool(way: Way, time: float, motion: Array, arms: Array, step: float, whole: bool, worst: Array) -> None:
+    """Measure the rates of x, y, phi: of the path's tool, and of the centre in the two last rows where it is another.
+
+    `motion` (3, 3, 3) holds the platform a step later and at a time; `arms` (2, 3, 3) is room for the tool's.
+    """
+    u, v = tool_at(way.knots, way.tools, law_at(way.law_knots, way.law_pieces, time)[0])
+    arms[:] = motion[:2]
+    if u != 0.0 or v != 0.0:
+        # Of the same point a step later, also where another one's piece begins in between.
+        transfer(arms[0], u, v)
+        transfer(arms[1], u, v)
+        for i in range(2):
+            _measure_rates(motion[1], motion[0], i, step, whole, worst[4 + i])
+    for i in range(3):
+        _measure_rates(arms[1], arms[0], i, step, whole, worst[1 + i])
+
+
+@compiled()
 def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst: Array) -> tuple[float, float]:
     """Look at a path at ascending times and a step later; return the last time within reach, and one beyond it."""
-    motion, sliders = np.empty((3, 3, 3)), np.empty((3, 6, 3))
+    motion, sliders, arms = np.empty((3, 3, 3)), np.empty((3, 6, 3)), np.empty((2, 3, 3))
     last = -math.inf
     for k in range(len(times)):
         time = times[k]
@@ -168,12 +187,12 @@ def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst:
         whole = time >= 0.0 and last <= until  # else it is the step from or to a standstill, in which nothing else is
         for i in range(3):
             _measure_rates(sliders[1], sliders[0], i, step, whole, worst[0])
-            _measure_rates(motion[1], motion[0], i, step, whole, worst[1 + i])
+        _measure_tool(way, time, motion, arms, step, whole, worst)
     return last, math.nan
 
 
 @compiled(
-    f"f8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], "
+    f"f8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[:, ::1], f8[::1], f8[:, :, ::1], "
     "f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
 def survey(
@@ -181,6 +200,7 @@ def survey(
     knots: Array,
     pieces: Array,
     in_sliders: bool,
+    tools: Array,
     law_knots: Array,
     law_pieces: Array,
     first: float,
@@ -196,10 +216,11 @@ def survey(
     It is looked at `even` times, at its knots and between them, and where a position turns near its limit. Jerk is
     what the setpoints before and after a `step` [s] say of it, as the drives see it. `start` is the pose at the first
     time. `box` (2, 5) holds the limits, low and high, of x, y, phi, lambda_10 and lambda_32. Returns when it is first
-    out of reach, else not a number. `worst` (4, 3) has velocity, acceleration and jerk of the fastest slider, of x, y
-    and phi; it means nothing where the path is out of reach.
+    out of reach, else not a number. `worst` (6, 3) has velocity, acceleration and jerk of the fastest slider, of x, y
+    and phi of the path's tool, and of x and y of the platform's centre where the tool is another point; nothing where
+    the path is out of reach.
     """
-    way = Way(legs, knots, pieces, in_sliders, law_knots, law_pieces, box)
+    way = Way(legs, knots, pieces, in_sliders, tools, law_knots, law_pieces, box)
     times = _moments(knots, law_knots, law_pieces, first, until, even, step)
     near = start.copy()
     worst[:] = 0.0

@@ -3,10 +3,15 @@
 A path has knots (n + 1,) in seconds and pieces (n, d, 6): coefficients of ascending powers of the time since the
 piece's knot, for each of d coordinates. A law is a path of one coordinate: s, the time along the path, as a function
 of time. Compiled; errors are codes.
+
+In pose space the coordinates are those of a point of the platform, the tool: its place in the base frame [m], and phi.
+The platform is a rigid body, so that its centre follows: p = T - R(phi) t for a tool at t in the platform's frame. This
+is where a path becomes a platform pose; nobody else need know of tools.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +20,19 @@ from trirail.kinematics.algebra import Array, Vector
 from trirail.kinematics.closure import LEGS_TYPE, forward_motion
 from trirail.kinematics.compiled import compiled
 
-__all__ = ["Path", "advance", "constant", "law_at", "platform_at", "reached", "value"]
+__all__ = [
+    "CENTRE",
+    "Path",
+    "advance",
+    "constant",
+    "law_at",
+    "path_motion",
+    "platform_at",
+    "reached",
+    "tool_at",
+    "transfer",
+    "value",
+]
 
 FOR_EVER = 1e9
 """How long the last piece of a law lasts [s]."""
@@ -23,6 +40,8 @@ HALVINGS = 48
 """Of an interval, until it is narrower than numbers of its size can tell."""
 ROUNDING = 1e-9
 """By so much may a position be beyond its limit, or two times be the same [m, rad, s]."""
+CENTRE = np.zeros((0, 2))
+"""The tools of a path of the platform's centre."""
 
 
 class Path(NamedTuple):
@@ -31,6 +50,8 @@ class Path(NamedTuple):
     knots: Array
     pieces: Array
     in_sliders: bool = False
+    tools: Array = CENTRE
+    """Of which point of the platform each piece is the motion, in the platform's frame (n, 2) [m]; CENTRE for none."""
 
     @property
     def duration(self) -> float:
@@ -39,7 +60,7 @@ class Path(NamedTuple):
 
     @property
     def end(self) -> Array:
-        """Where it ends, (d,)."""
+        """Where it ends, (d,), in its own coordinates."""
         end: Array = self.pieces[-1] @ (self.knots[-1] - self.knots[-2]) ** np.arange(6.0)
         return end
 
@@ -92,6 +113,35 @@ def value_at(knots: Array, pieces: Array, time: float, out: Array) -> None:
 
 
 @compiled()
+def tool_at(knots: Array, tools: Array, time: float) -> tuple[float, float]:
+    """Return of which point of the platform a path is the motion at a time along it, in the platform's frame [m]."""
+    if len(tools) == 0:
+        return 0.0, 0.0
+    piece = _moment(knots, time).piece
+    return tools[piece, 0], tools[piece, 1]
+
+
+@compiled("void(f8[:, ::1], f8, f8)")
+def transfer(motion: Array, u: float, v: float) -> None:
+    """Make of the motion of one point of the platform that of the point (u, v) beyond it, in the platform's frame [m].
+
+    `motion` (3, 3) has the rows x, y, phi, and their first and second derivatives. With r = R(phi) (u, v), and r turned
+    by a right angle: p + r, p' + phi' r_, p'' + phi'' r_ - phi'^2 r.
+    """
+    if u == 0.0 and v == 0.0:
+        return
+    c, s = math.cos(motion[0, 2]), math.sin(motion[0, 2])
+    x, y = c * u - s * v, s * u + c * v
+    rate, change = motion[1, 2], motion[2, 2]
+    motion[0, 0] += x
+    motion[0, 1] += y
+    motion[1, 0] -= rate * y
+    motion[1, 1] += rate * x
+    motion[2, 0] -= change * y + rate * rate * x
+    motion[2, 1] += change * x - rate * rate * y
+
+
+@compiled()
 def law_at(knots: Array, pieces: Array, time: float) -> Vector:
     """Return where a law is: time along the path [s], its rate, and the rate's change [1/s]."""
     at = _moment(knots, time)
@@ -105,25 +155,33 @@ def value(knots: Array, pieces: Array, time: float, out: Array) -> None:
 
 
 @compiled()
-def motion_at(knots: Array, pieces: Array, law: Vector, out: Array) -> None:
-    """Write where a path is, where its law is: value and two derivatives, (3, d)."""
+def motion_at(knots: Array, pieces: Array, tools: Array, law: Vector, out: Array) -> None:
+    """Write the motion of sliders or of the platform's centre where a path's law is: value and two derivatives."""
     s, rate, change = law
     value_at(knots, pieces, s, out)
     for i in range(3):
         out[2, i] = out[2, i] * rate * rate + out[1, i] * change
         out[1, i] *= rate
+    u, v = tool_at(knots, tools, s)
+    transfer(out, -u, -v)
+
+
+@compiled("void(f8[::1], f8[:, :, ::1], f8[:, ::1], f8, f8[:, ::1])")
+def path_motion(knots: Array, pieces: Array, tools: Array, time: float, out: Array) -> None:
+    """Write sliders or platform's centre at a time along a path [s], at full speed, into `out` (3, 3)."""
+    motion_at(knots, pieces, tools, (time, 1.0, 0.0), out)
 
 
 @compiled()
 def platform_at(
-    legs: Array, knots: Array, pieces: Array, in_sliders: bool, law: Vector, near: Array, out: Array
+    legs: Array, knots: Array, pieces: Array, in_sliders: bool, tools: Array, law: Vector, near: Array, out: Array
 ) -> int:
     """Write where the platform is, where a path's law is: pose, velocity and acceleration (3, 3).
 
     A path in slider space is turned into the platform's motion on the branch of the pose `near`. Returns 0, or a
     code of forward_into.
     """
-    motion_at(knots, pieces, law, out)
+    motion_at(knots, pieces, tools, law, out)
     if not in_sliders:
         return 0
     sliders = (
@@ -134,12 +192,13 @@ def platform_at(
     return forward_motion(legs, sliders, near, out)
 
 
-@compiled(f"i8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[::1], f8[:, :, ::1], f8, f8[::1], f8[:, ::1])")
+@compiled(f"i8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[:, ::1], f8[::1], f8[:, :, ::1], f8, f8[::1], f8[:, ::1])")
 def advance(
     legs: Array,
     knots: Array,
     pieces: Array,
     in_sliders: bool,
+    tools: Array,
     law_knots: Array,
     law_pieces: Array,
     time: float,
@@ -147,7 +206,7 @@ def advance(
     out: Array,
 ) -> int:
     """Write the platform's pose, velocity and acceleration (3, 3) at a time of the law [s]; see platform_at."""
-    return platform_at(legs, knots, pieces, in_sliders, law_at(law_knots, law_pieces, time), near, out)
+    return platform_at(legs, knots, pieces, in_sliders, tools, law_at(law_knots, law_pieces, time), near, out)
 
 
 @compiled("f8(f8[::1], f8[:, :, ::1], f8, f8)")

@@ -18,7 +18,7 @@ from trirail.motion.limits import COORDINATES, Bounds, beyond, told_apart
 from trirail.motion.paths import Path, constant
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.ruckig_call import solved
-from trirail.motion.runs import STILL, MotionState, from_ruckig, joined, stretched
+from trirail.motion.runs import STILL, MotionState, from_ruckig, joined, of_centre, of_tool, rest, stretched, tools_of
 from trirail.motion.straight_lines import time_optimal
 
 GENTLEST = 0.1
@@ -42,6 +42,10 @@ START = 1e-4
 """How far a trajectory may begin from where the robot stands [m, rad]."""
 STANDS = 1e-6
 """Velocity at the ends of a trajectory that counts as rounding, and is taken for none [m/s, rad/s]."""
+FASTEST = 1e6
+"""A limit for where nothing moves [m/s, m/s², m/s³]."""
+NO_TOOL = (0.0, 0.0)
+"""The platform's centre, as a point of the platform [m]."""
 
 TOO_FAST_IN_MOTION = RefusedError(
     RefusalCode.TOO_FAST, "from its present motion the robot cannot take this path within its sliders' limits"
@@ -80,19 +84,23 @@ class Planner:
     ) -> None:
         self._legs = geometry.packed()
         self._platform = Kinodynamic(platform.velocity, platform.acceleration, platform.jerk)
+        self._centre = checker.centre_limits
         self._sliders = Kinodynamic(*([ROOM * limit] * 3 for limit in checker.slider_limits.tolist()))
         self._checked_sliders = Kinodynamic(*([limit] * 3 for limit in checker.slider_limits.tolist()))
         self._travel = slider.position
         self._bounds = bounds
         self._checker = checker
         self._period = period
-        self._ruckig = Ruckig(3)
+        self._ruckig, self._along_a_line = Ruckig(3), Ruckig(1)
         # How far the platform's edges are: what a turn by one radian moves at most.
         self._reach = max(math.hypot(*leg.edge_point) for leg in geometry.legs)
 
-    def check_pose(self, target: Sequence[float]) -> None:
-        """Raise RefusedError, with coordinate, value and limit, if a pose is out of the workspace."""
-        if violation := self._bounds.pose(target):
+    def check_pose(self, target: Sequence[float], tool: Sequence[float] = NO_TOOL) -> None:
+        """Raise RefusedError, with coordinate, value and limit, if a pose is out of the workspace.
+
+        The pose is that of a tool, (u, v) in the platform's frame [m]; the workspace that of the platform's centre.
+        """
+        if violation := self._bounds.pose(of_centre(rest(target), tool).pose):
             raise RefusedError(
                 RefusalCode.OUT_OF_WORKSPACE,
                 f"the goal is out of the workspace: {violation}",
@@ -127,16 +135,24 @@ class Planner:
         )
 
     def to_pose(
-        self, start: MotionState, target: Sequence[float], speed: float = 1.0, limits: Kinodynamic | None = None
+        self,
+        start: MotionState,
+        target: Sequence[float],
+        speed: float = 1.0,
+        limits: Kinodynamic | None = None,
+        tool: Sequence[float] = NO_TOOL,
     ) -> Plan:
         """Plan to rest at a pose, straight in pose space from rest; at `speed` 0.5 it takes twice as long.
+
+        The target is the pose of a tool, (u, v) in the platform's frame [m]: it is this point that goes straight, and
+        within `limits`; those of the platform hold for its centre as well.
 
         A path that is too fast for a slider or the platform gives way to the time-optimal one on the same line, or is
         slowed as a whole where that is not quicker. Raises RefusedError with slider or coordinate, value and limit
         where it leaves the workspace, or where it cannot be slowed since it starts in motion.
         """
-        self.check_pose(target)
-        return self._to_rest(start, start, target, limits or self._platform, speed)
+        self.check_pose(target, tool)
+        return self._to_rest(start, of_tool(start, tool), target, limits or self._platform, speed, tool=tool)
 
     def to_sliders(self, start: MotionState, target: Sequence[float], speed: float = 1.0) -> Plan:
         """Plan to rest at slider positions, straight in slider space from rest; as to_pose otherwise."""
@@ -212,10 +228,11 @@ class Planner:
         limits: Kinodynamic,
         speed: float,
         in_sliders: bool = False,
+        tool: Sequence[float] = NO_TOOL,
     ) -> Plan:
-        """Plan from `begin`, the platform's motion `start` or that of the sliders."""
+        """Plan from `begin`, the platform's motion `start` as that of the sliders or of a tool."""
         if start.at_rest:
-            path = self._solve(begin, limits, in_sliders, target=target)
+            path = self._solve(begin, limits, in_sliders, tool, target=target)
             slower = max(1.0 / speed, excess(self._checker.whole(path, start.pose)))
             if slower * speed > 1.0:
                 quickest = self._quickest(path, limits, path.duration / speed, start.pose)
@@ -227,7 +244,7 @@ class Planner:
         shares = np.full(3, speed)
         for _ in range(TRIES):
             lower = Kinodynamic(*(np.array(limits) * shares[:, None]).tolist())
-            path = self._solve(begin, lower, in_sliders, target=target)
+            path = self._solve(begin, lower, in_sliders, tool, target=target)
             worst = self._checker.whole(path, start.pose)
             if self._checker.bears(worst):
                 return Plan(path, speed / float(shares.min()))
@@ -240,7 +257,7 @@ class Planner:
         None where there is none, or none that fits.
         """
         others = self._platform if path.in_sliders else self._checked_sliders
-        quickest = time_optimal(self._legs, path, limits, others, pose)
+        quickest = time_optimal(self._legs, path, limits, others, self._centre, pose)
         if quickest is None:
             return None
         try:
@@ -283,11 +300,14 @@ class Planner:
         start: MotionState,
         limits: Kinodynamic,
         in_sliders: bool = False,
+        tool: Sequence[float] = NO_TOOL,
         *,
         target: Sequence[float] | None = None,
         velocity: Sequence[float] | None = None,
     ) -> Path:
         """Ask Ruckig for the way to rest at a target, or to a velocity."""
+        if target is not None and start.at_rest:
+            return self._straight(start.pose, target, limits, in_sliders, tool)
         request, trajectory = InputParameter(3), Trajectory(3)
         request.current_position = list(start.pose)
         request.current_velocity = list(start.velocity)
@@ -300,10 +320,48 @@ class Planner:
         if velocity is not None:
             request.control_interface = ControlInterface.Velocity
             request.target_velocity = list(velocity)
+        return self._solved(self._ruckig, request, trajectory, limits.jerk, in_sliders, tool)
+
+    def _straight(
+        self,
+        begin: Sequence[float],
+        target: Sequence[float],
+        limits: Kinodynamic,
+        in_sliders: bool,
+        tool: Sequence[float],
+    ) -> Path:
+        """Return the straight way from rest to rest, in the coordinate that goes farthest; the others share its time.
+
+        Ruckig's phase synchronisation gives up where one coordinate's velocity, acceleration or jerk would have to be
+        lower than it takes alone: three goals in a hundred then left their line.
+        """
+        length = np.subtract(target, begin)
+        farthest = float(np.abs(length).max())
+        shares = length / farthest if farthest else np.zeros(3)
+        with np.errstate(divide="ignore"):
+            velocity, acceleration, jerk = (np.array(limits) / np.abs(shares)).min(axis=1)
+        request, trajectory = InputParameter(1), Trajectory(1)
+        request.target_position = [farthest]
+        request.max_velocity, request.max_acceleration = [min(velocity, FASTEST)], [min(acceleration, FASTEST)]
+        along = self._solved(self._along_a_line, request, trajectory, [min(jerk, FASTEST)])
+        pieces = along.pieces * shares[:, None]
+        pieces[:, :, 0] += begin
+        return Path(along.knots, pieces, in_sliders, tools_of(tool, len(pieces)))
+
+    def _solved(
+        self,
+        ruckig: Ruckig,
+        request: InputParameter,
+        trajectory: Trajectory,
+        jerk: Sequence[float],
+        in_sliders: bool = False,
+        tool: Sequence[float] = NO_TOOL,
+    ) -> Path:
+        """Return Ruckig's answer as a path; the request lacks its limits of jerk. Raises RefusedError."""
         for share in JERK_SHARES:
-            request.max_jerk = [share * limit for limit in limits.jerk]
-            if solved(self._ruckig, request, trajectory):
-                return from_ruckig(trajectory, in_sliders)
+            request.max_jerk = [share * limit for limit in jerk]
+            if solved(ruckig, request, trajectory):
+                return from_ruckig(trajectory, in_sliders, tool)
         raise RefusedError(
             RefusalCode.NO_PLAN, "no motion leads there from the present one: send the goal again when it holds"
         )

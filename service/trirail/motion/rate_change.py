@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail.motion.feasibility import Look, parts
+from trirail.motion.feasibility import SUBJECTS, Look, parts
 from trirail.motion.paths import Path, constant
 from trirail.motion.runs import Run
 from trirail.motion.schedule import Schedule
@@ -96,7 +96,7 @@ class RateChange:
         if self.rate > 1.0 and schedule.runs:
             run = schedule.runs[-1]
             self._from = run.at.s if len(schedule.runs) == 1 else 0.0
-            self._worst, self._leaves_at = np.zeros((4, 3)), math.nan
+            self._worst, self._leaves_at = np.zeros((len(SUBJECTS), 3)), math.nan
             law = constant(1.0, self._from)
             self._unbounded = parts(run.path, law, 0.0, run.path.duration - self._from, self._knots)[::-1]
 

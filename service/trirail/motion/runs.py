@@ -11,7 +11,7 @@ import numpy as np
 from ruckig import Trajectory
 
 from trirail.kinematics.algebra import Array
-from trirail.motion.paths import FOR_EVER, Path, advance, constant, reached, value
+from trirail.motion.paths import CENTRE, FOR_EVER, Path, advance, constant, path_motion, reached, transfer, value
 
 STILL = (0.0, 0.0, 0.0)
 SAME_TIME = 1e-9
@@ -34,6 +34,19 @@ class MotionState(NamedTuple):
 def rest(pose: Sequence[float]) -> MotionState:
     """Stand at a pose."""
     return MotionState(tuple(pose), STILL, STILL)
+
+
+def of_tool(motion: MotionState, tool: Sequence[float]) -> MotionState:
+    """Return the motion of a point of the platform, (u, v) in its frame [m], from that of the platform's centre."""
+    rows = np.array(motion, dtype=np.float64)
+    transfer(rows, *tool)
+    return MotionState(*rows.tolist())
+
+
+def of_centre(motion: MotionState, tool: Sequence[float]) -> MotionState:
+    """Return the motion of the platform's centre from that of a point, (u, v) in the platform's frame [m]."""
+    u, v = tool
+    return of_tool(motion, (-u, -v))
 
 
 class Rate(NamedTuple):
@@ -134,8 +147,14 @@ class Run:
 
     def destination(self, near: Sequence[float]) -> Sequence[float]:
         """Return the pose that the goal under way leads to, on the branch of the pose `near`."""
+        return self._end_of(self.seams[0].before if self.seams else self.path, near)
+
+    def end(self, near: Sequence[float]) -> Sequence[float]:
+        """Return the pose at the end of the path, that the last goal leads to, on the branch of the pose `near`."""
+        return self._end_of(self.path, near)
+
+    def _end_of(self, path: Path, near: Sequence[float]) -> Sequence[float]:
         self._near[:] = near
-        path = self.seams[0].before if self.seams else self.path
         code = advance(self._legs, *path, *constant(1.0)[:2], path.duration, self._near, self._out)
         return [math.nan] * 3 if code else self._out[0].tolist()
 
@@ -179,9 +198,9 @@ class Run:
 
 
 def nominal(path: Path, s: float) -> MotionState:
-    """Return the motion at a time along a path [s], at full speed; in the path's own coordinates."""
+    """Return the motion of the platform at a time along a path [s], at full speed; of sliders on a path in these."""
     out = np.zeros((3, 3))
-    value(path.knots, path.pieces, s, out)
+    path_motion(path.knots, path.pieces, path.tools, s, out)
     return MotionState(*out.tolist())
 
 
@@ -194,8 +213,8 @@ def arrival(law: Path, target: float, s: float) -> float:
     return begins + (s - at) / rate if rate > 0.0 and target > 0.0 else np.inf
 
 
-def from_ruckig(trajectory: Trajectory, in_sliders: bool = False) -> Path:
-    """Take a Ruckig trajectory over as a path: between its switching times everything is a cubic."""
+def from_ruckig(trajectory: Trajectory, in_sliders: bool = False, tool: Sequence[float] = STILL[:2]) -> Path:
+    """Take a Ruckig trajectory over as a path, of a tool: between its switching times everything is a cubic."""
     duration: float = trajectory.duration
     times = {0.0, duration}
     for profile in trajectory.profiles[0]:
@@ -216,7 +235,12 @@ def from_ruckig(trajectory: Trajectory, in_sliders: bool = False) -> Path:
     pieces[:, :, 1] = states[:-1, 1]
     pieces[:, :, 2] = states[:-1, 2] / 2.0
     pieces[:, :, 3] = np.diff(states[:, 2], axis=0) / np.diff(knots)[:, None] / 6.0
-    return Path(np.array(knots), pieces, in_sliders)
+    return Path(np.array(knots), pieces, in_sliders, tools_of(tool, len(pieces)))
+
+
+def tools_of(tool: Sequence[float], number: int) -> Array:
+    """Return the tools of a path of so many pieces, all of one point of the platform [m]."""
+    return np.tile(np.array(tool, dtype=np.float64), (number, 1)) if any(tool) else CENTRE
 
 
 def law_from_ruckig(trajectory: Trajectory, target: float) -> Path:
@@ -231,7 +255,10 @@ def joined(paths: Sequence[Path]) -> Path:
     """Return one path after the other."""
     ends = np.cumsum([path.duration for path in paths])
     knots = [paths[0].knots, *(path.knots[1:] + end for path, end in zip(paths[1:], ends, strict=False))]
-    return Path(np.concatenate(knots), np.concatenate([path.pieces for path in paths]), paths[0].in_sliders)
+    tools = CENTRE
+    if any(len(path.tools) for path in paths):
+        tools = np.concatenate([path.tools if len(path.tools) else np.zeros((len(path.pieces), 2)) for path in paths])
+    return Path(np.concatenate(knots), np.concatenate([path.pieces for path in paths]), paths[0].in_sliders, tools)
 
 
 def cut(path: Path, s: float) -> Path:
@@ -239,9 +266,9 @@ def cut(path: Path, s: float) -> Path:
     if s >= path.duration:
         return path
     last = max(1, int(np.searchsorted(path.knots, s - SAME_TIME)))
-    return Path(np.append(path.knots[:last], s), path.pieces[:last], path.in_sliders)
+    return path._replace(knots=np.append(path.knots[:last], s), pieces=path.pieces[:last], tools=path.tools[:last])
 
 
 def stretched(path: Path, factor: float) -> Path:
     """Return the same path, `factor` times slower."""
-    return Path(path.knots * factor, path.pieces / factor ** np.arange(6.0), path.in_sliders)
+    return path._replace(knots=path.knots * factor, pieces=path.pieces / factor ** np.arange(6.0))

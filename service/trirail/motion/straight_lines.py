@@ -11,7 +11,7 @@ from trirail.kinematics.algebra import Array
 from trirail.kinematics.closure import LEGS_TYPE, forward_motion, inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.recursion import ZERO
-from trirail.motion.paths import ROUNDING, Path, law_at
+from trirail.motion.paths import ROUNDING, Path, law_at, transfer
 from trirail.motion.time_optimal import FIXED, minimise_time, spline_states, too_fast
 
 __all__ = ["time_optimal"]
@@ -27,24 +27,32 @@ START = 1.01
 
 
 def time_optimal(
-    legs: Array, path: Path, own: Sequence[Sequence[float]], others: Sequence[Sequence[float]], near: Sequence[float]
+    legs: Array,
+    path: Path,
+    own: Sequence[Sequence[float]],
+    others: Sequence[Sequence[float]],
+    centre: Array,
+    near: Sequence[float],
 ) -> Path | None:
     """Return the fastest straight way from rest where a path begins to rest where it ends; None where there is none.
 
     Rows velocity, acceleration and jerk (3, 3) limit the coordinates in which the path is given, `own`, and those of
-    the other space, `others`: platform or sliders. `near` is a pose on the branch of a path in slider space. The limits
-    are held at some moments only: the way is to be looked at, as every path is.
+    the other space, `others`: platform or sliders; `centre` (2, 3) those of the platform's centre in x and y, where
+    the path is that of another point. `near` is a pose on the branch of a path in slider space. The limits are held at
+    some moments only: the way is to be looked at, as every path is.
     """
     begin = path.pieces[0, :, 0].copy()
     length = path.end - begin
     square = float((length * length).sum())
-    samples = np.empty((CELLS + 1, 4, 2))
+    limits = np.empty((6 if len(path.tools) else 4, 3))
+    samples = np.empty((CELLS + 1, len(limits), 2))
     branch = np.array(near, dtype=np.float64)
-    if math.sqrt(square) <= ROUNDING or _sample(legs, begin, length, path.in_sliders, branch, samples):
+    tool = path.tools[0] if len(path.tools) else np.zeros(2)
+    if math.sqrt(square) <= ROUNDING or _sample(legs, begin, length, path.in_sliders, tool, branch, samples):
         return None
-    limits = np.empty((4, 3))
     limits[:3] = np.array(others).T
     limits[3] = 1.0 / (np.abs(length) / np.array(own)).max(axis=1)
+    limits[4:] = centre[: len(limits) - 4]
     limits *= BETWEEN
     behind = (path.pieces * length[:, None]).sum(axis=1, keepdims=True) / square
     behind[:, :, 0] -= float((begin * length).sum()) / square
@@ -61,7 +69,8 @@ def time_optimal(
     pieces = np.zeros((INTERVALS, 3, 6))
     pieces[:, :, :4] = (states / (1.0, 1.0, 2.0, 6.0))[:, None] * length[:, None]
     pieces[:, :, 0] += begin
-    return Path(np.linspace(0.0, INTERVALS * step * slower, INTERVALS + 1), pieces, path.in_sliders)
+    knots = np.linspace(0.0, INTERVALS * step * slower, INTERVALS + 1)
+    return Path(knots, pieces, path.in_sliders, np.tile(path.tools[:1], (INTERVALS, 1)))
 
 
 def _fastest(states: Array, step: float) -> float:
@@ -74,12 +83,14 @@ def _fastest(states: Array, step: float) -> float:
     return float(np.abs(v + a * turn + j * turn**2 / 2.0).max())
 
 
-@compiled(f"i8({LEGS_TYPE}, f8[::1], f8[::1], b1, f8[::1], f8[:, :, ::1])")
-def _sample(legs: Array, begin: Array, length: Array, in_sliders: bool, near: Array, out: Array) -> int:
-    """Write how the other space's coordinates, and sigma itself, change with sigma; 0, or a code of forward_into."""
+@compiled(f"i8({LEGS_TYPE}, f8[::1], f8[::1], b1, f8[::1], f8[::1], f8[:, :, ::1])")
+def _sample(legs: Array, begin: Array, length: Array, in_sliders: bool, tool: Array, near: Array, out: Array) -> int:
+    """Write how the other space's coordinates, sigma itself and a tool path's centre change with sigma.
+
+    Returns 0, or a code of forward_into.
+    """
     motion, other = np.zeros((3, 3)), np.empty((6, 3))
     rate = length[0], length[1], length[2]
-    motion[1] = length
     cells = len(out) - 1
     for k in range(cells + 1):
         sigma = k / cells
@@ -89,12 +100,17 @@ def _sample(legs: Array, begin: Array, length: Array, in_sliders: bool, near: Ar
             near[:] = other[0]
         else:
             motion[0, 0], motion[0, 1], motion[0, 2] = at
+            motion[1] = length
+            motion[2] = 0.0
+            transfer(motion, -tool[0], -tool[1])
             code = inverse_motion(legs, motion, other)
         if code:
             return code
         for i in range(3):
             out[k, i, 0], out[k, i, 1] = other[1, i], other[2, i]
         out[k, 3, 0], out[k, 3, 1] = 1.0, 0.0
+        for i in range(out.shape[1] - 4):
+            out[k, 4 + i, 0], out[k, 4 + i, 1] = motion[1, i], motion[2, i]
     return 0
 
 

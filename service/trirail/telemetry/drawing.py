@@ -8,6 +8,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from trirail.config import FramesTable
 from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.telemetry import columns, palette
 from trirail.telemetry.columns import Column
@@ -24,7 +25,7 @@ QUATERNION = rr.Transform3D.descriptor_quaternion()
 _CROSS = (np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]]))
 
 
-def still(parts: Mechanism) -> Iterator[tuple[str, rr.AsComponents]]:
+def still(parts: Mechanism, frames: FramesTable) -> Iterator[tuple[str, rr.AsComponents]]:
     """Yield what is logged once, as static: entity path and archetype."""
     yield "/robot", rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # 2D views have y downwards
     yield "/robot/rails", _lines(parts.rails, [palette.FRAME], 4.5, order=10)
@@ -54,6 +55,7 @@ def still(parts: Mechanism) -> Iterator[tuple[str, rr.AsComponents]]:
     )
     cross = ORIGIN * np.ptp(parts.bounds)
     yield "/robot/origin", _lines([axis * cross for axis in _CROSS], [palette.ARMS], 0.8, order=14)
+    yield from _named(frames, cross)
     yield "/robot/commanded/outline", _lines(parts.outline, [palette.COMMANDED], 4.5, order=20)
     yield "/robot/platform/arms", _lines(parts.arms, [palette.ARMS], 0.8, order=21)
     yield "/robot/platform/outline", _lines(parts.outline, [palette.PLATFORM], 2.2, order=22)
@@ -110,6 +112,35 @@ def goal(parts: Mechanism, pose: Sequence[float] | None) -> Column:
         return Column("/robot/goal", STRIPS, columns.ragged([[]]))
     cross = [axis * ORIGIN * np.ptp(parts.bounds) for axis in _CROSS]
     return Column("/robot/goal", STRIPS, columns.ragged([mechanism.placed([*parts.outline, *cross], pose)]))
+
+
+def _named(frames: FramesTable, size: float) -> Iterator[tuple[str, rr.AsComponents]]:
+    """Yield the tools on the platform and the axes of work frames, each with its name."""
+    if frames.tool:
+        yield (
+            "/robot/platform/tools",
+            rr.Points2D(
+                list(frames.tool.values()),
+                radii=rr.Radius.ui_points(3.0),
+                colors=[palette.CENTRE],
+                labels=list(frames.tool),
+                show_labels=True,
+                draw_order=31,
+            ),
+        )
+    for name, frame in frames.work.items():
+        axes = mechanism.placed([np.array([[0.0, 0.0], [size, 0.0]]), np.array([[0.0, 0.0], [0.0, size]])], frame)
+        yield (
+            f"/robot/frames/{name}",
+            rr.LineStrips2D(
+                axes,
+                colors=[palette.ARMS],
+                radii=rr.Radius.ui_points(1.2),
+                labels=[f"{name} x", f"{name} y"],
+                show_labels=True,
+                draw_order=14,
+            ),
+        )
 
 
 def _lines(lines: list[Points], colours: Sequence[Colour], radius: float, *, order: float) -> rr.LineStrips2D:

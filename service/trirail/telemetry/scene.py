@@ -40,7 +40,7 @@ class Scene:
     def __init__(self, robot: ShownRobot, wall_offset_ns: int) -> None:
         self._rate_hz = robot.rate_hz
         self._timelines = columns.Timelines(self._rate_hz, wall_offset_ns)
-        self._geometry = robot.geometry
+        self._geometry, self._frames = robot.geometry, robot.frames
         self._parts = Mechanism.of(robot.geometry, robot.limits.slider)
         self._reach = Reach(robot.geometry, robot.limits)
         self._plots = curves.plots(robot)
@@ -49,7 +49,7 @@ class Scene:
 
     def still(self) -> Iterator[tuple[str, rr.AsComponents]]:
         """Yield what is logged once, as static: entity path and archetype."""
-        yield from drawing.still(self._parts)
+        yield from drawing.still(self._parts, self._frames)
         for path, lines in self._plots.items():
             yield path, _series(lines)
         yield readout.PATH, rr.TextDocument.from_fields(media_type=MARKDOWN)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import msgspec
 
 from trirail import config
-from trirail.config import Config, Limits
+from trirail.config import Config, FramesTable, Limits
 from trirail.kinematics.geometry import Geometry, Leg
 from trirail.wire.state import Info
 
@@ -20,18 +20,25 @@ class ShownRobot:
     geometry: Geometry
     limits: Limits
     rate_hz: int
+    frames: FramesTable
 
     @classmethod
     def configured(cls, settings: Config) -> ShownRobot:
         """Take it from a configuration."""
-        return cls(settings.robot.name, config.geometry(settings.geometry), settings.limits, settings.loop.rate_hz)
+        return cls(
+            settings.robot.name,
+            config.geometry(settings.geometry),
+            settings.limits,
+            settings.loop.rate_hz,
+            settings.frames,
+        )
 
     @classmethod
     def told(cls, info: Info) -> ShownRobot:
         """Take it from a service's answer. msgspec.ValidationError where that is of another version."""
         first, second, third = (msgspec.convert(_leg(leg), Leg) for leg in info.geometry)
-        limits = msgspec.convert(info.limits, Limits)
-        return cls(info.robot, Geometry(legs=(first, second, third)), limits, info.rate_hz)
+        limits, frames = msgspec.convert(info.limits, Limits), msgspec.convert(info.frames, FramesTable)
+        return cls(info.robot, Geometry(legs=(first, second, third)), limits, info.rate_hz, frames)
 
 
 def _leg(table: dict[str, object]) -> dict[str, object]:

@@ -36,6 +36,9 @@ Speed = Annotated[float, Meta(ge=1e-3, le=1.0)]
 Validity = Annotated[float, Meta(ge=1e-3, le=86_400.0)]
 Moment = Annotated[float, Meta(ge=-86_400.0, le=86_400.0)]
 OwnTriple = tuple[OwnLimit, OwnLimit, OwnLimit]
+FrameName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
+Tool = tuple[Coordinate, Coordinate] | FrameName
+"""A point of the platform in its own frame, whose origin is the centre [m], or the name of one in [frames.tool]."""
 
 
 class OwnLimits(Struct, frozen=True, forbid_unknown_fields=True):
@@ -56,11 +59,11 @@ class PoseGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
     """Move the platform to a pose, straight in pose space where the start allows."""
 
     x: Coordinate
-    """Of the platform's centre, in the base frame [m]."""
+    """Of the platform's centre, or of its `tool`, in the base frame or in `frame` [m]."""
     y: Coordinate
     """Likewise [m]."""
     phi: Coordinate
-    """The platform's angle in the base frame, counterclockwise [rad]."""
+    """The platform's angle in that frame, counterclockwise [rad]."""
     id: Identifier | None = None
     """A new one for every goal; the service makes one where there is none."""
     speed: Speed = 1.0
@@ -68,10 +71,48 @@ class PoseGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
     valid_for: Validity | None = None
     """The goal expires unless it starts within so many seconds."""
     limits: OwnLimits | None = None
-    """Lower ones than the platform's, for this goal alone."""
+    """Lower ones than the platform's, for this goal alone; with a `tool` they are the tool's."""
     blend: Annotated[float, Meta(ge=0.0, le=1e3)] | None = None
-    """The next pose goal waits for this one, and begins when no point of the platform is farther than that from where
-    it is to be [m]; without it, the next goal preempts this one."""
+    """The next pose or move waits for this one, and begins when no point of the platform is farther than that from
+    where it is to be [m]; without it, the next goal preempts this one."""
+    tool: Tool | None = None
+    """The point that goes where x, y say, straight and within the platform's limits; the centre where there is none."""
+    frame: FrameName = "base"
+    """In which x, y and phi are given: base, or a frame of [frames.work]."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+class MoveGoal(
+    Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="move", rename={"origin": "from"}
+):
+    """Move the platform by so much: a pose goal, relative to where its tool is."""
+
+    x: Coordinate
+    """How far its tool, or its centre, is to go along x of `frame` [m]."""
+    y: Coordinate
+    """Along y [m]."""
+    phi: Coordinate
+    """By what angle the platform is to turn about that point, counterclockwise [rad]."""
+    frame: FrameName = "base"
+    """Along whose axes: those of base, of the platform as it is then, or of a frame of [frames.work]."""
+    tool: Tool | None = None
+    """As of a pose goal."""
+    origin: Literal["commanded", "measured"] = "commanded"
+    """From which pose: "commanded" is where the goals before it lead, and where the robot is commanded to be without
+    one or in a jog, so that moves add up whenever they come; "measured" is where it is measured to be when they have
+    been planned."""
+    id: Identifier | None = None
+    """As of a pose goal."""
+    speed: Speed = 1.0
+    """As of a pose goal."""
+    valid_for: Validity | None = None
+    """As of a pose goal [s]."""
+    limits: OwnLimits | None = None
+    """As of a pose goal."""
+    blend: Annotated[float, Meta(ge=0.0, le=1e3)] | None = None
+    """As of a pose goal [m]."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -157,7 +198,9 @@ class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
                 )
 
 
-Goal = PoseGoal | SlidersGoal | VelocityGoal | TrajectoryGoal
+PlannedGoal = PoseGoal | SlidersGoal | VelocityGoal | TrajectoryGoal
+"""What the planner is asked for; its tools are points and its poses those of the base frame."""
+Goal = PlannedGoal | MoveGoal
 
 
 class Override(Struct, frozen=True, forbid_unknown_fields=True):

@@ -10,7 +10,7 @@ from msgspec import Struct, msgpack
 from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.messages import Goal
+from trirail.wire.messages import PlannedGoal
 
 
 class PackedPath(Struct, frozen=True, array_like=True):
@@ -19,6 +19,7 @@ class PackedPath(Struct, frozen=True, array_like=True):
     knots: bytes
     pieces: bytes
     in_sliders: bool = False
+    tools: bytes = b""
 
 
 class PackedRun(Struct, frozen=True, array_like=True):
@@ -53,7 +54,7 @@ class PlanRequest(Struct, frozen=True):
     """The platform's pose, velocity and acceleration now."""
     runs: tuple[PackedRun, ...]
     """The motion under way, and what follows it."""
-    goal: Goal
+    goal: PlannedGoal
     blend: float | None = None
     """How far from the end of the last run this goal may follow it [m]; None where it preempts the motion."""
 

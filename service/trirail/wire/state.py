@@ -147,6 +147,8 @@ class Info(Struct, frozen=True):
     """The legs A, B, C: `name`, and the keys of [[geometry.leg]] of the configuration [m, rad]."""
     limits: object
     """Section [limits] of the configuration, whole: metres, radians, seconds."""
+    frames: object
+    """Section [frames] of the configuration: points of the platform and work frames that goals may name [m, rad]."""
     rate_hz: int
     """Cycles a second."""
     state_hz: int
