@@ -106,7 +106,8 @@ class DriveGroup(Protocol):
 
     @property
     def traffic(self) -> int:
-        """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
+        """Bits of all frames sent and heard since the start, each with worst-case stuffing; what a kernel filters out
+        is not heard."""
 
     def configure(self, period: float) -> None:
         """Set the drives up for a cycle of `period` seconds, check what can be read back, start them without power."""
