@@ -1,4 +1,4 @@
-"""A headless Chromium that opens a page and takes pictures of it, by the DevTools protocol on a pipe."""
+"""A headless Chromium that opens pages, uses them as a person does and takes pictures, by DevTools on a pipe."""
 
 from __future__ import annotations
 
@@ -7,39 +7,40 @@ import io
 import itertools
 import json
 import os
+import shutil
+import signal
 import subprocess
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 from PIL import Image
 
+FLAGS = ["--headless=new", "--no-sandbox", "--window-size=1280,800", "--remote-debugging-pipe"]
 # The web viewer needs WebGL: Mesa's software renderer through ANGLE does without a graphics card.
-FLAGS = ["--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
+WEBGL = ["--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
+WITHIN = 20.0
+KEYS = {"Enter": "\r", "Space": " "}
+needs_chromium = pytest.mark.skipif(
+    shutil.which("chromium") is None, reason="no chromium: make ci-packages installs it on Debian"
+)
 
 
-class Page:
-    """One page."""
+class Pipe:
+    """The browser's end of the protocol, which all its pages share."""
 
     def __init__(self, to_browser: io.RawIOBase, from_browser: io.BufferedReader) -> None:
         self._to, self._from = to_browser, from_browser
         self._numbers = itertools.count(1)
-        self._session = ""
 
-    def open(self, url: str) -> None:
-        target = self._call("Target.createTarget", url=url)["targetId"]
-        self._session = self._call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-
-    def picture(self) -> Image.Image:
-        shot = self._call("Page.captureScreenshot", format="png")["data"]
-        return Image.open(io.BytesIO(base64.b64decode(shot))).convert("RGB")
-
-    def _call(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def call(self, method: str, session: str = "", **parameters: Any) -> dict[str, Any]:
         number = next(self._numbers)
         request = {"id": number, "method": method, "params": parameters}
-        if self._session:
-            request["sessionId"] = self._session
+        if session:
+            request["sessionId"] = session
         self._to.write(json.dumps(request).encode() + b"\0")
         while True:
             content = bytearray()
@@ -54,11 +55,113 @@ class Page:
                 return result
 
 
+class Page:
+    """One page, a tab of its own once something is opened in it."""
+
+    def __init__(self, pipe: Pipe) -> None:
+        self._pipe = pipe
+        self._target = ""
+        self._session = ""
+
+    def another(self) -> Page:
+        """One more page of the same browser."""
+        return Page(self._pipe)
+
+    def open(self, url: str) -> None:
+        # In a window of its own: pages behind others draw nothing.
+        self._target = self._pipe.call("Target.createTarget", url="about:blank", newWindow=True)["targetId"]
+        self._session = self._pipe.call("Target.attachToTarget", targetId=self._target, flatten=True)["sessionId"]
+        self._call("Page.navigate", url=url)
+        self.until("document.readyState === 'complete'")
+
+    def picture(self) -> Image.Image:
+        shot = self._call("Page.captureScreenshot", format="png")["data"]
+        return Image.open(io.BytesIO(base64.b64decode(shot))).convert("RGB")
+
+    # ------------------------------------------------------------------ looking
+
+    def evaluate(self, expression: str) -> Any:
+        """What an expression of JavaScript comes to in the page; a promise is waited for."""
+        found = self._call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in found, found["exceptionDetails"]
+        return found["result"].get("value")
+
+    def until(self, expression: str) -> None:
+        """Wait until an expression of JavaScript holds in the page."""
+        deadline = time.monotonic() + WITHIN
+        while not self.evaluate(f"Boolean({expression})"):
+            assert time.monotonic() < deadline, f"not {expression}: {self.text('body')}"
+            time.sleep(0.02)
+
+    def text(self, selector: str) -> str:
+        found: str = self.evaluate(f"document.querySelector({selector!r}).innerText")
+        return found
+
+    def resize(self, width: int, height: int, *, phone: bool = False) -> None:
+        self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        self._call("Emulation.setTouchEmulationEnabled", enabled=phone)
+
+    # ------------------------------------------------------------------ using
+
+    def middle(self, selector: str) -> dict[str, float]:
+        """Where an element is, scrolled into view."""
+        found: dict[str, float] = self.evaluate(
+            f"(() => {{ const it = document.querySelector({selector!r}); it.scrollIntoView({{block: 'nearest'}});"
+            " const at = it.getBoundingClientRect(); return {x: at.x + at.width / 2, y: at.y + at.height / 2}; })()"
+        )
+        return found
+
+    def press(self, selector: str) -> None:
+        self._mouse("mousePressed", self.middle(selector))
+
+    def let_go(self, selector: str = "body") -> None:
+        self._mouse("mouseReleased", self.middle(selector))
+
+    def click(self, selector: str) -> None:
+        self.press(selector)
+        self.let_go(selector)
+
+    def touch(self, selector: str) -> None:
+        self._call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[self.middle(selector)])
+
+    def end_touch(self, kind: str = "touchEnd") -> None:
+        self._call("Input.dispatchTouchEvent", type=kind, touchPoints=[])
+
+    def key_down(self, key: str) -> None:
+        text = KEYS.get(key, key if len(key) == 1 else "")
+        name = " " if key == "Space" else key
+        code = f"Key{key.upper()}" if len(key) == 1 else key
+        self._call("Input.dispatchKeyEvent", type="keyDown", key=name, code=code, text=text)
+
+    def key_up(self, key: str) -> None:
+        code = f"Key{key.upper()}" if len(key) == 1 else key
+        self._call("Input.dispatchKeyEvent", type="keyUp", key=" " if key == "Space" else key, code=code)
+
+    def type_key(self, key: str) -> None:
+        self.key_down(key)
+        self.key_up(key)
+
+    def close(self) -> None:
+        self._pipe.call("Target.closeTarget", targetId=self._target)
+
+    def signal_renderers(self, number: signal.Signals) -> None:
+        """Send a signal to the processes in which this browser's pages run: SIGSTOP freezes them."""
+        for process in self._pipe.call("SystemInfo.getProcessInfo")["processInfo"]:
+            if process["type"] == "renderer":
+                os.kill(process["id"], number)
+
+    def _mouse(self, kind: str, at: dict[str, float]) -> None:
+        self._call("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, **at)
+
+    def _call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        return self._pipe.call(method, self._session, **parameters)
+
+
 @contextmanager
-def chromium(program: str, profile: Path) -> Iterator[Page]:
+def chromium(program: str, profile: Path, flags: Sequence[str] = WEBGL) -> Iterator[Page]:
     """Run a browser with a profile of its own; it reads requests from descriptor 3 and answers on 4."""
     (ours_in, theirs_out), (theirs_in, ours_out) = os.pipe(), os.pipe()
-    command = [program, *FLAGS, "--window-size=1280,800", "--remote-debugging-pipe", f"--user-data-dir={profile}"]
+    command = [program, *FLAGS, *flags, f"--user-data-dir={profile}"]
     browser = subprocess.Popen(
         ["bash", "-c", f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}', "bash", *command],
         pass_fds=[theirs_in, theirs_out],
@@ -68,7 +171,7 @@ def chromium(program: str, profile: Path) -> Iterator[Page]:
     os.close(theirs_out)
     try:
         with os.fdopen(ours_out, "wb", buffering=0) as to_browser, os.fdopen(ours_in, "rb") as from_browser:
-            yield Page(to_browser, from_browser)
+            yield Page(Pipe(to_browser, from_browser))
     finally:
         browser.terminate()
         browser.wait(20)

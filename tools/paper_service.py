@@ -81,7 +81,8 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
 
     Nothing is fitted. The log names the goal and the cycle that set the robot in motion for it. In that cycle the
     motion advanced by one period for the first time (trirail.control.control.Control.advance), so its setpoints
-    are those of t = 1 period, those of the k-th cycle of motion t = k periods, and t = 0 is the standstill before.
+    are those of t = 1 period, those of the k-th cycle of motion t = k periods, and t = 0 is the standstill before. It
+    ends with its path, since it does not wait for the robot to settle.
     That time ran like this throughout is checked by the progress in each record.
     """
     records = recording.records
@@ -111,7 +112,7 @@ def _name(example: Example) -> str:
 
 def _send(robot: Robot, example: Example) -> GoalHandle:
     try:
-        return robot.follow(points(example), id=_name(example))
+        return robot.follow(points(example), settle=False, id=_name(example))
     except RefusedError as error:
         raise RefusedError(error.code, f"the service refused {example.name}: {error}") from error
 

@@ -109,6 +109,10 @@ class DriveGroup(Protocol):
         """Bits of all frames sent and heard since the start, each with worst-case stuffing; what a kernel filters out
         is not heard."""
 
+    @property
+    def told(self) -> tuple[DriveFault | None, ...]:
+        """Of each drive the first fault that it has told of by itself since the last reset, whichever came first."""
+
     def configure(self, period: float) -> None:
         """Set the drives up for a cycle of `period` seconds, check what can be read back, start them without power."""
 
@@ -121,14 +125,19 @@ class DriveGroup(Protocol):
     def write(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints [m] and velocity feed-forward [m/s], to be taken up at the next SYNC."""
 
-    def enable(self) -> None:
-        """Begin to power up; the following cycles carry it out, the feedback's states tell when it is done."""
+    def enable(self, alone: str | None = None) -> None:
+        """Begin to power up, all drives, or the one of this name `alone`: the others are kept without power.
+
+        The following cycles carry it out, the feedback's states tell when it is done. Drives that have power, or are
+        getting it, first have to be disabled.
+        """
 
     def home(self) -> None:
         """Begin to home the drives whose positions are not absolute; the following cycles carry it out.
 
-        Powered drives at standstill only. What is written for a drive is not for it while it does not follow; in
-        the cycle in which it follows again, that must be the position that was fed back one cycle before.
+        Powered drives at standstill only; one that was enabled alone is homed alone. What is written for a drive is
+        not for it while it does not follow; in the cycle in which it follows again, that must be the position that was
+        fed back one cycle before.
         """
 
     def stop_homing(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -20,7 +19,7 @@ import msgspec
 import numpy as np
 import pytest
 import screenshot
-from chromium import chromium
+from chromium import chromium, needs_chromium
 from PIL import Image
 from rerun.chunk import Chunk, RrdReader
 from trirail.cli import view
@@ -48,7 +47,6 @@ needs_vulkan = pytest.mark.skipif(
     not list(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json")),
     reason=f"no software Vulkan driver (mesa-vulkan-drivers): {INSTALL}",
 )
-needs_chromium = pytest.mark.skipif(shutil.which("chromium") is None, reason=f"no chromium: {INSTALL}")
 
 
 @pytest.fixture(scope="module")

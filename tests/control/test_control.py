@@ -102,6 +102,14 @@ def test_a_drive_that_does_not_power_up_is_named(rig: Rig, monkeypatch: pytest.M
     assert "2 s after enable" in answer.message
 
 
+def test_enabled_drives_whose_sliders_belong_to_no_pose_are_stopped(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They did when enable was sent, and were moved while the drives powered up."""
+    rig.order("enable")
+    monkeypatch.setattr(rig.control.measured, "pose_of", lambda sliders: None)
+    rig.until(lambda: rig.mode is Mode.FAULT, 100)
+    assert rig.control.fault == "the measured sliders belong to no pose"
+
+
 @pytest.mark.parametrize("name", ["disable", "quick_stop"])
 def test_a_drive_that_keeps_its_power_is_named_with_its_state(rig: Rig, name: str) -> None:
     rig.enable()
@@ -121,7 +129,7 @@ def test_a_goal_arrives_and_ends_once(rig: Rig) -> None:
     answer = rig.goal("g1", 0.05, -0.02, 0.3)
     assert isinstance(answer, Accepted)
     taken = rig.until(lambda: rig.mode is Mode.HOLDING)
-    assert taken <= math.ceil(answer.duration / PERIOD) + 2
+    assert taken <= math.ceil((answer.duration + CONFIG.limits.in_position.dwell) / PERIOD) + 2
     rig.cycles(50)
     assert rig.outcomes() == [("g1", "done")]
     assert rig.control.commanded.pose == pytest.approx((0.05, -0.02, 0.3), abs=1e-9)

@@ -78,6 +78,32 @@ def test_following_error_is_to_the_setpoint_that_was_due_at_the_sync_of_the_posi
 
 
 @pytest.mark.parametrize("index", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_following_error_is_beyond_its_limit_when_it_is_more(index: int, sign: float) -> None:
+    limit = 2.0**-8  # [m], a number that is exact
+    measured = Measured(ROBOT.packed(), PERIOD, STEP, limit)
+    measured.start(Feedback((0.0, 0.0, 0.0), ON, None))
+    for error, beyond in ((limit, 0), (limit * (1.0 + 1e-9), 1 + index)):
+        position = [0.0, 0.0, 0.0]
+        position[index] = -sign * error
+        a, b, c = position
+        assert measured.take(Feedback((a, b, c), ON, None)) == beyond
+        assert measured.following_error[index] == sign * error
+
+
+def test_sliders_that_belong_to_no_pose_leave_the_pose_as_it_was() -> None:
+    measured = Measured(ROBOT.packed(), PERIOD, 10.0)  # none jumps
+    measured.start(Feedback((0.0, 0.0, 0.0), ON, None))
+    measured.take(Feedback((0.01, 0.0, 0.0), ON, None))
+    before = measured.pose
+    nowhere = (1.0, 1.0, 1.0)
+    assert measured.pose_of(nowhere) is None
+    measured.take(Feedback(nowhere, ON, None))
+    assert not any(measured.jumps)
+    assert measured.pose == before
+
+
+@pytest.mark.parametrize("index", range(3))
 def test_a_robot_is_powered_while_any_drive_can_move_its_slider(index: int) -> None:
     measured = standing((0.0, 0.0, 0.0))
     can_move = {PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE}

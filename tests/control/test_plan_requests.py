@@ -14,7 +14,6 @@ from control.test_control import assert_within_limits
 from control.test_stop import PROMPT, STEP, braking, confirmed_after, play
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from trirail.control.plan_requests import LEADS, PATIENCE
 from trirail.motion.feasibility import Look
 from trirail.motion.paths import Path
 from trirail.motion.planning import MotionPlanner, revision
@@ -25,6 +24,7 @@ from trirail.wire.messages import Goal, PoseGoal, TrajectoryGoal, TrajectoryPoin
 from trirail.wire.packets import Accepted, CommandRequest, PlannerLost, Refused
 from trirail.wire.planning import (
     MAX_PLANNING,
+    Extended,
     PackedPath,
     PlanAnswer,
     Planned,
@@ -37,7 +37,10 @@ from trirail.wire.sizes import MAX_PACKET, MAX_POINTS
 from trirail.wire.vocabulary import Command, Mode
 
 PERIOD = CONFIG.period
-SILENT = round(PATIENCE / PERIOD)
+SILENT = round(0.5 / PERIOD)
+"""Cycles that the planner may say nothing."""
+LEADS = (0.003, 0.012, 0.048)
+"""How long before a motion from motion is to begin it is asked for, at the first, second and third time [s]."""
 
 
 Said = PlanAnswer | PlannerLost
@@ -192,6 +195,28 @@ def test_a_motion_that_begins_elsewhere_is_never_begun(rig: Rig, meddler: Meddle
         path = msgspec.structs.replace(answer.run.path, pieces=pieces.tobytes())
         return [msgspec.structs.replace(answer, run=msgspec.structs.replace(answer.run, path=path))]
 
+    meddler.change = elsewhere
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g2", "rejected"), ("g1", "done")]
+    assert rig.control.fault is None
+
+
+@pytest.mark.parametrize("coordinate", range(3))
+@pytest.mark.parametrize("power", range(3))
+def test_a_continuation_that_begins_elsewhere_is_never_appended(
+    rig: Rig, meddler: Meddler, coordinate: int, power: int
+) -> None:
+    """A goal that is to follow the one under way: beside its end in position, velocity or acceleration."""
+
+    def elsewhere(answer: PlanAnswer) -> list[PlanAnswer]:
+        assert isinstance(answer, Extended)
+        pieces = np.frombuffer(answer.path.pieces).copy()
+        pieces[6 * coordinate + power] += (1e-6, 1e-4, 1e-2)[power]
+        return [msgspec.structs.replace(answer, path=msgspec.structs.replace(answer.path, pieces=pieces.tobytes()))]
+
+    rig.send("g1", PoseGoal(0.08, 0.0, 0.0, blend=0.01))
+    rig.cycles(100)
     meddler.change = elsewhere
     rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
     rig.until(rig.holds)

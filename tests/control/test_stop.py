@@ -174,6 +174,20 @@ def test_what_was_sent_before_a_pause_does_not_begin(slow: Rig) -> None:
     assert len(tickets) == len(set(tickets)) == 2  # each is answered once
 
 
+@pytest.mark.parametrize("wait", [0, 3, 10, 30])
+def test_a_goal_that_is_sent_to_a_robot_that_pauses_is_not_paused(rig: Rig, wait: int) -> None:
+    rig.enable()
+    rig.goal("running", -0.1, 0.0, 0.0)
+    rig.cycles(150)
+    rig.order("pause")
+    rig.cycles(wait)
+    assert rig.mode is Mode.STOPPING
+    rig.send("g2", PoseGoal(0.0, 0.03, 0.0))
+    rig.until(lambda: rig.holds() and rig.control.goal_queue.idle)
+    assert dict(rig.outcomes()) == {"running": "preempted", "g2": "done"}
+    assert rig.control.commanded.pose == pytest.approx((0.0, 0.03, 0.0))
+
+
 def test_a_goal_that_is_sent_to_a_paused_robot_begins(slow: Rig) -> None:
     slow.goal("running", -0.05, 0.0, 0.0)
     slow.cycles(60)
@@ -220,6 +234,24 @@ def test_a_jog_lasts_as_long_as_it_is_renewed(rig: Rig, override: float) -> None
     assert rig.mode is Mode.MOVING
     assert rig.control.commanded.velocity[0] == pytest.approx(0.02 * min(override, 1.0), rel=1e-6)
     assert rig.outcomes() == []
+
+
+def test_a_jog_goes_on_until_its_time_is_over(rig: Rig) -> None:
+    rig.enable()
+    jog = VelocityGoal(0.05, 0.0, 0.0, timeout=0.2)
+    rig.cycle(GoalRequest(500, "ann", "j1", jog, round((rig.now + PERIOD) * 1e9)))
+    sent = len(rig.rows)
+    rig.until(lambda: rig.mode is Mode.STOPPING)
+    assert len(rig.rows) - sent == round(0.2 / PERIOD) + 1
+
+
+def test_a_stop_begins_in_the_cycle_in_which_it_is_asked_for(rig: Rig) -> None:
+    rig.enable()
+    rig.goal("g1", 0.1, 0.0, 0.0)
+    rig.cycles(250)
+    speed = rig.control.commanded.velocity[0]
+    rig.order("stop")
+    assert rig.control.commanded.velocity[0] < speed
 
 
 def test_a_jog_that_was_let_go_does_not_come_back(rig: Rig) -> None:

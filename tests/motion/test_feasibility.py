@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import msgspec
 import numpy as np
 import pytest
 from conftest import CONFIG
+from hypothesis import given
+from hypothesis import strategies as st
 from trirail.config import geometry
-from trirail.motion.feasibility import Checker
+from trirail.motion.feasibility import Checker, parts
 from trirail.motion.limits import Bounds
-from trirail.motion.paths import FOR_EVER, Path
+from trirail.motion.paths import FOR_EVER, Path, constant
 
 PERIOD = CONFIG.period
 PLATFORM = msgspec.structs.replace(CONFIG.limits.platform, jerk=(1e3, 1e3, 1e3))
@@ -46,3 +50,65 @@ def test_a_change_of_rate_counts_with_what_the_velocities_tell(share: float, wit
     by = share * LIMITS.slider.jerk * PERIOD**2 / 2.0 / SPEED
     law = slower(by, PERIOD, PERIOD / 20.0)
     assert CHECKER.look(straight(), law, 0.0, 0.9, (-SPEED / 2.0, 0.0, 0.0)).within_limits is within_limits
+
+
+@pytest.mark.parametrize("first", [0.0, 0.3])
+def test_a_path_that_begins_out_of_reach_leaves_it_at_once(first: float) -> None:
+    pieces = np.zeros((1, 3, 6))
+    pieces[0, 0, :2] = 2.0 * LIMITS.platform.x[1], SPEED
+    found = CHECKER.look(Path(np.array([0.0, 1.0]), pieces), constant(1.0), first, 0.9, (0.0, 0.0, 0.0))
+    assert found.leaves_at == pytest.approx(first, abs=1e-9)
+    assert not found.fits
+    assert not found.within_limits
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_where_a_path_leaves_the_workspace_is_said_to_the_moment(share: float) -> None:
+    pieces = np.zeros((1, 3, 6))
+    pieces[0, 0, :2] = LIMITS.platform.x[1] - share * SPEED, SPEED
+    found = CHECKER.look(Path(np.array([0.0, 1.0]), pieces), constant(1.0), 0.0, 1.0, (0.0, 0.0, 0.0))
+    assert found.leaves_at == pytest.approx(share, abs=1e-4)
+
+
+# ---------------------------------------------------------------------- shares of the limits
+
+# The code's own margins, written down once more: of the sliders, x, y and phi; velocity, acceleration and jerk.
+PLANS = np.array([(0.98, 0.98, 0.93), *[(1.0, 1.0, 1.0)] * 3])
+"""Shares of the limits that plans make use of."""
+CHANGES = np.array([(0.99, 0.99, 0.98), *[(1.0, 1.01, 1.05)] * 3])
+"""Shares of the limits that a motion may use while its rate changes."""
+
+
+@pytest.mark.parametrize("row", range(4))
+@pytest.mark.parametrize("quantity", range(3))
+def test_what_a_motion_may_use_of_each_limit_while_its_rate_changes(row: int, quantity: int) -> None:
+    for share, borne in ((1.0 - 1e-5, True), (1.0 + 1e-5, False)):
+        worst = np.zeros((4, 3))
+        worst[row, quantity] = share * CHANGES[row, quantity] / PLANS[row, quantity]
+        assert CHECKER.bears(worst) is borne
+
+
+def test_what_plans_may_use_of_the_sliders_limits() -> None:
+    slider = LIMITS.slider
+    expected = PLANS[0] * (slider.velocity, slider.acceleration, slider.jerk)
+    assert CHECKER.slider_limits == pytest.approx(expected)
+
+
+# ---------------------------------------------------------------------- part by part
+
+
+@given(
+    st.integers(1, 60), st.integers(1, 20), st.sampled_from([0.5, 1.0, 2.0]), st.floats(0.0, 0.4), st.floats(0.5, 1.0)
+)
+def test_the_parts_of_a_path_follow_each_other_and_have_so_many_knots(
+    pieces: int, knots: int, rate: float, begin: float, end: float
+) -> None:
+    path = Path(np.linspace(0.0, 1.0, pieces + 1), np.zeros((pieces, 3, 6)))
+    first, until = begin / rate, end / rate
+    found = parts(path, constant(rate), first, until, knots)
+    times = [first, *(end_of_part for _, end_of_part in found)]
+    assert found == list(pairwise(times))
+    assert times[-1] == until
+    inside = [((path.knots > rate * a + 1e-9) & (path.knots < rate * b - 1e-9)).sum() for a, b in found]
+    assert max(inside) < knots
+    assert len(found) == 1 + ((path.knots > rate * first) & (path.knots < rate * until)).sum() // knots

@@ -126,25 +126,46 @@ def test_the_very_end_of_a_sliders_travel(rig: Rig, leg: int, beyond: float) -> 
         assert "platform" in refusal(answer).message or "passive" in refusal(answer).message
 
 
+@pytest.mark.parametrize(("coordinate", "end"), [(0, 0), (0, 1), (1, 1)])
 @pytest.mark.parametrize("at", [1.38, 1.40, 1.42, 1.44])  # of these at most one peak can be where it is looked anyway
-def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(rig: Rig, at: float) -> None:
+def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(rig: Rig, at: float, coordinate: int, end: int) -> None:
     """Both ends inside, and by how much the middle is outside is less than what lies between two looks."""
     rig.enable()
-    low = CONFIG.limits.platform.x[1]
+    limit = (CONFIG.limits.platform.x, CONFIG.limits.platform.y)[coordinate][end]
     ends = TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(3.0, 0.0, 0.0, 0.0)
 
-    def through(x: float) -> tuple[TrajectoryPoint, ...]:
-        middle = TrajectoryPoint(at, x, 0.0, 0.0, velocity=(0.3 * x, 0.0, 0.0), acceleration=(-2.0 * x, 0.0, 0.0))
-        return ends[0], middle, ends[1]
+    def through(place: float) -> tuple[TrajectoryPoint, ...]:
+        x, y, phi = (np.eye(3)[coordinate] * place).tolist()
+        velocity, acceleration = (0.3 * x, 0.3 * y, 0.0), (-2.0 * x, -2.0 * y, 0.0)
+        return ends[0], TrajectoryPoint(at, x, y, phi, velocity=velocity, acceleration=acceleration), ends[1]
 
     points = [Point(p.t, (p.x, p.y, p.phi), p.velocity, p.acceleration) for p in through(1.0)]
     path, t = quintic(points, (0.0, 0.0, 0.0)), np.linspace(0.0, 3.0 - at, 200_001)
-    highest = float((path.pieces[1, 0] @ t ** np.arange(6.0)[:, None]).max())  # a while after the point
-    beyond = refusal(rig.send("g1", TrajectoryGoal(through((low + 2e-6) / highest))))
-    assert (beyond.code, "platform x: position" in beyond.message) == ("out_of_workspace", True)
-    accepted(rig.send("g2", TrajectoryGoal(through((low - 2e-6) / highest))))
+    highest = float((path.pieces[1, coordinate] @ t ** np.arange(6.0)[:, None]).max())  # a while after the point
+    room = math.copysign(2e-6, limit)
+    beyond = refusal(rig.send("g1", TrajectoryGoal(through((limit + room) / highest))))
+    assert (beyond.code, f"platform {'xy'[coordinate]}: position" in beyond.message) == ("out_of_workspace", True)
+    accepted(rig.send("g2", TrajectoryGoal(through((limit - room) / highest))))
     rig.until(rig.holds)
     assert rig.control.fault is None
+
+
+@pytest.mark.parametrize("by", [1.002, 1.005, 1.009])
+@pytest.mark.parametrize("quantity", ["velocity", "acceleration"])
+def test_a_path_that_is_hardly_too_fast_is_slowed(quantity: str, by: float) -> None:
+    """For sliders whose limit is so many times less than what it takes at the platform's own."""
+    row = ("velocity", "acceleration").index(quantity)
+
+    def used(config: Config) -> float:
+        rig = Rig(config)
+        rig.enable()
+        rig.goal("g1", 0.1, 0.02, 0.2)
+        rig.until(rig.holds)
+        rig.bus.shutdown()
+        return float(np.abs(rig.setpoints()[:, 1 + row]).max())
+
+    planned = used(CONFIG) / by ** (1 + row)
+    assert used(slower(CONFIG, **{quantity: planned / 0.98})) <= planned * (1.0 + 1e-3)
 
 
 def test_slowed_is_said(rig: Rig) -> None:
@@ -161,16 +182,25 @@ def test_slowed_is_said(rig: Rig) -> None:
 # ---------------------------------------------------------------------- a goal's own limits
 
 
-def test_own_limits_are_kept(rig: Rig) -> None:
+@pytest.mark.parametrize(
+    ("own", "most"),
+    [
+        (OwnLimits(velocity=(0.02, 0.02, 0.1)), (0.02, math.inf, math.inf)),
+        (OwnLimits(acceleration=(0.1, 0.1, 1.0)), (math.inf, 0.1, math.inf)),
+        (OwnLimits(jerk=(2.0, 2.0, 20.0)), (math.inf, math.inf, 2.0)),
+        (OwnLimits((0.02, 0.02, 0.1), (0.1, 0.1, 1.0), (2.0, 2.0, 20.0)), (0.02, 0.1, 2.0)),
+    ],
+)
+def test_own_limits_are_kept_and_made_use_of(rig: Rig, own: OwnLimits, most: tuple[float, float, float]) -> None:
     rig.enable()
-    own = OwnLimits(velocity=(0.02, 0.02, 0.1), acceleration=(0.1, 0.1, 1.0))
     accepted(rig.send("g1", PoseGoal(0.05, 0.0, 0.0, limits=own)))
-    speeds = []
+    motion = []
     while rig.mode is Mode.MOVING:
-        speeds.append(rig.control.commanded.velocity[0])
+        motion.append((rig.control.commanded.velocity[0], rig.control.commanded.acceleration[0]))
         rig.cycle()
-    assert max(speeds) == pytest.approx(0.02, rel=1e-6)
-    assert np.abs(np.diff(speeds)).max() <= 0.1 * PERIOD * 1.001
+    velocity, acceleration = np.transpose(motion)
+    used = np.array([np.abs(row).max() for row in (velocity, acceleration, np.diff(acceleration) / PERIOD)]) / most
+    assert used.max() == pytest.approx(1.0, rel=1e-3)
 
 
 def test_own_limits_above_the_robots_are_refused(rig: Rig) -> None:
@@ -216,6 +246,46 @@ def test_a_wider_blend_is_quicker() -> None:
         taken.append(square(rig, blend))
         rig.bus.shutdown()
     assert taken[0] > taken[1] > taken[2]
+
+
+@pytest.mark.parametrize("valid_for", [0.1, 0.25])
+def test_a_waiting_goal_is_valid_for_its_time_and_not_a_cycle_longer(rig: Rig, valid_for: float) -> None:
+    rig.enable()
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0, speed=0.2, blend=0.01))
+    goal = PoseGoal(0.05, 0.05, 0.0, valid_for=valid_for)
+    rig.cycle(GoalRequest(99, "ann", "g2", goal, round((rig.now + PERIOD) * 1e9)))  # it comes as it is sent
+    sent = rig.control.cycles
+    rig.until(lambda: ("g2", "expired") in rig.outcomes())
+    assert rig.control.cycles - sent == round(valid_for / PERIOD) + 1
+
+
+def test_what_waits_no_more_slows_nothing(rig: Rig) -> None:
+    """An override may take back a goal's own slowness, as far as what waits behind it can be taken so."""
+    rig.enable()
+    rig.send("slow", PoseGoal(0.1, 0.0, 0.0, speed=0.5, blend=0.0))
+    rig.send("fast", PoseGoal(0.0, 0.0, 0.0))
+    rig.cycles(100)
+    rig.command("override", 2.0)
+    rig.cycles(50)
+    assert rig.control._schedule.runs[0].target == pytest.approx(1.0, rel=1e-3)
+    rig.cycle(CommandRequest(99, "ann", Command.STOP, goal="fast"))
+    rig.until(lambda: rig.control._schedule.runs[0].target > 1.9, 50)
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("fast", "stopped"), ("slow", "done")]
+    assert_within_limits(rig)
+
+
+def test_what_is_over_slows_nothing(rig: Rig) -> None:
+    """How fast the rest of a path can be taken is what the rest of it says, not what lies behind."""
+    rig.enable()
+    rig.send("fast", PoseGoal(0.05, 0.0, 0.0, blend=0.0))
+    rig.send("slow", PoseGoal(0.0, 0.0, 0.0, speed=0.5))
+    rig.until(lambda: ("fast", "done") in rig.outcomes())
+    rig.cycles(50)
+    rig.command("override", 2.0)
+    rig.until(lambda: rig.control._schedule.runs[0].target > 1.2, 50)
+    rig.until(rig.holds)
+    assert_within_limits(rig)
 
 
 def test_without_blend_the_next_goal_preempts(rig: Rig) -> None:

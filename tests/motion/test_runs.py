@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from conftest import CONFIG
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
@@ -75,6 +75,7 @@ def until_it_stands(run: Run) -> float:
 # ---------------------------------------------------------------------- paths
 
 
+@example(HERE, STILL, STILL, HERE, 1.0)
 @given(PLACE, MOTION, MOTION, PLACE, SHARE)
 def test_a_path_is_ruckigs_trajectory(
     pose: tuple[float, float, float],

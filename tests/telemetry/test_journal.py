@@ -22,7 +22,8 @@ def test_lines_of_one_log_are_one_chunk_with_their_own_times() -> None:
     events, requests = journal.chunks([journal.said(EVENT), given[0], remark, given[1]])
     assert (events.entity_path, requests.entity_path) == (EVENTS, REQUESTS)
     batch = events.to_record_batch()
-    assert batch.column("TextLog:text").to_pylist() == [["goal g expired"], ["a word"]]
+    assert batch.column("TextLog:text").to_pylist() == [["    1.250 s   goal g expired"], ["    1.500 s   a word"]]
+    assert batch.column("words").to_pylist() == [["goal g expired"], ["a word"]]
     assert batch.column("TextLog:level").to_pylist() == [["WARN"], ["ERROR"]]
     assert batch.column("t").to_numpy().astype(int).tolist() == [1_250_000_000, 1_500_000_000]
     wall = [SAID, SAID + 250_000_000]
@@ -31,7 +32,7 @@ def test_lines_of_one_log_are_one_chunk_with_their_own_times() -> None:
     assert msgspec.json.decode(said[0], type=Event) == EVENT
     assert not none
     batch = requests.to_record_batch()
-    assert batch.column("TextLog:text").to_pylist() == [["goal g of ann: pose"], ["stop by ann"]]
+    assert batch.column("words").to_pylist() == [["goal g of ann: pose"], ["stop by ann"]]
     assert [msgspec.json.decode(text, type=ControlInput) for (text,) in batch.column("json").to_pylist()] == [
         GOAL,
         STOP,

@@ -226,7 +226,7 @@ def test_events_and_requests_of_another_version_are_refused(tmp_path: Path, log:
     stream.save(path)
     columns = [Column(RECORD, FIELDS, structs(sent))]
     stream.send_chunks(chunks(Timelines(1000, 0).of(sent), columns))
-    said = [Column(f"/{log}", kind, pa.array([["?"]])) for kind in (journal.TEXT, journal.LEVEL)]
+    said = [Column(f"/{log}", kind, pa.array([["?"]])) for kind in (journal.TEXT, journal.LEVEL, journal.WORDS)]
     said.append(Column(f"/{log}", journal.JSON, pa.array([['{"seq": 1, "omen": "dark"}']])))
     stream.send_chunks(chunks(Timelines(1000, 0).of(sent[:1]), said))
     stream.disconnect()

@@ -72,7 +72,7 @@ def lines(path: Path) -> list[tuple[str, str]]:
         for chunk in chunks(path, "/events")
         for level, text in zip(
             chunk.to_record_batch().column("TextLog:level").to_pylist(),
-            chunk.to_record_batch().column("TextLog:text").to_pylist(),
+            chunk.to_record_batch().column("words").to_pylist(),
             strict=True,
         )
     ]

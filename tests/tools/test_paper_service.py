@@ -82,7 +82,7 @@ def test_the_cycle_that_takes_the_goal_is_one_period_into_it(rig: conftest.Rig, 
     Also that the setpoint of a cycle is the one that drives are to have reached REACHED cycles later.
     """
     rig.enable()
-    assert isinstance(rig.send("g", TrajectoryGoal(tuple(points(example)))), Accepted)
+    assert isinstance(rig.send("g", TrajectoryGoal(tuple(points(example)), settle=False)), Accepted)
     first = len(rig.rows) - 1
     assert rig.control.measured.record["progress"][0] == pytest.approx(PERIOD / DURATION)
     moving = 1

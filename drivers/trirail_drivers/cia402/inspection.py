@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import can
@@ -37,6 +38,22 @@ def inspect(bus: can.BusABC, drives: Drives, period: float, clock: Clock, *, app
         refused = f"accept_without lacks {', '.join(lacking)}" if lacking else ""
         found.append({**_told(made), "refused": refused})
     return found
+
+
+def inputs(bus: can.BusABC, drives: Drives, clock: Clock) -> Callable[[str], int | None]:
+    """Return what reads the digital inputs 60FDh of the drive of a name; None where it has none to tell.
+
+    It waits for the answer and lets other frames go: for drives without power, between two cycles.
+    """
+    remotes = {remote.name: remote for remote in setup.remotes(bus, drives, clock)}
+
+    def read(name: str) -> int | None:
+        try:
+            return remotes[name].read(0x60FD)
+        except DriveError:
+            return None
+
+    return read
 
 
 def _told(made: setup.SetUp) -> dict[str, Any]:

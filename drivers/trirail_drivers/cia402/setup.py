@@ -88,30 +88,30 @@ def configure(
     check_nodes(drives)
     heartbeat_of(drives)
     interpolation_periods(period)
-    remotes = _remotes(bus, drives, clock)
+    asked = remotes(bus, drives, clock)
     for drive in drives.each:
         _send(bus, frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node))
-    for remote in remotes:
+    for remote in asked:
         _check_is_servo(remote)
         _take_power_off(remote)
-    for remote, drive, scale in zip(remotes, drives.each, scales, strict=True):
+    for remote, drive, scale in zip(asked, drives.each, scales, strict=True):
         # Everything is refused that can be, of every drive, before the first value is written.
         _bring(remote, drive, drives, scale, period, apply=False)[1].check_accepted(drive.accept_without)
     done = []
-    for remote, drive, scale in zip(remotes, drives.each, scales, strict=True):
+    for remote, drive, scale in zip(asked, drives.each, scales, strict=True):
         made, differences = _bring(remote, drive, drives, scale, period, apply=True)
         differences.check_accepted(drive.accept_without)
         done.append(made._replace(notes=tuple(differences.notes), lacking=tuple(differences.lacking)))
     _check_identifiers(done)
     for drive in drives.each:
         _send(bus, frames.nmt(frames.NMT_START, drive.node))
-    return tuple((made, _start(remote)) for made, remote in zip(done, remotes, strict=True))
+    return tuple((made, _start(remote)) for made, remote in zip(done, asked, strict=True))
 
 
 def look(bus: can.BusABC, name: str, drives: Drives, scale: Scale, period: float, clock: Clock) -> SetUp:
     """Read what the drive called `name` is and what its set-up would change; nothing is written, no state changes."""
     at = NAMES.index(name)
-    remote, drive = _remotes(bus, drives, clock)[at], drives.each[at]
+    remote, drive = remotes(bus, drives, clock)[at], drives.each[at]
     _check_is_servo(remote)
     return _bring(remote, drive, drives, scale, period, apply=False)[0]
 
@@ -141,12 +141,13 @@ def told(made: Iterable[SetUp]) -> list[str]:
     return [f"drive{'s' * (len(of) > 1)} {', '.join(of)}: {note}" for note, of in names.items()]
 
 
-def _remotes(bus: can.BusABC, drives: Drives, clock: Clock) -> list[Remote]:
-    remotes = []
+def remotes(bus: can.BusABC, drives: Drives, clock: Clock) -> list[Remote]:
+    """The three drives' dictionaries over SDO."""
+    made = []
     for name, drive in zip(NAMES, drives.each, strict=True):
         objects = eds.load(name, Path(drive.eds) if drive.eds else eds.SERVO, drive.node)
-        remotes.append(Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock)))
-    return remotes
+        made.append(Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock)))
+    return made
 
 
 def _bring(

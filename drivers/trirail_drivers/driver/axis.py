@@ -22,6 +22,7 @@ class Axis(ABC):
         "answers",
         "event",
         "heard",
+        "left_out",
         "name",
         "node",
         "position",
@@ -41,6 +42,8 @@ class Axis(ABC):
         """The positions that have come, each in answer to the beginning of a cycle."""
         self.setpoints_late = self.setpoints_lost = 0
         """Setpoints written after the next cycle was due, and those that the bus did not take."""
+        self.left_out = False
+        """It stays without power where others are to have it."""
         self.powered_up = False
         """It has followed setpoints since that was asked for."""
         self.event: DriveFault | None = None

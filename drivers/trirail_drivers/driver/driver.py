@@ -59,6 +59,11 @@ class Driver(ABC, Generic[AnyAxis]):
         """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
         return self._wire.traffic
 
+    @property
+    def told(self) -> tuple[DriveFault | None, ...]:
+        """Of each drive the first fault that it has told of by itself since the last reset, whichever came first."""
+        return tuple(axis.event for axis in self._axes)
+
     def close(self) -> None:
         """Leave the drives without power, and let go of the bus.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from trirail_drivers import config
 from trirail_drivers.cia402 import checks, frames, units
 from trirail_drivers.cia402.drives import Cia402
-from trirail_drivers.cia402.inspection import inspect
+from trirail_drivers.cia402.inspection import inputs, inspect
 from trirail_drivers.cia402.objects import PROTECTIONS, means
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import EDS, Frames, Mechanics, Servo, SimulatedDevice, SimulatedDrive
@@ -51,6 +51,7 @@ CIA402 = Protocol(
     traffic=frames.TRAFFIC,
     simulated_drive=_simulated_drive,
     inspect=inspect,
+    inputs=inputs,
     protections={name: means(name) for name in PROTECTIONS},
     fault_frames={
         "nmt": Frames(True, frames.NMT),

@@ -34,5 +34,8 @@ class Protocol:
     the clock, and whether to `apply` that; None where drives have nothing to tell."""
     protections: Mapping[str, str]
     """What `accept_without` may name, and what each means, for people."""
+    inputs: Callable[[can.BusABC, config.Drives, Clock], Callable[[str], int | None]] | None
+    """Makes what reads the digital inputs of the drive of a name, as bits of object 60FDh; None where drives do not
+    tell them."""
     fault_frames: Mapping[str, Frames]
     """The frames that faults on demand can name."""

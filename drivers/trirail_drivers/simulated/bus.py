@@ -42,6 +42,10 @@ class SimulatedBus(can.BusABC):
             others = tuple(other for other in everyone if other != index)
             drive.connect(partial(self._from_drive, index, others), now)
 
+    def press(self, index: int, switches: int) -> None:
+        """Press switches of a slider by hand, and let go of the others: bits of its drive's digital inputs (60FDh)."""
+        self.drives[index].press(switches)
+
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
         """Bring a frame to every drive; their answers can be received at once.
 

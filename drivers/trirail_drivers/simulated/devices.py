@@ -42,6 +42,9 @@ class SimulatedDevice(Protocol):
     def poll(self, now: float) -> None:
         """Do what is due."""
 
+    def press(self, switches: int) -> None:
+        """Have these switches of its slider pressed: bits of CiA 402's digital inputs."""
+
     def fail(self, code: int) -> None:
         """Break down with an error code of its protocol."""
 

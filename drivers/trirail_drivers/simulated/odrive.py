@@ -121,6 +121,9 @@ class SimulatedOdrive:
             if self._heartbeat_due <= now:  # too late for that one as well: leave it out
                 self._heartbeat_due = now + self._heartbeat
 
+    def press(self, switches: int) -> None:
+        """Do nothing: CANSimple does not tell of switches."""
+
     def fail(self, errors: int) -> None:
         """Disarm with these errors."""
         self.errors |= Error(errors)

@@ -230,13 +230,18 @@ class _Recorded:
         """Return what was said in this one; before the first cycle, what is said in it."""
         return self._said[max(0, self._row - 1)]._replace(fault=self._fault)
 
+    @property
+    def told(self) -> tuple[DriveFault | None, ...]:
+        """Return that no drive has told of a fault: what was wrong is told by `read`."""
+        return None, None, None
+
     def configure(self, period: float) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
     def write(self, position: Triple, velocity: Triple) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
-    def enable(self) -> None:
+    def enable(self, alone: str | None = None) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
     def home(self) -> None:

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import msgspec
-from cyclopts import App, CycloptsError
+from cyclopts import App, CoercionError, CycloptsError, UnknownOptionError
 
 from trirail import __version__
 from trirail.cli import (
+    commission,
     config_commands,
     drives_command,
+    help_pages,
     math_commands,
+    panel_command,
     recording_commands,
     robot_commands,
     terminal,
+    units,
     workspace_command,
 )
+from trirail.cli.completion import Shell, script
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
 from trirail.wire.vocabulary import Command
@@ -31,7 +36,9 @@ app = App(
 
 
 @app.command
-def run(config: Path | None = None, /, *, record: Path | None = None) -> int:
+def run(
+    config: Path | None = None, /, *, record: Path | None = None, log: Literal["text", "json"] | None = None
+) -> int:
     """Run the service in the foreground until SIGTERM or Ctrl-C: then a controlled stop, drives disabled, exit 0.
 
     Parameters
@@ -40,12 +47,24 @@ def run(config: Path | None = None, /, *, record: Path | None = None) -> int:
         Configuration file; the simulated robot if absent.
     record
         Recording file to write, instead of one named by the time in the configured folder.
+    log
+        Write what happens as lines for people, or as JSON, instead of as [telemetry] log has it.
     """
     from trirail.config import SIM, load
+    from trirail.processes.log import Log
     from trirail.processes.supervisor import Supervisor
 
     settings = load(config or SIM)
-    return Supervisor(settings, record, terminal.say).run(lambda ready: terminal.up(settings, ready))
+    form = log or settings.telemetry.log
+    lines = Log(form)
+
+    def up(ready: dict[str, dict[str, Any]]) -> None:
+        if form == "json":
+            lines.say(f"up: robot {settings.robot.name}, goals {', '.join(settings.zenoh.listen)}")
+        else:
+            terminal.up(settings, ready)
+
+    return Supervisor(settings, record, lines.say, lines.event).run(up)
 
 
 @app.command
@@ -119,6 +138,8 @@ def view(
 
 
 app.command(drives_command.drives)
+app.command(commission.commission)
+app.command(panel_command.panel)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)
@@ -133,15 +154,36 @@ app.command(recording_commands.replay)
 app.command(recording_commands.report)
 
 
+@app.command
+def completion(shell: Shell | None = None, /, *, install: Annotated[bool, Flag] = False) -> int:
+    """Print a script for tab completion, of the robots that answer too, or install it for this user.
+
+    Parameters
+    ----------
+    shell
+        The shell: bash, zsh or fish; the one in use if absent.
+    install
+        Write it where the shell finds it, and load it from the shell's start file where that is needed.
+    """
+    return script(app, shell, install=install)
+
+
+help_pages.arrange(app)
+
+
 def main() -> None:
     """Run a command and exit as it says."""
+    words = sys.argv[1:]
     try:
-        code = app(exit_on_error=False, print_error=False, result_action="return_value")
+        code = app(units.numbers(words), exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
-        terminal.complain(f"{str(error).strip()} (trirail --help tells the usage)")
+        terminal.complain(_wrong_usage(error, words))
         code = 2
     except TrirailError as error:
-        terminal.complain(str(error))
+        if "--json" in words:
+            terminal.failed(error)
+        else:
+            terminal.complain(str(error))
         code = 1
     except KeyboardInterrupt:
         code = 130
@@ -149,3 +191,16 @@ def main() -> None:
         sys.stderr.close()
         code = 0
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
+    """Say what is wrong with a command line, of what, and where its usage is told."""
+    said = str(error).strip()
+    behind = words[words.index("--") :] if "--" in words else []
+    unknown = error.token.keyword if isinstance(error, UnknownOptionError) else None
+    if unknown and any(word.split("=")[0] == unknown for word in behind):
+        said = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
+    elif isinstance(error, CoercionError) and error.msg and error.argument and not said.startswith("Invalid value"):
+        said = f"Invalid value for {error.argument.name.strip('-')}: {said}"
+    command = " ".join(("trirail", *(error.command_chain or ())))
+    return f"{said} ({command} --help tells the usage)"

@@ -25,7 +25,7 @@ from trirail.processes.replies import Replies
 from trirail.processes.state import StateMaker
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.links import Closed, PacketLink
-from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Goal, GoalReply, NoContent, Override, Stop
+from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Event, Goal, GoalReply, NoContent, Override, Stop
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -66,7 +66,15 @@ class _Waiting(NamedTuple):
 class Gateway:
     """Takes requests from Zenoh, passes them to the loop, and answers and publishes what the loop says."""
 
-    def __init__(self, config: Config, link: PacketLink, beat: Callable[[], None], opened: zenoh.Session) -> None:
+    def __init__(
+        self,
+        config: Config,
+        link: PacketLink,
+        beat: Callable[[], None],
+        opened: zenoh.Session,
+        log: Callable[[Event], None] = lambda _: None,
+    ) -> None:
+        self._log = log
         self._robot = config.robot.name
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
         self._home_within = REPLY_WITHIN + sum(homing)
@@ -231,7 +239,7 @@ class Gateway:
         self._last_words.take(answer)
         match answer:
             case Happened(event):
-                self._publications.event(event)
+                self._happened(event)
             case Status() | Welcome():
                 self._states.update(answer)
             case Accepted(ticket, goal_id, duration, slowed, stops_first, queued):
@@ -251,10 +259,15 @@ class Gateway:
             self._state_due = max(self._state_due + self._state_every, now)
             self._publications.state(self._states.newest())
 
+    def _happened(self, event: Event) -> None:
+        """Tell everyone of an event, and the service's log."""
+        self._publications.event(event)
+        self._log(event)
+
     def _tell_of_its_end(self) -> None:
         """The loop has gone: where it has died, tell everyone in its place."""
         for event in self._last_words.events(self._states.cycle):
-            self._publications.event(event)
+            self._happened(event)
         if (reason := self._last_words.reason) and self._states.cycle:
             state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason,))
             self._publications.state(state)
@@ -277,10 +290,16 @@ class Gateway:
         return zenoh_session.key(self._robot, *parts)
 
 
-def main(config: Config, link: PacketLink, beat: Callable[[], None], ready: Callable[[object], None]) -> int:
-    """Run the gateway's process; `ready` is called once it can be reached."""
+def main(
+    config: Config,
+    link: PacketLink,
+    beat: Callable[[], None],
+    ready: Callable[[object], None],
+    log: Callable[[Event], None],
+) -> int:
+    """Run the gateway's process; `ready` is called once it can be reached, `log` with each event."""
     with zenoh_session.open_service(config.zenoh.listen) as opened:
-        gateway = Gateway(config, link, beat, opened)
+        gateway = Gateway(config, link, beat, opened, log)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
         gateway.serve(lambda: ready({}))
     return 0

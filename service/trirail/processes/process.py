@@ -1,12 +1,13 @@
 """What each child process of the service begins with: `trirail.processes.process NAME RUNTIME READY BEATS [SOCKETS…]`.
 
-Its order comes on standard input; READY is a descriptor on which the process says, once, that it is up;
-BEATS that of the heartbeats.
+Its order comes on standard input; READY is a descriptor on which it says, in lines of JSON, what it compiles, once that
+it is up, and what is to be in the log; BEATS that of the heartbeats.
 """
 
 from __future__ import annotations
 
 import os
+import select
 import signal
 import socket
 import sys
@@ -17,9 +18,11 @@ import msgspec
 
 from trirail.config import Config
 from trirail.errors import TrirailError
+from trirail.kinematics.compiled import tell_of_compiling
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.realtime import die_with_parent
 from trirail.wire import links
+from trirail.wire.messages import Event
 from trirail.wire.planning import MAX_PLANNING
 
 
@@ -31,7 +34,22 @@ class Order(msgspec.Struct, frozen=True):
     """Recording file to write, None for one named by the time."""
 
 
-def _main(name: str, runtime: Path, heartbeats: Heartbeats, ready: Callable[[object], None], sockets: list[int]) -> int:
+COMPILING = "compiling"
+"""The key of what is said of a function that is being compiled."""
+HAPPENED = "happened"
+"""The key of an event, for the service's log."""
+LOG_WITHIN = 0.05
+"""How long a line for the log waits for a supervisor whose own output is held up, before it is left out [s]."""
+
+
+def _main(
+    name: str,
+    runtime: Path,
+    heartbeats: Heartbeats,
+    ready: Callable[[object], None],
+    log: Callable[[Event], None],
+    sockets: list[int],
+) -> int:
     order = msgspec.json.decode(sys.stdin.buffer.read(), type=Order)
     config = order.config
     # Each process imports what it needs and no more: the loop must not load Zenoh or Rerun.
@@ -49,10 +67,10 @@ def _main(name: str, runtime: Path, heartbeats: Heartbeats, ready: Callable[[obj
     if name == "gateway":
         from trirail.processes import gateway as gate
 
-        return gate.main(config, link, heartbeats.of("gateway").beat, ready)
+        return gate.main(config, link, heartbeats.of("gateway").beat, ready, log)
     from trirail.processes import recording
 
-    return recording.main(config, order.record, link, ready)
+    return recording.main(config, order.record, link, heartbeats.of(name), ready)
 
 
 def main() -> int:
@@ -65,10 +83,16 @@ def main() -> int:
 
     def ready(content: object) -> None:
         # The descriptor stays open: its end is how the supervisor learns of this process's end.
-        os.write(int(descriptor), msgspec.json.encode(content))
+        os.write(int(descriptor), msgspec.json.encode(content) + b"\n")
+
+    def log(event: Event) -> None:
+        if select.select([], [int(descriptor)], [], LOG_WITHIN)[1]:
+            ready({HAPPENED: event})
+
+    tell_of_compiling(lambda function: ready({COMPILING: function}))
 
     try:
-        return _main(name, Path(runtime), Heartbeats(int(beats)), ready, [int(number) for number in sockets])
+        return _main(name, Path(runtime), Heartbeats(int(beats)), ready, log, [int(number) for number in sockets])
     except TrirailError as error:
         print(f"trirail: {error}", file=sys.stderr, flush=True)  # noqa: T201 - a process says why it ends
         return os.EX_CONFIG

@@ -18,11 +18,13 @@ from msgspec import structs
 
 from trirail.config import Config
 from trirail.errors import ServiceError
+from trirail.processes.compiling import Progress
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
 from trirail.processes.interpreter import CHILD, python
-from trirail.processes.process import Order
+from trirail.processes.process import COMPILING, HAPPENED, Order
 from trirail.processes.systemd import Watchdog, notify
 from trirail.wire import links
+from trirail.wire.messages import Event, Level
 
 CHILDREN = ("loop", "planner", "gateway", "recorder")
 PORTS = ("gateway", "recorder", "planner")
@@ -36,7 +38,7 @@ CONSEQUENCES = {
 }
 """What the death of a process means for the robot."""
 START_WITHIN = 300.0
-"""How long the processes may take to come up; the very first start compiles the kinematics [s]."""
+"""How long the processes may take to come up; the very first start may for each function that it compiles [s]."""
 END_WITHIN = 6.0
 """How long they may take to end before they are killed [s]."""
 RESTARTS = 5
@@ -45,6 +47,8 @@ TURN = 0.1
 """How often the supervisor looks whether the others are alive [s]."""
 SILENT = 0.7
 """A process that should give signs of life and gives none for so long is hung, and is killed [s]."""
+RECORDER_SILENT = 5.0
+"""The same of the recorder, which may wait for a disk: nothing that moves depends on it [s]."""
 LEAST_CYCLES = 3
 """So many cycles the loop may take for a sign of life, however long they are."""
 RETRY = 10.0
@@ -57,6 +61,9 @@ class _Child:
     def __init__(self, name: str, order: bytes, runtime: Path, beats: int, sockets: list[int]) -> None:
         self.name = name
         self.began = time.monotonic()
+        self.compiling: list[str] = []
+        self.happened: list[Event] = []
+        self._begun_line = b""
         self.ready_with: dict[str, Any] | None = None
         self._hung_for = 0.0
         self.pipe, write = os.pipe()
@@ -65,15 +72,26 @@ class _Child:
             python("-m", CHILD, *arguments), stdin=subprocess.PIPE, pass_fds=[write, beats, *sockets]
         )
         os.close(write)
+        os.set_blocking(self.pipe, False)
         if self.process.stdin is not None:
             self.process.stdin.write(order)
             self.process.stdin.close()
 
     def listen(self) -> bool:
         """Read what the child says; False once it has ended."""
-        content = os.read(self.pipe, 65_536)
-        if content:
-            self.ready_with = msgspec.json.decode(content)
+        try:
+            content = os.read(self.pipe, 65_536)
+        except BlockingIOError:
+            return False
+        *lines, self._begun_line = (self._begun_line + content).split(b"\n")
+        for line in lines:
+            said = msgspec.json.decode(line)
+            if COMPILING in said:
+                self.compiling.append(said[COMPILING])
+            elif HAPPENED in said:
+                self.happened.append(msgspec.convert(said[HAPPENED], Event))
+            else:
+                self.ready_with = said
         return bool(content)
 
     def wait(self, deadline: float) -> bool:
@@ -101,12 +119,19 @@ class _Child:
 
 
 class Supervisor:
-    """Runs the service in the foreground."""
+    """Runs the service in the foreground; `say` takes what it has to say of the processes, `tell` every event."""
 
-    def __init__(self, config: Config, record: Path | None, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        config: Config,
+        record: Path | None,
+        say: Callable[[str, Level], None],
+        tell: Callable[[Event], None] = lambda _: None,
+    ) -> None:
         self._orders = dict.fromkeys(CHILDREN, Order(config, None))
         self._orders["recorder"] = Order(config, str(record) if record else None)
         self._say = say
+        self._tell = tell
         self._children: dict[str, _Child] = {}
         self._selector = selectors.DefaultSelector()
         self._restarts: dict[str, list[float]] = {name: [] for name in CHILDREN}
@@ -117,12 +142,14 @@ class Supervisor:
             "loop": loop_silent,
             "gateway": max(SILENT, config.watchdogs.gateway_timeout),
             "planner": SILENT,
+            "recorder": RECORDER_SILENT,
         }
         self._watches = {
             name: Watch(self._heartbeats.of(name), round(seconds / TURN)) for name, seconds in self._patience.items()
         }
         self._watchdog = Watchdog([self._heartbeats.of(name) for name in WATCHED_BY_SYSTEMD])
         self._next_turn = 0.0
+        self._went_on = 0.0
         self._ending = False
         self._failed = False
         self._turned = False
@@ -157,17 +184,23 @@ class Supervisor:
         self._selector.register(child.pipe, selectors.EVENT_READ, child)
 
     def _watch(self, up: Callable[[dict[str, dict[str, Any]]], None], signals: _Signals) -> None:
-        deadline = time.monotonic() + START_WITHIN
+        progress = Progress(lambda words: self._say(words, "info"), START_WITHIN)
+        began = time.monotonic()
         is_up = False
         while not self._ending:
             heard: list[_Child | None] = [key.data for key, _ in self._selector.select(TURN)]
             # The loop first: the others end because it has ended, and not by themselves.
             for child in sorted(heard, key=lambda child: child is not self._children.get("loop")):
                 if child is None:
-                    self._say(f"{signals.take().name}: stopping the robot and disabling the drives")
+                    self._say(f"{signals.take().name}: stopping the robot and disabling the drives", "info")
                     self._ending = True
                 elif not child.listen() and not self._ending:
                     self._on_end(child)
+                if child is not None:
+                    self._pass_on(child)
+                while child is not None and child.compiling:
+                    self._went_on = time.monotonic()
+                    progress.begin(child.compiling.pop(0))
             if self._ending:
                 continue
             self._start_due()
@@ -180,7 +213,7 @@ class Supervisor:
                 is_up = True
                 up(ready)
                 notify("READY=1")
-            elif time.monotonic() > deadline:
+            elif time.monotonic() - max(began, self._went_on) > START_WITHIN:
                 missing = ", ".join(name for name in CHILDREN if name not in ready)
                 raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")
 
@@ -191,7 +224,7 @@ class Supervisor:
             return
         self._next_turn = now + TURN
         for child in self._children.values():
-            if child.ready_with is None and now - child.began > START_WITHIN:
+            if child.ready_with is None and now - max(child.began, self._went_on) > START_WITHIN:
                 child.kill_hung(START_WITHIN)
         for name, watch in self._watches.items():
             if watch.silent() and name in self._children:
@@ -225,7 +258,7 @@ class Supervisor:
             self._fail(f"the gateway keeps dying ({child.how}): ending the service")
             return
         when = f" in {wait:g} s" if wait else ""
-        self._say(f"the {name} has died ({child.how}): {CONSEQUENCES[name]}; starting it again{when}")
+        self._say(f"the {name} has died ({child.how}): {CONSEQUENCES[name]}; starting it again{when}", "warning")
         self._orders[name] = structs.replace(self._orders[name], record=None)  # never over the first recording
         self._due[name] = now + wait
 
@@ -243,9 +276,16 @@ class Supervisor:
     def _fail(self, reason: str) -> None:
         self._failed = self._ending = True
         if reason:
-            self._say(reason)
+            self._say(reason, "error")
+
+    def _pass_on(self, child: _Child) -> None:
+        while child.happened:
+            self._tell(child.happened.pop(0))
 
     def _forget(self, child: _Child) -> None:
+        while child.listen():
+            pass
+        self._pass_on(child)
         self._selector.unregister(child.pipe)
         os.close(child.pipe)
         del self._children[child.name]
@@ -276,7 +316,7 @@ class Supervisor:
             self._forget(child)
 
     def _kill(self, child: _Child) -> None:
-        self._say(f"the {child.name} does not end: killing it")
+        self._say(f"the {child.name} does not end: killing it", "warning")
         child.process.kill()
         child.process.wait()
 

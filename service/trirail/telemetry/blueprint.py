@@ -37,7 +37,7 @@ def layout(robot: ShownRobot, bounds: Points) -> rrb.Blueprint:
         name="Events",
         origin="/events",
         columns=rrb.TextLogColumns(
-            timeline_columns=[rrb.encodings.TimelineColumn("t")],
+            timeline_columns=[rrb.encodings.TimelineColumn("t", visible=False)],
             text_log_columns=["LogLevel", "Body"],
         ),
     )
@@ -46,7 +46,7 @@ def layout(robot: ShownRobot, bounds: Points) -> rrb.Blueprint:
         rrb.TextDocumentView(name="Now", origin=readout.PATH),
         rrb.StateTimelineView(name="Mode", origin="/mode", time_view=window),
         events,
-        row_shares=[52, 26, 10, 19],
+        row_shares=[53, 23, 11, 21],
     )
     return rrb.Blueprint(
         rrb.Horizontal(left, sliders, platform, column_shares=[8, 6, 6]),

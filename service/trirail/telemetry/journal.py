@@ -30,7 +30,8 @@ from trirail.wire.planning import Extended, NotPlanned, Planned
 
 EVENTS, REQUESTS = "/events", "/requests"
 TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
-JSON = rr.ComponentDescriptor("json")
+JSON, WORDS = rr.ComponentDescriptor("json"), rr.ComponentDescriptor("words")
+"""Beside the line that a viewer shows: the message itself, and the line without its time."""
 LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
 
@@ -69,7 +70,9 @@ def chunks(entries: Sequence[Entry]) -> list[Chunk]:
 def _chunk(log: str, entries: Sequence[Entry]) -> Chunk:
     messages = [[msgspec.json.encode(entry.message).decode()] if entry.message else [] for entry in entries]
     parts = [
-        Column(log, TEXT, pa.array([[entry.text] for entry in entries])),
+        # The viewer's own column of times is too narrow for them, and cannot be made wider.
+        Column(log, TEXT, pa.array([[f"{entry.t:9.3f} s   {entry.text}"] for entry in entries])),
+        Column(log, WORDS, pa.array([[entry.text] for entry in entries])),
         Column(log, LEVEL, pa.array([[LEVELS[entry.level]] for entry in entries])),
         Column(log, JSON, pa.array(messages, pa.list_(pa.string()))),
     ]

@@ -30,7 +30,7 @@ from trirail_drivers.errors import FileError
 
 from trirail.errors import EmptyRecordingError, ServiceError
 from trirail.telemetry.columns import FIELDS, RECORD, SECOND, SOFTWARE, structs
-from trirail.telemetry.journal import EVENTS, JSON, REQUESTS
+from trirail.telemetry.journal import EVENTS, JSON, REQUESTS, WORDS
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE
@@ -44,7 +44,7 @@ _MESSAGE_HEADER = struct.Struct("<QQ")
 _END = 0
 """The kind of the last message of a file that was closed; only a table of contents follows."""
 
-_TEXT, _LEVEL = rr.TextLog.descriptor_text().component, rr.TextLog.descriptor_level().component
+_LEVEL = rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
 _KEPT = (RECORD, EVENTS, REQUESTS)
 T = TypeVar("T", bound=msgspec.Struct)
@@ -213,7 +213,7 @@ def _events(chunks: list[Chunk], path: Path) -> list[Line]:
     for batch in (chunk.to_record_batch() for chunk in chunks):
         t = batch.column("t").to_numpy().astype(np.int64) / SECOND
         wall = batch.column("wall").to_numpy()
-        levels, texts = (batch.column(name).flatten().to_pylist() for name in (_LEVEL, _TEXT))
+        levels, texts = (batch.column(name).flatten().to_pylist() for name in (_LEVEL, WORDS.component))
         spoken = batch.column(JSON.component).to_pylist() if JSON.component in batch.schema.names else [None] * len(t)
         events = [_decoded(content[0], Event, path, "events") if content else None for content in spoken]
         lines += map(Line, t.tolist(), wall, levels, texts, events)

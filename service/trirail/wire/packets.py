@@ -62,7 +62,7 @@ class Accepted(Struct, frozen=True, tag=True):
     ticket: int
     id: str
     duration: float
-    """Expected time from now to arrival [s]; infinite at override 0."""
+    """Expected time from now to the end of its path [s]; infinite at override 0."""
     slowed: float
     """As in trirail.wire.messages.GoalReply, and the two below."""
     stops_first: bool

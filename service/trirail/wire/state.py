@@ -64,9 +64,9 @@ class GoalState(Struct, frozen=True):
     id: str
     """As it was sent, or as the service made it."""
     progress: float
-    """Share of its time that is over, 0 to 1."""
+    """Share of its path's time that is over, 0 to 1; 1 while it settles."""
     remaining: float
-    """Time to its end [s]."""
+    """Time to the end of its path [s]; 0 while it settles."""
     target: Triple | None = None
     """The pose that it leads to; None for a jog."""
 
@@ -127,6 +127,8 @@ class State(Struct, frozen=True):
     """What the drives say."""
     goal: GoalState | None
     """The goal under way, or paused; None where there is none."""
+    settled: bool
+    """Whether the robot stands where it is commanded to, by what was measured for the dwell of [limits.in_position]."""
     override: float
     """The share of full speed at which motions are to run, 0 to 2."""
     faults: tuple[str, ...]
@@ -154,6 +156,8 @@ class Info(Struct, frozen=True):
     """The folder of the service's recordings, on its machine."""
     live: str
     """Where a Rerun viewer on the service's machine finds the live view; "" for nowhere."""
+    homes: tuple[str, ...] = ()
+    """The sliders whose encoders are not absolute: they have no position until the command home."""
     versions: dict[str, str] = msgspec.field(default_factory=dict)
     """Of Python and the libraries that matter, by name."""
     missing_protections: tuple[MissingProtection, ...] = ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import unicodedata
+from datetime import datetime
 
 from trirail.wire.sizes import MAX_NAME, MAX_TEXT
 
@@ -40,6 +41,11 @@ def quoted(text: str) -> str:
     """Return text from outside as a part of a line: printable, and not longer than a line may be."""
     said = printable(text[: MAX_TEXT + 1])
     return said if len(said) <= MAX_TEXT else said[: MAX_TEXT - 1] + "…"
+
+
+def wall_clock(seconds: float) -> str:
+    """Return a time since 1970 [s] as the clock on the wall shows it, to milliseconds."""
+    return datetime.fromtimestamp(seconds).astimezone().isoformat(" ", "milliseconds")[:23]
 
 
 def _is_hidden(character: str) -> bool:

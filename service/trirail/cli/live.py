@@ -1,0 +1,159 @@
+"""The robot's state as people read it: once, live, and beside a jog."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Iterator, Sequence
+
+import msgspec
+from rich.live import Live
+from rich.table import Table
+from trirail_drivers.interface import NAMES, MissingProtection
+
+from trirail.cli import units
+from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain
+from trirail.client.client import Jog, Robot
+from trirail.config import Limits
+from trirail.errors import ServiceError
+from trirail.wire.state import GoalState, Info, State
+from trirail.wire.vocabulary import Mode
+
+NEAR = 0.05
+"""A position is near a limit in the last such share of its range, a rate in that below its limit."""
+_ALONG = (("x", "mm", "mm/s", 3), ("y", "mm", "mm/s", 3), ("φ", "°", "°/s", 4))
+
+
+def show(state: State, info: Info) -> None:
+    """Print a state, with what drives do without."""
+    out.print(table(state, info.robot, limits_of(info)))
+    _missing(info.missing_protections)
+
+
+def watch(robot: Robot, *, json_lines: bool) -> None:
+    """Show the state live, or as lines of JSON, until Ctrl-C; raises ServiceError where nobody answers any more."""
+    limits = limits_of(robot.info())  # so that a missing service is said, not waited for
+    with contextlib.suppress(KeyboardInterrupt):
+        if json_lines:
+            for state in robot.states(SILENT):
+                json(msgspec.to_builtins(state))
+        else:
+            with Live(console=out, refresh_per_second=10, transient=False) as live:
+                for state in robot.states(SILENT):
+                    live.update(table(state, robot.name, limits))
+        raise ServiceError("the service has gone silent")
+
+
+def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
+    """Show where a jog leads, until it ends or its time is over."""
+    ends = math.inf if seconds is None else time.monotonic() + seconds
+    with Live(console=out, refresh_per_second=10, transient=True) as live:
+        for state in robot.states(SILENT):
+            if show:
+                live.update(table(state, robot.name))
+            if time.monotonic() >= ends or jog.error is not None or jog.result is not None:
+                return
+    raise ServiceError("the service has gone silent")
+
+
+def limits_of(info: Info) -> Limits:
+    """Return the limits of a robot from what its service tells of it. Raises ServiceError where they are none."""
+    try:
+        return msgspec.convert(info.limits, Limits)
+    except msgspec.ValidationError as error:
+        raise ServiceError(f"the service is of another version: its limits cannot be read: {error}") from error
+
+
+def table(state: State, robot: str, limits: Limits | None = None) -> Table:
+    """Return a state as a table: what is wrong, what is under way, measured and commanded, near limits, the loop."""
+    grid = Table.grid(padding=(0, 2))
+    grid.add_row("robot", f"[bold]{plain(robot)}[/]  {_mode(state)}  t {state.t:.2f} s")
+    for fault in state.faults:
+        grid.add_row("fault", f"[bold red]{plain(fault)}[/]")
+    colour = "yellow" if state.override != 1.0 else "default"
+    grid.add_row("override", f"[{colour}]{units.written(state.override * 100.0, '%', 0)}[/]")
+    if state.goal:
+        _add_goal(grid, state.goal, state.pose)
+    grid.add_row("measured", units.pose(state.pose, 9))
+    grid.add_row("commanded", units.pose(state.commanded.pose, 9))
+    _add_sliders(grid, state)
+    for words in near_limits(state, limits) if limits else ():
+        grid.add_row("[yellow]near[/]", plain(words))
+    loop = state.loop
+    words = f"{loop.rate_hz} Hz, {loop.cycles} cycles, {loop.overruns} missed"
+    grid.add_row("loop", f"{words}, bus {loop.bus_load_measured:.0%} of at most {loop.bus_load:.0%}")
+    grid.add_row("lateness", percentiles(loop.lateness_us))
+    grid.add_row("cycle", percentiles(loop.cycle_us))
+    for lack in loop.lacking:
+        grid.add_row("[yellow]without[/]", plain(lack))
+    return grid
+
+
+def near_limits(state: State, limits: Limits) -> Iterator[str]:
+    """Yield a line for each limit that a measured position, commanded rate or following error is near, or beyond."""
+    slider, platform = limits.slider, limits.platform
+    for name, at, error in zip(NAMES, state.sliders.position, state.sliders.following_error, strict=True):
+        yield from _position(f"slider {name}", at, slider.position, "mm", 3)
+        yield from _rate(f"following error of {name}", error, slider.following_error, "µm", 1)
+    for name, rate in zip(NAMES, state.commanded.velocity, strict=True):
+        yield from _rate(f"velocity of slider {name}", rate, slider.velocity, "mm/s", 2)
+    ranges = (platform.x, platform.y, platform.phi)
+    for (name, unit, per_second, digits), at, rate, ends, most in zip(
+        _ALONG, state.pose, state.commanded.pose_velocity, ranges, platform.velocity, strict=True
+    ):
+        yield from _position(name, at, ends, unit, digits)
+        yield from _rate(f"velocity of {name}", rate, most, per_second, 2)
+
+
+def _position(name: str, at: float, ends: Sequence[float], unit: str, digits: int) -> Iterator[str]:
+    low, high = ends
+    limit = low if at - low < high - at else high
+    if abs(limit - at) <= NEAR * (high - low) or not low <= at <= high:
+        yield f"{name} {units.written(at, unit, digits)}, limit {units.written(limit, unit, digits)}"
+
+
+def _rate(name: str, at: float, most: float, unit: str, digits: int) -> Iterator[str]:
+    if abs(at) >= (1.0 - NEAR) * most:
+        limit = math.copysign(most, at)
+        yield f"{name} {units.written(at, unit, digits)}, limit {units.written(limit, unit, digits)}"
+
+
+def _mode(state: State) -> str:
+    colour = COLOURS.get(state.mode, "default")
+    paused = "  [yellow]paused[/]" if state.mode == Mode.HOLDING and state.goal else ""
+    settled = "  settled" if state.settled else ""
+    return f"[{colour}]{plain(state.mode)}[/]{paused}{settled}"
+
+
+def _add_goal(grid: Table, goal: GoalState, pose: Sequence[float]) -> None:
+    grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {left(goal)}")
+    if goal.target is not None:
+        grid.add_row("  target", units.pose(goal.target, 9))
+        grid.add_row("  to go", units.pose([end - at for end, at in zip(goal.target, pose, strict=True)], 9))
+
+
+def _add_sliders(grid: Table, state: State) -> None:
+    sliders = state.sliders
+    for index, name in enumerate(NAMES):
+        written = (
+            units.written(sliders.position[index], "mm", 3, 9),
+            f"commanded {units.written(state.commanded.position[index], 'mm', 3, 9)}",
+            f"error {units.written(sliders.following_error[index], 'µm', 1, 7)}",
+            units.written(sliders.velocity[index], "mm/s", 2, 8),
+            sliders.status[index],
+        )
+        grid.add_row(f"slider {name}", "  ".join(written))
+        traffic = msgspec.to_builtins(sliders.traffic[index])
+        if said := [f"{kind.replace('_', ' ')} {count}" for kind, count in traffic.items() if count]:
+            grid.add_row("", f"[yellow]{', '.join(said)}[/]")
+
+
+def _missing(protections: Sequence[MissingProtection]) -> None:
+    """Print what drives do without, a line for what is so of several."""
+    drives: dict[str, list[str]] = {}
+    for each in protections:
+        drives.setdefault(f"{each.object}, {each.means}", []).append(each.drive)
+    for what, names in drives.items():
+        whose = f"drive{'s' * (len(names) > 1)} {', '.join(names)}"
+        out.print(f"[yellow]lacking[/]   {whose}: {plain(what)}", soft_wrap=True)

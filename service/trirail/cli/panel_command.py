@@ -1,0 +1,49 @@
+"""`trirail panel`: the operator's page, served on this machine's loopback for as long as the command lasts."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from trirail.cli.options import HERE, Service
+from trirail.cli.robot_commands import show
+
+
+def panel(
+    *,
+    port: int | None = None,
+    open_: Annotated[bool, Parameter(name="--open", negative="")] = False,
+    service: Service = HERE,
+) -> int:
+    """Serve the operator's page to browsers on this machine: jog, STOP, commands, the robot live. Ends by Ctrl-C.
+
+    Who has the address that is printed can move the robot; it is another one each time.
+
+    Parameters
+    ----------
+    port
+        Port of the loopback, 0 for any that is free; 9880 if absent, or any where that is taken.
+    open_
+        Open it in the browser.
+    """
+    from trirail.client.client import Robot
+    from trirail.panel.server import Panel
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with Robot(service.robot, service.connect) as robot, Panel(robot, port) as served:
+        show(
+            service,
+            {"url": served.url},
+            f"the panel of {robot.name}, on this machine alone, until Ctrl-C: {served.url}",
+        )
+        if open_:
+            import webbrowser
+
+            webbrowser.open(served.url)
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
+    return 0

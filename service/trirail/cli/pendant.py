@@ -1,0 +1,209 @@
+"""`trirail jog` without arguments: a pendant in the terminal, that moves the robot while a key is held."""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import signal
+import sys
+import termios
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+import msgspec
+from rich.live import Live
+from rich.text import Text
+
+from trirail.cli import terminal
+from trirail.cli.keyboard import keys
+from trirail.client.client import Robot
+from trirail.client.held_jog import SPEEDS, USUAL, HeldJog, Velocity
+from trirail.config import Limits
+from trirail.errors import ServiceError, TrirailError
+from trirail.wire.state import State
+from trirail.wire.text import printable
+
+REPEAT = 0.15
+"""A key that has not come again for so long is let go [s]: a terminal tells of no key's end, and repeats one that is
+held every 30 to 50 ms, but for the pause before the first repeat."""
+DRAWN = 0.1
+"""The numbers are drawn so often [s]."""
+STALLED = 0.5
+"""After standing still for so long the program does not know what was pressed meanwhile [s]."""
+SILENT = 1.0
+"""After so long without a state the service is taken for silent [s]."""
+AXES = {"right": (1, 0, 0), "left": (-1, 0, 0), "up": (0, 1, 0), "down": (0, -1, 0), "a": (0, 0, 1), "d": (0, 0, -1)}
+"""Directions along x, y and φ."""
+HELP = "← → x   ↑ ↓ y   a d φ   + − speed   Space stop   q leave"
+
+
+class Pendant:
+    """What keys mean: a jog while one is held, a speed, a stop. `top` is the platform's greatest velocity."""
+
+    def __init__(self, robot: Robot, top: Velocity) -> None:
+        self._robot = robot
+        self._top = top
+        self._jog = HeldJog(robot.send, self._say)
+        self._until = -math.inf
+        self._choice = USUAL
+        self.said = HELP
+        """One line for the operator: what the robot said last."""
+        self.over = False
+        """Whether the operator wants to leave."""
+
+    @property
+    def speed(self) -> Velocity:
+        """The velocity of a jog along each axis [m/s, m/s, rad/s]."""
+        x, y, phi = (SPEEDS[self._choice] * top for top in self._top)
+        return x, y, phi
+
+    def press(self, key: str, now: float) -> None:
+        """Take in a key, pressed or repeated by the terminal, at a time of the monotonic clock."""
+        if key in AXES:
+            x, y, phi = (sign * speed for sign, speed in zip(AXES[key], self.speed, strict=True))
+            self._until = now + REPEAT
+            self._jog.hold((x, y, phi))
+            return
+        self.let_go()
+        if key in (" ", "escape"):
+            threading.Thread(target=self._stop, name="stop", daemon=True).start()
+        elif key in "+-":
+            self._choice = min(max(self._choice + (1 if key == "+" else -1), 0), len(SPEEDS) - 1)
+        elif key == "q":
+            self.over = True
+
+    def tick(self, now: float) -> None:
+        """Let go of a key that has not come again."""
+        if now > self._until:
+            self.let_go()
+
+    def let_go(self) -> None:
+        """Let go of the key that is held, if one is."""
+        if self._until > -math.inf:
+            self._until = -math.inf
+            self._jog.release()
+
+    def close(self) -> None:
+        """Let go, for good."""
+        self._jog.close()
+
+    def _stop(self) -> None:
+        try:
+            self._robot.stop()
+            self._say("stopped")
+        except TrirailError as error:
+            self._say(str(error))
+
+    def _say(self, words: str) -> None:
+        self.said = words
+
+
+class _Newest:
+    """The newest state, heard by a thread of its own; None where the service is silent."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.state: State | None = None
+        self._robot = robot
+        threading.Thread(target=self._hear, name="states", daemon=True).start()
+
+    def _hear(self) -> None:
+        while True:
+            for state in self._robot.states(SILENT):
+                self.state = state
+            self.state = None
+
+
+def run(robot: Robot) -> int:
+    """Serve the operator until he leaves or his terminal is gone; return the exit code.
+
+    Raises ServiceError where standard input is no terminal, or nobody answers.
+    """
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise ServiceError("a jog by keys needs a terminal; without one: trirail jog VX VY W --seconds S")
+    top = msgspec.convert(robot.info().limits, Limits).platform.velocity
+    pendant, newest = Pendant(robot, top), _Newest(robot)
+    try:
+        with Live(console=terminal.out, auto_refresh=False, transient=True) as live, _raw(pendant):
+            _serve(pendant, newest, live)
+    except (KeyboardInterrupt, _HungUp, OSError):
+        pass  # an OSError is that of a terminal that is gone
+    finally:
+        pendant.close()
+    return 0
+
+
+def _serve(pendant: Pendant, newest: _Newest, live: Live) -> None:
+    descriptor = sys.stdin.fileno()
+    drawn, last = -math.inf, time.monotonic()
+    while not pendant.over:
+        ready, _, _ = select.select([descriptor], [], [], REPEAT / 5.0)
+        now = time.monotonic()
+        if now - last > STALLED:  # stopped and continued: what waits in the terminal is from before
+            pendant.let_go()
+            termios.tcflush(descriptor, termios.TCIFLUSH)
+        elif ready:
+            typed = os.read(descriptor, 1024)
+            if not typed:
+                return  # the terminal is gone
+            for key in keys(typed):
+                pendant.press(key, now)
+        pendant.tick(now)
+        last = now
+        if now - drawn > DRAWN:
+            live.update(_shown(pendant, newest.state), refresh=True)
+            drawn = now
+
+
+def _shown(pendant: Pendant, state: State | None) -> Text:
+    """Return the lines that the operator sees."""
+    x, _, phi = pendant.speed
+    lines = ["no contact with the service" if state is None else f"{state.mode}, override {state.override:.0%}"]
+    if state is not None:
+        at_x, at_y, at_phi = state.pose
+        v_x, v_y, v_phi = state.velocity
+        lines += [f"fault: {fault}" for fault in state.faults]
+        lines.append(f"x {at_x * 1e3:9.3f} mm   y {at_y * 1e3:9.3f} mm   φ {math.degrees(at_phi):9.4f}°")
+        lines.append(f"  {v_x * 1e3:9.2f} mm/s   {v_y * 1e3:9.2f} mm/s   {math.degrees(v_phi):9.3f} °/s")
+    lines.append(f"speed {x * 1e3:.3g} mm/s, {math.degrees(phi):.3g} °/s")
+    lines.append(pendant.said)
+    return Text("\n".join(map(printable, lines)), no_wrap=True, overflow="ellipsis")
+
+
+class _HungUp(Exception):
+    """The terminal is gone, or the program is told to end."""
+
+
+@contextmanager
+def _raw(pendant: Pendant) -> Iterator[None]:
+    """Have keys as they are pressed, and not shown; let go and restore the terminal when suspended, and at the end."""
+    descriptor = sys.stdin.fileno()
+    before = termios.tcgetattr(descriptor)
+
+    def hung_up(_number: int, _frame: FrameType | None) -> None:
+        raise _HungUp
+
+    def suspended(number: int, _frame: FrameType | None) -> None:
+        pendant.let_go()
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+        signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)  # here it stands until it is continued
+        signal.signal(number, suspended)
+        tty.setcbreak(descriptor, termios.TCSAFLUSH)
+
+    handlers = {signal.SIGHUP: hung_up, signal.SIGTERM: hung_up, signal.SIGTSTP: suspended}
+    earlier = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    tty.setcbreak(descriptor, termios.TCSAFLUSH)
+    try:
+        yield
+    finally:
+        for number, handler in earlier.items():
+            signal.signal(number, handler)
+        try:
+            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+        except termios.error:
+            return  # a terminal that is gone needs nothing

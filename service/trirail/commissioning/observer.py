@@ -1,0 +1,83 @@
+"""What a person beside the robot sees and reads; beside simulated drives, what they would answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from trirail_drivers.interface import NAMES
+from trirail_drivers.simulated import Carriages
+
+from trirail.commissioning.bench import FOLLOWING
+from trirail.commissioning.moves import DISTANCE
+from trirail.commissioning.person import Person, Question, choose, number
+from trirail.kinematics.algebra import Array
+
+SEEN = 0.00005
+"""How far a simulated slider must have gone for somebody to see it [m]."""
+
+Rules = tuple[float, ...]
+"""What rules beside the sliders A, B, C read [m]."""
+
+
+class Observer:
+    """Asks a person for what no encoder tells."""
+
+    def __init__(self, person: Person, simulated: Carriages | None, idle: Callable[[], object]) -> None:
+        """`idle` is called while the person thinks."""
+        self._person = person
+        self._simulated = simulated
+        self._idle = idle
+        self._read_to: float | None = None
+
+    def rules(self) -> Rules | None:
+        """Return what rules read; None where only the person can tell."""
+        return None if self._simulated is None else self._simulated.read()
+
+    def read_to(self) -> float:
+        """Return how finely the rule can be read [m]; asked once."""
+        if self._read_to is None:
+            text = "To how many mm can you read your rule or indicator? (a steel rule 0.5, a dial indicator 0.01)"
+            question = Question(text, None if self._simulated is None else "0.01")
+            self._read_to = number(self._person, self._idle, question, 0.0001, 5.0) / 1e3
+        return self._read_to
+
+    def reading(self, index: int) -> float:
+        """Return what the rule beside a slider reads [m]."""
+        rules = self.rules()
+        text = f"What does the rule at slider {NAMES[index]} read now, in mm?"
+        return self.number(text, None if rules is None else rules[index])
+
+    def number(self, text: str, simulated: float | None) -> float:
+        """Return a length that is asked for in mm [m]."""
+        default = None if simulated is None else f"{simulated * 1e3 + 0.0:.2f}"
+        return number(self._person, self._idle, Question(text, default)) / 1e3
+
+    def which(self, before: Rules | None, now: Rules | None) -> str | None:
+        """Ask which slider has moved, from what rules read before to what they read now."""
+        default, text = None, "Which slider moved: A, B, C, or n for none?"
+        if before is not None and now is not None:
+            ways = [abs(here - was) for here, was in zip(now, before, strict=True)]
+            most = ways.index(max(ways))
+            default = NAMES[most] if ways[most] > SEEN else "n"
+        choices = {each: f"slider {each}" for each in NAMES} | {"n": "none of them"}
+        answer = choose(self._person, self._idle, Question(text, default), choices)
+        return None if answer == "n" else answer
+
+    def yes(self, text: str) -> bool:
+        """Ask what can be answered by yes or no."""
+        return self._agrees(text, None if self._simulated is None else "y")
+
+    def square(self, wanted: Array, before: Rules | None, corner: Rules | None) -> bool:
+        """Ask whether the platform went around; simulated sliders are compared at its far corner, `wanted` (3,) [m]."""
+        default = None
+        if before is not None and corner is not None:
+            went = np.array(corner) - np.array(before)
+            default = "y" if np.abs(went - wanted).max() < FOLLOWING else "n"
+        return self._agrees(
+            f"Did the platform go {DISTANCE * 1e3:g} mm along x, then along y, then back both?", default
+        )
+
+    def _agrees(self, text: str, default: str | None) -> bool:
+        question = Question(f"{text} y/n", default)
+        return choose(self._person, self._idle, question, {"y": "yes", "n": "no"}) == "y"

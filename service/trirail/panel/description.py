@@ -1,0 +1,49 @@
+"""What a tab must know of a robot to draw it and to name its buttons: from what the service tells of itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from trirail.client.held_jog import SPEEDS
+from trirail.errors import ServiceError
+from trirail.telemetry import palette
+from trirail.telemetry.shown_robot import ShownRobot
+from trirail.wire.state import Info
+from trirail.workspace.mechanism import Mechanism
+
+
+def describe(info: Info, user: str) -> dict[str, Any]:
+    """Return it, ready to be encoded. Raises ServiceError where the service is of another version."""
+    try:
+        robot = ShownRobot.told(info)
+    except msgspec.ValidationError as error:
+        raise ServiceError(f"the service is of another version, {info.version}: {error}") from error
+    parts = Mechanism.of(robot.geometry, robot.limits.slider)
+    platform = robot.limits.platform
+    return {
+        "tell": "robot",
+        "name": info.robot,
+        "user": user,
+        "version": info.version,
+        "velocity": platform.velocity,
+        "speeds": SPEEDS,
+        "homes": info.homes,
+        "legs": [
+            {"anchor": leg.anchor, "home": leg.home, "rail_angle": leg.rail_angle, "edge_angle": leg.edge_angle}
+            for leg in robot.geometry.legs
+        ],
+        "parts": {name: _lists(getattr(parts, name)) for name in parts.__slots__},
+        "colours": {
+            "sliders": [palette.code(colour) for colour in palette.SLIDERS],
+            "modes": {mode: palette.code(colour) for mode, colour in palette.MODES.items()},
+        },
+    }
+
+
+def _lists(part: Any) -> Any:
+    if isinstance(part, np.ndarray):
+        return part.tolist()
+    return [line.tolist() for line in part] if isinstance(part, list) else part

@@ -1,0 +1,85 @@
+"""What the service publishes, gathered once for all tabs: the newest state and the last events."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections import deque
+
+import msgspec
+
+from trirail.client.client import Robot
+from trirail.errors import TrirailError
+from trirail.panel.description import describe
+
+SILENT = 1.0
+"""After so long without a state the service is taken for gone [s]."""
+EVENTS = 200
+"""So many events are kept for tabs that come later."""
+
+
+class Feed:
+    """Hears one robot for as long as the program lasts. Raises ServiceError where that does not answer at first.
+
+    What a tab has not sent yet is read under `changed`, which is notified whenever there is something new.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self.changed = threading.Condition()
+        self.robot = msgspec.json.encode(describe(robot.info(), robot.user))
+        """What a tab must know of the robot before it can draw it, as JSON."""
+        self.state: bytes | None = None
+        """The newest state, as JSON with its stamp; None where the service is silent."""
+        self.stamp = 0
+        """When that came: milliseconds of this process's monotonic clock."""
+        self._closed = False
+        self._events: deque[tuple[int, bytes]] = deque(maxlen=EVENTS)
+        for hear in (self._hear_states, self._hear_events):
+            threading.Thread(target=hear, name=hear.__name__.strip("_"), daemon=True).start()
+
+    def events(self, after: int) -> list[tuple[int, bytes]]:
+        """Return the events that came after that number, numbered as they came, as JSON."""
+        return [event for event in self._events if event[0] > after]
+
+    def close(self) -> None:
+        """Gather no more states; what hears events ends with the robot's connection."""
+        self._closed = True
+
+    def _hear_states(self) -> None:
+        while not self._closed:
+            for state in self._robot.states(SILENT):
+                if self._closed:
+                    return
+                if self.state is None:
+                    self._describe()
+                stamp = now()
+                content = msgspec.json.encode({"tell": "state", "stamp": stamp, "state": state})
+                with self.changed:
+                    self.state, self.stamp = content, stamp
+                    self.changed.notify_all()
+            with self.changed:
+                self.state = None
+                self.changed.notify_all()
+
+    def _describe(self) -> None:
+        """Ask again what robot it is: a service that was silent may have been started anew."""
+        try:
+            content = msgspec.json.encode(describe(self._robot.info(), self._robot.user))
+        except TrirailError:
+            return  # the old description stands until it answers
+        with self.changed:
+            self.robot = content
+
+    def _hear_events(self) -> None:
+        for number, event in zip(itertools.count(1), self._robot.events(history=True), strict=False):
+            content = msgspec.json.encode({"tell": "event", "event": event})
+            with self.changed:
+                self._events.append((number, content))
+                self.changed.notify_all()
+
+
+def now() -> int:
+    """Return the time of stamps: milliseconds of the monotonic clock."""
+    return time.monotonic_ns() // 1_000_000

@@ -1,0 +1,45 @@
+"""What the page says to its server. What the server says is State, Event and the like, each beside what it `tell`s."""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+from trirail.wire.messages import Coordinates
+from trirail.wire.vocabulary import Command
+
+
+class Seen(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="seen"):
+    """The page has drawn a state."""
+
+    stamp: int
+    """That state's."""
+
+
+class Hold(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="hold"):
+    """A jog button is held down, now."""
+
+    velocity: Coordinates
+    """Of x, y [m/s] and phi [rad/s], in the base frame."""
+    seen: int
+    """The stamp of the newest state that the page has drawn: who sees an old picture must not move the robot."""
+
+
+class Release(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="release"):
+    """No jog button is held down any more."""
+
+
+class Tell(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="command"):
+    """A command's button has been pressed."""
+
+    name: Command
+    """The command, one without content."""
+
+
+class SetOverride(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="override"):
+    """The override's slider has been moved."""
+
+    percent: float
+    """Share of full speed [%]."""
+
+
+FromPage = Seen | Hold | Release | Tell | SetOverride

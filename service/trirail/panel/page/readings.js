@@ -1,0 +1,90 @@
+// What the robot says in words and numbers: mode, faults, pose, sliders, events, and answers to what was pressed.
+
+const KEPT = 200; // so many events are shown
+const byId = (id) => document.getElementById(id);
+
+export class Readings {
+  constructor() {
+    this.colours = {};
+    this.pose = rows(byId("pose"), ["x", "y", "φ"], 2);
+    this.sliders = rows(byId("sliders"), ["A", "B", "C"], 2);
+    this.rank = [0, 0];
+  }
+
+  robot({ name, user, version, colours }) {
+    this.colours = colours.modes;
+    byId("name").textContent = name;
+    byId("user").textContent = `as ${user}, trirail ${version}`;
+    document.title = `${name} – trirail`;
+    this.sliders.forEach((cells, k) => { cells[0].parentElement.firstChild.style.color = colours.sliders[k]; });
+  }
+
+  state({ mode, pose, goal, sliders, faults, override }) {
+    const doing = [];
+    if (goal) doing.push(goal.target ? `${goal.id} ${Math.round(goal.progress * 100)} %, ${goal.remaining.toFixed(1)} s left` : "jog");
+    if (override !== 1) doing.push(`override ${Math.round(override * 100)} %`);
+    text(byId("mode-name"), mode);
+    text(byId("doing"), doing.join(" · "));
+    byId("lamp").style.background = this.colours[mode] ?? "transparent";
+    this.alarm(faults.length ? `Fault: ${faults.join("\n")}\nRemove the cause, then Reset, then Enable.` : "");
+    const shown = (value, k) => (k < 2 ? `${fixed(value * 1e3, 2)} mm` : `${fixed((value * 180) / Math.PI, 3)}°`);
+    this.pose.forEach(([measured, target], k) => {
+      text(measured, shown(pose[k], k));
+      text(target, goal?.target ? shown(goal.target[k], k) : "–");
+    });
+    this.sliders.forEach(([position, velocity], k) => {
+      text(position, `${fixed(sliders.position[k] * 1e3, 2)} mm`);
+      text(velocity, `${fixed(sliders.velocity[k] * 1e3, 1)} mm/s`);
+    });
+  }
+
+  lost(why) {
+    text(byId("mode-name"), "no contact");
+    text(byId("doing"), "");
+    byId("lamp").style.background = "transparent";
+    for (const cell of [...this.pose, ...this.sliders].flat()) text(cell, "–");
+    this.alarm(why);
+  }
+
+  alarm(words) {
+    byId("alarm").hidden = !words;
+    text(byId("alarm"), words); // the same words again are not said again
+  }
+
+  event({ seq, time, level, message, outcome }) {
+    if (seq <= this.rank[0] && time <= this.rank[1]) return; // told again, on a new connection
+    this.rank = [seq, time];
+    const item = document.createElement("li");
+    const at = document.createElement("time");
+    at.textContent = new Date(time * 1e3).toLocaleTimeString("en-GB");
+    item.className = level;
+    if (outcome) item.dataset.outcome = outcome;
+    item.append(at, message);
+    byId("events").prepend(item);
+    while (byId("events").childElementCount > KEPT) byId("events").lastChild.remove();
+  }
+
+  answer(words, refused = false) {
+    byId("answer").classList.toggle("refused", refused);
+    text(byId("answer"), words);
+  }
+}
+
+function rows(body, names, columns) {
+  return names.map((name) => {
+    const row = body.insertRow();
+    const head = document.createElement("th");
+    head.scope = "row";
+    head.textContent = name;
+    row.append(head);
+    return Array.from({ length: columns }, () => row.insertCell());
+  });
+}
+
+function text(element, words) {
+  if (element.textContent !== words) element.textContent = words;
+}
+
+function fixed(value, digits) {
+  return (Number(value.toFixed(digits)) + 0).toFixed(digits).replace("-", "−");
+}

@@ -1,0 +1,107 @@
+"""The panel's server: the page's files and a WebSocket for each tab, on the loopback, for who has the token."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import socket
+import threading
+from collections.abc import Iterator
+from http import HTTPStatus
+from importlib import resources
+
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+from websockets.sync.server import Server, ServerConnection, serve
+
+from trirail.client.client import Robot
+from trirail.errors import ServiceError
+from trirail.panel.feed import Feed
+from trirail.panel.guard import refused
+from trirail.panel.tab import Tab
+
+HOST = "127.0.0.1"
+PORT = 9880
+"""The page's port, where it is free and no other is asked for."""
+SOCKET = "socket"
+"""The name below the token under which the page's WebSocket is."""
+LONGEST = 4096
+"""Messages of the page are shorter than that [bytes]."""
+TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+HEADERS = {
+    # Nothing from elsewhere, in no frame of elsewhere (clickjacking), and the token is told to nobody.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+
+
+class Panel:
+    """The page of one robot while the context lasts. Raises ServiceError where the port is taken or nobody answers."""
+
+    def __init__(self, robot: Robot, port: int | None = None) -> None:
+        self._robot = robot
+        self._feed = Feed(robot)
+        self._token = secrets.token_urlsafe(16)
+        self._files = dict(_files())
+        listening = _listen(port)
+        self.url = f"http://{HOST}:{listening.getsockname()[1]}/{self._token}/"
+        """The address to open; whoever has it can move the robot."""
+        self._server: Server = serve(
+            self._serve,
+            sock=listening,
+            process_request=self._answer,
+            compression=None,  # a small message at once, not a smaller one later
+            server_header=None,
+            max_size=LONGEST,
+            close_timeout=1.0,
+        )
+        self._thread = threading.Thread(target=self._server.serve_forever, name="panel", daemon=True)
+
+    def __enter__(self) -> Panel:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._feed.close()
+        self._server.shutdown()
+        self._thread.join()
+
+    def _serve(self, opened: ServerConnection) -> None:
+        Tab(opened, self._robot, self._feed).serve()
+
+    def _answer(self, _opened: ServerConnection, request: Request) -> Response | None:
+        """Answer a request for a file, refuse what may not ask; None lets the WebSocket open."""
+        headers = request.headers
+        path = request.path.partition("?")[0]
+        if why := refused(self._token, path, headers.get_all("Host"), headers.get_all("Origin")):
+            return _response(HTTPStatus.FORBIDDEN, f"{why}\n".encode(), "txt")
+        name = path.removeprefix(f"/{self._token}/") or "index.html"
+        if name == SOCKET:
+            return None
+        if name not in self._files:
+            return _response(HTTPStatus.NOT_FOUND, b"no such file\n", "txt")
+        return _response(HTTPStatus.OK, self._files[name], name.rpartition(".")[2])
+
+
+def _files() -> Iterator[tuple[str, bytes]]:
+    for file in (resources.files("trirail.panel") / "page").iterdir():
+        yield file.name, file.read_bytes()
+
+
+def _response(status: HTTPStatus, body: bytes, suffix: str) -> Response:
+    kind = f"{TYPES.get(suffix, 'text/plain')}; charset=utf-8"
+    headers = Headers({"Content-Type": kind, "Content-Length": str(len(body)), "Connection": "close"} | HEADERS)
+    return Response(status.value, status.phrase, headers, body)
+
+
+def _listen(port: int | None) -> socket.socket:
+    """Listen on a port of the loopback: the one that is asked for, or the usual one, or where that is taken any."""
+    with contextlib.suppress(OSError):
+        return socket.create_server((HOST, PORT if port is None else port))
+    if port is not None:
+        raise ServiceError(f"port {port} cannot be listened on: choose another, or none for any that is free")
+    return socket.create_server((HOST, 0))

@@ -1,0 +1,148 @@
+"""One open tab of the operator's page: what it says is done, what there is to show it is sent."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable
+
+import msgspec
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import ServerConnection
+
+from trirail.client.client import Robot
+from trirail.client.held_jog import HeldJog
+from trirail.errors import TrirailError
+from trirail.panel.feed import Feed, now
+from trirail.panel.messages import FromPage, Hold, Release, Seen, SetOverride, Tell
+from trirail.wire.vocabulary import Command
+
+AHEAD = 3
+"""So many states may be on their way to the page: a frozen tab, or a slow network, is sent no more, and none waits."""
+FRESH = 500
+"""A jog from a page whose newest state is older than that is none: it, or what leads to it, stands still [ms]."""
+
+_FROM_PAGE = msgspec.json.Decoder(FromPage)
+
+
+class Tab:
+    """Serves one WebSocket until it is closed; then whatever it held has been let go.
+
+    Each command has a thread of its own, so that STOP waits for nothing. Whether the robot moves is decided by the
+    service alone: what stands still or is lost here, and on the way here, renews no jog.
+    """
+
+    def __init__(self, socket: ServerConnection, robot: Robot, feed: Feed) -> None:
+        self._socket = socket
+        self._robot = robot
+        self._feed = feed
+        self._jog = HeldJog(robot.send, lambda why: self._say("ended", message=why))
+        self._outbox: list[bytes] = []
+        self._unseen: deque[int] = deque()
+        self._under_way: set[Command] = set()
+        self._open = True
+
+    def serve(self) -> None:
+        """Do what the page says until it is gone."""
+        sender = threading.Thread(target=self._send, name="tab", daemon=True)
+        sender.start()
+        try:
+            with contextlib.suppress(ConnectionClosed):  # a tab that is killed, or says too much, is gone like another
+                for text in self._socket:
+                    self._take(text)
+        finally:
+            self._jog.close()
+            with self._feed.changed:
+                self._open = False
+                self._feed.changed.notify_all()
+
+    def _take(self, text: str | bytes) -> None:
+        try:
+            said: FromPage = _FROM_PAGE.decode(text)
+        except msgspec.MsgspecError as error:
+            self._say("refused", to="page", message=f"not a message of this page: {error}")
+            return
+        match said:
+            case Seen(stamp):
+                with self._feed.changed:
+                    while self._unseen and self._unseen[0] <= stamp:
+                        self._unseen.popleft()
+                    self._feed.changed.notify_all()
+            case Hold(velocity, seen):
+                if now() - seen <= FRESH:
+                    self._jog.hold(velocity)
+            case Release():
+                self._jog.release()
+            case Tell(name):
+                self._tell(name)
+            case SetOverride(percent):
+                self._begin(lambda: self._robot.override(percent), Command.OVERRIDE)
+
+    # ------------------------------------------------------------------ doing
+
+    def _tell(self, name: Command) -> None:
+        """Send a command, unless it is under way already; what stops the robot is always sent."""
+        if name.stops:
+            self._jog.release()
+        elif name in self._under_way:
+            return
+        self._under_way.add(name)
+
+        def tell() -> None:
+            try:
+                self._robot.command(name)
+            finally:
+                self._under_way.discard(name)
+
+        self._begin(tell, name)
+
+    def _begin(self, do: Callable[[], object], what: str) -> None:
+        def run() -> None:
+            try:
+                do()
+            except TrirailError as error:
+                self._say("refused", to=what, message=str(error))
+            else:
+                self._say("done", to=what)
+
+        threading.Thread(target=run, name=what, daemon=True).start()
+
+    # ------------------------------------------------------------------ showing
+
+    def _say(self, tell: str, **content: str) -> None:
+        with self._feed.changed:
+            self._outbox.append(msgspec.json.encode({"tell": tell, **content}))
+            self._feed.changed.notify_all()
+
+    def _send(self) -> None:
+        """Send what there is, each thing once, states only as fast as the page draws them."""
+        robot, event, stamp, silent = b"", 0, 0, False
+        feed = self._feed
+        while True:
+            due: list[bytes] = []
+            with feed.changed:
+                if feed.robot is not robot:
+                    due.append(robot := feed.robot)
+                for number, content in feed.events(event):
+                    event = number
+                    due.append(content)
+                due += self._outbox
+                self._outbox.clear()
+                if feed.state is None:
+                    if not silent:
+                        due.append(b'{"tell":"silent"}')
+                    silent = True
+                elif feed.stamp != stamp and len(self._unseen) < AHEAD:
+                    stamp, silent = feed.stamp, False
+                    self._unseen.append(stamp)
+                    due.append(feed.state)
+                if not self._open:
+                    return
+                if not due:
+                    feed.changed.wait()
+            try:
+                for content in due:
+                    self._socket.send(content, text=True)
+            except ConnectionClosed:
+                return

@@ -1,0 +1,57 @@
+"""The service's own output: what happens to the robot and to the processes, a line each, as text or as JSON."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Final, Literal, TextIO
+
+import msgspec
+
+from trirail.wire.messages import Event, Level
+from trirail.wire.text import json_printable, printable, wall_clock
+
+Form = Literal["text", "json"]
+
+PRIORITIES: Final[Mapping[str, int]] = {"info": 6, "warning": 4, "error": 3}
+"""Of each level, as journald takes it in front of a line: sd-daemon(3)."""
+
+
+class Log:
+    """Writes lines with time and level. At rest nothing happens, and nothing is written."""
+
+    def __init__(
+        self,
+        form: Form,
+        out: TextIO | None = None,
+        clock: Callable[[], float] = time.time,
+        environment: Mapping[str, str] = os.environ,
+    ) -> None:
+        self._json = form == "json"
+        self._out = out or sys.stdout
+        self._clock = clock
+        self._to_journal = "JOURNAL_STREAM" in environment
+        self._newest = 0
+
+    def say(self, words: str, level: Level = "info") -> None:
+        """Write what the service says of itself."""
+        now = self._clock()
+        self._write(now, level, words, {"time": now, "kind": "service", "level": level, "message": words})
+
+    def event(self, event: Event) -> None:
+        """Write an event, once: a gateway that was started again tells the past anew."""
+        if event.seq > self._newest:
+            self._newest = event.seq
+            self._write(event.time, event.level, event.message, event)
+
+    def _write(self, moment: float, level: Level, words: str, content: object) -> None:
+        if self._json:
+            line = json_printable(msgspec.json.encode(content).decode())
+        else:
+            line = f"{wall_clock(moment)}  {level:7}  {printable(words)}"
+            if self._to_journal:
+                line = f"<{PRIORITIES[level]}>{line}"
+        self._out.write(f"{line}\n")
+        self._out.flush()

@@ -1,0 +1,146 @@
+"""`trirail commission`, called as from a terminal: answers from standard input, what it refuses, what it leaves."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from trirail.cli import commission
+from trirail.cli.commands import app
+from trirail.commissioning.person import Question, Quit
+from trirail.config import SIM
+from trirail.errors import ConfigError
+from trirail_drivers.errors import FileError
+from trirail_drivers.simulated.faultlines import FaultSyntaxError
+
+PUSH = ["", "0.01", "0", "10"]
+"""Answers to the step of the first slider by hand."""
+
+
+def run(*words: str) -> int:
+    return int(app(["commission", *words], result_action="return_value") or 0)
+
+
+@pytest.fixture
+def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "robot.toml"
+    path.write_text(SIM.read_text(encoding="utf-8"), encoding="utf-8")
+    return str(path)
+
+
+@pytest.fixture
+def typed(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """Return where lines of a script can be written, for standard input."""
+    reading, writing = os.pipe()
+    with os.fdopen(reading) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        yield writing
+    with contextlib.suppress(OSError):  # where the test has not
+        os.close(writing)
+
+
+def test_a_scripts_lines_are_the_answers_and_its_end_leaves(
+    robot: str, typed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.write(typed, "\n".join(["", "", *PUSH, "s"]).encode() + b"\n")
+    os.close(typed)
+    assert run(robot, "--fault", "A reversed", "--json", "--report", "first.json") == 1
+    told = capsys.readouterr()
+    report = json.loads(told.out)
+    assert json.loads((tmp_path / "first.json").read_text()) == report
+    assert [(step["step"], step["drive"], step["verdict"]) for step in report["steps"]] == [
+        ("bus", "", "ok"),
+        ("setup", "", "ok"),
+        ("push", "A", "wrong"),
+    ]
+    assert report["changes"] == {"drives.A.direction": -1}
+    assert "wrong direction" in told.err
+    assert (tmp_path / report["written"]).name == "robot-commissioned.toml"
+    assert Path(robot).read_text(encoding="utf-8") == SIM.read_text(encoding="utf-8")
+
+
+def test_what_is_refused_step_by_step_leaves_nothing_wrong(
+    robot: str, typed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.write(typed, b"\n\n" + b"s\n" * 20)
+    os.close(typed)
+    assert run(robot, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["ok"], report["complete"], report["written"]) == (True, False, None)
+    assert {step["verdict"] for step in report["steps"][2:]} == {"skipped"}
+    assert len(list(tmp_path.glob("commission-demo-*.json"))) == len(list(tmp_path.glob("commission-demo-*.txt"))) == 1
+
+
+@pytest.mark.parametrize("done", [[], ["bus"], ["bus", "setup"]], ids=["at once", "before set-up", "afterwards"])
+def test_ctrl_c_ends_it_and_the_report_stays(
+    done: list[str], robot: str, typed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.write(typed, b"\n" * len(done))
+    ask, questions = commission.Console.ask, []
+
+    def press(self: commission.Console, question: Question, idle: Callable[[], object]) -> str:
+        questions.append(question)
+        if len(questions) > len(done):
+            signal.raise_signal(signal.SIGINT)
+        return ask(self, question, idle)
+
+    monkeypatch.setattr(commission.Console, "ask", press)
+    with pytest.raises(SystemExit, match="130"):
+        run(robot, "--report", "r.json")
+    text = (tmp_path / "r.json").read_text()
+    assert [step["step"] for step in (json.loads(text)["steps"] if text else [])] == done
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_what_cannot_be_is_refused_before_anything_is_asked(robot: str, tmp_path: Path) -> None:
+    (tmp_path / "precious.toml").write_text("precious")
+    with pytest.raises(ConfigError, match=r"precious\.toml exists already: name another file with --out"):
+        run(robot, "--out", "precious.toml")
+    with pytest.raises(FileError, match=r"precious\.toml exists already: name another file with --report"):
+        run(robot, "--report", "precious.toml")
+    with pytest.raises(FaultSyntaxError, match="did you mean reversed"):
+        run(robot, "--yes", "--fault", "A reverse", "--report", "a.json")
+    real = tmp_path / "real.toml"
+    real.write_text(SIM.read_text(encoding="utf-8").replace('interface = "simulated"', 'interface = "vcan"'))
+    for option in (["--yes"], ["--fault", "A loose"]):
+        with pytest.raises(ConfigError, match=f"{option[0]} is for simulated drives"):
+            run(str(real), *option)
+    assert (tmp_path / "precious.toml").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("written", "answers"),
+    [
+        (b"a\nb", ["a", "b"]),
+        (b"\n\n", ["default", "default"]),
+        (b" x \xff\n", ["x \N{REPLACEMENT CHARACTER}"]),
+        (b"", []),
+    ],
+)
+def test_lines_are_answers_and_the_end_is_none(typed: int, written: bytes, answers: list[str]) -> None:
+    os.write(typed, written)
+    os.close(typed)
+    person = commission.Console(by_itself=False, quiet=True)
+    found = [person.ask(Question("?", "default"), lambda: None) for _ in answers]
+    assert found == answers
+    with pytest.raises(Quit):
+        person.ask(Question("?", "default"), lambda: None)
+
+
+def test_the_drives_are_kept_alive_while_somebody_thinks(typed: int) -> None:
+    person = commission.Console(by_itself=False, quiet=True)
+    turned: list[int] = []
+
+    def idle() -> None:
+        turned.append(len(turned))
+        if len(turned) == 5:
+            os.write(typed, b"7\n")
+
+    assert person.ask(Question("?"), idle) == "7"
+    assert turned == [0, 1, 2, 3, 4]

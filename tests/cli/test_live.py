@@ -1,0 +1,108 @@
+"""The state as people read it: all that matters by name, with units, and limits only where they are near."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+from trirail.cli import live
+from trirail.cli.units import ANGLE, LENGTH, VELOCITY, quantity
+from trirail.config import SIM, load
+from trirail.wire.state import Commanded, FrameCounts, GoalState, LoopState, Percentiles, Sliders, State
+
+LIMITS = load(SIM).limits
+NONE = Percentiles(0.0, 0.0, 0.0, 0.0)
+COUNTS = FrameCounts(0, 0, 0, 0)
+REST = (0.0, 0.0, 0.0)
+
+
+def a_state(**changed: Any) -> State:
+    state = State(
+        seq=1,
+        t=1.0,
+        mode="holding",
+        pose=REST,
+        velocity=REST,
+        acceleration=REST,
+        commanded=Commanded(REST, REST, REST, REST, REST, REST),
+        sliders=Sliders(REST, REST, REST, REST, ("operation enabled",) * 3, (COUNTS,) * 3),
+        goal=None,
+        settled=True,
+        override=1.0,
+        faults=(),
+        loop=LoopState(1000, 1, 0, NONE, NONE, 0.5, 0.4, ()),
+    )
+    return msgspec.structs.replace(state, **changed)
+
+
+def printed(state: State) -> dict[str, str]:
+    """Return the lines by name."""
+    console = Console(width=160, color_system=None, no_color=True)
+    with console.capture() as captured:
+        console.print(live.table(state, "demo", LIMITS))
+    rows = (re.fullmatch(r" *(\S+(?: \S+)?)  +(.*?) *", line) for line in captured.get().splitlines())
+    return {row[1]: row[2] for row in rows if row}
+
+
+@given(st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-1.0, 1.0)), st.floats(-0.3, 0.3))
+def test_what_is_printed_can_be_typed(pose: tuple[float, float, float], slider: float) -> None:
+    sliders = Sliders((slider, 0.0, 0.0), (slider, 0.0, 0.0), REST, REST, ("ready",) * 3, (COUNTS,) * 3)
+    lines = printed(a_state(pose=pose, sliders=sliders))
+    x, y, phi = re.findall(r"[xyφ] +(-?[\d.]+ ?(?:mm|°))", lines["measured"])
+    assert quantity(x, LENGTH) == pytest.approx(pose[0], abs=0.51e-6)
+    assert quantity(y, LENGTH) == pytest.approx(pose[1], abs=0.51e-6)
+    assert quantity(phi, ANGLE) == pytest.approx(pose[2], abs=math.radians(0.51e-4))
+    assert quantity(lines["slider A"].split("  ")[0], LENGTH) == pytest.approx(slider, abs=0.51e-6)
+    rate = re.findall(r"-?[\d.]+ mm/s", lines["slider A"])[0]
+    assert quantity(rate, VELOCITY) == pytest.approx(slider, abs=0.51e-5)
+
+
+def test_measured_and_commanded_stand_below_each_other() -> None:
+    commanded = Commanded((0.01, -0.02, 0.1), REST, REST, REST, REST, REST)
+    lines = printed(a_state(pose=(0.011, 0.0, 0.0), commanded=commanded))
+    assert lines["measured"] == "x    11.000 mm   y     0.000 mm   φ    0.0000°"
+    assert lines["commanded"] == "x    10.000 mm   y   -20.000 mm   φ    5.7296°"
+
+
+def test_a_goal_is_shown_with_its_target_and_how_far_it_is() -> None:
+    goal = GoalState("g-17", 0.25, 1.5, (0.05, 0.0, 0.0))
+    lines = printed(a_state(mode="moving", pose=(0.02, 0.0, 0.0), goal=goal, settled=False, override=0.5))
+    assert lines["goal"] == "g-17  25%, 1.5 s left"
+    assert lines["target"].startswith("x    50.000 mm")
+    assert lines["to go"].startswith("x    30.000 mm")
+    assert lines["override"] == "50 %"
+    assert "paused" not in lines["robot"]
+    assert "settled" not in lines["robot"]
+
+
+def test_a_paused_goal_and_a_robot_that_has_settled_are_named() -> None:
+    assert "holding  paused" in printed(a_state(goal=GoalState("g", 0.5, 1.0, None)))["robot"]
+    assert "holding  settled" in printed(a_state())["robot"]
+    assert printed(a_state(faults=("drive B: over-current",)))["fault"] == "drive B: over-current"
+
+
+def test_limits_are_shown_only_where_they_are_near() -> None:
+    assert list(live.near_limits(a_state(), LIMITS)) == []
+    high = LIMITS.platform.x[1]
+    assert list(live.near_limits(a_state(pose=(high - 0.001, 0.0, 0.0)), LIMITS)) == [
+        f"x {(high - 0.001) * 1e3:.3f} mm, limit {high * 1e3:.3f} mm"
+    ]
+    error = LIMITS.slider.following_error
+    sliders = Sliders(REST, REST, (0.0, -0.96 * error, 0.0), REST, ("ready",) * 3, (COUNTS,) * 3)
+    (said,) = live.near_limits(a_state(sliders=sliders), LIMITS)
+    assert said == f"following error of B {-0.96e6 * error:.1f} µm, limit {-1e6 * error:.1f} µm"
+
+
+@given(st.floats(-1.0, 1.0))
+def test_a_position_beyond_its_limit_is_always_said(at: float) -> None:
+    low, high = LIMITS.slider.position
+    sliders = Sliders((at, 0.0, 0.0), REST, REST, REST, ("ready",) * 3, (COUNTS,) * 3)
+    said = [words for words in live.near_limits(a_state(sliders=sliders), LIMITS) if words.startswith("slider A")]
+    near = min(abs(at - low), abs(high - at)) <= 0.05 * (high - low)
+    assert bool(said) == (near or not low <= at <= high)

@@ -1,0 +1,136 @@
+"""The pendant: what a terminal sends is taken for keys, and a key moves the robot only while it comes again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from panel.fake_robot import FakeRobot
+from trirail.cli.keyboard import keys
+from trirail.cli.pendant import REPEAT, Pendant
+
+TOP = (0.25, 0.25, 1.5)
+
+
+@pytest.mark.parametrize(
+    ("typed", "found"),
+    [
+        (b"\x1b[A\x1b[B\x1b[C\x1b[D", ["up", "down", "right", "left"]),
+        (b"\x1bOA\x1bOC", ["up", "right"]),
+        (b"\x1b[1;2C", ["right"]),
+        (b"aDq +-=", ["a", "d", "q", " ", "+", "-", "+"]),
+        (b"\x1b", ["escape"]),
+        (b"\x1b[3~\x1b[15~\x1b[200~", []),
+        ("φ\xff".encode("latin-1", "ignore"), []),
+    ],
+)
+def test_keys(typed: bytes, found: list[str]) -> None:
+    assert list(keys(typed)) == found
+
+
+@given(st.binary())
+def test_whatever_is_typed_is_keys(typed: bytes) -> None:
+    assert all(keys(typed))
+
+
+class Operator:
+    """A pendant, and a clock of its own for the repetition of keys."""
+
+    def __init__(self) -> None:
+        self.robot = FakeRobot()
+        self.robot.command("enable")
+        self.pendant = Pendant(self.robot.robot(), TOP)
+        self.now = 0.0
+
+    def press(self, key: str) -> None:
+        self.pendant.press(key, self.now)
+        self.pendant.tick(self.now)
+
+    def wait(self, seconds: float) -> None:
+        """Let the pendant's clock go on."""
+        self.now += seconds
+        self.pendant.tick(self.now)
+
+    def sent(self, number: int) -> list[tuple[float, float, float]]:
+        """What has been sent, as soon as it is so many."""
+        until(lambda: len(self.robot.sent) >= number)
+        return [(goal.x, goal.y, goal.phi) for goal in self.robot.sent]
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def operator() -> Iterator[Operator]:
+    made = Operator()
+    yield made
+    made.pendant.close()
+
+
+@pytest.mark.parametrize(
+    ("key", "velocity"),
+    [
+        ("right", (0.025, 0.0, 0.0)),
+        ("left", (-0.025, 0.0, 0.0)),
+        ("up", (0.0, 0.025, 0.0)),
+        ("down", (0.0, -0.025, 0.0)),
+        ("a", (0.0, 0.0, 0.15)),
+        ("d", (0.0, 0.0, -0.15)),
+    ],
+)
+def test_a_key_that_comes_again_is_one_jog_until_it_does_not(
+    operator: Operator, key: str, velocity: tuple[float, float, float]
+) -> None:
+    for number in range(1, 6):
+        operator.press(key)
+        sent = operator.sent(number)
+        operator.wait(0.9 * REPEAT)
+    assert all(each == pytest.approx(velocity) for each in sent)
+    operator.wait(0.2 * REPEAT)
+    assert operator.sent(6)[5] == (0.0, 0.0, 0.0)
+    assert len({goal.id for goal in operator.robot.sent}) == 1
+    operator.wait(10.0 * REPEAT)
+    assert len(operator.robot.sent) == 6
+
+
+def test_another_key_ends_what_is_held(operator: Operator) -> None:
+    for other in ("+", "q"):
+        operator.robot.sent.clear()
+        operator.press("right")
+        operator.sent(1)
+        operator.press(other)
+        assert operator.sent(2)[1] == (0.0, 0.0, 0.0)
+        until(lambda: operator.robot.state().goal is None)
+    assert operator.pendant.over
+
+
+@pytest.mark.parametrize("key", [" ", "escape"])
+def test_space_and_escape_stop_also_what_others_have_begun(operator: Operator, key: str) -> None:
+    operator.press(key)
+    until(lambda: "stop" in operator.robot.commands)
+    until(lambda: operator.pendant.said == "stopped")
+
+
+def test_the_speed_goes_up_and_down_within_its_bounds(operator: Operator) -> None:
+    usual = operator.pendant.speed
+    operator.press("+")
+    assert operator.pendant.speed == pytest.approx([2.0 * value for value in usual])
+    for _ in range(20):
+        operator.press("+")
+    assert operator.pendant.speed == TOP
+    for _ in range(20):
+        operator.press("-")
+    assert operator.pendant.speed == pytest.approx([0.01 * value for value in TOP])
+
+
+def test_a_refusal_is_shown(operator: Operator) -> None:
+    operator.robot.command("disable")
+    operator.press("up")
+    until(lambda: "send enable first" in operator.pendant.said)

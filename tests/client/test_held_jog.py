@@ -1,0 +1,119 @@
+"""A jog that is held: it moves while signs of the hand come, and nothing but a sign that is fresh moves it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from panel.fake_robot import FakeRobot
+from trirail.client.held_jog import TIMEOUT, HeldJog
+from trirail.errors import RefusalCode, RefusedError
+
+RIGHT = (0.01, 0.0, 0.0)
+
+
+class Hand:
+    """A jog of a robot that is none, and why it has ended."""
+
+    def __init__(self) -> None:
+        self.robot = FakeRobot()
+        self.robot.command("enable")
+        self.ends: list[str] = []
+        self.jog = HeldJog(self.robot.send, self.ends.append)
+
+    def velocities(self) -> list[float]:
+        return [goal.x for goal in self.robot.sent]
+
+    def hold(self, until: Callable[[], bool]) -> None:
+        """Give signs, four in a time-out, until something holds."""
+        deadline = time.monotonic() + 20.0
+        while not until():
+            assert time.monotonic() < deadline
+            self.jog.hold(RIGHT)
+            time.sleep(TIMEOUT / 4)
+
+    def wait(self, until: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 20.0
+        while not until():
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+
+
+@pytest.fixture
+def hand() -> Iterator[Hand]:
+    hand = Hand()
+    yield hand
+    hand.jog.close()
+
+
+def test_signs_are_one_jog_and_letting_go_ends_it_at_once(hand: Hand) -> None:
+    hand.hold(lambda: len(hand.robot.sent) >= 8)
+    hand.jog.release()
+    hand.wait(lambda: hand.velocities()[-1] == 0.0)
+    assert len({goal.id for goal in hand.robot.sent}) == 1
+    assert {goal.timeout for goal in hand.robot.sent[:-1]} == {TIMEOUT}
+    assert hand.robot.sent[-1].timeout < TIMEOUT
+    assert hand.ends == []
+
+
+def test_a_new_press_is_a_new_jog(hand: Hand) -> None:
+    for _ in range(3):
+        hand.jog.hold(RIGHT)
+        hand.wait(lambda: hand.robot.sent[-1:] != [] and hand.velocities()[-1] > 0.0)
+        hand.jog.release()
+        hand.wait(lambda: hand.velocities()[-1] == 0.0)
+    assert len({goal.id for goal in hand.robot.sent}) == 3
+
+
+def test_without_signs_nothing_is_renewed(hand: Hand) -> None:
+    hand.jog.hold(RIGHT)
+    hand.wait(lambda: hand.robot.goal is not None)
+    hand.wait(lambda: hand.robot.state().goal is None)
+    assert len(hand.robot.sent) == 1
+
+
+def test_a_sign_that_has_waited_for_a_slow_service_is_thrown_away(hand: Hand) -> None:
+    with hand.robot.hanging("goal"):
+        hand.jog.hold(RIGHT)
+        hand.wait(lambda: len(hand.robot.sent) == 1)
+        hand.jog.hold(RIGHT)
+        time.sleep(1.5 * TIMEOUT)  # the second sign grows old: that is what is tried here
+    hand.wait(lambda: hand.robot.goal is not None)
+    hand.wait(lambda: hand.robot.state().goal is None)
+    assert len(hand.robot.sent) == 1
+
+
+def test_letting_go_while_the_service_is_slow_is_not_forgotten(hand: Hand) -> None:
+    with hand.robot.hanging("goal"):
+        hand.jog.hold(RIGHT)
+        hand.wait(lambda: len(hand.robot.sent) == 1)
+        hand.jog.hold(RIGHT)
+        hand.jog.release()
+    hand.wait(lambda: hand.velocities() == [RIGHT[0], 0.0])
+
+
+@pytest.mark.parametrize("code", [RefusalCode.NOT_ENABLED, RefusalCode.STOPPING, RefusalCode.AT_LIMIT])
+def test_what_the_robot_has_refused_is_not_asked_again_before_the_hand_lets_go(hand: Hand, code: RefusalCode) -> None:
+    hand.robot.refusal = RefusedError(code, "no")
+    hand.hold(lambda: hand.ends == ["no"])
+    hand.robot.refusal = None
+    for _ in range(4):
+        hand.jog.hold(RIGHT)
+    hand.jog.release()
+    hand.hold(lambda: hand.robot.goal is not None)
+    assert len(hand.robot.sent) >= 2
+    assert hand.robot.sent[0].id != hand.robot.sent[1].id
+    assert hand.ends == ["no"]
+
+
+def test_a_stop_of_somebody_else_ends_it_until_the_hand_lets_go(hand: Hand) -> None:
+    hand.hold(lambda: hand.robot.goal is not None)
+    hand.robot.command("stop")
+    hand.hold(lambda: hand.ends != [])
+    assert hand.ends == ["stop of ann"]
+    asked = len(hand.robot.sent)
+    for _ in range(4):
+        hand.jog.hold(RIGHT)
+    hand.jog.close()
+    assert len(hand.robot.sent) == asked

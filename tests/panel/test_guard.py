@@ -1,0 +1,200 @@
+"""Who may ask the panel: only who has its token, on this machine's loopback, from the panel's own page."""
+
+from __future__ import annotations
+
+import http.client
+import logging
+import re
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from panel.fake_robot import FakeRobot
+from trirail.errors import ServiceError
+from trirail.panel.guard import refused
+from trirail.panel.server import Panel
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin
+
+TOKEN = "a-token"
+PATH = f"/{TOKEN}/index.html"
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1:9880", "localhost:9880", "localhost", "127.0.0.1:80", "[::1]:9880", "LOCALHOST:1"]
+)
+def test_who_has_the_token_on_the_loopback_may(host: str) -> None:
+    """Whatever the port: ssh -L has another at its other end."""
+    assert refused(TOKEN, PATH, [host], []) is None
+    assert refused(TOKEN, f"/{TOKEN}/socket", [host], [f"http://{host}"]) is None
+
+
+@pytest.mark.parametrize(
+    "hosts",
+    [
+        [],
+        [""],
+        ["evil.example:9880"],
+        ["127.0.0.1.evil.example:9880"],
+        ["evil.example@127.0.0.1@evil.example"],
+        ["192.168.1.7:9880"],
+        ["127.0.0.1:9880", "evil.example"],
+        ["[::1"],
+        ["127.0.0.1\x00.evil.example"],
+    ],
+)
+def test_a_name_of_elsewhere_is_refused(hosts: list[str]) -> None:
+    """So is a page whose name was made to lead here after it was loaded."""
+    assert refused(TOKEN, PATH, hosts, []) is not None
+
+
+@pytest.mark.parametrize(
+    "origin",
+    ["http://evil.example", "null", "", "https://127.0.0.1:9880", "http://127.0.0.1:3000", "http://localhost:9880"],
+)
+def test_a_page_of_another_origin_is_refused(origin: str) -> None:
+    assert refused(TOKEN, PATH, ["127.0.0.1:9880"], [origin]) is not None
+    assert refused(TOKEN, PATH, ["127.0.0.1:9880"], ["http://127.0.0.1:9880", origin]) is not None
+
+
+@given(st.text())
+def test_no_other_token_opens(path: str) -> None:
+    for asked in (path, f"/{path}", f"/{path}/{TOKEN}", f"//{TOKEN}/{path}", f"/{TOKEN}{path}"):
+        may = re.match(rf"/?{TOKEN}(/|$)", asked) is not None
+        assert (refused(TOKEN, asked, ["localhost"], []) is None) == may
+
+
+# ---------------------------------------------------------------------- the same, asked of the server
+
+
+@pytest.fixture(scope="module")
+def panel() -> Iterator[Panel]:
+    with Panel(FakeRobot().robot(), 0) as panel:
+        yield panel
+
+
+def ask(panel: Panel, path: str, **headers: str) -> http.client.HTTPResponse:
+    parts = urlsplit(panel.url)
+    connection = http.client.HTTPConnection(str(parts.hostname), parts.port, timeout=10.0)
+    connection.request("GET", path, headers=headers)
+    return connection.getresponse()
+
+
+def test_the_page_is_served_with_what_keeps_it_to_itself(panel: Panel) -> None:
+    answer = ask(panel, urlsplit(panel.url).path)
+    assert answer.status == 200
+    assert b"STOP" in answer.read()
+    policy = str(answer.headers["Content-Security-Policy"])
+    assert "default-src 'none'" in policy
+    assert "frame-ancestors 'none'" in policy
+    assert "unsafe" not in policy
+    assert answer.headers["Referrer-Policy"] == "no-referrer"
+    assert answer.headers["Cache-Control"] == "no-store"
+
+
+def test_nothing_is_served_without_the_token_or_under_another_name(panel: Panel) -> None:
+    path = urlsplit(panel.url).path
+    for asked, headers in (
+        ("/", {}),
+        ("/panel.js", {}),
+        ("/wrong-token/", {}),
+        (path, {"Host": "evil.example"}),
+        (path, {"Origin": "http://evil.example"}),
+    ):
+        answer = ask(panel, asked, **headers)
+        assert answer.status == 403
+        assert path.strip("/") not in answer.read().decode()
+
+
+def test_only_the_page_s_own_files_are_served(panel: Panel) -> None:
+    path = urlsplit(panel.url).path
+    for asked in ("../server.py", "%2e%2e/server.py", "../../../../../../etc/passwd", "nothing", "index.html/", "?x"):
+        answer = ask(panel, f"{path}{asked}")
+        assert answer.status == (200 if asked == "?x" else 404)
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1"])
+def test_no_other_page_opens_the_socket(panel: Panel, origin: str) -> None:
+    with pytest.raises(InvalidStatus) as refusal, connect(socket_of(panel), origin=Origin(origin), legacy=True):
+        pass
+    assert refusal.value.response.status_code == 403
+
+
+def socket_of(panel: Panel) -> str:
+    return f"{panel.url.replace('http', 'ws')}socket"
+
+
+def test_each_start_has_a_token_of_its_own(panel: Panel) -> None:
+    with Panel(FakeRobot().robot(), 0) as other:
+        tokens = {urlsplit(each.url).path for each in (panel, other)}
+    assert len(tokens) == 2
+    assert all(len(token) > 20 for token in tokens)
+
+
+def test_it_listens_on_the_loopback_alone(panel: Panel) -> None:
+    port = urlsplit(panel.url).port
+    listening = Path("/proc/net/tcp").read_text() + Path("/proc/net/tcp6").read_text()
+    found = re.findall(rf"^\s*\d+: ([0-9A-F]+):{port:04X} \S+ 0A ", listening, re.MULTILINE)
+    assert found == ["0100007F"]
+
+
+def test_a_port_that_is_taken_is_told() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(ServiceError, match="cannot be listened on"):
+        Panel(FakeRobot().robot(), taken.getsockname()[1])
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"",
+        b"\xff",
+        b"[" * 3000,
+        b'{"do": "fly"}',
+        b'{"do": "hold"}',
+        b'{"do": "hold", "velocity": [NaN, 0, 0], "seen": 1}',
+        b'{"do": "hold", "velocity": [1e9, 0, 0], "seen": 1}',
+        b'{"do": "command", "name": "reboot"}',
+        b'{"do": "seen", "stamp": "x"}',
+    ],
+)
+def test_what_is_no_message_is_refused_and_the_tab_goes_on(panel: Panel, message: bytes) -> None:
+    with connect(socket_of(panel), legacy=True) as opened:
+        opened.send(message)
+        opened.send('{"do": "command", "name": "pause"}')
+        said: list[str] = []
+        while not said or "done" not in said[-1]:
+            said.append(str(opened.recv(10.0)))
+    assert any("not a message of this page" in text for text in said)
+
+
+@pytest.mark.parametrize("end", ["cut off", "too large", "closed"])
+def test_a_tab_that_goes_in_whatever_way_is_no_error(panel: Panel, end: str, caplog: pytest.LogCaptureFixture) -> None:
+    before = set(threading.enumerate())
+    opened = connect(socket_of(panel), legacy=True)
+    opened.recv(10.0)
+    serving = [thread for thread in threading.enumerate() if thread not in before and "sock_handler" in thread.name]
+    assert serving
+    if end == "cut off":
+        opened.socket.shutdown(socket.SHUT_RDWR)
+    elif end == "too large":
+        opened.send("x" * 10_000)
+    else:
+        opened.close()
+    for thread in serving:
+        thread.join(20.0)
+        assert not thread.is_alive()
+    assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+def test_a_service_of_another_version_is_told_in_one_line() -> None:
+    robot = FakeRobot()
+    robot.told = msgspec.structs.replace(robot.told, limits={"platform": {}})
+    with pytest.raises(ServiceError, match="another version"):
+        Panel(robot.robot(), 0)

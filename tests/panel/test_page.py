@@ -1,0 +1,455 @@
+"""The operator's page in a browser, used as an operator does, beside a robot that is none."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from chromium import Page, chromium, needs_chromium
+from panel.fake_robot import FakeRobot
+from trirail.client.held_jog import TIMEOUT
+from trirail.errors import RefusalCode, RefusedError
+from trirail.panel.server import Panel
+
+pytestmark = [pytest.mark.viewer, needs_chromium]
+
+WITHIN = 20.0
+SHOWN = "document.body.dataset.contact === 'yes'"
+SIZES = {"desk": (1280, 800, False), "phone": (375, 667, True)}
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with chromium("chromium", tmp_path_factory.mktemp("profile"), ["--disable-gpu"]) as page:
+        yield page
+
+
+@pytest.fixture
+def robot() -> FakeRobot:
+    return FakeRobot()
+
+
+@pytest.fixture
+def panel(robot: FakeRobot) -> Iterator[Panel]:
+    with Panel(robot.robot()) as panel:
+        yield panel
+
+
+@pytest.fixture
+def page(browser: Page, panel: Panel) -> Iterator[Page]:
+    page = browser.another()
+    page.open(panel.url)
+    page.until(SHOWN)
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def enabled(page: Page, robot: FakeRobot) -> Page:
+    page.click("[data-command=enable]")
+    page.until("document.querySelector('#mode-name').textContent === 'holding'")
+    return page
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + WITHIN
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.005)
+
+
+def moves(robot: FakeRobot) -> None:
+    until(lambda: robot.velocity[0] > 0.0, "the robot moves")
+
+
+def stands(robot: FakeRobot) -> None:
+    until(lambda: not any(robot.velocity) and robot.goal is None, "the robot stands")
+
+
+# ---------------------------------------------------------------------- the dead man
+
+
+def test_the_robot_moves_while_a_button_is_held(enabled: Page, robot: FakeRobot) -> None:
+    before = robot.pose[0]
+    enabled.press("[data-axis=x][data-sign='1']")
+    moves(robot)
+    until(lambda: robot.pose[0] > before + 0.025 * 3 * TIMEOUT, "it goes on for longer than one time-out")
+    enabled.let_go()
+    stands(robot)
+    assert len({goal.id for goal in robot.sent}) == 1
+    assert max(goal.timeout for goal in robot.sent) == TIMEOUT
+    assert robot.sent[-1].timeout < TIMEOUT
+    assert robot.pose[1:] == (0.005, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("key", "axis", "sign"),
+    [("ArrowRight", 0, 1), ("ArrowLeft", 0, -1), ("ArrowUp", 1, 1), ("ArrowDown", 1, -1), ("a", 2, 1), ("d", 2, -1)],
+)
+def test_keys_jog_while_they_are_down(enabled: Page, robot: FakeRobot, key: str, axis: int, sign: int) -> None:
+    enabled.key_down(key)
+    until(lambda: robot.velocity[axis] * sign > 0.0, "it moves that way")
+    assert [value != 0.0 for value in robot.velocity] == [k == axis for k in range(3)]
+    enabled.key_up(key)
+    stands(robot)
+
+
+def test_two_buttons_at_once_are_one_jog_and_each_ends_by_itself(enabled: Page, robot: FakeRobot) -> None:
+    enabled.key_down("ArrowRight")
+    moves(robot)
+    enabled.press("[data-axis=phi][data-sign='-1']")
+    until(lambda: robot.velocity[2] < 0.0 < robot.velocity[0], "both")
+    enabled.key_up("ArrowRight")
+    until(lambda: robot.velocity[0] == 0.0 and robot.velocity[2] < 0.0, "the button alone")
+    enabled.let_go()
+    stands(robot)
+    assert len({goal.id for goal in robot.sent}) == 1
+
+
+def test_a_finger_holds_and_what_takes_the_touch_away_lets_go(enabled: Page, robot: FakeRobot) -> None:
+    for end in ("touchEnd", "touchCancel"):
+        enabled.resize(375, 667, phone=True)
+        enabled.touch("[data-axis=x][data-sign='1']")
+        moves(robot)
+        enabled.end_touch(end)
+        stands(robot)
+
+
+@pytest.mark.parametrize(
+    "gone",
+    [
+        "dispatchEvent(new Event('blur'))",
+        "dispatchEvent(new Event('pagehide'))",
+        "Object.defineProperty(document, 'hidden', {value: true, configurable: true}),"
+        " document.dispatchEvent(new Event('visibilitychange'))",
+        "document.querySelector('.held').dispatchEvent(new PointerEvent('lostpointercapture', {pointerId: 1}))",
+    ],
+)
+def test_what_takes_the_page_from_the_operator_lets_go(enabled: Page, robot: FakeRobot, gone: str) -> None:
+    enabled.press("[data-axis=x][data-sign='1']")
+    moves(robot)
+    enabled.evaluate(gone)
+    stands(robot)
+    asked = len(robot.sent)
+    enabled.evaluate("new Promise((done) => setTimeout(done, 300))")  # the button is still down
+    assert len(robot.sent) == asked
+    enabled.let_go()
+
+
+def test_a_page_that_hangs_moves_nothing_and_begins_nothing_when_it_goes_on(enabled: Page, robot: FakeRobot) -> None:
+    enabled.press("[data-axis=x][data-sign='1']")
+    moves(robot)
+    enabled.evaluate("(() => { const over = performance.now() + 1500; while (performance.now() < over); })()")
+    stands(robot)
+    assert len({goal.id for goal in robot.sent}) == 1
+    enabled.let_go()
+
+
+def test_a_frozen_tab_moves_nothing(enabled: Page, robot: FakeRobot) -> None:
+    enabled.press("[data-axis=x][data-sign='1']")
+    moves(robot)
+    enabled.signal_renderers(signal.SIGSTOP)
+    try:
+        stands(robot)
+    finally:
+        enabled.signal_renderers(signal.SIGCONT)
+    enabled.let_go()
+    assert len({goal.id for goal in robot.sent}) == 1
+
+
+def test_a_tab_that_is_closed_lets_go(browser: Page, enabled: Page, panel: Panel, robot: FakeRobot) -> None:
+    other = browser.another()
+    other.open(panel.url)
+    other.until(f"{SHOWN} && !document.querySelector('.hold').disabled")
+    other.press("[data-axis=x][data-sign='1']")
+    moves(robot)
+    other.close()
+    stands(robot)
+
+
+def test_a_jog_that_the_robot_has_ended_begins_again_only_by_a_new_press(enabled: Page, robot: FakeRobot) -> None:
+    enabled.press("[data-axis=x][data-sign='1']")
+    moves(robot)
+    robot.refusal = RefusedError(RefusalCode.AT_LIMIT, "jog 'x' has ended at the limit of platform x")
+    enabled.until("document.querySelector('#answer').textContent.includes('platform x')")
+    robot.refusal = None
+    asked = len(robot.sent)
+    stands(robot)
+    enabled.evaluate("new Promise((done) => setTimeout(done, 300))")
+    assert len(robot.sent) == asked
+    enabled.let_go()
+    enabled.press("[data-axis=x][data-sign='1']")
+    moves(robot)
+    enabled.let_go()
+
+
+def test_the_speed_is_chosen_by_slider_and_keys(enabled: Page, robot: FakeRobot) -> None:
+    found = []
+    for key in ("", "-", "+", "+"):
+        if key:
+            enabled.type_key(key)
+        said = enabled.text("#speed-says")
+        enabled.key_down("ArrowRight")
+        moves(robot)
+        found.append(round(robot.velocity[0] * 1e3, 6))
+        assert said.startswith(f"{found[-1]:g} mm/s")
+        enabled.key_up("ArrowRight")
+        stands(robot)
+    assert found == [25.0, 12.5, 25.0, 50.0]
+
+
+# ---------------------------------------------------------------------- STOP and the other commands
+
+
+@pytest.mark.parametrize("by", ["mouse", "Space", "Escape", "Space on a button", "touch"])
+def test_stop_from_wherever_one_is(enabled: Page, robot: FakeRobot, by: str) -> None:
+    enabled.key_down("ArrowRight")
+    moves(robot)
+    if by == "mouse":
+        enabled.press("#stop")
+    elif by == "touch":
+        enabled.resize(375, 667, phone=True)
+        enabled.touch("#stop")
+    else:
+        enabled.evaluate("document.querySelector('[data-command=disable]').focus()" if "button" in by else "0")
+        enabled.type_key(by.split(maxsplit=1)[0])
+    until(lambda: "stop" in robot.commands, "a stop")
+    stands(robot)
+    enabled.evaluate("new Promise((done) => setTimeout(done, 300))")
+    stands(robot)
+    assert robot.commands == ["enable", "stop"]
+    enabled.key_up("ArrowRight")
+    enabled.let_go()
+
+
+def test_stop_waits_for_no_command_under_way(enabled: Page, robot: FakeRobot) -> None:
+    with robot.hanging("pause"):
+        enabled.key_down("ArrowRight")
+        enabled.until("!document.querySelector('[data-command=pause]').disabled")
+        enabled.click("[data-command=pause]")
+        until(lambda: "pause" in robot.commands, "pause is under way")
+        enabled.click("#stop")
+        stands(robot)
+        until(lambda: "stop" in robot.commands, "a stop")
+    enabled.key_up("ArrowRight")
+
+
+def test_two_tabs_show_the_same_and_either_stops(browser: Page, enabled: Page, panel: Panel, robot: FakeRobot) -> None:
+    other = browser.another()
+    other.open(panel.url)
+    other.until("document.querySelector('#mode-name').textContent === 'holding'")
+    other.press("[data-axis=y][data-sign='1']")
+    until(lambda: robot.velocity[1] > 0.0, "the second tab moves it")
+    enabled.until("document.querySelector('#mode-name').textContent === 'moving'")
+    enabled.click("#stop")
+    stands(robot)
+    other.until("document.querySelector('#mode-name').textContent === 'holding'")
+    asked = len(robot.sent)
+    other.evaluate("new Promise((done) => setTimeout(done, 300))")
+    assert len(robot.sent) == asked
+    other.let_go()
+    other.close()
+
+
+def test_a_fault_is_told_with_its_reason_and_reset(enabled: Page, robot: FakeRobot) -> None:
+    robot.fault("drive B: EMCY 8700: it missed the service's SYNC")
+    enabled.until("document.querySelector('#mode-name').textContent === 'fault'")
+    alarm = enabled.evaluate("(({innerText, role}) => [innerText, role])(document.querySelector('#alarm'))")
+    assert "EMCY 8700" in alarm[0]
+    assert alarm[1] == "alert"
+    assert enabled.evaluate("[...document.querySelectorAll('.hold')].every((button) => button.disabled)")
+    enabled.click("[data-command=reset]")
+    enabled.until("document.querySelector('#alarm').hidden")
+    assert robot.mode == "disabled"
+
+
+def test_a_refusal_is_told(page: Page, robot: FakeRobot) -> None:
+    robot.refusal = RefusedError(RefusalCode.NOT_AT_REST, "slider A is moved from outside")
+    page.click("[data-command=enable]")
+    page.until("document.querySelector('#answer').textContent === 'enable: slider A is moved from outside'")
+
+
+def test_the_override_is_shown_and_set(enabled: Page, robot: FakeRobot) -> None:
+    robot.share = 0.4
+    enabled.until("document.querySelector('#override').value === '40'")
+    enabled.evaluate("document.querySelector('#override').focus()")
+    for _ in range(2):
+        enabled.type_key("ArrowRight")  # moves the slider, not the robot
+    until(lambda: robot.share == 0.5, "both are sent")
+    assert robot.sent == []
+    robot.share = 0.8  # by somebody else
+    enabled.until("document.querySelector('#override').value === '80'")
+
+
+def test_only_a_robot_that_homes_has_the_button(page: Page, browser: Page) -> None:
+    assert page.evaluate("document.querySelector('[data-command=home]').hidden")
+    homing = FakeRobot(homes=("A", "C"))
+    with Panel(homing.robot()) as panel:
+        other = browser.another()
+        other.open(panel.url)
+        other.until(SHOWN)
+        other.click("[data-command=enable]")
+        other.until("document.querySelector('#mode-name').textContent === 'holding'")
+        other.click("[data-command=home]")
+        until(lambda: homing.commands == ["enable", "home"], "homing")
+        other.close()
+
+
+# ---------------------------------------------------------------------- what is shown
+
+
+def test_the_numbers_and_the_drawing_are_the_state(page: Page, robot: FakeRobot) -> None:
+    robot.pose = (0.0321, -0.0123, -0.2)
+    page.until("document.querySelector('#pose').innerText.includes('32.10 mm')")
+    shown = page.text("#pose")
+    assert "−12.30 mm" in shown
+    assert "−11.459°" in shown
+    placed = page.evaluate("document.querySelector('.platform').parentElement.getAttribute('transform')")
+    assert placed.startswith("translate(0.0321 0.0123) rotate(11.459")
+
+
+def test_a_service_that_is_silent_is_told_and_comes_back(page: Page, robot: FakeRobot) -> None:
+    robot.silent.set()
+    page.until("document.querySelector('#mode-name').textContent === 'no contact'")
+    assert "old" in page.text("#alarm")
+    assert "mm" not in page.text("#pose")
+    robot.silent.clear()
+    page.until(f"{SHOWN} && document.querySelector('#alarm').hidden")
+
+
+def test_a_server_that_has_ended_is_told(browser: Page) -> None:
+    page = browser.another()
+    with Panel(FakeRobot().robot()) as panel:
+        page.open(panel.url)
+        page.until(SHOWN)
+    page.until("document.querySelector('#alarm').innerText.includes('trirail panel')")
+    page.close()
+
+
+def test_events_come_with_their_time_the_past_too(page: Page, robot: FakeRobot) -> None:
+    page.until("document.querySelector('#events').innerText.includes('the loop turns')")
+    robot.say("recorder <b>lacks</b> 20 cycles", "warning")
+    page.until("document.querySelector('#events li').innerText.includes('<b>lacks</b>')")
+    newest = page.evaluate("document.querySelector('#events li').innerText")
+    assert newest.split("recorder")[0].strip().count(":") == 2
+    assert page.evaluate("document.querySelector('#events li').className") == "warning"
+
+
+def test_nothing_is_loaded_from_elsewhere_and_nothing_fails(page: Page, panel: Panel) -> None:
+    loaded = page.evaluate("performance.getEntriesByType('resource').map((each) => [each.name, each.responseStatus])")
+    assert {name.removeprefix(panel.url) for name, _ in loaded} >= {"panel.js", "hold.js", "drawing.js", "panel.css"}
+    assert all(name.startswith(panel.url) and status == 200 for name, status in loaded), loaded
+
+
+# ---------------------------------------------------------------------- for every eye and hand
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("faulty", [False, True])
+def test_text_has_the_contrast_of_wcag_aa(enabled: Page, robot: FakeRobot, size: str, faulty: bool) -> None:
+    width, height, phone = SIZES[size]
+    enabled.resize(width, height, phone=phone)
+    robot.say("a warning", "warning")
+    robot.say("an error", "error")
+    enabled.until("document.querySelector('#events li').innerText.includes('an error')")
+    if faulty:
+        robot.fault("drive B")
+        enabled.until("document.querySelector('#mode-name').textContent === 'fault'")
+    else:
+        enabled.press("[data-axis=x][data-sign='1']")
+        enabled.until("document.querySelector('.held')")
+    found = enabled.evaluate(COLOURS)
+    enabled.let_go()
+    assert len(found) > 30
+    low = {
+        (words, round(contrast(ink, ground), 2))
+        for words, ink, ground, large in found
+        if contrast(ink, ground) < (3.0 if large else 4.5)
+    }
+    assert not low
+
+
+COLOURS = """(() => {
+  const number = (colour) => colour.match(/[\\d.]+/g).map(Number);
+  const ground = (element) => {
+    for (; element; element = element.parentElement) {
+      const colour = number(getComputedStyle(element).backgroundColor);
+      if (colour.length === 3 || colour[3] === 1) return colour.slice(0, 3);
+    }
+    throw new Error("no ground");
+  };
+  return [...document.querySelectorAll("body *")].flatMap((element) => {
+    const own = [...element.childNodes].filter((node) => node.nodeType === 3 && node.data.trim());
+    const style = getComputedStyle(element);
+    if (!own.length || !element.getClientRects().length || style.visibility === "hidden") return [];
+    const size = parseFloat(style.fontSize);
+    const colour = element instanceof SVGElement ? style.fill : style.color;
+    return [[own[0].data.trim(), number(colour).slice(0, 3), ground(element), size >= 24]];
+  });
+})()"""
+
+
+def contrast(one: list[float], other: list[float]) -> float:
+    """The contrast ratio of WCAG 2.2 for two colours of sRGB, 0 to 255."""
+    light, dark = sorted((luminance(one), luminance(other)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
+
+
+def luminance(colour: list[float]) -> float:
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (value / 255.0 for value in colour)]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_everything_fits_and_stop_is_always_in_reach(enabled: Page, robot: FakeRobot, size: str) -> None:
+    width, height, phone = SIZES[size]
+    enabled.resize(width, height, phone=phone)
+    robot.fault("drive B: " + "a long reason " * 20)
+    enabled.until("document.querySelector('#mode-name').textContent === 'fault'")
+    assert enabled.evaluate("document.documentElement.scrollWidth") == width
+    for place in ("0", "document.documentElement.scrollHeight"):
+        enabled.evaluate(f"scrollTo(0, {place})")
+        x, y, w, h = enabled.evaluate(
+            "(({x, y, width, height}) => [x, y, width, height])"
+            "(document.querySelector('#stop').getBoundingClientRect())"
+        )
+        assert x >= 0.0
+        assert y >= 0.0
+        assert x + w <= width
+        assert y + h <= height
+        assert w >= 300.0
+        assert h >= 140.0
+        over = enabled.evaluate(f"document.elementFromPoint({x + w / 2}, {y + h / 2}).closest('button').id")
+        assert over == "stop"
+
+
+def test_every_control_is_reached_by_tab_named_and_seen_to_have_the_focus(enabled: Page) -> None:
+    wanted = enabled.evaluate("document.querySelectorAll('button:enabled:not([hidden]), input:enabled').length")
+    reached: dict[str, Any] = {}
+    for _ in range(40):
+        enabled.type_key("Tab")
+        found = enabled.evaluate(
+            "(({id, dataset, tagName, innerText, labels}, style) => [id || JSON.stringify(dataset), tagName,"
+            " innerText || labels?.[0]?.innerText || '', style.outlineStyle, parseFloat(style.outlineWidth)])"
+            "(document.activeElement, getComputedStyle(document.activeElement))"
+        )
+        if found[1] in ("BUTTON", "INPUT"):
+            reached[found[0]] = found
+    assert len(reached) == wanted, reached
+    for name, _, words, style, outline in reached.values():
+        assert words.strip(), name
+        assert style == "solid", name
+        assert outline >= 2.0, name
+
+
+def test_mode_and_answers_are_told_to_those_who_hear_the_page(page: Page) -> None:
+    roles = page.evaluate("['mode-name', 'alarm', 'answer'].map((id) => document.getElementById(id).role)")
+    assert roles == ["status", "alert", "status"]
+    for busy in ("#doing", "#pose", "#sliders", "#mechanism"):  # what changes all the time would be said all the time
+        assert (
+            page.evaluate(f"document.querySelector('{busy}').closest('[role=status], [role=alert], [aria-live]')")
+            is None
+        )

@@ -1,0 +1,55 @@
+"""The service's own output: one line for each thing that happens, once, as text or as JSON."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+
+import msgspec
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.processes.log import Log
+from trirail.wire.messages import Event
+
+FAULT = Event(7, 1.0, 1000, 1_700_000_000.25, "fault", "error", "drive B: following error", mode="fault")
+
+
+def written(form: str, *events: Event, **environment: str) -> list[str]:
+    out = io.StringIO()
+    log = Log(form, out, clock=lambda: 1_700_000_000.0, environment=environment)  # type: ignore[arg-type]
+    for event in events:
+        log.event(event)
+    log.say("the planner has died", "warning")
+    return out.getvalue().splitlines()
+
+
+def test_a_line_has_time_level_and_words() -> None:
+    fault, words = written("text", FAULT)
+    assert re.fullmatch(r"2023-11-1[45] \d\d:\d\d:20\.250  error    drive B: following error", fault)
+    assert re.fullmatch(r"2023-11-1[45] \d\d:\d\d:20\.000  warning  the planner has died", words)
+
+
+def test_journald_is_told_the_level() -> None:
+    fault, words = written("text", FAULT, JOURNAL_STREAM="8:1")
+    assert fault.startswith("<3>2023-11-1")
+    assert words.startswith("<4>2023-11-1")
+
+
+def test_lines_of_json_are_the_events() -> None:
+    fault, words = written("json", FAULT)
+    assert msgspec.json.decode(fault, type=Event) == FAULT
+    said = {"time": 1_700_000_000.0, "kind": "service", "level": "warning", "message": "the planner has died"}
+    assert json.loads(words) == said
+
+
+def test_what_is_told_again_is_written_once() -> None:
+    told = [msgspec.structs.replace(FAULT, seq=seq) for seq in (1, 2, 3, 1, 2, 3, 4)]
+    assert len(written("text", *told)) == 5
+
+
+@given(st.text(max_size=50))
+def test_whatever_is_said_stays_one_line(words: str) -> None:
+    event = msgspec.structs.replace(FAULT, message=words)
+    assert all(len(written(form, event)) == 2 for form in ("text", "json"))
+    assert "\x1b" not in written("text", event)[0]
