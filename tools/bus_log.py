@@ -88,14 +88,19 @@ def read(path: Path) -> list[Frame]:
 def problems(log: Sequence[Frame], config: Config, missed: int, until: float) -> list[str]:
     """Return what is wrong in the frames before the time `until`, a line each; `missed` ticks the service told of."""
     log = [frame for frame in log if frame.t < until]
-    syncs = [frame.t for frame in log if frame.identifier == layout.SYNC]
-    if len(syncs) < 3:
-        return [f"SYNC: {len(syncs)} in the log: nothing ran"]
-    found = list(_sync_problems(syncs, config.period, missed))
+    found = sync_problems(log, config.period, missed, until)
     for name, drive in zip(NAMES, config.drives.each, strict=True):
         found += (f"drive {name}: {problem}" for problem in _setpoint_problems(log, drive, config))
         found += (f"drive {name}: {problem}" for problem in _power_problems(log, drive.node))
     return found
+
+
+def sync_problems(log: Sequence[Frame], period: float, missed: int, until: float) -> list[str]:
+    """Return what is wrong with the SYNCs before the time `until`, for a cycle of `period` seconds."""
+    syncs = [frame.t for frame in log if frame.identifier == layout.SYNC and frame.t < until]
+    if len(syncs) < 3:
+        return [f"SYNC: {len(syncs)} in the log: nothing ran"]
+    return list(_sync_problems(syncs, period, missed))
 
 
 def differences(own: Sequence[Frame], log: Sequence[Frame], until: float) -> list[str]:

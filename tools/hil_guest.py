@@ -1,6 +1,6 @@
-"""What tools/hil.py runs inside the machine: the service on can0, drives on can1, goals from a client.
+"""What tools/hil.py runs inside the machine: a service on can0, its drives on can1, a client; then a second robot.
 
-python tools/hil_guest.py FOLDER    as root; FOLDER has robot.toml, and takes logs and result.json
+python tools/hil_guest.py FOLDER    as root; FOLDER has robot.toml and second.toml, and takes logs and result.json
 """
 
 from __future__ import annotations
@@ -8,24 +8,24 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
+import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import hil_scenario
-from hil_programs import Failed, Machine
-from trirail.config import load
-from trirail.errors import TrirailError
+from hil_programs import Machine
+
+LOGS = {"bus.log": "bus.log", "second-bus.log": "second-bus.log", "recordings/*.log": "service-frames.log"}
+"""What is brought out of memory: what the host has it by."""
 
 
 def main() -> int:
-    """Run the scenario; leave logs and result.json."""
+    """Run both robots; leave logs and result.json."""
     folder, began = Path(sys.argv[1]), time.monotonic()
-    # The folder is on the host and slow to write: the frames go to memory first.
+    # The folder is on the host and slow to write: what is written in motion goes to memory first.
     memory = Path(os.environ["TMPDIR"])
-    frames = memory / "bus.log"
     result: dict[str, Any] = {"checks": {}, "failure": None, "loops": {}}
 
     def held(check: str, detail: str) -> None:
@@ -33,18 +33,47 @@ def main() -> int:
         print(f"guest {time.monotonic() - began:5.0f} s  {check}: {detail}", flush=True)
 
     try:
-        with Machine(folder, frames) as machine:
-            held("doctor", machine.doctor())
-            machine.candump()
-            hil_scenario.disturbed(machine, load(folder / "robot.toml"), held, result)
-    except (Failed, TrirailError, TimeoutError, OSError, subprocess.SubprocessError) as error:
+        with Machine(folder, memory) as machine:
+            _run(machine, folder, held, result)
+    except Exception as error:  # noqa: BLE001 - whatever it is, the host is to tell it
         result["failure"] = f"{type(error).__name__}: {error}"
     finally:
-        for log in (frames, *(memory / "recordings").glob("*.log")):
-            if log.exists():
-                shutil.copy(log, folder / ("bus.log" if log == frames else "service-frames.log"))
+        for pattern, name in LOGS.items():
+            for log in memory.glob(pattern):
+                shutil.copy(log, folder / name)
         (folder / "result.json").write_text(json.dumps(result))
     return 0 if result["failure"] is None else 1
+
+
+def _run(machine: Machine, folder: Path, held: Callable[[str, str], None], result: dict[str, Any]) -> None:
+    prepared = _compiled()
+    # What takes this slow machine long begins at once, beside this program's own imports.
+    drives = machine.begin_drives("robot.toml", "can1")
+    doctor = machine.doctor()
+    machine.candump("can1", "bus.log")
+    import hil_scenario
+    import hil_second
+    from trirail.config import load
+
+    machine.await_drives(drives)
+    held("drives", "three virtual drives on can1")
+    service = machine.begin_service("robot.toml")
+    held("doctor", doctor())
+    machine.await_service(service)
+    hil_scenario.disturbed(machine, load(folder / "robot.toml"), held, result)
+    # The first service writes its black boxes; the second one starts beside it.
+    service.send_signal(signal.SIGTERM)
+    second = hil_second.begin(machine)
+    machine.await_end(service, "the service")
+    held("end", "exit code 0 after SIGTERM")
+    hil_second.run(machine, second, load(folder / "second.toml"), held, result)
+    here = sorted(_compiled() - prepared)
+    held("compiled code", f"{len(prepared)} functions from outside, {len(here)} compiled here: {', '.join(here)}")
+
+
+def _compiled() -> set[str]:
+    """The names of what numba keeps."""
+    return {path.name for path in Path(os.environ["NUMBA_CACHE_DIR"]).glob("*/*.nbc")}
 
 
 if __name__ == "__main__":

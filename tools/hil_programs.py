@@ -17,9 +17,11 @@ WITHIN = 300.0
 """How long anything may take in this slow machine [s]; the whole run has a time limit of its own, outside."""
 BUFFER = 8_000_000
 """Of candump's socket [bytes]: it shall see every frame, however busy the machine is."""
+SILENT = 10.0
+"""How long a process may give no sign of life in this slow machine [s]: while the others start, its turn comes late."""
 PATIENT = (
     "from trirail.cli import commands; from trirail.processes import supervisor; "
-    f"supervisor.START_WITHIN = supervisor.END_WITHIN = {WITHIN}; commands.main()"
+    f"supervisor.START_WITHIN = supervisor.END_WITHIN = {WITHIN}; supervisor.SILENT = {SILENT}; commands.main()"
 )
 """`trirail`, with more patience: the interpreters alone take a minute to start here, and a black
 box for each fault some seconds to be written."""
@@ -32,9 +34,11 @@ class Failed(Exception):
 class Machine:
     """The programs under test, each with its output in a log in `folder`; all ended when the context is left."""
 
-    def __init__(self, folder: Path, frames: Path) -> None:
+    def __init__(self, folder: Path, memory: Path) -> None:
+        """`memory` is a folder that is fast to write."""
         self._folder = folder
-        self._frames = frames
+        self._memory = memory
+        self._systemd: dict[str, socket.socket] = {}
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def __enter__(self) -> Machine:
@@ -67,6 +71,10 @@ class Machine:
     def end(self, process: subprocess.Popen[bytes], name: str) -> None:
         """End a program by SIGTERM. Raises Failed unless it ends as one that was told to."""
         process.send_signal(signal.SIGTERM)
+        self.await_end(process, name)
+
+    def await_end(self, process: subprocess.Popen[bytes], name: str) -> None:
+        """Wait for the end of a program that was told to. Raises Failed unless it ends well."""
         until(lambda: process.poll() is not None, f"{name} ends")
         if process.returncode != 0:
             raise Failed(f"{name} ended with exit code {process.returncode}, not 0, after SIGTERM")
@@ -75,45 +83,63 @@ class Machine:
         """What a program has said so far."""
         return (self._folder / f"{name}.log").read_text(errors="replace")
 
-    def doctor(self) -> str:
-        """What `trirail doctor` says of can0. Raises Failed unless all of it is well."""
-        command = (sys.executable, "-P", "-m", "trirail", "doctor", self._folder / "robot.toml", "--json")
-        said = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=False)
-        can0 = [check for check in json.loads(said.stdout)["checks"] if check["name"].startswith("can0")]
-        if len(can0) != 3 or any(check["verdict"] != "ok" for check in can0):
-            raise Failed(f"the doctor says of can0: {can0}")
-        return ", ".join(f"{check['name']} {check['found']}" for check in can0)
+    def doctor(self) -> Callable[[], str]:
+        """Begin `trirail doctor`; return what waits for it and tells what it says of can0.
 
-    def candump(self) -> None:
-        """Start the log of all frames that pass can1."""
-        with self._frames.open("wb") as log:
-            command = ("candump", "-L", "-D", "-r", str(BUFFER), "can1")
+        That raises Failed unless all of it is well.
+        """
+        command = (sys.executable, "-P", "-m", "trirail", "doctor", self._folder / "robot.toml", "--json")
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
+        self._processes.append(process)
+
+        def told() -> str:
+            said, _ = process.communicate(timeout=WITHIN)
+            can0 = [check for check in json.loads(said)["checks"] if check["name"].startswith("can0")]
+            if len(can0) != 3 or any(check["verdict"] != "ok" for check in can0):
+                raise Failed(f"the doctor says of can0: {can0}")
+            return ", ".join(f"{check['name']} {check['found']}" for check in can0)
+
+        return told
+
+    def candump(self, channel: str, name: str) -> None:
+        """Start the log of all frames that pass an interface: NAME, in memory."""
+        with (self._memory / name).open("wb") as log:
+            command = ("candump", "-L", "-D", "-r", str(BUFFER), channel)
             self._processes.append(subprocess.Popen(command, stdout=log))
 
-    def drives(self, config: str, name: str = "drives") -> subprocess.Popen[bytes]:
-        """Start the drives of a configuration on can1."""
-        # Real drives do not share a processor with a desktop: these get theirs before everything but the loop.
-        process = self.start(
-            name,
-            *("chrt", "--fifo", "50", sys.executable, "tools/virtual_drives.py", self._folder / config),
-            *("--interface", "socketcan", "--channel", "can1"),
-        )
-        until(lambda: "C " in self.log(name), "the virtual drives are there", process)
-        return process
+    def begin_drives(
+        self, config: str, channel: str, name: str = "drives", faults: str | None = None
+    ) -> subprocess.Popen[bytes]:
+        """Start the virtual drives of a configuration on an interface."""
+        more = ("--faults", self._folder / faults) if faults else ()
+        return self.begin("tools/virtual_drives.py", config, channel, name, *more)
 
-    def service(self, config: str, name: str = "service") -> subprocess.Popen[bytes]:
-        """Start the service; wait until it tells systemd, whose place is taken here, that it is up."""
-        address = f"{os.environ['TMPDIR']}/notify-{name}"
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
-            systemd.bind(address)
-            systemd.settimeout(1.0)
-            process = self.start(
-                name,
-                *(sys.executable, "-P", "-c", PATIENT, "run", self._folder / config),
-                NOTIFY_SOCKET=address,
-            )
-            until(lambda: _received(systemd) == "READY=1", "the service is up", process)
-        return process
+    def begin(self, program: str, config: str, channel: str, name: str, *more: object) -> subprocess.Popen[bytes]:
+        """Start a program that is a configuration's drives on an interface."""
+        # Real drives do not share a processor with a desktop: these get theirs before everything but the loop.
+        return self.start(
+            name,
+            *("chrt", "--fifo", "50", sys.executable, program, self._folder / config),
+            *("--interface", "socketcan", "--channel", channel, *more),
+        )
+
+    def await_drives(self, process: subprocess.Popen[bytes], name: str = "drives") -> None:
+        """Wait until the last of a program's drives says its state."""
+        until(lambda: "C " in self.log(name), f"{name} are there", process)
+
+    def begin_service(self, config: str, name: str = "service") -> subprocess.Popen[bytes]:
+        """Start the service, which tells systemd, whose place is taken here, when it is up."""
+        self._systemd[name] = systemd = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        address = self._memory / f"notify-{name}"
+        systemd.bind(str(address))
+        systemd.settimeout(1.0)
+        command = (sys.executable, "-P", "-c", PATIENT, "run", self._folder / config)
+        return self.start(name, *command, NOTIFY_SOCKET=str(address))
+
+    def await_service(self, process: subprocess.Popen[bytes], name: str = "service") -> None:
+        """Wait until a service that was begun is up."""
+        with self._systemd.pop(name) as systemd:
+            until(lambda: _received(systemd) == "READY=1", f"{name} is up", process)
 
 
 def run(*command: str) -> None:

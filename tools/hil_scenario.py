@@ -27,12 +27,9 @@ def disturbed(machine: Machine, config: Config, held: Held, result: dict[str, An
 
     `result` gets "cut": the time up to which the frames on the bus are those of a robot that nobody disturbs.
     """
-    machine.drives("robot.toml")
-    held("drives", "three virtual drives on can1")
-    service = machine.service("robot.toml")
     held("service", "up on can0, its drives set up and read back by SDO")
     with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
-        robot.enable()
+        recover(robot)  # a machine that stalls while all begins is a fault rightly told, and none of the service's
         held("enable", "confirmed, the robot holds")
         moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(WITHIN)
         expect(moved, "done", robot)
@@ -41,16 +38,14 @@ def disturbed(machine: Machine, config: Config, held: Held, result: dict[str, An
         _stopped(robot, held)
         robot.disable()
         held("disable", "confirmed, no drive has power")
-        result["loops"] |= {f"{config.loop.rate_hz} Hz": _loop(robot.state())}
+        result["loops"] |= {f"{config.loop.rate_hz} Hz": loop_of(robot.state())}
         result["cut"] = time.time()
         robot.enable()
-        _quick_stopped(robot, held)
+        quick_stopped(robot, held)
         _flooded(robot, held)
         _thrown_out(robot, held)
         _drives_link_down(robot, machine, held)
         _link_down(robot, machine, held)
-    machine.end(service, "the service")
-    held("end", "exit code 0 after SIGTERM")
 
 
 def _refused(robot: Robot, held: Held) -> None:
@@ -71,14 +66,17 @@ def _stopped(robot: Robot, held: Held) -> None:
     held("stop", result.message)
 
 
-def _quick_stopped(robot: Robot, held: Held) -> None:
+def quick_stopped(robot: Robot, held: Held, name: str = "quick stop and reset") -> float:
+    """Stop by a quick stop in motion, reset and enable; return when the stop was asked for [s since 1970]."""
     goal = robot.move_to(x=0.08, y=0.0, phi=0.0)
     _until_moving(robot, goal.id)
+    at = time.time()
     robot.quick_stop()
     expect(goal.wait(WITHIN), "faulted", robot)
     state = until_state(robot, lambda state: state.mode == "fault", "fault after a quick stop")
-    _recover(robot)
-    held("quick stop and reset", f"{'; '.join(state.faults)}; then enabled again")
+    recover(robot)
+    held(name, f"{'; '.join(state.faults)}; then enabled again")
+    return at
 
 
 def _flooded(robot: Robot, held: Held) -> None:
@@ -97,7 +95,7 @@ def _thrown_out(robot: Robot, held: Held) -> None:
     _until_moving(robot, goal.id)
     run("cansend", "can1", PRE_OPERATIONAL_B)
     held("a foreign master's NMT", _faulted(robot, goal.wait(WITHIN), "drive B"))
-    _recover(robot)
+    recover(robot)
 
 
 def _drives_link_down(robot: Robot, machine: Machine, held: Held) -> None:
@@ -108,7 +106,7 @@ def _drives_link_down(robot: Robot, machine: Machine, held: Held) -> None:
     words = _faulted(robot, goal.wait(WITHIN), "drive")
     until(lambda: _in_fault(machine.log("drives")), "the drives stop by their own watchdogs")
     run("ip", "link", "set", "can1", "up")
-    _recover(robot)
+    recover(robot)
     held("drives' interface down in motion", f"{words}; up again, reset and enabled")
 
 
@@ -130,10 +128,12 @@ def _faulted(robot: Robot, result: Result, whose: str) -> str:
     return "; ".join(state.faults)
 
 
-def _recover(robot: Robot) -> None:
-    """Reset as soon as the cause is gone, and enable."""
+def recover(robot: Robot) -> None:
+    """Reset as soon as the cause is gone, where there is a fault, and enable."""
 
     def cleared() -> bool:
+        if robot.state().mode != "fault":
+            return True
         try:
             robot.reset()
         except RefusedError:
@@ -179,7 +179,8 @@ def _in_fault(log: str) -> bool:
     return len(newest) == 3 and all(line[2:].startswith("fault,") for line in newest.values())
 
 
-def _loop(state: State) -> dict[str, Any]:
+def loop_of(state: State) -> dict[str, Any]:
+    """How a loop kept its time."""
     loop = state.loop
     return {
         "cycles": loop.cycles,

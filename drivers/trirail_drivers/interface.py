@@ -106,7 +106,8 @@ class DriveGroup(Protocol):
 
     @property
     def traffic(self) -> int:
-        """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
+        """Bits of all frames sent and heard since the start, each with worst-case stuffing; what a kernel filters out
+        is not heard."""
 
     @property
     def told(self) -> tuple[DriveFault | None, ...]:

@@ -14,10 +14,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.cli import doctor, probes
-from trirail.cli.doctor import Check, Machine
+from trirail.cli.doctor import Check, Machine, Passed
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
 from trirail.processes.clock import Tick
+from trirail_drivers.bus.frames import bits_of, frame_bits
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.errors import BusError
 from trirail_drivers.protocols import PROTOCOLS
@@ -142,6 +143,39 @@ def test_a_virtual_interface_has_no_bitrate_to_be_wrong() -> None:
 def test_another_interface_is_said_to_be_unknown() -> None:
     checks = doctor.examine(changed(REAL, "can", interface="pcan"), GOOD)
     assert bad(checks)["CAN"].verdict == "warning"
+
+
+@pytest.mark.parametrize(("frames", "verdict"), [(0, "ok"), (100, "ok"), (11_000, "ok"), (13_000, "warning")])
+def test_what_passes_on_the_bus_is_counted_whoever_sends_it(frames: int, verdict: str) -> None:
+    """At 1 Mbit/s frames of eight bytes fill the bus at 7407 a second."""
+    machine = msgspec.structs.replace(GOOD, passed=Passed(2.0, frames, 8 * frames))
+    (check,) = [check for check in doctor.examine(REAL, machine) if check.name == "can0 traffic"]
+    assert check.verdict == verdict
+    assert float(check.found.partition("%")[0]) == pytest.approx(frames * frame_bits(8) / 2e4, abs=0.6)
+
+
+@given(st.lists(st.integers(0, 8), max_size=50))
+def test_bits_are_those_of_the_frames_one_a_frame_at_most_too_many(lengths: list[int]) -> None:
+    bits = sum(map(frame_bits, lengths))
+    assert bits <= bits_of(len(lengths), sum(lengths)) < bits + len(lengths) + 1
+
+
+def test_the_kernels_counters_are_read_and_subtracted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "SYSTEM", tmp_path)
+    assert probes.counted("can0") is None
+    assert probes.counted("") is None
+    folder = tmp_path / "class/net/can0/statistics"
+    folder.mkdir(parents=True)
+    for name, value in {"rx_packets": 30, "tx_packets": 12, "rx_bytes": 200, "tx_bytes": 96}.items():
+        (folder / name).write_text(f"{value}\n")
+    now = probes.counted("can0")
+    assert now is not None
+    assert (now.frames, now.data) == (42, 296)
+    difference = probes.passed(now, Passed(now.seconds + 2.0, 142, 1096))
+    assert difference is not None
+    assert difference.seconds == pytest.approx(2.0)
+    assert (difference.frames, difference.data) == (100, 800)
+    assert probes.passed(None, now) is None
 
 
 def test_protections_that_drives_may_lack_are_listed_once_each_with_their_drives() -> None:

@@ -1,7 +1,7 @@
 """Drives that others made: python-canopen's own SDO server over the dictionary of a real drive, on python-can's bus.
 
-Nothing here is of this project: frames come and go by python-can's `virtual` interface, requests are served by
-canopen's LocalNode, and the servo believes only its own units. No threads: whoever waits for a frame turns the clock.
+Nothing here is of this project: frames come and go by python-can, requests are served by canopen's LocalNode, and the
+servo believes only its own units. No threads: whoever waits for a frame turns the clock.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class ForeignDrive:
         self,
         name: str,
         node: int,
-        channel: str,
+        bus: can.BusABC,
         clock: Callable[[], float],
         truth: Truth,
         start: float = 0.0,
@@ -163,7 +163,7 @@ class ForeignDrive:
     ) -> None:
         self.node, self.clock, self.truth = node, clock, truth
         self.habits = replace(habits) if habits else Habits()
-        self.bus = can.Bus(channel, interface="virtual")
+        self.bus = bus
         self.network = canopen.Network(self.bus)
         self.local = canopen.LocalNode(node, dictionary(name, node, self.habits, rebased=rebased))
         # This node's clock sends the heartbeats, and no thread.
@@ -264,10 +264,11 @@ class ForeignDrive:
 
     # ---- frames
 
-    def pump(self) -> None:
-        """Take in what is on the bus, and do what time asks for."""
-        while (message := self.bus.recv(0)) is not None:
+    def pump(self, wait: float = 0.0) -> None:
+        """Take in what is on the bus, which may take so long to come [s], and do what time asks for."""
+        while (message := self.bus.recv(wait)) is not None:
             self._take(message)
+            wait = 0.0
         if self.clock() > self._last:
             self._last = self.clock()
             self._time()
@@ -568,7 +569,7 @@ def three(
     channel = f"foreign-{next(_names)}"
     wires = Wires(channel, clock)
     wires.nodes = [
-        ForeignDrive(name, node, channel, clock, truth, start, habits, rebased=rebased)
+        ForeignDrive(name, node, can.Bus(channel, interface="virtual"), clock, truth, start, habits, rebased=rebased)
         for (node, truth), start in zip(truths.items(), starts, strict=True)
     ]
     return wires, clock

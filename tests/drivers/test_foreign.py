@@ -230,6 +230,20 @@ UNITS = [
 ]
 
 
+def test_the_factors_6096_and_6097_go_as_makers_have_them(rigs: list[Rig]) -> None:
+    """Beckhoff's AX8000 as it comes: 2^20 counts a turn, velocities in 0.0001 rpm, accelerations in degrees/s²."""
+    factors = {(0x6096, 1): 600_000, (0x6096, 2): 2**20, (0x6097, 1): 360, (0x6097, 2): 600_000}
+    truth = Truth(2**20 * TURNS, 60e4 * TURNS, 360 * TURNS)
+    rig = Rig("elmo_gold", Habits(values=factors), truth, counts_per_metre=truth.position)
+    rigs.append(rig)
+    rig.ready()
+    rig.enable()
+    rig.move(0.1, 150)
+    for node, commanded in zip(rig.nodes, rig.commanded, strict=True):
+        assert commanded - node.servo.position == pytest.approx(0.1 * PERIOD, abs=5e-5)
+        assert node.value(0x6085) / truth.acceleration == pytest.approx(2.0, rel=1e-3)
+
+
 @pytest.mark.parametrize(("position", "velocity", "acceleration", "truth"), UNITS)
 def test_a_tenth_of_a_metre_a_second_is_that_in_every_unit(
     rigs: list[Rig], position: int, velocity: int, acceleration: int, truth: Truth

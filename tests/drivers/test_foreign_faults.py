@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import can
 import pytest
-from drivers.foreign import DISABLED, ENABLED, OPERATIONAL, PRE_OPERATIONAL, STOPPED, ForeignDrive, Habits
-from drivers.test_foreign import PERIOD, Rig
+from drivers.foreign import DISABLED, ENABLED, OPERATIONAL, PRE_OPERATIONAL, QUICK_STOP, STOPPED, ForeignDrive, Habits
+from drivers.test_foreign import MAKES, PERIOD, Rig
 from trirail_drivers.cia402.codes import words
 from trirail_drivers.interface import PowerState
 
@@ -187,6 +187,36 @@ def test_an_emcy_that_is_still_in_force_does(rig: Rig) -> None:
 def test_setpoints_that_are_not_followed_are_noticed(rig: Rig) -> None:
     rig.nodes[1].habits.has_bit_12 = False
     assert "drive B: does not follow setpoints" in stopped_within(rig, round(0.05 / PERIOD))
+
+
+@pytest.mark.parametrize("option", [5, 6, 7, 8])
+@pytest.mark.parametrize("way", [way for way, named in WAYS.items() if named.make != "pilz_prbt"])  # it lacks 605Ah
+def test_a_drive_that_stays_in_quick_stop_active_loses_its_power_once_it_stands(way: str, option: int) -> None:
+    """605Ah = 5 to 8, and read-only; power that were taken off before would let the slider coast."""
+    make, habits, keys = WAYS[way]
+    made = habits()
+    made.values[0x605A, 0] = option
+    made.access[0x605A, 0] = "ro"
+    lacking = (*MAKES[make].keys.get("accept_without", ()), "605A")
+    rig = Rig(make, made, **{**keys, "accept_without": lacking})
+    try:
+        rig.ready()
+        rig.enable()
+        rig.move(0.05, 60)
+        rig.drives.quick_stop()
+        moving = set(PowerState) - {PowerState.SWITCH_ON_DISABLED}
+        for _ in range(round(0.5 / PERIOD)):
+            before = [(node.state, node.servo.velocity) for node in rig.nodes]
+            feedback = rig.cycle()
+            assert feedback.fault is None
+            for node, (state, velocity) in zip(rig.nodes, before, strict=True):
+                if node.state != state == QUICK_STOP:
+                    assert velocity == 0.0
+        assert not moving & set(feedback.state)
+        rig.feedback = feedback
+        rig.enable()
+    finally:
+        rig.drives.close()
 
 
 def test_a_silent_drive_stops_the_others(rig: Rig) -> None:

@@ -30,6 +30,11 @@ def frame_bits(n: int) -> int:
     return 8 * n + 47 + (34 + 8 * n - 1) // 4
 
 
+def bits_of(frames: int, data: int) -> float:
+    """Bits that so many frames with so many data bytes in all take at most, at most one more a frame: frame_bits."""
+    return 8 * data + 47 * frames + (33 * frames + 8 * data) / 4
+
+
 BITS: Final = tuple(frame_bits(n) for n in range(9))
 """`frame_bits` of each length."""
 

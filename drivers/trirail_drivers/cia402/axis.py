@@ -16,6 +16,9 @@ FOLLOW_TIME = MISSED_STATUSES * frames.STATUS_PERIOD
 """How long an enabled drive may take to say that it follows setpoints [s]."""
 REGISTER_TIME = 0.5
 """How long a drive may take to tell its error register after a reset [s]."""
+STILL = 2e-5
+"""A slider that has been within this [m] of a place for STILL_FOR [s] stands."""
+STILL_FOR = 0.1
 APART = 0.005
 """Positions that answer one SYNC and are so far apart [m] are those of two sliders."""
 SECOND_ANSWERS = 3
@@ -42,6 +45,8 @@ class Cia402Axis(Axis):
         "_operational",
         "_register_until",
         "_restarted",
+        "_stands_at",
+        "_stands_since",
         "_unfollowed_since",
         "actual",
         "command_age",
@@ -120,10 +125,14 @@ class Cia402Axis(Axis):
         self._operational = self._restarted = self._followed = self.stopped = False
         self._unfollowed_since: float | None = None
         self._came = self._answered_twice = 0
+        self._stands_at, self._stands_since = 0, math.inf
 
     def on_position(self, data: bytes | bytearray, now: float) -> None:
         """TPDO2: the position sampled at a SYNC, and the statusword where the drive's way has it here."""
         counts, statusword = self.way.feedback.unpack(data)
+        if abs(counts - self._stands_at) > max(1.0, abs(self.scale.counts_per_metre) * STILL):
+            self._stands_at, self._stands_since = counts, now
+        self._stands_since = min(self._stands_since, now)
         apart = abs(counts - self.actual) > abs(self.scale.counts_per_metre) * APART
         self._came += not self._came or apart  # about the same again is a frame, or a SYNC, that came twice
         self.take_position(counts)
@@ -247,6 +256,9 @@ class Cia402Axis(Axis):
         if self.state is PowerState.FAULT and now < self.reset_until:
             # Bit 7 stays up until the drive is out of fault: some look at it once in a few cycles only.
             return frames.FAULT_RESET
+        if self.state is PowerState.QUICK_STOP_ACTIVE and self._stands(now):
+            # 605Ah = 5 to 8: it would stay there, with power (CiA 402-2, transition 12). Before, it would coast.
+            return frames.DISABLE_VOLTAGE
         word = frames.controlword(self.state, wanted)
         if word != frames.ENABLE_OPERATION:
             return word
@@ -257,11 +269,15 @@ class Cia402Axis(Axis):
 
     def is_not_followed(self, word: int, wanted: frames.Wanted) -> bool:
         """Whether a controlword, by what the drive says, has not taken it where it is to go."""
-        if wanted is PowerState.OPERATION_ENABLED:
-            return self.state in _ON_THE_WAY or not self.cyclic  # of its mode's bits the state does not tell
         if self.state is PowerState.QUICK_STOP_ACTIVE:
             return word == frames.DISABLE_VOLTAGE
+        if wanted is PowerState.OPERATION_ENABLED:
+            return self.state in _ON_THE_WAY or not self.cyclic  # of its mode's bits the state does not tell
         return self.state in _CAN_MOVE_OR_SOON
+
+    def _stands(self, now: float) -> bool:
+        """Whether its slider stands: only positions that still come can tell."""
+        return now - self._stands_since >= STILL_FOR and self.answers.missed == 0
 
     def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
         """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not.

@@ -94,7 +94,7 @@ _STATES: Final = {
     0x07: PowerState.QUICK_STOP_ACTIVE,
 }
 
-# A quick stop under way is left to end by itself, in switch on disabled: 605Ah = 2.
+# A quick stop under way is left to end: by itself, in switch on disabled (605Ah = 2), or see Cia402Axis.word.
 _TOWARDS_OPERATION: Final = {
     PowerState.SWITCH_ON_DISABLED: SHUTDOWN,
     PowerState.READY_TO_SWITCH_ON: SWITCH_ON,

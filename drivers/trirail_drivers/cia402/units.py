@@ -3,8 +3,13 @@
 Positions are `counts_per_metre`: whatever unit 6064h counts in. A drive tells its units of position, velocity and
 acceleration in 60A8h, 60A9h and 60AAh (CiA 402-2), each as a power of ten, a numerator and a denominator
 (CiA 303-2), or what its velocity is of its position by 6096h and 6097h, the velocity and acceleration factor:
-velocity = position units per second * numerator / divisor. Where it tells neither, `velocity_unit` and
-`acceleration_unit` say it. Nothing is taken for granted: a velocity offset in the wrong unit moves metal.
+velocity = position units per second * numerator / divisor. So Kollmorgen's AKD2G has it in its manual (6096h), and
+Beckhoff's AX8000 in its defaults: 600000 / 1048576 at 2^20 counts a turn is 0.0001 rpm, and 6097h = 360 / 600000 of
+that makes degrees per second squared. A maker who means the inverse contradicts a `velocity_unit` that is right, and
+is refused.
+
+Where a drive tells neither, `velocity_unit` and `acceleration_unit` say it. Nothing is taken for granted: a velocity
+offset in the wrong unit moves metal.
 """
 
 from __future__ import annotations

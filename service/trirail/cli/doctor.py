@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from msgspec import Struct
+from trirail_drivers.bus.frames import bits_of
 from trirail_drivers.bus.load import HIGH
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
@@ -32,6 +33,17 @@ class Check(Struct, frozen=True):
     remedy: str = ""
 
 
+class Passed(Struct, frozen=True):
+    """What the kernel counted on a network interface."""
+
+    seconds: float
+    """For how long [s]."""
+    frames: int
+    """Sent and received, whoever listens."""
+    data: int
+    """Bytes in them."""
+
+
 class Machine(Struct, frozen=True):
     """What was read of the machine; None where it does not say."""
 
@@ -50,6 +62,8 @@ class Machine(Struct, frozen=True):
     link: dict[str, Any] | None
     """The CAN interface as `ip -details -json link` has it."""
     ticks: tuple[Tick, ...]
+    passed: Passed | None = None
+    """What passed on the CAN interface meanwhile."""
     adapter: str = ""
     """What python-can's interface would lack, with the remedy; "" for nothing."""
 
@@ -136,7 +150,7 @@ def can_interface(config: Config, machine: Machine) -> list[Check]:
         return [Check("CAN", "warning", found, "look at it with its maker's tools; SocketCAN tells its state")]
     if not machine.af_can:
         return [Check("CAN", "failure", "this kernel has no SocketCAN", "modprobe can_raw")]
-    return [Check("CAN", "ok", "SocketCAN"), *_link(config, machine.link)]
+    return [Check("CAN", "ok", "SocketCAN"), *_link(config, machine.link), *_traffic(config, machine.passed)]
 
 
 def _link(config: Config, link: dict[str, Any] | None) -> list[Check]:
@@ -154,6 +168,18 @@ def _link(config: Config, link: dict[str, Any] | None) -> list[Check]:
     data = info.get("info_data", {})
     queue = _queue(name, link.get("txqlen"), PROTOCOLS[config.drives.protocol].traffic.most_sent)
     return [_bitrate(name, bitrate, data, up), _state(name, data, up), queue]
+
+
+def _traffic(config: Config, passed: Passed | None) -> list[Check]:
+    """What is on the bus now, of everybody: the service hears only its own drives, and shows no other load."""
+    if passed is None:
+        return []
+    share = bits_of(passed.frames, passed.data) / passed.seconds / config.can.bitrate
+    name = f"{config.can.channel} traffic"
+    found = f"{share:.1%} of {config.can.bitrate} bit/s, {passed.frames} frames in {passed.seconds:.1f} s, by whomever"
+    if share <= HIGH:
+        return [Check(name, "ok", found)]
+    return [Check(name, "warning", found, f"look who sends: candump {config.can.channel}")]
 
 
 def _bitrate(name: str, bitrate: int, data: dict[str, Any], up: str) -> Check:

@@ -14,7 +14,7 @@ from typing import Any
 from msgspec import structs
 from trirail_drivers.bus import adapters
 
-from trirail.cli.doctor import Machine
+from trirail.cli.doctor import Machine, Passed
 from trirail.config import Config, LoopTable
 from trirail.errors import ServiceError
 from trirail.processes import realtime
@@ -30,6 +30,9 @@ def machine(config: Config) -> Machine:
     lacking = realtime.acquire(structs.replace(config.loop, realtime=_wished(config.loop)))
     cpu = max(os.sched_getaffinity(0)) if config.loop.cpu is None else config.loop.cpu
     processor = SYSTEM / f"devices/system/cpu/cpu{cpu}"
+    channel = config.can.channel if config.can.interface == "socketcan" else ""
+    before = counted(channel)
+    ticked = ticks(config.period)
     return Machine(
         release=platform.release(),
         preempt_rt=_text(SYSTEM / "kernel/realtime") == "1" or "PREEMPT_RT" in platform.version(),
@@ -41,7 +44,8 @@ def machine(config: Config) -> Machine:
         governor=_text(processor / "cpufreq/scaling_governor"),
         isolated=processors(_text(SYSTEM / "devices/system/cpu/isolated") or ""),
         link=link(config.can.channel) if config.can.interface == "socketcan" else None,
-        ticks=ticks(config.period),
+        ticks=ticked,
+        passed=passed(before, counted(channel)),
         adapter=adapters.lacking(config.can.interface),
     )
 
@@ -70,6 +74,24 @@ def link(name: str) -> dict[str, Any] | None:
         raise ServiceError(f"{' '.join(command)}: {error.stderr.decode(errors='replace').strip()}") from error
     (found,) = json.loads(said.stdout)
     return dict(found)
+
+
+def counted(name: str) -> Passed | None:
+    """What a network interface has sent and received since it is there; None where the kernel does not say."""
+    at = time.monotonic()
+    statistics = SYSTEM / "class/net" / name / "statistics"
+    texts = [_text(statistics / file) for file in ("rx_packets", "tx_packets", "rx_bytes", "tx_bytes")] if name else []
+    if not texts or not all(text and text.isdecimal() for text in texts):
+        return None
+    received, sent, received_bytes, sent_bytes = (int(text) for text in texts if text)
+    return Passed(at, received + sent, received_bytes + sent_bytes)
+
+
+def passed(before: Passed | None, after: Passed | None) -> Passed | None:
+    """What passed from one count to the next; None where there is none."""
+    if before is None or after is None:
+        return None
+    return Passed(after.seconds - before.seconds, after.frames - before.frames, after.data - before.data)
 
 
 def ticks(period: float) -> tuple[Tick, ...]:

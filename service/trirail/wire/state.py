@@ -100,7 +100,8 @@ class LoopState(Struct, frozen=True):
     bus_load: float
     """Worst-case share of the bus that the cycle takes, as computed at the start."""
     bus_load_measured: float
-    """Share of the bus that the frames sent and heard took in the last second, counted with worst-case stuffing."""
+    """Share of the bus that the frames sent and heard took in the last second, counted with worst-case stuffing.
+    Frames of strangers count only where all is heard: with `capture_can`, or where no kernel filters them out."""
     lacking: tuple[str, ...]
     """What the loop runs without: real-time rights and the like, each with its remedy."""
 
