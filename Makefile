@@ -14,7 +14,8 @@ test: $(READY)  ## everything that decides: lint, format, types, import contract
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
-	$(VENV)/bin/pytest
+	$(VENV)/bin/pytest --numprocesses auto --dist worksteal -m "not slow and not viewer"
+	$(VENV)/bin/pytest -m "slow or viewer"
 
 hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; installs what that needs, as root on Debian
 	$(VENV)/bin/python -m pip install --quiet --group hil
@@ -38,6 +39,7 @@ $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --upgrade "pip>=25.1"
 	$(VENV)/bin/python -m pip install --quiet --editable . --group dev
+	$(VENV)/bin/python -m trirail.processes.compiling
 	touch $(READY)
 
 clean:  ## remove what the commands above made

@@ -211,6 +211,7 @@ class Followers:
     """Powered drives that are where they were told to be: no bus, no frames, and next to no memory of their own."""
 
     bus_load = 0.0
+    missing_protections = ()
     traffic = 0
 
     def __init__(self, feedback: Feedback) -> None:

@@ -288,6 +288,31 @@ def run_a_little(config: Config) -> str:
         ("rate_hz = 1000", "rate_hz = 1", "drives.heartbeat = 0.1: heartbeats go out with the cycle; wanted at least"),
         ("bitrate = 1_000_000", "bitrate = 1", "can.bitrate = 1: expected int >= 10000"),
         ("velocity = 1.0", "velocity = 5e-5", "too coarse for limits.slider.velocity"),
+        (
+            "sliders = [1e-4, 1e-4, 1e-4]",
+            "sliders = [1e-4, 2e-7, 1e-4]",
+            "limits.in_position.sliders[1] = 2e-07: the position of drive B goes in steps of 1e-07 m, and 3 of them "
+            "move it by 3e-07 m; wanted at least that",
+        ),
+        ("sliders = [1e-4, 1e-4, 1e-4]", "sliders = [3.1e-7, 3.1e-7, 3.1e-7]", ""),
+        (
+            "pose = [1e-4, 1e-4, 1e-3]",
+            "pose = [1e-7, 1e-4, 1e-3]",
+            "limits.in_position.pose[0] = 1e-07: the position of",
+        ),
+        (
+            "pose = [1e-4, 1e-4, 1e-3]",
+            "pose = [1e-4, 1e-4, 1e-6]",
+            "limits.in_position.pose[2] = 1e-06: the position of",
+        ),
+        (
+            "pose = [1e-4, 1e-4, 1e-3]",
+            "pose = [1e-4, 1e-4, 0.0]",
+            "limits.in_position.pose[2] = 0.0: expected float >=",
+        ),
+        ("dwell = 0.02", "dwell = 2.0", "limits.in_position.timeout = 2: it must be longer than the dwell, 2 s"),
+        ("dwell = 0.02", "dwell = 0.0", "limits.in_position.dwell = 0.0: expected float >= 0.001"),
+        ("timeout = 2.0", "timeout = 3600.0", "limits.in_position.timeout = 3600.0: expected float <= 60.0"),
         ('directory = "recordings"', 'directory = "a\\u0000b"', "telemetry.directory"),
     ],
 )
@@ -300,6 +325,12 @@ def test_numbers_no_machine_could_carry_out_are_refused(right: str, wrong: str, 
     with pytest.raises(ConfigError) as refused:
         parse(text)
     assert said in str(refused.value)
+
+
+def test_without_windows_there_are_some() -> None:
+    begin = TEXT.index("[limits.in_position]")
+    without = TEXT[:begin] + TEXT[TEXT.index("[motion]", begin) :]
+    assert parse(without) == parse(TEXT)
 
 
 def bounds(kind: object, path: str = "") -> Iterator[tuple[str, Meta | None]]:

@@ -62,9 +62,9 @@ def test_the_wheel_holds_the_packages_the_configurations_and_nothing_of_the_work
     typed = {"trirail/py.typed", "trirail_drivers/py.typed"}
     data = {f"trirail_drivers/{path.relative_to(ROOT / 'drivers/trirail_drivers')}" for path in ROOT.rglob("*.eds")}
     assert shipped | typed | data <= names
-    pictures = re.findall(r"!\[[^]]*\]\(([^)]*)\)", metadata)
-    assert pictures
-    assert all(picture.startswith("https://") for picture in pictures), "an index has no files beside the page"
+    links = re.findall(r"\]\(([^)]*)\)", metadata)
+    assert any(link.endswith("/service/README.md") for link in links)
+    assert all(link.startswith("https://") for link in links), "an index has no files beside the page"
 
 
 @pytest.mark.slow

@@ -79,19 +79,20 @@ def drives(config: Path, bus: str) -> Iterator[None]:
             process.terminate()
 
 
-def without_pause(robot: Robot, seconds: float, each: Callable[[], None] = lambda: None) -> int:
-    """Send goal after goal, GOALS_HZ a second, for so long; return how many were accepted. `each` comes before each."""
+def without_pause(robot: Robot, seconds: float, refused: Callable[[], None] = lambda: None) -> int:
+    """Send goal after goal, GOALS_HZ a second, for so long; return how many were taken. `refused` is told of others."""
     choice, accepted = random.Random(1), 0
     shown = sys.stderr.isatty()
     due = began = time.monotonic()
     while (now := time.monotonic()) < began + seconds:
         if shown:
             print(f"\r{began + seconds - now:4.0f} s left ", end="", file=sys.stderr, flush=True)
-        each()
         x, y, phi = (choice.uniform(-span, span) for span in SPAN)
-        with contextlib.suppress(TrirailError):
+        try:
             robot.move_to(x=x, y=y, phi=phi)
             accepted += 1
+        except TrirailError:
+            refused()
         due += 1.0 / GOALS_HZ
         time.sleep(max(0.0, due - time.monotonic()))
     if shown:

@@ -67,8 +67,8 @@ class Case(NamedTuple):
             return (0,) if self.harm not in {"KILL", "STOP"} else (-signal.SIGKILL,)
         if self.victim == "loop":
             return (1,)
-        # A recorder that is frozen for ever is killed when the service ends: what it had is lost, which is a failure.
-        return (1,) if (self.victim, self.harm) == ("recorder", "STOP") else (0,)
+        # A recorder that is frozen as the service ends is killed: what it had is lost, which is a failure.
+        return (0, 1) if (self.victim, self.harm) == ("recorder", "STOP") else (0,)
 
     def __str__(self) -> str:
         return "/".join(self)

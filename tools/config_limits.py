@@ -35,6 +35,8 @@ BOUNDS = (
     Bound("Velocity, acceleration, jerk", ("limits.slider.velocity", "limits.slider.acceleration", "limits.slider.jerk",
           "limits.platform.velocity", "limits.platform.acceleration", "limits.platform.jerk"),
           "a goal is slowed; a trajectory without `stretch` is refused, `too_fast`"),
+    Bound("Rest in position after a path", ("limits.in_position.sliders", "limits.in_position.pose",
+          "limits.in_position.dwell", "limits.in_position.timeout"), "the goal ends `unsettled`, the robot holds"),
     Bound("Following error, watched by the service", ("limits.slider.following_error",), "fault, all three stop"),
     Bound("Following error, watched by the drives", ("drives.following_error",), "fault of that drive, all three stop"),
     Bound("Ramp of a quick stop", ("drives.quick_stop_deceleration",), "none: it is what the drives brake with"),

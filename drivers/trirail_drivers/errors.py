@@ -26,7 +26,7 @@ class TrirailError(Exception):
 
 
 class FileError(TrirailError):
-    """A file that cannot be read."""
+    """A file that cannot be read, or cannot be made where it is to be."""
 
 
 class DriveError(TrirailError):

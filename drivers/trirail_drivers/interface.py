@@ -6,6 +6,8 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
+from msgspec import Struct
+
 NAMES = ("A", "B", "C")
 """The drives are named as the sliders they move."""
 
@@ -41,7 +43,18 @@ class DriveFault(NamedTuple):
     code: int
     """The EMCY or 603Fh error code, or an ODrive's error bits; 0 where there is none."""
     message: str
-    """One line for people, with drive, cause and code in it."""
+    """One line for people, of bounded length, with drive, cause and code in words."""
+
+
+class MissingProtection(Struct, frozen=True):
+    """What would stop a drive where the service cannot, and what it does without, as its configuration accepts."""
+
+    drive: str
+    """Name of the drive."""
+    object: str
+    """As `accept_without` names it: the object's index, as 1006."""
+    means: str
+    """One line for people: what it is for, and what is so without."""
 
 
 class Counts(NamedTuple):
@@ -88,10 +101,16 @@ class DriveGroup(Protocol):
 
     bus_load: float
     """Worst-case share of the bus that the cyclic traffic takes, with stuffing; 1.0 is full."""
+    missing_protections: tuple[MissingProtection, ...]
+    """What the drives do without; known once they are set up."""
 
     @property
     def traffic(self) -> int:
         """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
+
+    @property
+    def told(self) -> tuple[DriveFault | None, ...]:
+        """Of each drive the first fault that it has told of by itself since the last reset, whichever came first."""
 
     def configure(self, period: float) -> None:
         """Set the drives up for a cycle of `period` seconds, check what can be read back, start them without power."""
@@ -105,14 +124,19 @@ class DriveGroup(Protocol):
     def write(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints [m] and velocity feed-forward [m/s], to be taken up at the next SYNC."""
 
-    def enable(self) -> None:
-        """Begin to power up; the following cycles carry it out, the feedback's states tell when it is done."""
+    def enable(self, alone: str | None = None) -> None:
+        """Begin to power up, all drives, or the one of this name `alone`: the others are kept without power.
+
+        The following cycles carry it out, the feedback's states tell when it is done. Drives that have power, or are
+        getting it, first have to be disabled.
+        """
 
     def home(self) -> None:
         """Begin to home the drives whose positions are not absolute; the following cycles carry it out.
 
-        Powered drives at standstill only. What is written for a drive is not for it while it does not follow; in
-        the cycle in which it follows again, that must be the position that was fed back one cycle before.
+        Powered drives at standstill only; one that was enabled alone is homed alone. What is written for a drive is
+        not for it while it does not follow; in the cycle in which it follows again, that must be the position that was
+        fed back one cycle before.
         """
 
     def stop_homing(self) -> None:

@@ -13,6 +13,7 @@ from types import UnionType
 from typing import Annotated, Any, Literal, get_args
 
 import msgspec
+import numpy as np
 from msgspec import Meta, Struct
 from trirail_drivers import files
 from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
@@ -20,7 +21,7 @@ from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES
 
 from trirail.errors import ConfigError
-from trirail.kinematics.geometry import Geometry, Leg, singular_angles
+from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles
 
 _PACKAGED = Path(__file__).parent / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[2] / "configs") / "sim.toml"
@@ -98,11 +99,29 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """Setpoint less measured position beyond which everything stops [m]."""
 
 
+Window = Annotated[float, Meta(ge=1e-9, le=1.0)]
+"""How far from where it is to be, to either side [m] or [rad]."""
+
+
+class InPosition(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [limits.in_position]: a goal is `done` when all that is measured has been in these for the dwell."""
+
+    sliders: tuple[Window, Window, Window] = (1e-4, 1e-4, 1e-4)
+    """How far the sliders A, B, C may be from where they are to be [m]; three steps of their drives at least."""
+    pose: tuple[Window, Window, Window] = (1e-4, 1e-4, 1e-3)
+    """How far the measured pose may be from the goal's, in x, y [m] and phi [rad]."""
+    dwell: Annotated[float, Meta(ge=0.001, le=10.0)] = 0.02
+    """How long all of it must stay inside without leaving [s]."""
+    timeout: Annotated[float, Meta(ge=0.01, le=60.0)] = 2.0
+    """How long after the end of its path a goal may take for that, dwell and all [s]; then it ends `unsettled`."""
+
+
 class Limits(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [limits]."""
 
     platform: PlatformLimits
     slider: SliderLimits
+    in_position: InPosition = InPosition()
     singularity_margin: Annotated[float, Meta(ge=0.001, le=1.5)] = 0.1
     """How near phi may come to a singular angle [rad]."""
 
@@ -293,10 +312,17 @@ def _type_at(path: str) -> Any:
     return kind
 
 
+_WINDOWS = (
+    *((f"sliders[{i}]", "m") for i in range(3)),
+    *((f"pose[{i}]", unit) for i, unit in enumerate(("m", "m", "rad"))),
+)
+"""The windows of [limits.in_position], each with its unit."""
+
+
 def _check(config: Config) -> None:
     """Refuse what is well-formed but impossible."""
     from trirail_drivers.connection import checks
-    from trirail_drivers.driver.requirements import Requirements
+    from trirail_drivers.driver.requirements import Requirements, Window
 
     robot = geometry(config.geometry)
     platform, slider = config.limits.platform, config.limits.slider
@@ -320,6 +346,11 @@ def _check(config: Config) -> None:
                 f"to the singular angle {angle:.4f}: keep {'below ' if angle > 0 else 'above '}"
                 f"{angle - math.copysign(margin, angle):.4f}"
             )
+    settling = config.limits.in_position
+    if settling.timeout <= settling.dwell:
+        raise ConfigError(
+            f"limits.in_position.timeout = {settling.timeout:g}: it must be longer than the dwell, {settling.dwell:g} s"
+        )
     nodes = [config.drives.master_node, *(drive.node for drive in config.drives.each)]
     if len(set(nodes)) < len(nodes):
         raise ConfigError(
@@ -332,7 +363,14 @@ def _check(config: Config) -> None:
             "as with 100, 200, 250, 400, 500, 800, 1000"
         )
     places = (*slider.position, *(config.can.simulated.start if config.can.interface == "simulated" else ()))
-    required = Requirements(config.period, min(places), max(places), slider.velocity, slider.following_error)
+    corners = list(itertools.product(platform.x, platform.y, platform.phi))
+    most = np.abs([gains(robot, corner) for corner in corners]).max(axis=0).tolist()
+    widths = zip((*np.eye(3).tolist(), *most), (*settling.sliders, *settling.pose), strict=True)
+    windows = tuple(
+        Window(f"limits.in_position.{key}", width, unit, (a, b, c))
+        for (key, unit), ((a, b, c), width) in zip(_WINDOWS, widths, strict=True)
+    )
+    required = Requirements(config.period, min(places), max(places), slider.velocity, slider.following_error, windows)
     try:
         checks.check_bus(config.can)
         checks.check(config.drives, required)

@@ -15,7 +15,8 @@ from trirail.cli import recording_commands, terminal
 from trirail.config import SIM, load
 from trirail.telemetry import palette
 from trirail.telemetry.recorder import Recorder
-from trirail.wire.messages import Outcome
+from trirail.wire.messages import Event, Outcome, SlidersGoal
+from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.vocabulary import MODES, Mode
 
 
@@ -52,3 +53,28 @@ def test_a_session_that_was_in_every_mode_is_drawn(
         assert all(f"fill: {colour}" in drawn for colour in charts.MODE_COLOURS.values())
     else:
         assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
+
+
+def test_faults_are_numbered_at_their_moment_and_told_below_the_curves(tmp_path: Path) -> None:
+    """Texts in a picture of vectors are what a reader sees; ids and messages of any letters are drawn as they are."""
+    records = made.records(2.0)
+    records["position"][1000, 0] = -0.165  # near its limit of -0.17 m
+    recorder = Recorder(load(SIM), tmp_path, path=tmp_path / "session.rrd", live=False)
+    for half in np.split(records, 2):
+        recorder.records(half.tobytes())
+    for n in range(charts.LISTED + 2):
+        fault = Event(n + 1, 0.15 * n, 150 * n, 1.7e9, "fault", "error", f"drive B: fault $_{{{n}}} $")
+        recorder.event(fault)
+    name = "g $x_{1}$ %s"
+    recorder.event(Event(20, 1.9, 1900, 1.7e9, "goal", "info", "done", id=name, outcome="done"))
+    recorder.given(ControlInput(1, 100, 0, GoalRequest(1, "somebody", name, SlidersGoal((0.0, 0.0, 0.0)), 0)))
+    recorder.close()
+    picture = tmp_path / "session.svg"
+    assert recording_commands.report(tmp_path / "session.rrd", plot=picture) == 0
+    drawn = picture.read_text()
+    assert all(f"<!-- {number} -->" in drawn for number in range(1, charts.LISTED + 1))
+    for n in range(charts.LISTED):
+        assert f"{n + 1}   {0.15 * n:.3f} s   drive B: fault $_{{{n}}} $" in drawn
+    assert "and 2 more" in drawn
+    assert f"<!-- {name} -->" in drawn
+    assert drawn.count("stroke-dasharray") > 2, "the limit that A came near, beside the period and its legend"

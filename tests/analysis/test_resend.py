@@ -30,9 +30,9 @@ class Heard:
 
     def send(self, make: Any, name: str) -> GoalHandle:
         self.log.append(f"send {name[:-7]}")
-        return Ending(name, cast("Robot", self))
+        return Ending(name, self)
 
-    def command(self, name: str, content: bytes | None) -> None:
+    def command(self, name: str, content: bytes | None = None) -> None:
         assert content is None
         self.log.append(name)
 
@@ -40,8 +40,12 @@ class Heard:
 class Ending(GoalHandle):
     """A goal that ends as soon as it is waited for."""
 
+    def __init__(self, name: str, heard: Heard) -> None:
+        super().__init__(name, heard.command)
+        self._heard = heard
+
     def wait(self, timeout: float | None = None) -> Result:
-        cast("Heard", self._robot).log.append(f"end {self.id[:-7]}")
+        self._heard.log.append(f"end {self.id[:-7]}")
         return Result(self.id, "done", "")
 
 

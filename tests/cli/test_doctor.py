@@ -144,6 +144,23 @@ def test_another_interface_is_said_to_be_unknown() -> None:
     assert bad(checks)["CAN"].verdict == "warning"
 
 
+def test_protections_that_drives_may_lack_are_listed_once_each_with_their_drives() -> None:
+    a, _, c = REAL.drives.each
+    config = changed(
+        REAL,
+        "drives",
+        A=msgspec.structs.replace(a, accept_without=("1006",)),
+        C=msgspec.structs.replace(c, accept_without=("1006", "6041")),
+    )
+    found = bad(doctor.examine(config, GOOD))
+    assert {name: check.found for name, check in found.items()} == {
+        "lacking 1006": "drives A, C may lack 1006, its watch on SYNC; without: it goes on without SYNC",
+        "lacking 6041": "drives C may lack 6041, saying that it follows setpoints; without: that is not looked at",
+    }
+    assert {check.verdict for check in found.values()} == {"warning"}
+    assert all("trirail drives" in check.remedy for check in found.values())
+
+
 @pytest.mark.parametrize(
     ("bitrate", "rate", "verdict"),
     [(1_000_000, 1000, "ok"), (500_000, 1000, "failure"), (800_000, 1000, "warning"), (500_000, 500, "ok")],

@@ -121,7 +121,7 @@ def test_what_only_the_service_refuses_is_a_warning(line: str, words: str, capsy
 
 @pytest.mark.parametrize("line", ["ik 0 0 nan", "fk 0 inf 0", "workspace --phi nan"])
 def test_numbers_must_be_finite(line: str) -> None:
-    with pytest.raises(KinematicsError):
+    with pytest.raises(CycloptsError, match="bare number is in"):
         call(line)
 
 

@@ -25,6 +25,7 @@ from PIL import Image
 from rerun.chunk import Chunk, RrdReader
 from trirail.cli import view
 from trirail.config import SIM, load
+from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.sinks import free_port
 
@@ -56,7 +57,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "made.rrd"
     recorder = Recorder(load(SIM), path.parent, path=path, live=False)
     recorder.bus_load(0.75)
-    recorder.target((0.05, 0.02, 0.3))
+    recorder.stands(Standing("g-1", (0.05, 0.02, 0.3)))
     records = made.records(10.0)
     for start in range(0, len(records), 50):
         recorder.records(records[start : start + 50].tobytes())

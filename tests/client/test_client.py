@@ -58,7 +58,7 @@ def noisy(tmp_path: Path) -> Iterator[Robot]:
         (lambda robot: list(robot.events(history=True, timeout=TIMEOUT)), None),
         (lambda robot: list(robot.states(timeout=TIMEOUT)), None),
         (lambda robot: robot.state(timeout=TIMEOUT), ServiceError),
-        (lambda robot: GoalHandle("mine", robot).wait(timeout=TIMEOUT), TimeoutError),
+        (lambda robot: GoalHandle("mine", robot.command).wait(timeout=TIMEOUT), TimeoutError),
         (lambda robot: robot.stop(), ServiceError),
         (lambda robot: robot.home(), ServiceError),
     ],

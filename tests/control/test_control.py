@@ -13,7 +13,7 @@ from conftest import CONFIG, Delay, Rig, changed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from trirail.config import Config, geometry
+from trirail.config import SIM, Config, geometry, load
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState, rest
@@ -129,7 +129,8 @@ def test_a_goal_arrives_and_ends_once(rig: Rig) -> None:
     answer = rig.goal("g1", 0.05, -0.02, 0.3)
     assert isinstance(answer, Accepted)
     taken = rig.until(lambda: rig.mode is Mode.HOLDING)
-    assert taken <= math.ceil(answer.duration / PERIOD) + 2
+    dwell = load(SIM).limits.in_position.dwell
+    assert taken <= math.ceil((answer.duration + dwell) / PERIOD) + 2
     rig.cycles(50)
     assert rig.outcomes() == [("g1", "done")]
     assert rig.control.commanded.pose == pytest.approx((0.05, -0.02, 0.3), abs=1e-9)
@@ -402,7 +403,9 @@ def test_a_drive_fault(rig: Rig) -> None:
     moving(rig)
     rig.drives[1].fail(0x4310)
     rig.until(lambda: rig.mode is Mode.FAULT, 2)
-    assert_tripped(rig, "drive B: emergency 4310")
+    said = "drive B: emergency 0x4310 (drive too hot), error register 0x09; let it cool down; look at load and air"
+    assert_tripped(rig, said)
+    assert [notice.message for notice in rig.notices if notice.kind == "fault"] == [said]
     assert refusal(rig.goal("g2", 0.0, 0.0, 0.0)).code == "fault"
     answer = rig.command("reset")
     assert isinstance(answer, Confirmed)

@@ -129,7 +129,7 @@ def test_a_jog_is_renewed_by_velocities_of_its_id_alone() -> None:
     assert ended(ledger) == [("j", "stopped", "ann")]
 
 
-@pytest.mark.parametrize("code", set(RefusalCode) - {RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT})
+@pytest.mark.parametrize("code", sorted(set(RefusalCode) - {RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT}))
 def test_a_refused_goal_has_ended(code: RefusalCode) -> None:
     outcome = "expired" if code is RefusalCode.EXPIRED else "rejected"
     ledger = Ledger()

@@ -18,6 +18,7 @@ OPERATIONAL, PRE_OPERATIONAL, BOOT_UP = b"\x05", b"\x7f", b"\0"
 WANTED: frames.Wanted = P.OPERATION_ENABLED
 OFF: frames.Wanted = P.SWITCH_ON_DISABLED
 T = 50.0
+COOL = "let it cool down; look at load and air"
 
 
 def made() -> Cia402Axis:
@@ -73,13 +74,18 @@ def test_a_fault_from_before_the_start_is_told_and_left_alone_until_it_is_to_be_
 def test_a_fault_has_the_code_of_its_emergency_until_it_is_over() -> None:
     axis = made()
     axis.on_emergency(ERROR, T)
-    assert axis.fault(T, WANTED) == ("B", "emcy", 0x4310, "drive B: emergency 4310, error register 08")
+    assert axis.fault(T, WANTED) == (
+        "B",
+        "emcy",
+        0x4310,
+        f"drive B: emergency 0x4310 (drive too hot), error register 0x08; {COOL}",
+    )
     axis.forgive(T)  # its error register is asked for, and does not answer
     assert axis.register_wanted
     axis.on_status(ENABLED, T + REGISTER_TIME)
     axis.heard = T + REGISTER_TIME
     assert axis.fault(T + REGISTER_TIME - 0.01, OFF) is None
-    said = ("B", "emcy", 0x4310, "drive B: emergency 4310 is still in force")
+    said = ("B", "emcy", 0x4310, f"drive B: emergency 0x4310 (drive too hot) is still in force; {COOL}")
     assert axis.fault(T + REGISTER_TIME, OFF) == said
     axis.on_emergency(OVER, T)
     assert axis.fault(T, WANTED) is None
@@ -91,7 +97,7 @@ def test_a_drive_that_has_left_its_fault_has_no_code_of_it() -> None:
     axis.on_emergency(ERROR, T)
     axis.forgive(T)
     assert axis.fault(T + 1.0, WANTED) == (
-        "B", "fault", 0x4310, "drive B: fault, error 4310, still 0.2 s after a fault reset",
+        "B", "fault", 0x4310, f"drive B: fault, error 0x4310 (drive too hot), still 0.2 s after a fault reset; {COOL}",
     )  # fmt: skip
     axis.on_status(READY, T + 1.0)
     assert axis.error_code == 0

@@ -13,6 +13,7 @@ import msgspec
 import pytest
 from rigs import START, STEP, Bus, Clock, DriverRig, ideal_servo
 from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402.codes import words
 from trirail_drivers.cia402.drives import REPEAT_AFTER, Cia402
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.settings import interpolation_periods
@@ -837,7 +838,7 @@ class TestReset:
         feedback = enabled.found("fault", within=250)
         assert feedback.fault is not None
         assert feedback.fault[:3] == ("A", "fault", 0x2310)
-        assert feedback.fault.message == "drive A: fault, error 2310, still 0.2 s after a fault reset"
+        assert feedback.fault.message == (f"drive A: fault, error {words(0x2310, ', still 0.2 s after a fault reset')}")
         enabled.cycle()
         assert enabled.controlwords()[0] == [0x02, 0x80, 0x02]
 

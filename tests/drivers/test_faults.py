@@ -175,14 +175,14 @@ STOP = [
     Case("A drop tpdo2", 3, r"drive A: no position for 3 cycles in a row"),
     Case("B drop tpdo1", 400, r"drive B: no statusword for 0\.3\d* s"),
     Case("C drop heartbeat", 400, r"drive C: no heartbeat for 0\.3\d* s"),
-    Case("A drop sync", 4, r"drive A: (no position for 3 cycles|emergency 8700)"),
-    Case("all drop sync", 4, r"drive A: (no position for 3 cycles|emergency 8700)"),
+    Case("A drop sync", 4, r"drive A: (no position for 3 cycles|emergency 0x8700)"),
+    Case("all drop sync", 4, r"drive A: (no position for 3 cycles|emergency 0x8700)"),
     Case("B drop rpdo2", 150, r"slider B: following error", IN_MOTION, lasts=False),
-    Case("B drop 0x77E", 400, r"drive B: emergency 8130"),
+    Case("B drop 0x77E", 400, r"drive B: emergency 0x8130"),
     Case("A delay 0.01 tpdo2", 3, r"drive A: no position for 3 cycles in a row", lasts=False),
     Case("A delay 0.05 rpdo2", 60, r"slider A: following error", IN_MOTION, lasts=False),
     Case("C corrupt tpdo2", 30, r"slider C: following error", lasts=False),
-    Case("C corrupt rpdo2", 60, r"(slider C: following error|drive C: emergency 8611)", lasts=False),
+    Case("C corrupt rpdo2", 60, r"(slider C: following error|drive C: emergency 0x8611)", lasts=False),
     Case(
         "B corrupt tpdo1",
         400,
@@ -193,13 +193,13 @@ STOP = [
     Case("A dlc 8 tpdo2", 1, r"drive A: frame 281 has wrong length 8"),
     Case("A dlc 1 tpdo1", 110, r"drive A: frame 181 has wrong length 1"),
     Case("A dlc 0 heartbeat", 110, r"drive A: frame 701 has wrong length 0"),
-    Case("B dlc 7 rpdo2", 2, r"drive B: emergency 8210, error register 11"),
-    Case("B dlc 1 sync", 1, r"drive B: emergency 8240, error register 11"),
+    Case("B dlc 7 rpdo2", 2, r"drive B: emergency 0x8210 .*, error register 0x11; look for another node"),
+    Case("B dlc 1 sync", 1, r"drive B: emergency 0x8240 .*, error register 0x11; look for another node"),
     # drives
     Case("C silent", 3, r"drive C: no position for 3 cycles in a row"),
     Case("all silent", 3, r"drive A: no position for 3 cycles in a row"),
-    Case("B emcy 4310 for 5", 1, r"drive B: emergency 4310, error register 09"),
-    Case("B fault 2310 for 5", 1, r"drive B: emergency 2310, error register 03"),
+    Case("B emcy 4310 for 5", 1, r"drive B: emergency 0x4310 \(drive too hot\), error register 0x09; let it cool"),
+    Case("B fault 2310 for 5", 1, r"drive B: emergency 0x2310 .*, error register 0x03; look at motor"),
     Case("A stuck", 60, r"slider A: following error", IN_MOTION, lasts=False),
     Case("A lag 0.1", 100, r"slider A: following error", IN_MOTION, lasts=False),
     Case("C runaway 0.1", 100, r"slider C: following error", stands=1100, lasts=False),
@@ -371,7 +371,7 @@ def test_a_drive_that_does_not_leave_its_fault_is_not_reset(rig: Cia402Rig) -> N
     rig.drives[1].objects.on_write(0x6040, lambda entry, old: None)
     answer = rig.command("reset")
     assert isinstance(answer, Refused)
-    assert "drive B: fault, error 2310" in answer.message
+    assert "drive B: fault, error 0x2310 (continuous overcurrent of the motor)" in answer.message
 
 
 def test_a_warning_of_the_bus_is_an_event(rig: Cia402Rig) -> None:

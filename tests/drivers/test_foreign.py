@@ -11,11 +11,16 @@ from typing import Any
 import msgspec
 import pytest
 from drivers.foreign import ForeignDrive, Habits, Truth, three
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trirail.config import SIM, load
+from trirail.errors import ConfigError
 from trirail_drivers.cia402.drives import Cia402
-from trirail_drivers.cia402.objects import USES
+from trirail_drivers.cia402.objects import FOLLOWING_BIT, PROTECTIONS, USES
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import Feedback, PowerState, Triple
+from trirail_drivers.protocols import PROTOCOLS
 
 PERIOD = 0.002
 COUNTS = 819_200.0
@@ -172,6 +177,44 @@ def test_a_drive_with_neither_mode_is_refused_by_6502(rigs: list[Rig]) -> None:
     rigs.append(rig)
     with pytest.raises(DriveError, match=r"6502:00 \(supported drive modes\) is 0000002D: neither"):
         rig.ready()
+
+
+LACKABLE = [name for name in PROTECTIONS if name not in ("1016", FOLLOWING_BIT)]
+"""Protections whose place nothing takes; for 1016 there is guarding."""
+
+
+@settings(max_examples=20)
+@given(lacking=st.sets(st.sampled_from(LACKABLE)), more=st.sets(st.sampled_from(LACKABLE)), bit_12=st.booleans())
+def test_what_drives_do_without_is_known_by_drive_and_object(lacking: set[str], more: set[str], bit_12: bool) -> None:
+    """What is only named, and is there, is not told to be missing; bit 12, once named, is not looked at."""
+    accepted = tuple(lacking | more) + ((FOLLOWING_BIT,) if bit_12 else ())
+    rig = Rig("elmo_gold", Habits(without=frozenset(int(name, 16) for name in lacking)), accept_without=accepted)
+    try:
+        rig.ready()
+        missing = lacking | ({FOLLOWING_BIT} if bit_12 else set())
+        told = rig.drives.missing_protections
+        assert sorted((each.drive, each.object) for each in told) == sorted(
+            (d, name) for d in "ABC" for name in missing
+        )
+        for each in told:
+            assert each.means == PROTOCOLS["cia402"].protections[each.object]
+            assert any(f"lacks {each.object} (" in warning for warning in rig.warnings)
+    finally:
+        rig.drives.close()
+
+
+@pytest.mark.parametrize(
+    ("example", "name", "known"),
+    [("elmo_gold", "6040", "1006, "), ("elmo_gold", "1001", "1006, "), ("odrive_s1", "1006", "none$")],
+)
+def test_what_is_no_protection_cannot_be_accepted_to_be_missing(
+    tmp_path: Path, example: str, name: str, known: str
+) -> None:
+    text = (SIM.parent / f"drives/{example}.toml").read_text()
+    path = tmp_path / "robot.toml"
+    path.write_text(text.replace("[drives.B]", f'[drives.B]\naccept_without = ["{name}"]'))
+    with pytest.raises(ConfigError, match=rf'drives.B.accept_without: "{name}" is no protection; there are {known}'):
+        load(path)
 
 
 # 60A8h, 60A9h, 60AAh (CiA 303-2), and what they are of a metre: 819 200 counts and 200 revolutions.

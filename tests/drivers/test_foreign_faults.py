@@ -9,6 +9,7 @@ import can
 import pytest
 from drivers.foreign import DISABLED, ENABLED, OPERATIONAL, PRE_OPERATIONAL, STOPPED, ForeignDrive, Habits
 from drivers.test_foreign import PERIOD, Rig
+from trirail_drivers.cia402.codes import words
 from trirail_drivers.interface import PowerState
 
 
@@ -153,7 +154,7 @@ def test_a_restart_is_noticed(rig: Rig) -> None:
 
 def test_a_drives_own_fault_stops_all(rig: Rig) -> None:
     rig.nodes[2].fail(0x4310)
-    assert "drive C: emergency 4310" in stopped_within(rig, 2)
+    assert "drive C: emergency 0x4310 (drive too hot)" in stopped_within(rig, 2)
     rig.drives.reset()
     for _ in range(100):
         feedback = rig.cycle()
@@ -163,7 +164,7 @@ def test_a_drives_own_fault_stops_all(rig: Rig) -> None:
 
 def test_an_emcy_that_is_never_taken_back_does_not_block_reset(rig: Rig) -> None:
     rig.nodes[0].emergency(0x8210, register=0)
-    assert "drive A: emergency 8210" in stopped_within(rig, 2)
+    assert "drive A: emergency 0x8210 (a PDO was too short to be used)" in stopped_within(rig, 2)
     rig.drives.reset()
     for _ in range(10):
         feedback = rig.cycle()
@@ -180,7 +181,7 @@ def test_an_emcy_that_is_still_in_force_does(rig: Rig) -> None:
     for _ in range(round(0.6 / PERIOD)):
         feedback = rig.cycle()
     assert feedback.fault is not None
-    assert feedback.fault.message == "drive A: emergency 8130 is still in force"
+    assert feedback.fault.message == f"drive A: emergency {words(0x8130, ' is still in force')}"
 
 
 def test_setpoints_that_are_not_followed_are_noticed(rig: Rig) -> None:

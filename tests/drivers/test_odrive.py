@@ -22,6 +22,7 @@ from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState
 from trirail_drivers.odrive import frames
+from trirail_drivers.odrive.codes import words
 from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.odrive.frames import AxisState, Error, ProcedureResult
 from trirail_drivers.odrive.setpoints import SETTLING
@@ -164,7 +165,7 @@ class TestConfigure:
         new.drives.configure(PERIOD)
         fault = new.cycle().fault
         assert fault is not None
-        assert fault == ("B", "fault", 0x200, "drive B: DC_BUS_UNDER_VOLTAGE")
+        assert fault == ("B", "fault", 0x200, f"drive B: error {words(Error.DC_BUS_UNDER_VOLTAGE)}")
 
     @pytest.mark.parametrize("bitrate", [500_000, 1_000])
     def test_full_bus_is_refused_with_the_rate_that_fits(self, new: Rig, bitrate: int) -> None:
@@ -287,7 +288,7 @@ class TestStop:
         enabled.devices[1].fail(Error.DRV_FAULT)
         enabled.bus.sent.clear()
         feedback = enabled.move(40)
-        assert feedback.fault == ("B", "fault", 0x20, "drive B: DRV_FAULT")
+        assert feedback.fault == ("B", "fault", 0x20, f"drive B: error {words(Error.DRV_FAULT)}")
         _, slower = np.abs(enabled.setpoints()[:, -2:, 1]).T
         assert slower == pytest.approx(np.abs(SPEED) - 10.0 * PERIOD, abs=1e-4)
         assert enabled.cycles(200).state == (P.SWITCH_ON_DISABLED, P.FAULT, P.SWITCH_ON_DISABLED)
@@ -754,7 +755,7 @@ class TestUnderTheControl:
         robot.cycles(100)
         robot.drives[2].fail(Error.DC_BUS_OVER_REGEN_CURRENT)
         robot.until(lambda: robot.mode is Mode.FAULT, within=40)
-        assert robot.control.fault == "drive C: DC_BUS_OVER_REGEN_CURRENT"
+        assert robot.control.fault == f"drive C: error {words(Error.DC_BUS_OVER_REGEN_CURRENT)}"
         robot.until(lambda: not robot.control.measured.powered, within=400)
         robot.command("reset")
         assert robot.mode is Mode.DISABLED

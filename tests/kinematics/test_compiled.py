@@ -93,3 +93,28 @@ def test_processes_that_start_together_compile_once(room: Path, tmp_path: Path) 
     together = [subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) for _ in range(4)]
     misses = [int(process.communicate(timeout=100)[0]) for process in together]
     assert sum(misses) == 1
+
+
+def test_who_compiles_is_told_of_each_function_once(room: Path, tmp_path: Path) -> None:
+    (room / "closure.py").write_text(
+        "from trirail.kinematics.compiled import compiled\n"
+        "@compiled('f8(f8)')\n"
+        "def kept(x):\n"
+        "    return 2.0 * x\n"
+        "@compiled()\n"
+        "def inlined(x):\n"
+        "    return x\n"
+        "@compiled(\n"
+        "    'f8(f8)'\n"
+        ")\n"
+        "def other(x):\n"
+        "    return inlined(x)\n"
+    )
+    code = (
+        "from trirail.kinematics.compiled import FUNCTIONS, tell_of_compiling\n"
+        "tell_of_compiling(print)\n"
+        "import trirail.kinematics.closure\n"
+        "print(FUNCTIONS)"
+    )
+    assert run(code, tmp_path).split() == ["kept", "other", "2"]
+    assert run(code, tmp_path).split() == ["2"]

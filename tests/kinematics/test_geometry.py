@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from trirail.errors import KinematicsError
-from trirail.kinematics.geometry import Geometry, Leg, singular_angles
+from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles
 from trirail.kinematics.robot import jacobians
 
 L0 = 0.3
@@ -96,6 +96,13 @@ def test_home_must_be_regular() -> None:
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (0.04, -0.03)])
 def test_singular_angles_of_the_symmetric_robot(l0: float, centre: tuple[float, float]) -> None:
     assert_allclose(singular_angles(Geometry.symmetric(l0), centre), [-2 * math.pi / 3, math.pi / 3], atol=1e-12)
+
+
+@pytest.mark.parametrize("robot", [Geometry.symmetric(0.3), AS_BUILT])
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (0.05, -0.02, 0.3), (-0.08, 0.06, -0.7)])
+def test_what_a_slider_changes_is_by_the_jacobians(robot: Geometry, pose: tuple[float, float, float]) -> None:
+    j1, j2 = jacobians(robot, pose)
+    assert_allclose(j2 @ gains(robot, pose), j1, atol=1e-12)
 
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (0.05, 0.02)])

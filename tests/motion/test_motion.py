@@ -433,7 +433,7 @@ def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig) -> None:
     answered = Counter(getattr(answer, "ticket", None) for answer in rig.answers)
     assert set(answered.values()) == {1}
     said = [notice.message for notice in rig.notices if notice.kind == "fault"]
-    assert all("emergency 4310" in message or message == "quick_stop by ann" for message in said), set(said)
+    assert all("emergency 0x4310" in message or message == "quick_stop by ann" for message in said), set(said)
 
 
 # ---------------------------------------------------------------------- while a goal is being planned

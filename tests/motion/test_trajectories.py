@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from conftest import CONFIG, Rig
 from control.test_control import PERIOD, assert_within_limits, refusal
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.wire.messages import PoseGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.packets import Accepted
@@ -54,6 +54,7 @@ def test_one_that_is_sent_in_motion_is_told_to_wait(rig: Rig) -> None:
 SPEED = st.floats(-0.5, 0.5)
 
 
+@settings(max_examples=30)
 @given(st.tuples(SPEED, SPEED, SPEED), st.tuples(SPEED, SPEED, SPEED), st.booleans())
 def test_whatever_its_ends_the_setpoints_stay_within_the_limits(
     first: tuple[float, float, float], last: tuple[float, float, float], stretch: bool

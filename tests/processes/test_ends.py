@@ -62,6 +62,22 @@ def test_a_frozen_gateway_is_a_controlled_stop_and_is_replaced(service: Service)
     assert any("the gateway is frozen, no sign of life for 0.3 s" in event.message for event in events(recorded))
 
 
+def test_a_frozen_recorder_is_replaced_and_the_robot_does_not_mind(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        os.kill(service.child("recorder"), signal.SIGSTOP)
+        service.wait_said(
+            "the recorder has died (no sign of life for 5 s, so it was killed): the robot is not affected"
+        )
+        state = until(robot, lambda state: state.mode == "holding")
+        assert state.pose[0] == pytest.approx(0.1, abs=1e-5)
+        until(robot, lambda _: len([*(service.folder / "recordings").glob("*.rrd")]) == 2)
+        robot.move_to(x=0.0, y=0.0, phi=0.0, id="afterwards").wait(timeout=10.0)
+    assert service.end() == 0
+    newest = max((service.folder / "recordings").glob("*.rrd"), key=lambda path: path.stat().st_mtime)
+    assert ("afterwards", "done") in outcomes(read(newest))
+
+
 def test_a_frozen_loop_ends_the_service_and_everyone_is_told(service: Service) -> None:
     heard: list[Event] = []
     with service.robot() as robot:

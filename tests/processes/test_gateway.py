@@ -16,8 +16,10 @@ from trirail.processes.backlog import PATIENCE
 from trirail.processes.gateway import UNDER_WAY, Gateway
 from trirail.processes.inbox import Incoming
 from trirail.wire import boundary, packets, zenoh_session
-from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, RefusedRequest, Request
+from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, RefusedRequest, Request, Welcome
+from trirail.wire.state import Info
 from trirail.wire.vocabulary import Command
+from trirail_drivers.interface import MissingProtection
 
 
 class FakeLink:
@@ -165,3 +167,16 @@ def test_an_asker_that_takes_no_answer_holds_up_nobody_else(rig: Rig, tmp_path: 
             asker.kill()
             over.set()
             serving.join()
+
+
+def test_info_tells_what_the_drives_do_without(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop says so in its welcome, before anybody can ask."""
+    gateway, _ = rig
+    said: list[object] = []
+    monkeypatch.setattr(gateway._replies, "send", lambda _incoming, content: said.append(content))
+    missing = (MissingProtection("A", "1006", "its watch on SYNC"), MissingProtection("C", "6007", "its stop"))
+    gateway._hear(packets.message(Welcome((), 0.5, 0.0, missing)), lambda: None)
+    gateway._handle(Incoming("info", "trirail/demo/info", 0, b"", "", None))
+    (info,) = said
+    assert isinstance(info, Info)
+    assert info.missing_protections == missing

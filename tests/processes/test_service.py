@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import edsfiles
 import msgspec
 import numpy as np
 import pytest
@@ -37,6 +38,7 @@ from trirail.wire.state import State
 from trirail.wire.vocabulary import MODES, Mode
 from trirail.wire.zenoh_session import open_client
 from trirail_drivers.cia402 import frames
+from trirail_drivers.interface import MissingProtection
 from trirail_drivers.odrive import frames as odrive_frames
 
 pytestmark = pytest.mark.slow
@@ -222,6 +224,26 @@ def test_a_session_with_odrives(tmp_path: Path) -> None:
         assert [state for state, _ in itertools.groupby(states)] == [1, 8, 1]
 
 
+def test_what_a_drive_does_without_stands_in_every_place_where_one_looks(tmp_path: Path) -> None:
+    """Announced at the start, listed by the doctor, in info and in status: drives B and C of a make without 1006."""
+    eds = tmp_path / "without.eds"
+    eds.write_text(edsfiles.eds(edsfiles.rows("elmo_gold"), lacks=[0x1006]))
+    lines = f'\neds = "{eds}"\naccept_without = ["1006"]\n'
+    service = Service(tmp_path, **{f"[drives.{name}]\n": f"[drives.{name}]{lines}" for name in "BC"})
+    service.wait_up()
+    words = "its watch on SYNC; without: it goes on without SYNC"
+    said = trirail("doctor", tmp_path / "robot.toml").stdout
+    assert f"drives B, C may lack 1006, {words}" in said
+    assert f"drives B, C: 1006, {words}" in trirail("status", locator=service.locator).stdout
+    missing = json.loads(trirail("status", "--json", locator=service.locator).stdout)["missing_protections"]
+    assert missing == [{"drive": name, "object": "1006", "means": words} for name in "BC"]
+    with service.robot() as robot:
+        told = [event.message for event in itertools.islice(robot.events(history=True), 1)]
+        assert robot.info().missing_protections == tuple(MissingProtection(**each) for each in missing)
+    assert any("drives B, C: lacks 1006" in message for message in told), told
+    assert service.end() == 0
+
+
 def test_the_commands(service: Service) -> None:
     def call(*arguments: object) -> subprocess.CompletedProcess[str]:
         return trirail(*arguments, locator=service.locator)
@@ -237,7 +259,7 @@ def test_the_commands(service: Service) -> None:
     assert out.returncode == 1
     assert "platform x: position 0.5 m is beyond its limit 0.15 m" in out.stderr
     assert call("reset").returncode == 1
-    assert call("goto", "nan", 0, 0).returncode == 1
+    assert call("goto", "nan", 0, 0).returncode == 2
     assert call("goto", 1, 2).returncode == 2
     assert call("quick-stop").returncode == 0
     failed = call("enable")
@@ -386,6 +408,54 @@ def test_goals_that_wait_at_override_zero_keep_no_command_waiting(service: Servi
             ended = {goal.wait(timeout=10.0).outcome for goal in goals}
             assert ended == {"faulted" if command == "quick_stop" else "stopped"}
     assert service.end() == 0
+
+
+def test_done_is_said_when_the_robot_is_measured_to_be_there(tmp_path: Path) -> None:
+    """Servos 0.2 s behind: not before, and where that takes too long, what is left to go; a replay judges the same."""
+    lagging = Service(
+        tmp_path,
+        **{
+            "time_constant = 0.004": "time_constant = 0.2",
+            "feed_forward_gain = 0.95": "feed_forward_gain = 0.0",
+            "\nfollowing_error = 0.004": "\nfollowing_error = 0.05",
+            "\nfollowing_error = 0.005": "\nfollowing_error = 0.06",
+            "timeout = 2.0": "timeout = 0.3",
+        },
+    )
+    windows = load(tmp_path / "robot.toml").limits.in_position
+    lagging.wait_up()
+    with lagging.robot() as robot:
+        robot.enable()
+        near = robot.move_to(x=0.0003, y=-0.0002, phi=0.0).wait(timeout=10.0)
+        assert near.outcome == "done"
+        assert near.settle is not None
+        assert near.settle > 0.02
+        assert near.residual is not None
+        assert (np.abs(near.residual.pose) <= windows.pose).all()
+        assert near.overshoot == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+        until(robot, lambda state: state.settled)
+        far = trirail("goto", 0.006, -0.004, 0.02, "--wait", locator=lagging.locator)
+        assert far.returncode == 1
+        assert "unsettled: not in position 0.3 s after the end of its path; left to go: slider A " in far.stdout
+        said = json.loads(trirail("goto", 0.05, 0.0, 0.0, "--wait", "--json", locator=lagging.locator).stdout)
+        assert (said["outcome"], said["settle"]) == ("unsettled", None)
+        assert max(np.abs(said["residual"]["pose"]) / windows.pose) > 1.0
+        state = robot.state()
+        assert (state.mode, state.faults) == ("holding", ())
+        until(robot, lambda state: state.settled)
+        there = trirail("goto", 0.05, 0.0, 0.0, "--wait", locator=lagging.locator)
+        assert (there.returncode, "done: arrived, settled in 1 ms" in there.stdout) == (0, True)
+    assert lagging.end() == 0
+    (file,) = (tmp_path / "recordings").glob("*.rrd")
+    recording = read(file)
+    (done,) = [line.event for line in recording.events if line.event is not None and line.event.id == near.id]
+    last = int(np.searchsorted(recording.records["cycle"], done.cycle))
+    dwell = recording.records[last + 1 - round(windows.dwell * 1000) : last + 1]
+    assert (np.abs(dwell["pose"] - (0.0003, -0.0002, 0.0)) <= windows.pose).all()
+    report = trirail("report", file)
+    assert "unsettled" in report.stdout
+    assert f"settled in {near.settle * 1e3:g} ms" in report.stdout
+    assert trirail("replay", file).returncode == 0
 
 
 def test_goals_wait_blend_and_are_cancelled(service: Service) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from trirail.config import SIM, load
+from trirail.kinematics.compiled import FUNCTIONS
 from trirail.processes import supervisor
 
 CHILD = """
@@ -113,21 +114,27 @@ def test_a_frozen_loop_ends_the_service(told: list[str], tmp_path: Path) -> None
     )
 
 
-def test_a_hung_planner_is_killed_and_started_again(told: list[str], tmp_path: Path) -> None:
-    code = run(
-        told,
-        tmp_path,
-        loop_1="ready(); beat_until(lambda: begun('planner-2')); heartbeats.of('loop').rest()",
-        gateway_1=SERVING,
-        planner_1="ready(); heartbeats.of(name).beat(); freeze()",
-        planner_2="ready()",
-        recorder_1=RECORDING,
-    )
-    assert code == 1
+@pytest.mark.parametrize(
+    ("name", "silent", "consequence"),
+    [
+        ("planner", 0.7, "the motion under way goes on, new goals are refused"),
+        ("recorder", 5, "the robot is not affected"),
+    ],
+)
+def test_what_hangs_beside_the_loop_is_killed_and_started_again(
+    name: str, silent: float, consequence: str, told: list[str], tmp_path: Path
+) -> None:
+    children = {
+        "loop_1": f"ready(); beat_until(lambda: begun('{name}-2')); heartbeats.of('loop').rest()",
+        "gateway_1": SERVING,
+        "recorder_1": RECORDING,
+        f"{name}_1": "ready(); heartbeats.of(name).beat(); freeze()",
+        f"{name}_2": "ready()",
+    }
+    assert run(told, tmp_path, **children) == 1
     assert told[:2] == [
         "up",
-        "the planner has died (no sign of life for 0.7 s, so it was killed): the motion under way goes on, "
-        "new goals are refused; starting it again",
+        f"the {name} has died (no sign of life for {silent} s, so it was killed): {consequence}; starting it again",
     ]
 
 
@@ -151,3 +158,19 @@ def test_a_loop_that_has_not_begun_has_stopped_nothing(told: list[str], tmp_path
     code = run(told, tmp_path, loop_1="os.kill(os.getpid(), 15)", gateway_1="freeze()", recorder_1="freeze()")
     assert code == 1
     assert told == ["the loop is dead (killed by SIGTERM): it had not begun; ending"]
+
+
+def test_a_first_start_is_waited_for_as_long_as_it_compiles(
+    told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "START_WITHIN", 3.0)
+    compiling = f"""
+for number in range({FUNCTIONS}):
+    os.write(int(ready_on), b'{{"compiling": "f%d"}}\\n' % number)
+    time.sleep(4.0 / {FUNCTIONS})
+"""
+    end = "ready(); beat_until(lambda: begun('gateway-1')); heartbeats.of('loop').rest()"
+    assert run(told, tmp_path, loop_1=compiling + end, gateway_1=SERVING, recorder_1=RECORDING) == 1
+    assert told[0] == f"the first start compiles the mathematics, {FUNCTIONS} functions; once, a minute or two"
+    assert told[1:4] == [f"compiling: {-(-FUNCTIONS * part // 4)} of {FUNCTIONS} functions" for part in (1, 2, 3)]
+    assert told[4:6] == [f"compiling: {FUNCTIONS} of {FUNCTIONS} functions", "up"]

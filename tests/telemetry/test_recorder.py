@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk, RrdReader
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
+from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import BACKLOG, Archive, Relay, free_port
@@ -310,9 +311,9 @@ def test_a_live_view_is_drawn_for_only_while_somebody_watches(tmp_path: Path, mo
     drawn: list[int] = []
     draw = recording._streams.scene.drawn
 
-    def counted(records: NDArray[np.void]) -> list[Chunk]:
+    def counted(records: NDArray[np.void], standing: Standing) -> list[Chunk]:
         drawn.append(len(records))
-        return draw(records)
+        return draw(records, standing)
 
     monkeypatch.setattr(recording._streams.scene, "drawn", counted)
     records = made.records(10.0)

@@ -23,6 +23,7 @@ from trirail.telemetry import blackbox, provenance, retention
 from trirail.telemetry.blackbox import AFTER, BEFORE, BlackBox
 from trirail.telemetry.columns import SOFTWARE
 from trirail.telemetry.reading import Recording, join, read
+from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.messages import Event, PoseGoal
 from trirail.wire.packets import ControlInput, GoalRequest
@@ -275,7 +276,7 @@ def faulted(folder: Path, seconds: float, at: float, after: float) -> tuple[list
     box = BlackBox(1000, lambda name: recorder(folder, time, config, name=name), told.append)
     sent = made.records(seconds)
     cycle = round(at * 1000)
-    box.stands("target", (0.01, 0.02, 0.1))
+    box.stands("stands", Standing(None, (0.01, 0.02, 0.1)))
     feed(box, sent[: cycle - 500], time)
     box.given(goal(cycle - 500))
     feed(box, sent[cycle - 500 : cycle], time)
@@ -307,7 +308,7 @@ def test_a_flood_of_messages_before_a_fault_leaves_the_newest(tmp_path: Path, mo
     monkeypatch.setattr(blackbox, "SAID_MB", 0.05)
     time, told = Time(), list[str]()
     box = BlackBox(1000, lambda name: recorder(tmp_path, time, configured(), name=name), told.append)
-    box.stands("target", (0.01, 0.02, 0.1))
+    box.stands("stands", Standing(None, (0.01, 0.02, 0.1)))
     sent = made.records(3.0)
     for number in range(100):
         feed(box, sent[20 * number :][:20], time)

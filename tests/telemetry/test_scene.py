@@ -14,6 +14,7 @@ from rerun.chunk import Chunk
 from trirail.config import SIM, LegTable, load
 from trirail.kinematics.geometry import Geometry, Leg
 from trirail.processes.info import info
+from trirail.telemetry.readout import Standing
 from trirail.telemetry.scene import Scene
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.records import DTYPE
@@ -71,7 +72,7 @@ def test_sliders_are_drawn_on_their_rail_and_on_their_edge(geometry: Geometry) -
     records["pose"], records["position"] = records["commanded_pose"], records["commanded_position"]
     parts = Mechanism.of(geometry, CONFIG.limits.slider)
     config = _with_geometry(geometry)
-    drawn = by_entity(Scene(ShownRobot.configured(config), 0).drawn(records))
+    drawn = by_entity(Scene(ShownRobot.configured(config), 0).drawn(records, Standing()))
 
     points = values(drawn["/robot/sliders"], "Points2D:positions")
     centre = values(drawn["/robot/platform"], "Transform3D:translation")[:, 0, :2]
@@ -117,9 +118,10 @@ def test_sliders_follow_their_rails() -> None:
 
 def test_curves_are_in_the_units_of_people(scene: Scene) -> None:
     records = made.records(0.5)
-    drawn = by_entity(scene.drawn(records))
-    newest = records[9::10]
     slider = CONFIG.limits.slider
+    records["position"][9] = *slider.position, 0.0
+    drawn = by_entity(scene.drawn(records, Standing()))
+    newest = records[9::10]
     position = values(drawn["/sliders/position"], "Scalars:scalars")
     assert position[:, :3] == pytest.approx(newest["position"] * 1e3)
     assert np.all(position[:, 3:] == [slider.position[0] * 1e3, slider.position[1] * 1e3])
@@ -133,7 +135,7 @@ def test_no_spike_is_lost_to_thinning(scene: Scene) -> None:
     records = made.records(0.5)
     records["following_error"][123] = [-2e-3, 1e-3, 0.0]
     records["lateness_ns"][271] = 5_000_000
-    drawn = by_entity(scene.drawn(records))
+    drawn = by_entity(scene.drawn(records, Standing()))
     error = values(drawn["/sliders/following_error"], "Scalars:scalars")
     assert error[12, :2] == pytest.approx([-2000.0, 1000.0])
     timing = values(drawn["/loop/timing"], "Scalars:scalars")
@@ -142,14 +144,14 @@ def test_no_spike_is_lost_to_thinning(scene: Scene) -> None:
 
 def test_a_gap_in_the_cycles_is_a_gap_in_time(scene: Scene) -> None:
     records = np.concatenate([made.records(0.1)[:33], made.records(0.1)[58:]])
-    t = by_entity(scene.drawn(records))["/pose/phi"].to_record_batch().column("t").to_numpy().astype(int)
+    t = by_entity(scene.drawn(records, Standing()))["/pose/phi"].to_record_batch().column("t").to_numpy().astype(int)
     assert np.array_equal(t // 1_000_000, [9, 19, 29, 32, 59, 69, 79, 89, 99])
 
 
 def test_modes_are_said_when_they_change_and_at_the_start_of_a_batch(scene: Scene) -> None:
     records = made.records(0.1)
     records["mode"][40:] = MODES.index(Mode.STOPPING)
-    mode = by_entity(scene.drawn(records))["/mode"]
+    mode = by_entity(scene.drawn(records, Standing()))["/mode"]
     assert values(mode, "StateChange:state").tolist() == [["moving"], ["stopping"]]
     t = mode.to_record_batch().column("t").to_numpy().astype(int)
     assert np.array_equal(t, [0, 40_000_000])
@@ -198,11 +200,12 @@ def test_the_distance_to_singularity_is_that_of_the_mathematics() -> None:
 
 def test_limits_of_the_following_error_come_into_view_with_it(scene: Scene) -> None:
     records = made.records(0.1)
-    limits = values(by_entity(scene.drawn(records))["/sliders/following_error"], "Scalars:scalars")[:, 3:]
+    limits = values(by_entity(scene.drawn(records, Standing()))["/sliders/following_error"], "Scalars:scalars")[:, 3:]
     assert np.isnan(limits.astype(float)).all()
-    records["following_error"][50, 1] = 0.5e-3
-    limits = values(by_entity(scene.drawn(records))["/sliders/following_error"], "Scalars:scalars")[:, 3:]
-    assert np.all(limits == [-4000.0, 4000.0])
+    records["following_error"][50, 1] = 3.5e-3
+    limits = values(by_entity(scene.drawn(records, Standing()))["/sliders/following_error"], "Scalars:scalars")[:, 3:]
+    assert np.isnan(limits[:, 0].astype(float)).all()
+    assert np.all(limits[:, 1] == 4000.0)
 
 
 def test_a_robot_is_the_same_by_its_configuration_and_by_its_services_words() -> None:

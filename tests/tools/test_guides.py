@@ -5,6 +5,7 @@ import importlib
 import json
 import pkgutil
 import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 import trirail
 import trirail_drivers
 from trirail.cli.commands import app
+from trirail.cli.units import numbers
 from trirail.config import Config
 from trirail.errors import TrirailError
 from trirail.wire.messages import Goal
@@ -90,10 +92,10 @@ def test_what_a_step_names_is_in_one_of_its_files(step: str) -> None:
 def test_every_command_can_be_typed_as_it_is_shown(guide: Path) -> None:
     for line in "".join(blocks(guide, "sh")).splitlines():
         for command in line.partition("#")[0].split(";"):
-            program, *words = command.split() or [""]
+            program, *words = shlex.split(command) or [""]
             if program == "trirail":
                 words = [{"FILE": "file.rrd", "NAME": "demo"}.get(word, word) for word in words]
-                app.parse_args(words, exit_on_error=False, print_error=False)
+                app.parse_args(numbers(words), exit_on_error=False, print_error=False)
             elif program == "make":
                 assert f"\n{words[0]}:" in (ROOT / "Makefile").read_text(encoding="utf-8"), command
             elif program == "python" and words[0].startswith("tools/"):

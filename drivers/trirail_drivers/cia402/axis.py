@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from trirail_drivers.cia402 import frames, ways
+from trirail_drivers.cia402.codes import words
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.scaling import Scale
@@ -193,7 +194,7 @@ class Cia402Axis(Axis):
             self.error_code = 0
             return
         self.error_code = code
-        self.tell("emcy", code, f"emergency {code:04X}, error register {register:02X}")
+        self.tell("emcy", code, f"emergency {words(code, f', error register 0x{register:02X}')}")
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
         """Heartbeat, answer to node guarding or boot-up: the drive lives, and should be operational."""
@@ -278,14 +279,13 @@ class Cia402Axis(Axis):
             return self.event
         if self.state in _IN_FAULT:
             if now >= self.reset_until:
-                reason = f", error {self.error_code:04X}" if self.error_code else ""
-                if self.reset_until > -math.inf:
-                    reason += f", still {RESET_TIME:g} s after a fault reset"
+                still = f", still {RESET_TIME:g} s after a fault reset" if self.reset_until > -math.inf else ""
+                reason = f", error {words(self.error_code, still)}" if self.error_code else still
                 return self.made("fault", self.error_code, f"{self.state}{reason}")
         elif (
             self.error_code and now >= self._register_until
         ):  # CiA 301: in force until the drive sends "error reset", code 00xxh
-            return self.made("emcy", self.error_code, f"emergency {self.error_code:04X} is still in force")
+            return self.made("emcy", self.error_code, f"emergency {words(self.error_code, ' is still in force')}")
         elif silent := self.silence(now):
             return silent
         elif now - self.status_heard > MISSED_STATUSES * frames.STATUS_PERIOD:

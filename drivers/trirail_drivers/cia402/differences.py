@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from trirail_drivers.cia402.objects import USES, Key, Need, title, use
+from trirail_drivers.cia402.objects import PROTECTIONS, Key, Need, title, use
 from trirail_drivers.cia402.sdo import Remote, SdoRefused, same, shown
 from trirail_drivers.errors import ConfigurationRefused, DriveError
 
@@ -32,7 +32,7 @@ class Differences:
         self.notes: list[str] = []
         """What is done otherwise, and is told once."""
         self.lacking: dict[str, str] = {}
-        """Protections that the drive lacks, as USES names them, and why each is said to lack."""
+        """Protections that the drive lacks, as PROTECTIONS names them, and why each is said to lack."""
 
     def give(self, index: int, subindex: int, value: int, also: Sequence[int] = ()) -> int | None:
         """See that an object holds a value, or one that will do `also`; return what it holds, None where it lacks.
@@ -111,11 +111,11 @@ class Differences:
         """Refuse the drive where it lacks a protection that the configuration does not name; tell of the others."""
         refused = [name for name in self.lacking if name not in accepted]
         if refused:
-            what = "; ".join(f"{name}, {USES[name].purpose}: {self.lacking[name]}" for name in refused)
+            what = "; ".join(f"{name}, {PROTECTIONS[name].purpose}: {self.lacking[name]}" for name in refused)
             listed = ", ".join(f'"{name}"' for name in sorted({*refused, *accepted}))
             raise DriveError(
                 f"drive {self.remote.name} lacks protections: {what}. To drive it all the same say "
                 f"drives.{self.remote.name}.accept_without = [{listed}]"
             )
         for name, reason in self.lacking.items():
-            self.tell(f"lacks {name} ({USES[name].purpose}): {reason}; accepted, so {USES[name].without}")
+            self.tell(f"lacks {name} ({PROTECTIONS[name].purpose}): {reason}; accepted, so {PROTECTIONS[name].without}")

@@ -17,9 +17,10 @@ from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames, setup, ways
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.homing import HomingSequence
+from trirail_drivers.cia402.objects import means
 from trirail_drivers.cia402.strangers import Strangers
 from trirail_drivers.driver.driver import Driver
-from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
+from trirail_drivers.interface import Clock, Feedback, MissingProtection, PowerState, Triple
 
 REPEAT_AFTER = 3
 """A controlword that a drive does not follow is sent again after so many SYNCs: the frame may be lost."""
@@ -60,6 +61,9 @@ class Cia402(Driver[Cia402Axis]):
         self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
         for line in setup.told(made for made, _ in done):
             self._wire.warn(line)
+        self.missing_protections = tuple(
+            MissingProtection(made.name, name, means(name)) for made, _ in done for name in made.lacking
+        )
 
     def _listen(self, axis: Cia402Axis) -> None:
         listen, way = self._wire.listen, axis.way
@@ -105,7 +109,7 @@ class Cia402(Driver[Cia402Axis]):
         for axis in self._axes:
             axis.answers.read_over()
             axis.cycle_over()
-            fault = axis.fault(now, self._wanted) if self._wire.fault is None else None
+            fault = axis.fault(now, _asked_of(axis, self._wanted)) if self._wire.fault is None else None
             if fault is not None:
                 self._wire.fail(fault)
         self._watch_stopping(now)
@@ -157,10 +161,10 @@ class Cia402(Driver[Cia402Axis]):
                 axis.setpoints_late += 1
         self._command()
 
-    def enable(self) -> None:
-        """Begin to power up; the following writes carry it out, the feedback's states tell when it is done.
+    def enable(self, alone: str | None = None) -> None:
+        """Begin to power up, all drives or one `alone`; the following writes carry it out, the states tell when.
 
-        Does nothing while a fault is latched.
+        Does nothing while a fault is latched, or while drives are to have power.
         """
         if self._wire.fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
             return
@@ -168,14 +172,16 @@ class Cia402(Driver[Cia402Axis]):
         self._off_by = math.inf
         for axis in self._axes:
             axis.powered_up = axis.has_followed = False
+            axis.left_out = alone not in (None, axis.name)
         self._homing.restore()
 
     def home(self) -> None:
         """Begin to home the drives that have a homing method, one after the other: see homing402.
 
-        Does nothing unless all drives have power and no fault is latched.
+        Does nothing unless all drives that were enabled have power and no fault is latched.
         """
-        if self._wire.fault is None and all(axis.state is PowerState.OPERATION_ENABLED for axis in self._axes):
+        ready = (axis.left_out or axis.state is PowerState.OPERATION_ENABLED for axis in self._axes)
+        if self._wire.fault is None and self._wants_power() and all(ready):
             self._homing.start()
 
     def stop_homing(self) -> None:
@@ -232,9 +238,10 @@ class Cia402(Driver[Cia402Axis]):
         """Send the controlwords that are due: one transition per drive at a time."""
         now = self._clock()
         for axis in self._axes:
-            word = axis.word(now, self._next)
-            deaf = axis.may_be_deaf and self._wanted is not PowerState.OPERATION_ENABLED
-            repeat = axis.command_age >= REPEAT_AFTER and (deaf or axis.is_not_followed(word, self._next))
+            wanted = _asked_of(axis, self._next)
+            word = axis.word(now, wanted)
+            deaf = axis.may_be_deaf and _asked_of(axis, self._wanted) is not PowerState.OPERATION_ENABLED
+            repeat = axis.command_age >= REPEAT_AFTER and (deaf or axis.is_not_followed(word, wanted))
             if not (word != axis.controlword or repeat):
                 continue
             if deaf:
@@ -282,3 +289,9 @@ class Cia402(Driver[Cia402Axis]):
 
     def _powered(self) -> bool:
         return any(axis.state in setup.HAS_POWER for axis in self._axes)
+
+
+def _asked_of(axis: Cia402Axis, wanted: frames.Wanted) -> frames.Wanted:
+    """What a drive is asked for where the drives are `wanted` in a state: one that is left out gets no power."""
+    left_off = axis.left_out and wanted is PowerState.OPERATION_ENABLED
+    return PowerState.SWITCH_ON_DISABLED if left_off else wanted

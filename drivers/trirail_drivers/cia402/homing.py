@@ -72,7 +72,7 @@ class HomingSequence:
         self._forget_homes()
 
     def start(self) -> None:
-        """Begin to home all drives that have a homing method; until each is done it does not count as homed."""
+        """Begin to home all drives with a homing method and power; until each is done it does not count as homed."""
         self._forget_homes()
         self.under_way, self._stopping = True, False
         self._steps = self._home_all()
@@ -118,11 +118,11 @@ class HomingSequence:
 
     def _forget_homes(self) -> None:
         for axis, _ in self._plan:
-            axis.homed = False
+            axis.homed = axis.homed and axis.left_out
 
     def _home_all(self) -> Steps:
         for axis, timeout in self._plan:
-            if not self._stopping:
+            if not self._stopping and not axis.left_out:
                 self._axis = axis
                 yield from self._home(axis, timeout)
 

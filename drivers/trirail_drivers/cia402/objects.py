@@ -92,6 +92,15 @@ USES: Final = {
 """By index, or index and subindex. 605B (shutdown) and 605C (disable operation) are not used: power is taken off by
 "disable voltage" and "quick stop", which they do not bear on."""
 
+FOLLOWING_BIT: Final = "6041"
+"""What `accept_without` names where bit 12 of the statusword says nothing."""
+PROTECTIONS: Final = {name: used for name, used in USES.items() if used.need is Need.PROTECTION} | {
+    FOLLOWING_BIT: Use(
+        _P, "Bit 12 of the statusword", "saying that it follows setpoints", "that is not looked at", "CiA 402-2, 6041h"
+    )
+}
+"""What `accept_without` may name."""
+
 _WIDTHS: Final = {
     **dict.fromkeys((0x1001, 0x1029, 0x6060, 0x6061, 0x6098, 0x60C2), 1),
     **dict.fromkeys((0x100C, 0x1015, 0x1017, 0x603F, 0x6040, 0x6041), 2),
@@ -130,6 +139,12 @@ def use(key: Key) -> tuple[str, Use] | None:
         if name in USES:
             return name, USES[name]
     return None
+
+
+def means(protection: str) -> str:
+    """What a protection is for, and what is so without, for people."""
+    used = PROTECTIONS[protection]
+    return f"{used.purpose}; without: {used.without}"
 
 
 def title(key: Key) -> str:

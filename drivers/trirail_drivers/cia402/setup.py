@@ -14,6 +14,7 @@ from trirail_drivers.cia402.differences import Difference, Differences
 from trirail_drivers.cia402.drive_units import read_units
 from trirail_drivers.cia402.guarding import give_watchdogs
 from trirail_drivers.cia402.modes import choose_mode, give_mode
+from trirail_drivers.cia402.objects import FOLLOWING_BIT
 from trirail_drivers.cia402.pdos import Pdos
 from trirail_drivers.cia402.sdo import Client, Remote, SdoRefused
 from trirail_drivers.cia402.settings import (
@@ -170,6 +171,8 @@ def _bring(
     for key in ((0x603F, 0), (0x1001, 0)):
         if not remote.has(*key):
             differences.lack(key, "it has no such object")
+    if FOLLOWING_BIT in drive.accept_without:
+        differences.lacking[FOLLOWING_BIT] = "the configuration says so"
     way = Exchange(
         mode,
         setpoints,
@@ -180,7 +183,7 @@ def _bring(
         watched.guarded,
         watched.heard,
         watched.emergency,
-        "6041" not in drive.accept_without,
+        FOLLOWING_BIT not in drive.accept_without,
     )
     vendor, product, revision, serial = (remote.look(0x1018, subindex) for subindex in range(1, 5))
     identity = Identity(remote.look(0x1000) or 0, vendor, product, revision, serial, remote.look(0x6502))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from trirail_drivers.config import Can, Drives
 from trirail_drivers.driver.requirements import Requirements
 from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
 _OWN = ("simulated", "unix")
@@ -36,4 +37,10 @@ def check(drives: Drives, required: Requirements) -> None:
             f"drives.heartbeat = {drives.heartbeat:g}: heartbeats go out with the cycle; "
             f"wanted at least its period, {required.period:g} s"
         )
-    PROTOCOLS[drives.protocol].check(drives, required)
+    protocol = PROTOCOLS[drives.protocol]
+    known = ", ".join(protocol.protections) or "none"
+    for name, drive in zip(NAMES, drives.each, strict=True):
+        for protection in drive.accept_without:
+            if protection not in protocol.protections:
+                raise DriveError(f'drives.{name}.accept_without: "{protection}" is no protection; there are {known}')
+    protocol.check(drives, required)

@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 
 from trirail_drivers.driver.answers import Answers
 from trirail_drivers.driver.scaling import Scale
+from trirail_drivers.errors import shortened
 from trirail_drivers.interface import Counts, DriveFault
 
 MISSED_ANSWERS = 3
@@ -21,6 +22,7 @@ class Axis(ABC):
         "answers",
         "event",
         "heard",
+        "left_out",
         "name",
         "node",
         "position",
@@ -40,6 +42,8 @@ class Axis(ABC):
         """The positions that have come, each in answer to the beginning of a cycle."""
         self.setpoints_late = self.setpoints_lost = 0
         """Setpoints written after the next cycle was due, and those that the bus did not take."""
+        self.left_out = False
+        """It stays without power where others are to have it."""
         self.powered_up = False
         """It has followed setpoints since that was asked for."""
         self.event: DriveFault | None = None
@@ -60,7 +64,7 @@ class Axis(ABC):
 
     def made(self, cause: str, code: int, text: str) -> DriveFault:
         """A fault of this drive."""
-        return DriveFault(self.name, cause, code, f"drive {self.name}: {text}")
+        return DriveFault(self.name, cause, code, shortened(f"drive {self.name}: {text}"))
 
     @abstractmethod
     def late_for(self, wanted: str, seconds: float) -> DriveFault | None:

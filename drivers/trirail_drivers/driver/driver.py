@@ -15,7 +15,7 @@ from trirail_drivers.bus import load
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.scaling import Scale, scale_of
-from trirail_drivers.interface import NAMES, Clock, DriveFault
+from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection
 
 AnyAxis = TypeVar("AnyAxis", bound=Axis)
 
@@ -36,6 +36,7 @@ class Driver(ABC, Generic[AnyAxis]):
         axis: Callable[[str, int, Scale, float], AnyAxis],
     ) -> None:
         self.bus_load = 0.0
+        self.missing_protections: tuple[MissingProtection, ...] = ()
         self._wire = Wire(bus, self._stop)
         self._bitrate = bitrate
         self._drives = drives
@@ -57,6 +58,11 @@ class Driver(ABC, Generic[AnyAxis]):
     def traffic(self) -> int:
         """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
         return self._wire.traffic
+
+    @property
+    def told(self) -> tuple[DriveFault | None, ...]:
+        """Of each drive the first fault that it has told of by itself since the last reset, whichever came first."""
+        return tuple(axis.event for axis in self._axes)
 
     def close(self) -> None:
         """Leave the drives without power, and let go of the bus.

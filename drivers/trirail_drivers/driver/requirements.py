@@ -7,9 +7,26 @@ from typing import Final, NamedTuple
 
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import NAMES, Triple
 
 FINE_ENOUGH: Final = 10
 """So many steps of a drive's position the following error must have, lest rounding alone be a fault."""
+
+
+SEVERAL: Final = 3
+"""So many steps of a drive's position a window must have to either side, lest rounding and its flicker leave it."""
+
+
+class Window(NamedTuple):
+    """How far something that follows from the sliders' positions may be from where it is to be."""
+
+    key: str
+    """Of the configuration."""
+    width: float
+    """To either side."""
+    unit: str
+    gains: Triple
+    """By how much at most a metre of the sliders A, B, C changes it."""
 
 
 class Requirements(NamedTuple):
@@ -24,6 +41,8 @@ class Requirements(NamedTuple):
     """Of the sliders at most [m/s]."""
     following_error: float
     """Beyond which the service stops everything [m]."""
+    windows: tuple[Window, ...] = ()
+    """In which the robot is to settle."""
 
 
 def check_resolution(
@@ -43,4 +62,11 @@ def check_resolution(
             raise DriveError(
                 f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}, offset = {drive.offset:g}: the position "
                 f"goes in steps of {step:g} m, too coarse for {key}, {limit:g} {unit}; {remedy(limit / steps)}"
+            )
+    for window in required.windows:
+        least = SEVERAL * step * window.gains[NAMES.index(name)]
+        if window.width < least:
+            raise DriveError(
+                f"{window.key} = {window.width:g}: the position of drive {name} goes in steps of {step:g} m, and "
+                f"{SEVERAL} of them move it by {least:g} {window.unit}; wanted at least that, to settle in"
             )

@@ -8,6 +8,7 @@ from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.odrive import frames
+from trirail_drivers.odrive.codes import words
 from trirail_drivers.odrive.frames import AxisState, ProcedureResult
 
 RESET_TIME = 3 * 3 * frames.ERROR_PERIOD
@@ -121,7 +122,7 @@ class OdriveAxis(Axis):
         if self.event is not None:
             return self.event
         if self.errors and now >= self.reset_until:
-            return self.made("fault", self.errors, frames.error_names(self.errors))
+            return self.made("fault", self.errors, f"error {words(self.errors)}")
         if silent := self.silence(now):
             return silent
         if self.state in frames.PROCEDURES:

@@ -108,7 +108,7 @@ class Odrive(Driver[OdriveAxis]):
         on = self._enabled
         return Feedback(
             (a.position, b.position, c.position),
-            (a.power(on), b.power(on), c.power(on)),
+            (a.power(on and not a.left_out), b.power(on and not b.left_out), c.power(on and not c.left_out)),
             self._wire.fault,
             (a.counts, b.counts, c.counts),
             self._wire.warnings(),
@@ -131,8 +131,8 @@ class Odrive(Driver[OdriveAxis]):
             for axis in self._axes:
                 axis.setpoints_late += 1
 
-    def enable(self) -> None:
-        """Begin to power up, after the setpoints of the next SYNC; the feedback's states tell when it is done.
+    def enable(self, alone: str | None = None) -> None:
+        """Begin to power up, all drives or one `alone`, after the setpoints of the next SYNC; the states tell when.
 
         Does nothing while a fault is latched. A drive tells its state with its heartbeat: that long it takes.
         """
@@ -143,6 +143,7 @@ class Odrive(Driver[OdriveAxis]):
         self._off_by = math.inf
         for axis in self._axes:
             axis.powered_up = False
+            axis.left_out = alone not in (None, axis.name)
             axis.requested = None
 
     def home(self) -> None:
@@ -202,7 +203,7 @@ class Odrive(Driver[OdriveAxis]):
     def _found(self, now: float) -> DriveFault | None:
         """The first thing that is wrong."""
         for number, axis in enumerate(self._axes):
-            fault = axis.fault(now, self._enabled)
+            fault = axis.fault(now, self._enabled and not axis.left_out)
             if fault is not None:
                 return fault
             due = self._due[-1 - min(axis.answers.age, MISSED_ANSWERS - 1)]
@@ -221,7 +222,7 @@ class Odrive(Driver[OdriveAxis]):
     def _command(self) -> None:
         """Ask drives for the state they should be in, once, and again where a heartbeat shows another."""
         for axis in self._axes:
-            wanted = self._wanted()  # anew for each: a frame that cannot be sent begins a quick stop
+            wanted = self._wanted(axis)  # anew for each: a frame that cannot be sent begins a quick stop
             if wanted is None or axis.requested is wanted:
                 continue
             if wanted is AxisState.CLOSED_LOOP_CONTROL:  # with every power-up, for a drive may have restarted
@@ -231,8 +232,10 @@ class Odrive(Driver[OdriveAxis]):
             if self._wire.send(frames.command(axis.node, frames.SET_AXIS_STATE, frames.AXIS_STATE.pack(wanted))):
                 axis.ask(wanted)
 
-    def _wanted(self) -> AxisState | None:
-        """The state that drives should be in now; None leaves them as they are."""
+    def _wanted(self, axis: OdriveAxis) -> AxisState | None:
+        """The state that a drive should be in now; None leaves it as it is."""
+        if self._enabled and axis.left_out:
+            return AxisState.IDLE
         if not self._enabled:
             return None if self._setpoints.stopping else AxisState.IDLE
         return AxisState.CLOSED_LOOP_CONTROL if self._setpoints.sent is not None else None

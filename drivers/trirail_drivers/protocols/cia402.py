@@ -9,6 +9,7 @@ from trirail_drivers import config
 from trirail_drivers.cia402 import checks, frames, units
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.inspection import inspect
+from trirail_drivers.cia402.objects import PROTECTIONS, means
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import EDS, Frames, Mechanics, Servo, SimulatedDevice, SimulatedDrive
 
@@ -50,6 +51,7 @@ CIA402 = Protocol(
     traffic=frames.TRAFFIC,
     simulated_drive=_simulated_drive,
     inspect=inspect,
+    protections={name: means(name) for name in PROTECTIONS},
     fault_frames={
         "nmt": Frames(True, frames.NMT),
         "sync": Frames(True, frames.SYNC),

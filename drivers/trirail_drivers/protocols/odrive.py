@@ -38,6 +38,7 @@ ODRIVE = Protocol(
     traffic=frames.TRAFFIC,
     simulated_drive=_simulated_drive,
     inspect=None,
+    protections={},
     fault_frames={  # named as in the manual
         "set_axis_state": Frames(True, frames.SET_AXIS_STATE, _NODE),
         "set_controller_mode": Frames(True, frames.SET_CONTROLLER_MODE, _NODE),

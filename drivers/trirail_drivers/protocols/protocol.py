@@ -32,5 +32,7 @@ class Protocol:
     inspect: Callable[..., list[dict[str, Any]]] | None
     """Tells what each drive is and what its set-up would change, from the bus, section [drives], the period [s] and
     the clock, and whether to `apply` that; None where drives have nothing to tell."""
+    protections: Mapping[str, str]
+    """What `accept_without` may name, and what each means, for people."""
     fault_frames: Mapping[str, Frames]
     """The frames that faults on demand can name."""

@@ -1,6 +1,7 @@
 """Drives simulated as devices on a CAN bus, CiA 402 servos and ODrives: for tests and work without hardware."""
 
 from trirail_drivers.simulated.bus import SimulatedBus
+from trirail_drivers.simulated.carriages import Carriages
 from trirail_drivers.simulated.devices import SimulatedDevice
 from trirail_drivers.simulated.drive import EDS, SimulatedDrive
 from trirail_drivers.simulated.faultlines import Frames
@@ -10,6 +11,7 @@ from trirail_drivers.simulated.units import Mechanics
 
 __all__ = [
     "EDS",
+    "Carriages",
     "Frames",
     "Mechanics",
     "Servo",

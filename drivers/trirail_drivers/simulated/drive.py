@@ -45,7 +45,8 @@ class SimulatedDrive(Device):
 
     The axis moves one interpolation period (60C2h) per SYNC: at each SYNC first the motion since the last one
     is done, then TPDOs sample it, then the latched setpoints take effect. Where no SYNC comes it moves with
-    the time; until the SYNC is found lost, it keeps its velocity. Without power it is held by its brake.
+    the time; until the SYNC is found lost, it keeps its velocity. Without power it is held by its brake, which gives
+    way to a hand.
     """
 
     def __init__(
@@ -175,6 +176,7 @@ class SimulatedDrive(Device):
 
     def _move(self, step: float, feed_forward: float) -> None:
         if self.state not in _POWERED:
+            self._profile.tell(self.servo)
             return
         if self._follows_command:
             self.servo.follow(self._profile.setpoint, feed_forward, step)

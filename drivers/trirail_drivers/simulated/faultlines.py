@@ -30,6 +30,11 @@ faults of a drive:
   fault CODE        breaks down with an EMCY      reboot        loses its supply and its set-up
   stuck             the slider does not move      lag SECONDS   the slider is so far behind
   runaway SPEED     the slider moves with SPEED [m/s] whatever it is told, until it has no power
+faults of its mechanics and wiring, as a rule beside the rail shows them:
+  reversed          the slider goes the other way         scale RATIO    it goes RATIO times as far as counted
+  swapped DRIVE     it moves that drive's slider          loose          its encoder does not turn with it
+  slips SHARE       its encoder misses that share of the way while the slider's position rises
+  against           its encoder counts against its motor: with power it runs away
 faults of the bus (no DRIVE):
   bus-off           the master's controller leaves the bus        error-passive   ... is about to
   babble ID         a node sends this identifier without pause; what has a higher one does not get through
@@ -109,6 +114,24 @@ def _time(word: str) -> float:
     return value
 
 
+def _ratio(word: str) -> float:
+    value = _decimal(word)
+    if value <= 0.0:
+        raise ValueError
+    return value
+
+
+def _share(word: str) -> float:
+    value = _decimal(word)
+    if not 0.0 <= value <= 1.0:
+        raise ValueError
+    return value
+
+
+def _drive(word: str) -> float:
+    return NAMES.index(word)
+
+
 def _between(low: int, high: int, base: int) -> Callable[[str], float]:
     def read(word: str) -> float:
         value = int(word, base)
@@ -145,6 +168,12 @@ _OF_DRIVES: Final = {
     "stuck": _Kind(),
     "lag": _Kind("seconds", _time, "0.05"),
     "runaway": _Kind("a speed in m/s", _decimal, "0.2"),
+    "reversed": _Kind(),
+    "scale": _Kind("a ratio above 0", _ratio, "0.5"),
+    "swapped": _Kind("a drive, A, B or C", _drive, "B"),
+    "loose": _Kind(),
+    "slips": _Kind("a share from 0 to 1", _share, "0.3"),
+    "against": _Kind(),
 }
 _OF_BUS: Final = {
     "bus-off": _Kind(),

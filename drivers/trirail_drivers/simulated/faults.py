@@ -15,9 +15,11 @@ from trirail_drivers import files
 from trirail_drivers.bus import canerrors
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES, Clock, PowerState
+from trirail_drivers.simulated.carriages import Carriages
 from trirail_drivers.simulated.devices import SimulatedDevice
 from trirail_drivers.simulated.emergency import Emergencies
 from trirail_drivers.simulated.faultlines import Condition, Fault, FaultSyntaxError, Frames, parse
+from trirail_drivers.simulated.servo import SOUND
 
 MOVING: Final = 1e-3
 """A slider moves from this speed on [m/s]."""
@@ -72,6 +74,8 @@ class Faults:
         `tell`: hears what begins and ends.
         """
         self.tell = tell
+        self.carriages = Carriages([drive.servo for drive in drives], counts_per_metre)
+        """Where the sliders really are."""
         self._drives = drives
         self._frames = frames
         self._scales = counts_per_metre
@@ -269,6 +273,22 @@ class Faults:
             drive.servo.forced_velocity = fault["runaway"].value * scale if "runaway" in fault else None
             if "stuck" in fault:
                 drive.servo.forced_velocity = 0.0
+            drive.servo.encoder = self._encoder(fault, scale)
+            slider = round(fault["swapped"].value) if "swapped" in fault else index
+            ratio = fault["scale"].value if "scale" in fault else 1.0
+            self.carriages.couple(index, slider, -ratio if "reversed" in fault else ratio)
+
+    @staticmethod
+    def _encoder(fault: Mapping[str, Fault], scale: float) -> tuple[float, float]:
+        """The shares of its travel that a drive's encoder counts, as its counts rise and as they fall."""
+        if "loose" in fault:
+            return 0.0, 0.0
+        if "against" in fault:
+            return -1.0, -1.0
+        if "slips" not in fault:
+            return SOUND
+        held = 1.0 - fault["slips"].value  # while the slider's position rises
+        return (held, 1.0) if scale > 0.0 else (1.0, held)
 
     def _emergencies(self, fault: Fault) -> list[Emergencies]:
         struck = (self._drives[index].emergencies for index in fault.drives)

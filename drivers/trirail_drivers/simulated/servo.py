@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from trirail_drivers import config
 from trirail_drivers.driver.ramp import braked
+
+SOUND: Final = (1.0, 1.0)
+"""An encoder that counts all of its travel, forwards and backwards."""
 
 
 class Servo:
@@ -42,6 +46,10 @@ class Servo:
         """Whether the last step was cut to a limit."""
         self.forced_velocity: float | None = None
         """A defect: the velocity [counts/s] that the slider has whatever it is told, until its brake holds it."""
+        self.encoder = SOUND
+        """A defect: which shares of its travel the encoder counts, forwards and backwards; (0, 0) where it is loose."""
+        self.travelled = 0.0
+        """How far the motor has turned since power-on, whatever the encoder says [counts]."""
         self.lag: float | None = None
         """A defect: how long it is behind its setpoint [s]; feed-forward does not help then."""
         self._feed_forward = 0.0
@@ -125,7 +133,7 @@ class Servo:
         if self.forced_velocity is not None:
             velocity = self.forced_velocity
         self.velocity = velocity
-        self.position += velocity * step
+        self.turn(velocity * step)
 
     def brake(self, deceleration: float, step: float) -> None:
         """Slow down for `step` seconds with `deceleration` [counts/s²], at most to standstill."""
@@ -138,7 +146,8 @@ class Servo:
 
     def roll(self, deceleration: float, step: float) -> None:
         """Slow down as `brake` does, but without power: no defect drives it on."""
-        self.position, self.velocity = braked(self.position, self.velocity, deceleration, step)
+        way, self.velocity = braked(0.0, self.velocity, deceleration, step)
+        self.turn(way)
         self.setpoint, self._feed_forward = self.position, 0.0
 
     def run(self, velocity: float, acceleration: float, step: float) -> None:
@@ -148,7 +157,7 @@ class Servo:
         self.velocity = max(before - change, min(velocity, before + change))
         if self.forced_velocity is not None:
             before = self.velocity = self.forced_velocity
-        self.position += 0.5 * (before + self.velocity) * step
+        self.turn(0.5 * (before + self.velocity) * step)
         self.setpoint, self._feed_forward = self.position, 0.0
 
     def shift(self, by: float) -> None:
@@ -158,4 +167,15 @@ class Servo:
 
     def coast(self, step: float) -> None:
         """Keep the velocity for `step` seconds, as a drive does that waits for its next setpoint."""
-        self.position += self.velocity * step
+        self.turn(self.velocity * step)
+
+    def push(self, by: float) -> None:
+        """Be turned by hand, without power [counts]."""
+        self.turn(by)
+        self.setpoint = self.position
+
+    def turn(self, by: float) -> None:
+        """Turn the motor `by` so much [counts]; the encoder counts what it counts of it."""
+        forwards, backwards = self.encoder
+        self.travelled += by
+        self.position += by * (forwards if by > 0.0 else backwards)

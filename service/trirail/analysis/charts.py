@@ -1,7 +1,8 @@
-"""A session drawn: modes, goals, sliders, following error and the loop's timing over time. Needs matplotlib."""
+"""A session drawn: modes, goals, pose, sliders, following error and the loop's timing over time. Needs matplotlib."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from trirail.analysis.summary import ENABLED_MODES, GoalSummary, Summary
-from trirail.telemetry import palette
+from trirail.analysis.summary import ENABLED_MODES, GoalSummary, Incident, Summary
+from trirail.config import Limits
+from trirail.errors import ConfigError
+from trirail.kinematics.geometry import LEGS
+from trirail.telemetry import palette, provenance
 from trirail.telemetry.reading import Recording
 from trirail.wire.vocabulary import MODES, Mode
 
@@ -21,12 +25,29 @@ __all__ = ["draw"]
 
 INK, GREY, PALE, RED = "#1f2933", "#7b8794", "#d3d9e0", "#c0392b"
 SLIDERS = ("#d1495b", "#2e8b57", "#2f6fb3")
+CENTRE, PHI = ("#0e7c86", "#7a4fc0"), "#b7791f"
+DASHES = (0, (4, 3))
 MODE_COLOURS = {mode: palette.code(palette.pale(colour)) for mode, colour in palette.MODES.items()}
 OUTCOME_COLOURS = {outcome: palette.code(colour) for outcome, colour in palette.OUTCOMES.items()}
 BINS = 1500
 """So many points of a curve are drawn: of each bin the least and the greatest value."""
-HEIGHTS = (0.9, 2.2, 1.6, 1.6, 1.6)
+PANELS = {
+    "goals": 1.1,
+    "x, y [mm]": 1.3,
+    "φ [°]": 1.0,
+    "λ [mm]": 1.3,
+    "velocity [mm/s]": 1.3,
+    "error [µm]": 1.3,
+    "loop [µs]": 1.3,
+}
+"""From top to bottom, with their heights [inch]: centre and angle of the platform, then the sliders and the loop."""
 WIDTH = 13.0
+NEAR = 0.7
+"""A limit is drawn where a curve reaches this share of it: else it would flatten the curve."""
+LISTED = 8
+"""So many faults are listed below the curves."""
+LETTER = 4.0
+"""The width of a letter of a goal's name [point]."""
 
 
 def draw(file: Path, recording: Recording, summed: Summary) -> None:
@@ -34,32 +55,77 @@ def draw(file: Path, recording: Recording, summed: Summary) -> None:
 
     ValueError for one that matplotlib does not write, OSError if the file cannot be written.
     """
-    figure = Figure(figsize=(WIDTH, sum(HEIGHTS) + 1.2), dpi=150, layout="constrained")
+    listed = _listed(summed.faults)
+    figure = Figure(figsize=(WIDTH, sum(PANELS.values()) + 1.2 + 0.17 * len(listed)), dpi=150, layout="constrained")
     figure.suptitle(_title(summed), x=0.008, ha="left", color=INK, fontsize=14, fontweight="bold")
-    panels = figure.subplots(len(HEIGHTS), 1, sharex=True, height_ratios=HEIGHTS)
-    modes, position, velocity, error, timing = panels
+    axes = figure.subplots(len(PANELS), 1, sharex=True, height_ratios=[*PANELS.values()])
+    panels: dict[str, Axes] = dict(zip(PANELS, axes, strict=True))
+    for name, panel in panels.items():
+        panel.set_ylabel(name, color=GREY, fontsize=9)
     records, t = recording.records, recording.t
-    _modes(modes, records, t, summed)
-    _bands(position, t, records["position"] * 1e3, "position [mm]")
-    _bands(velocity, t, records["commanded_velocity"] * 1e3, "velocity [mm/s]")
-    enabled = np.isin(records["mode"], ENABLED_MODES)[:, np.newaxis]
-    _bands(error, t, np.where(enabled, records["following_error"], np.nan) * 1e6, "following error [µm]")
-    _timing(timing, records, t, 1e6 / summed.rate_hz)
+    axes[-1].set_xlim(t[0], max(t[-1], t[0] + 1e-3))
+    _modes(panels["goals"], records, t, summed)
+    _motion(panels, records, t, _limits(recording))
+    _timing(panels["loop [µs]"], records, t, 1e6 / summed.rate_hz)
     worst = [f"{each.slider}  max {each.max * 1e6:.0f}, rms {each.rms * 1e6:.1f} µm" for each in summed.tracking]
-    handles = [Line2D([], [], color=colour, label=text) for colour, text in zip(SLIDERS, worst, strict=True)]
-    _legend(error, handles)
-    _legend(position, [Line2D([], [], color=colour, label=name) for colour, name in zip(SLIDERS, "ABC", strict=True)])
-    for panel in panels:
+    _names(panels["error [µm]"], worst, SLIDERS)
+    for panel in axes:
         _quiet(panel)
         for incident in summed.faults:
             panel.axvline(incident.t, color=RED, linewidth=1.0, zorder=9)
-    for incident in summed.faults:
-        side = "left" if incident.t < (t[0] + t[-1]) / 2.0 else "right"  # where there is room
-        style = {"color": RED, "fontsize": 8, "va": "top", "ha": side, "zorder": 10}
-        position.text(incident.t, 0.97, f" {incident.message} ", transform=position.get_xaxis_transform(), **style)
-    panels[-1].set_xlabel("nominal time since the loop's start [s]", color=GREY, fontsize=9)
-    panels[-1].set_xlim(t[0], max(t[-1], t[0] + 1e-3))
+    for number, incident in enumerate(summed.faults[:LISTED], start=1):
+        mark = {"color": "white", "fontsize": 7, "ha": "center", "va": "center", "zorder": 10}
+        box = {"boxstyle": "circle,pad=0.25", "facecolor": RED, "linewidth": 0}
+        axes[0].text(incident.t, 1.0, str(number), transform=axes[0].get_xaxis_transform(), bbox=box, **mark)
+    axes[-1].set_xlabel("\n".join(["nominal time since the loop's start [s]", *listed]), color=GREY, fontsize=9)
+    if listed:
+        axes[-1].xaxis.label.set(horizontalalignment="left", x=0.0, parse_math=False)
     figure.savefig(file)
+
+
+def _listed(faults: list[Incident]) -> list[str]:
+    """Return a numbered line for each fault, those at the end counted together."""
+    lines = [f"{n}   {each.t:.3f} s   {each.message}" for n, each in enumerate(faults[:LISTED], start=1)]
+    return lines + ([f"and {len(faults) - LISTED} more"] if len(faults) > LISTED else [])
+
+
+def _limits(recording: Recording) -> Limits | None:
+    """Return the limits in force, None where the recording does not say them in a way that is known here."""
+    try:
+        config = provenance.configuration(recording.texts)
+    except ConfigError:
+        return None
+    return config.limits if config else None
+
+
+def _motion(panels: dict[str, Axes], records: NDArray[np.void], t: NDArray[np.float64], limits: Limits | None) -> None:
+    """Draw the platform and the sliders, in millimetres and degrees, each with the limits that it comes near."""
+    enabled = np.isin(records["mode"], ENABLED_MODES)[:, np.newaxis]
+    error = np.where(enabled, records["following_error"], np.nan)
+    _curves(panels["x, y [mm]"], t, records["pose"][:, :2] * 1e3, CENTRE)
+    _curves(panels["φ [°]"], t, np.degrees(records["pose"][:, 2:]), (PHI,))
+    _curves(panels["λ [mm]"], t, records["position"] * 1e3, SLIDERS)
+    _curves(panels["velocity [mm/s]"], t, records["commanded_velocity"] * 1e3, SLIDERS)
+    _curves(panels["error [µm]"], t, error * 1e6, SLIDERS)
+    _names(panels["x, y [mm]"], "xy", CENTRE)
+    _names(panels["λ [mm]"], LEGS, SLIDERS)
+    if limits is None:
+        return
+    slider, platform = limits.slider, limits.platform
+    for x_or_y, values in zip((platform.x, platform.y), records["pose"][:, :2].T, strict=True):
+        _bounds(panels["x, y [mm]"], values * 1e3, x_or_y[0] * 1e3, x_or_y[1] * 1e3)
+    _bounds(panels["λ [mm]"], records["position"] * 1e3, slider.position[0] * 1e3, slider.position[1] * 1e3)
+    velocity, allowed = slider.velocity * 1e3, slider.following_error * 1e6
+    _bounds(panels["velocity [mm/s]"], records["commanded_velocity"] * 1e3, -velocity, velocity)
+    _bounds(panels["error [µm]"], error * 1e6, -allowed, allowed)
+
+
+def _bounds(panel: Axes, values: NDArray[np.float64], low: float, high: float) -> None:
+    """Draw those of two limits that the values come near."""
+    for limit in (low, high):
+        reached = np.nanmax(values * np.sign(limit), initial=0.0)
+        if limit and reached >= NEAR * abs(limit):
+            panel.axhline(limit, color=RED, linewidth=0.9, linestyle=DASHES)
 
 
 def _title(summed: Summary) -> str:
@@ -76,8 +142,8 @@ def _modes(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], summe
     colours = [MODE_COLOURS[MODES[mode]] for mode in records["mode"][starts]]
     panel.add_collection(PatchCollection(bands, facecolors=colours, linewidths=0))
     for number, goal in enumerate(summed.goals):
-        _goal(panel, goal, 1.1 + 0.5 * (number % 2), float(t[-1]))
-    panel.set(ylim=(-0.1, 2.2), yticks=[0.45, 1.55], yticklabels=["mode", "goals"])
+        _goal(panel, goal, 1.1 + 0.75 * (number % 2), float(t[0]), float(t[-1]))
+    panel.set(ylim=(-0.1, 2.75), yticks=[0.45, 1.8], yticklabels=["mode", "goals"], ylabel="")
     shown = [Patch(color=MODE_COLOURS[Mode(name)], label=name) for name in summed.modes]
     kinds = {goal.outcome: OUTCOME_COLOURS[goal.outcome] for goal in summed.goals}
     shown += [Patch(color=colour, label=f"goal {outcome}") for outcome, colour in kinds.items()]
@@ -86,34 +152,46 @@ def _modes(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], summe
     )
 
 
-def _goal(panel: Axes, goal: GoalSummary, y: float, end: float) -> None:
+def _goal(panel: Axes, goal: GoalSummary, y: float, begin: float, end: float) -> None:
+    """Draw a goal as a bar with its name, as much of that as there is room for."""
     ended = end if goal.ended is None else goal.ended
     colour = OUTCOME_COLOURS[goal.outcome]
-    panel.add_patch(Rectangle((goal.given, y), ended - goal.given, 0.4, facecolor=colour, linewidth=0))
+    panel.add_patch(Rectangle((goal.given, y), ended - goal.given, 0.65, facecolor=colour, linewidth=0))
     if goal.outcome in ("rejected", "expired"):
-        panel.plot([goal.given], [y + 0.2], "x", color=colour, markersize=6, markeredgewidth=2)
+        panel.plot([goal.given], [y + 0.32], "x", color=colour, markersize=6, markeredgewidth=2)
+    room = int((ended - goal.given) / max(end - begin, 1e-9) * 68.0 * WIDTH / LETTER) - 1
+    name = goal.id if len(goal.id) <= room else f"{goal.id[: room - 1]}…"
+    if room >= min(4, len(goal.id)):
+        where, right = (goal.given, y + 0.3), (3.0, 0.0)
+        panel.annotate(
+            name, where, right, textcoords="offset points", color="white", fontsize=7, va="center", parse_math=False
+        )
 
 
-def _bands(panel: Axes, t: NDArray[np.float64], values: NDArray[np.float64], name: str) -> None:
-    """Draw (N, 3) values of the sliders: every excursion shows, however short."""
-    for column, colour in zip(values.T, SLIDERS, strict=True):
+def _curves(panel: Axes, t: NDArray[np.float64], values: NDArray[np.float64], colours: Sequence[str]) -> None:
+    """Draw the columns of (N, k) values: every excursion shows, however short."""
+    for column, colour in zip(values.T, colours, strict=True):
         panel.plot(*_thinned(t, column), color=colour, linewidth=1.0)
-    panel.set_ylabel(name, color=GREY, fontsize=9)
+
+
+def _names(panel: Axes, names: Sequence[str], colours: Sequence[str]) -> None:
+    """Say which curve is which."""
+    pairs = zip(names, colours, strict=True)
+    _legend(panel, [Line2D([], [], color=colour, label=name) for name, colour in pairs])
 
 
 def _timing(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], budget: float) -> None:
     lateness, cycle = records["lateness_ns"] / 1e3, records["parts_ns"].sum(axis=1) / 1e3
     panel.plot(*_thinned(t, lateness), color="#8c6bb1", linewidth=0.7)
     panel.plot(*_thinned(t, cycle), color="#2f6fb3", linewidth=0.7)
-    panel.axhline(budget, color=RED, linewidth=0.9, linestyle=(0, (4, 3)))
+    panel.axhline(budget, color=RED, linewidth=0.9, linestyle=DASHES)
     missed = t[1:][np.diff(records["overruns"]) > 0]
     panel.plot(missed, np.full(len(missed), budget), "|", color=RED, markersize=7)
-    panel.set_ylabel("loop [µs]", color=GREY, fontsize=9)
     panel.set_ylim(0.0, 1.15 * budget)
     handles = [
         Line2D([], [], color="#8c6bb1", label="lateness"),
         Line2D([], [], color="#2f6fb3", label="cycle time"),
-        Line2D([], [], color=RED, linestyle=(0, (4, 3)), label="period"),
+        Line2D([], [], color=RED, linestyle=DASHES, label="period"),
     ]
     if len(missed):
         handles.append(Line2D([], [], color=RED, marker="|", linestyle="", label=f"missed ticks, {len(missed)} times"))

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from trirail_drivers.connection.opening import connect
-from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, PowerState, Triple
+from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, MissingProtection, PowerState, Triple
 
 from trirail.config import Config
 from trirail.control.control import Control, Given
@@ -203,6 +203,7 @@ class _Recorded:
     """Drives that say what they said in the recording, and take anything: trirail_drivers.interface.DriveGroup."""
 
     bus_load = 0.0
+    missing_protections: tuple[MissingProtection, ...] = ()
     traffic = 0
 
     def __init__(self, records: NDArray[np.void]) -> None:
@@ -229,13 +230,18 @@ class _Recorded:
         """Return what was said in this one; before the first cycle, what is said in it."""
         return self._said[max(0, self._row - 1)]._replace(fault=self._fault)
 
+    @property
+    def told(self) -> tuple[DriveFault | None, ...]:
+        """Return that no drive has told of a fault: what was wrong is told by `read`."""
+        return None, None, None
+
     def configure(self, period: float) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
     def write(self, position: Triple, velocity: Triple) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
-    def enable(self) -> None:
+    def enable(self, alone: str | None = None) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
     def home(self) -> None:

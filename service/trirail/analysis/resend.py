@@ -171,11 +171,11 @@ def _beginnings(recording: Recording) -> list[tuple[str, int]]:
 
 
 def _motion(records: NDArray[np.void], began: int | None) -> NDArray[np.float64]:
-    """Return the setpoints of a motion that began in a cycle, (N, 3): as long as the robot moves, without a gap."""
+    """Return the setpoints of a motion that began in a cycle, (N, 3): to the end of its path, without a gap."""
     if began is None or not len(records):
         return np.zeros((0, 3))
     rows = records[int(np.searchsorted(records["cycle"], began)) :]
-    whole = (rows["mode"] == _MOVING) & (rows["cycle"] == began + np.arange(len(rows)))
+    whole = (rows["mode"] == _MOVING) & (rows["progress"] < 1.0) & (rows["cycle"] == began + np.arange(len(rows)))
     length = int(np.argmin(np.append(whole, False)))
     setpoints: NDArray[np.float64] = rows["commanded_position"][:length]
     return setpoints

@@ -7,18 +7,22 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-from cyclopts import App, CycloptsError
+from cyclopts import App, CoercionError, CycloptsError, UnknownOptionError
 
 from trirail import __version__
 from trirail.cli import (
+    commission,
     config_commands,
     drives_command,
+    help_pages,
     math_commands,
     recording_commands,
     robot_commands,
     terminal,
+    units,
     workspace_command,
 )
+from trirail.cli.completion import Shell, script
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
 from trirail.wire.vocabulary import Command
@@ -119,6 +123,7 @@ def view(
 
 
 app.command(drives_command.drives)
+app.command(commission.commission)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)
@@ -133,15 +138,36 @@ app.command(recording_commands.replay)
 app.command(recording_commands.report)
 
 
+@app.command
+def completion(shell: Shell | None = None, /, *, install: Annotated[bool, Flag] = False) -> int:
+    """Print a script for tab completion, of the robots that answer too, or install it for this user.
+
+    Parameters
+    ----------
+    shell
+        The shell: bash, zsh or fish; the one in use if absent.
+    install
+        Write it where the shell finds it, and load it from the shell's start file where that is needed.
+    """
+    return script(app, shell, install=install)
+
+
+help_pages.arrange(app)
+
+
 def main() -> None:
     """Run a command and exit as it says."""
+    words = sys.argv[1:]
     try:
-        code = app(exit_on_error=False, print_error=False, result_action="return_value")
+        code = app(units.numbers(words), exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
-        terminal.complain(f"{str(error).strip()} (trirail --help tells the usage)")
+        terminal.complain(_wrong_usage(error, words))
         code = 2
     except TrirailError as error:
-        terminal.complain(str(error))
+        if "--json" in words:
+            terminal.failed(error)
+        else:
+            terminal.complain(str(error))
         code = 1
     except KeyboardInterrupt:
         code = 130
@@ -149,3 +175,16 @@ def main() -> None:
         sys.stderr.close()
         code = 0
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
+    """Say what is wrong with a command line, of what, and where its usage is told."""
+    said = str(error).strip()
+    behind = words[words.index("--") :] if "--" in words else []
+    unknown = error.token.keyword if isinstance(error, UnknownOptionError) else None
+    if unknown and any(word.split("=")[0] == unknown for word in behind):
+        said = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
+    elif isinstance(error, CoercionError) and error.msg and error.argument and not said.startswith("Invalid value"):
+        said = f"Invalid value for {error.argument.name.strip('-')}: {said}"
+    command = " ".join(("trirail", *(error.command_chain or ())))
+    return f"{said} ({command} --help tells the usage)"

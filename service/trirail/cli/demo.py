@@ -65,8 +65,9 @@ def run(*, stay: bool, record: Path | None) -> int:
         f"[bold]trirail demo[/]: starting the service on {SIM.name}, simulated drives at {config.loop.rate_hz} Hz"
     )
     with contextlib.ExitStack() as stack:
-        with out.status("starting the service (the very first time compiles the kinematics, some seconds)"):
-            service = stack.enter_context(own_service.service(SIM, recording))
+        with out.status("starting the service") as status:
+            said = lambda words: status.update(f"starting the service: {plain(words)}")  # noqa: E731
+            service = stack.enter_context(own_service.service(SIM, recording, said))
         with Robot(config.robot.name, locator, user="demo") as robot:
             robot.enable()
             rows = list(_tour(robot))

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from msgspec import Struct
 from trirail_drivers.bus.load import HIGH
+from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.config import Config
@@ -63,6 +64,7 @@ def examine(config: Config, machine: Machine) -> list[Check]:
         governor(machine.cpu, machine.governor),
         isolation(machine.cpu, machine.isolated, simulated=simulated),
         *can_interface(config, machine),
+        *protections(config),
         load(config),
         lateness(machine.ticks, config),
     ]
@@ -183,6 +185,20 @@ def _queue(name: str, length: int | None, most_sent: int) -> Check:
         return Check(f"{name} queue", "ok", f"{length or 'unknown number of'} frames")
     found = f"{length} frames; two cycles may come together and take {wanted}"
     return Check(f"{name} queue", "warning", found, f"ip link set {name} txqueuelen 100")
+
+
+def protections(config: Config) -> list[Check]:
+    """What the configuration lets the drives lack of what would stop them where the service cannot."""
+    known = PROTOCOLS[config.drives.protocol].protections
+    drives: dict[str, list[str]] = {}
+    for name, drive in zip(NAMES, config.drives.each, strict=True):
+        for protection in drive.accept_without:
+            drives.setdefault(protection, []).append(name)
+    remedy = "named in accept_without; trirail drives CONFIG tells what each drive lacks"
+    return [
+        Check(f"lacking {name}", "warning", f"drives {', '.join(of)} may lack {name}, {known[name]}", remedy)
+        for name, of in drives.items()
+    ] or [Check("protections", "ok", "no drive may lack any")]
 
 
 def load(config: Config) -> Check:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from trirail.cli import terminal
 from trirail.cli.options import Flag
@@ -30,6 +30,7 @@ def drives(
     from trirail_drivers.errors import DriveError
     from trirail_drivers.protocols import PROTOCOLS
 
+    from trirail.commissioning import drives_told
     from trirail.config import SIM, load
 
     settings = load(config or SIM)
@@ -43,28 +44,6 @@ def drives(
         terminal.json({"ok": fit, "applied": apply, "drives": found})
     else:
         for each in found:
-            for line in _lines(each, applied=apply):
+            for line in (*drives_told.identity(each), *drives_told.differences(each, applied=apply)):
                 terminal.say(line)
     return 0 if fit else 1
-
-
-def _lines(drive: dict[str, Any], *, applied: bool) -> list[str]:
-    lines = [f"drive {drive['name']}, node {drive['node']}"]
-    if "device_type" in drive:
-        who = ", ".join(f"{key} {drive[key]}" for key in ("vendor", "product", "revision", "serial"))
-        modes = drive["modes"] or "not told"
-        lines += [
-            f"  device type {drive['device_type']}h, {who}",
-            f"  modes {modes}: {drive['way']}",
-            f"  velocities in {drive['velocity_unit'] or '?'}, accelerations in {drive['acceleration_unit'] or '?'}",
-        ]
-        verb = "written" if applied else "would be written"
-        lines += [
-            f"  {verb}: {each['object']} {each['name']}: {each['found'] or '?'} -> {each['wanted']}, for {each['why']}"
-            for each in drive["differences"]
-        ] or ["  nothing differs"]
-        lines += [f"  lacks {each}" for each in drive["lacking"]]
-        lines += [f"  {note}" for note in drive["notes"]]
-    if drive["refused"]:
-        lines.append(f"  refused: {drive['refused']}")
-    return lines

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Annotated
 
-from trirail_drivers.interface import Triple
-
-from trirail.cli import terminal
+from trirail.cli import terminal, units
 from trirail.cli.options import DEFAULT, Flag, Offline
 from trirail.errors import KinematicsError
 
@@ -17,17 +15,15 @@ if TYPE_CHECKING:
     from trirail.kinematics.geometry import Geometry
     from trirail.motion.limits import Violation
 
-AT_REST: Triple = (0.0, 0.0, 0.0)
-
 
 def ik(
-    x: float,
-    y: float,
-    phi: float,
+    x: units.Length,
+    y: units.Length,
+    phi: units.Angle,
     /,
     *,
-    velocity: Annotated[Triple, Flag] = AT_REST,
-    acceleration: Annotated[Triple, Flag] = AT_REST,
+    velocity: units.PoseVelocity = units.AT_REST,
+    acceleration: units.PoseAcceleration = units.AT_REST,
     deg: Annotated[bool, Flag] = False,
     offline: Offline = DEFAULT,
 ) -> int:
@@ -49,7 +45,7 @@ def ik(
     acceleration
         Acceleration of the platform in x, y [m/s²] and phi [rad/s²].
     deg
-        All angles are in degrees.
+        Angles without a unit are in degrees.
     """
     import numpy as np
 
@@ -58,9 +54,10 @@ def ik(
     from trirail.workspace.singularity import conditioning, distance_to_singularity, sensitivity
 
     config, robot = robot_of(offline)
-    unit = np.array([1.0, 1.0, math.radians(1.0) if deg else 1.0])
-    pose = np.array([x, y, phi]) * unit
-    motion = inverse(robot, pose, velocity * unit, acceleration * unit)
+    pose = np.array([x, y, units.radians(phi, deg)])
+    rates = [*velocity[:2], units.radians(velocity[2], deg, units.ANGULAR_VELOCITY)]
+    changes = [*acceleration[:2], units.radians(acceleration[2], deg, units.ANGULAR_ACCELERATION)]
+    motion = inverse(robot, pose, rates, changes)
     _check_reach(config, robot, pose)
     solved = {name: values.tolist() for name, values in motion._asdict().items()}
     sensitivities = sensitivity(robot, pose)
@@ -74,13 +71,13 @@ def ik(
         return 0
     _print_pose(pose)
     _print_joints(solved, sensitivities)
-    terminal.say(f"conditioning {isotropy:.3f} (1 is isotropic), singular {math.degrees(distance):.2f}° away in φ")
+    terminal.say(f"conditioning {isotropy:.3f} (1 is isotropic), singular {units.written(distance, '°', 2)} away in φ")
     for warning in warnings:
         terminal.complain(f"warning: the service would refuse this: {warning}")
     return 0
 
 
-def fk(a: float, b: float, c: float, /, *, offline: Offline = DEFAULT) -> int:
+def fk(a: units.Length, b: units.Length, c: units.Length, /, *, offline: Offline = DEFAULT) -> int:
     """Solve the forward kinematics: the pose at which the sliders stand as given.
 
     Sliders beyond their travel, and a pose that the robot cannot reach, are an error.
@@ -135,9 +132,8 @@ def _out_of_reach(found: list[Violation]) -> KinematicsError:
 
 
 def _print_pose(pose: Array) -> None:
-    x, y, phi = pose.tolist()
-    angle = f"{terminal.number(math.degrees(phi), 4)}° = {terminal.number(phi, 6)} rad"
-    terminal.say(f"x {terminal.number(x * 1e3, 3)} mm   y {terminal.number(y * 1e3, 3)} mm   φ {angle}")
+    values = pose.tolist()
+    terminal.say(f"{units.pose(values)} = {units.written(values[2], 'rad', 6)}")
 
 
 def _print_joints(solved: dict[str, list[float]], sensitivities: Array) -> None:
@@ -150,8 +146,8 @@ def _print_joints(solved: dict[str, list[float]], sensitivities: Array) -> None:
         ("  velocity", "passive_velocity", 1e3, "mm/s"),
         ("  acceleration", "passive_acceleration", 1.0, "m/s²"),
     ):
-        table.add_row(title, *(terminal.number(value * scale, 3) for value in solved[name]), unit)
+        table.add_row(title, *(units.number(value * scale, 3) for value in solved[name]), unit)
     columns = sensitivities.T * [[1.0], [1.0], [1e3 * math.radians(1.0)]]
     for axis, unit, values in zip("xyφ", ("mm/mm", "mm/mm", "mm/°"), columns.tolist(), strict=True):
-        table.add_row(f"slider per {axis}", *(terminal.number(value, 3) for value in values), unit)
+        table.add_row(f"slider per {axis}", *(units.number(value, 3) for value in values), unit)
     terminal.out.print(table)

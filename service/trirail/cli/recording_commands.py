@@ -20,11 +20,12 @@ if TYPE_CHECKING:
     from trirail.telemetry.provenance import Software
     from trirail.telemetry.reading import Recording
 
-Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")]
+Recordings = Annotated[Path, Parameter(required=True)]
+"""One recording at least."""
 
 
 def replay(
-    *file: Path,
+    *file: Recordings,
     config: Path | None = None,
     to: str | None = None,
     robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT")] = "demo",
@@ -70,7 +71,7 @@ def replay(
     return 1 if differs and by == here and config is None else 0
 
 
-def report(*file: Path, plot: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
+def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
     """Sum a recorded session up: goals and outcomes, tracking error, timing, faults, and what is missing.
 
     Parameters
@@ -119,8 +120,6 @@ def _resend(recording: Recording, name: str, locator: str, json: bool) -> int:
 def _read(files: tuple[Path, ...]) -> Recording:
     from trirail.telemetry.reading import join, read
 
-    if not files:
-        raise ServiceError("name a recording, or all files of one that was rotated")
     return join([read(path) for path in files])
 
 
@@ -202,6 +201,8 @@ def _print_goals(goals: list[GoalSummary]) -> None:
         colour = palette.code(palette.OUTCOMES[goal.outcome])
         name = terminal.plain(f"{goal.id:{longest}}")
         words = "" if goal.outcome == "done" else f": {terminal.plain(goal.message)}"
+        if goal.settle is not None:
+            words = f", settled in {goal.settle * 1e3:g} ms"
         line = f"  {goal.given:9.3f} s  {took:>9}  [{colour}]{goal.outcome:9}[/]  {name}  {goal.kind} of "
         terminal.out.print(f"{line}{terminal.plain(goal.user)}{words}", soft_wrap=True)
 

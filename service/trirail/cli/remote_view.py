@@ -11,6 +11,7 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.samples import SampleReader
 from trirail.errors import ServiceError
+from trirail.telemetry.readout import Standing
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import free_port, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, Shortfall, Streams
@@ -121,7 +122,8 @@ class RemoteView:
         self._streams.save()  # those of the past come in one go: each alone would be a batch to skip
 
     def _state(self, state: State) -> None:
-        self._streams.target(state.goal.target if state.goal else None)
+        goal, target = (state.goal.id, state.goal.target) if state.goal else (None, None)
+        self._streams.stands(Standing(goal, target, state.override, "; ".join(state.faults) or None))
         if state.loop.bus_load != self._bus_load:
             self._bus_load = state.loop.bus_load
             self._streams.bus_load(state.loop.bus_load)

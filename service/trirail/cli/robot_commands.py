@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from trirail.cli import terminal
+from trirail.cli import terminal, units
 from trirail.cli.options import HERE, Flag, Service
 from trirail.wire.vocabulary import Command
 
@@ -18,14 +17,14 @@ if TYPE_CHECKING:
 
 
 def goto(
-    x: float,
-    y: float,
-    phi: float,
+    x: units.Length,
+    y: units.Length,
+    phi: units.Angle,
     /,
     *,
     wait: Annotated[bool, Flag] = False,
     speed: float = 1.0,
-    blend: float | None = None,
+    blend: units.Length | None = None,
     deg: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
@@ -34,11 +33,11 @@ def goto(
     Parameters
     ----------
     x
-        Position of the platform's centre [m].
+        Position of the platform's centre [m], or with a unit: 20mm, -0.8in.
     y
-        Position of the platform's centre [m].
+        Likewise.
     phi
-        Angle of the platform [rad].
+        Angle of the platform, counterclockwise [rad], or with a unit: 10deg, 50mrad.
     wait
         Show the progress; exit 0 only when the robot has arrived.
     speed
@@ -46,30 +45,36 @@ def goto(
     blend
         The next goto waits for this one, and begins that near to its end [m], instead of preempting it.
     deg
-        The angle is in degrees.
+        An angle without a unit is in degrees.
     """
     from trirail.client.client import Robot
 
-    angle = math.radians(phi) if deg else phi
+    angle = units.radians(phi, deg)
     with Robot(service.robot, service.connect) as robot:
         goal = robot.move_to(x=x, y=y, phi=angle, speed=speed, blend=blend)
-        return _follow(service, robot, goal, wait, f"x {x:g} m, y {y:g} m, φ {math.degrees(angle):g}°")
+        return _follow(service, robot, goal, wait, units.pose((x, y, angle)))
 
 
 def sliders(
-    a: float,
-    b: float,
-    c: float,
+    a: units.Length,
+    b: units.Length,
+    c: units.Length,
     /,
     *,
     wait: Annotated[bool, Flag] = False,
     speed: float = 1.0,
     service: Service = HERE,
 ) -> int:
-    """Move the sliders to positions [m]; also the way out of a pose that goto refuses.
+    """Move the sliders to positions; also the way out of a pose that goto refuses.
 
     Parameters
     ----------
+    a
+        Position of slider A [m], or with a unit: 20mm.
+    b
+        Of slider B.
+    c
+        Of slider C.
     wait
         Show the progress; exit 0 only when the robot has arrived.
     speed
@@ -79,16 +84,30 @@ def sliders(
 
     with Robot(service.robot, service.connect) as robot:
         goal = robot.move_sliders(a, b, c, speed=speed)
-        return _follow(service, robot, goal, wait, f"A {a:g} m, B {b:g} m, C {c:g} m")
+        return _follow(service, robot, goal, wait, _sliders(a, b, c))
 
 
-def jog(vx: float, vy: float, w: float, /, *, seconds: float | None = None, service: Service = HERE) -> int:
-    """Move at a velocity [m/s, rad/s] while the command lasts: until Ctrl-C, or for some seconds.
+def jog(
+    vx: units.Velocity,
+    vy: units.Velocity,
+    w: units.AngularVelocity,
+    /,
+    *,
+    seconds: units.Time | None = None,
+    service: Service = HERE,
+) -> int:
+    """Move at a velocity while the command lasts: until Ctrl-C, or for some seconds.
 
     Parameters
     ----------
+    vx
+        Velocity of the platform's centre along x [m/s], or with a unit: 5mm/s.
+    vy
+        Along y.
+    w
+        Rate of the platform's angle [rad/s], or with a unit: 2deg/s.
     seconds
-        How long.
+        How long [s].
     """
     from trirail.client.client import Robot
 
@@ -133,8 +152,14 @@ def follow(
         return _follow(service, robot, goal, wait, f"{file.name}: {len(points)} points")
 
 
-def override(percent: float, /, *, service: Service = HERE) -> int:
-    """Send the one command that takes a number; its help is the command's, as of the others below."""
+def override(percent: units.Percentage, /, *, service: Service = HERE) -> int:
+    """Send the one command that takes a number.
+
+    Parameters
+    ----------
+    percent
+        Share of full speed, 50 or 50%.
+    """
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
@@ -148,11 +173,12 @@ def status(*, service: Service = HERE) -> int:
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
-        state = robot.state()
+        state, missing = robot.state(), robot.info().missing_protections
     if service.json:
-        terminal.json(msgspec.to_builtins(state))
+        terminal.json(msgspec.to_builtins(state) | {"missing_protections": msgspec.to_builtins(missing)})
     else:
         terminal.show(state, service.robot)
+        terminal.missing(missing)
     return 0
 
 
@@ -161,11 +187,8 @@ def watch(*, service: Service = HERE) -> int:
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect) as robot:
-        if service.json:
-            for state in robot.states():
-                terminal.json(msgspec.to_builtins(state))
-        else:
-            terminal.watch(robot)
+        robot.state()  # so that a missing service is said, not waited for
+        terminal.watch(robot, json_lines=service.json)
     return 0
 
 
@@ -199,6 +222,10 @@ def telling(name: Command) -> Callable[..., int]:
         return 0
 
     return tell
+
+
+def _sliders(*positions: float) -> str:
+    return "   ".join(f"{name} {units.written(at, 'mm', 3)}" for name, at in zip("ABC", positions, strict=True))
 
 
 def _follow(service: Service, robot: Robot, goal: GoalHandle, wait: bool, title: str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -17,12 +18,15 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 from trirail_drivers.bus import load
 from trirail_drivers.errors import shortened
+from trirail_drivers.interface import MissingProtection
 
+from trirail.cli import units
+from trirail.cli.options import HERE
 from trirail.client.client import GoalHandle, Jog, Result, Robot
-from trirail.errors import ServiceError
+from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.telemetry import palette
 from trirail.wire.messages import Event, GoalReply
-from trirail.wire.state import Percentiles, State
+from trirail.wire.state import GoalState, Percentiles, State
 from trirail.wire.text import json_printable, printable
 
 if TYPE_CHECKING:
@@ -60,6 +64,15 @@ def json(content: object) -> None:
     sys.stdout.flush()
 
 
+def failed(error: TrirailError) -> None:
+    """Print an error as one JSON object, with the code of a refusal and the value that a limit forbids."""
+    found = {"ok": False, "error": type(error).__name__, "message": str(error)}
+    if isinstance(error, RefusedError):
+        found["code"] = error.code
+    beyond = {name: getattr(error, name, None) for name in ("slider", "leg", "value", "limit")}
+    json(found | {name: value for name, value in beyond.items() if value not in (None, "")})
+
+
 def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
     """Say that the service is up, where it is, and what it lacks."""
     loop, recorder = ready["loop"], ready["recorder"]
@@ -69,10 +82,22 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
         out.print(f"    live view  trirail view  ({recorder['live']})", soft_wrap=True)
     out.print(f"    recording  {plain(recorder['recording'])}", soft_wrap=True)
     out.print(f"    bus load   {loop['bus_load']:.0%}")
+    out.print(f"    next       {plain(' '.join(['trirail enable', *_reach(config)]))}", soft_wrap=True)
     if warning := load.warning(config.loop.rate_hz, loop["bus_load"]):
         out.print(f"    [yellow]warning[/] {warning}", soft_wrap=True)
     for lack in loop["lacking"]:
         out.print(f"    [yellow]without[/] {plain(lack)}", soft_wrap=True)
+
+
+def _reach(config: Config) -> list[str]:
+    """Return the options that a command on this machine needs to reach a service; none where it is the usual one."""
+    options = []
+    if (robot := config.robot.name) != HERE.robot:
+        options += ["--robot", robot]
+    if HERE.connect not in config.zenoh.listen:
+        anywhere = config.zenoh.listen[0].replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+        options += ["--connect", anywhere]
+    return options
 
 
 def notes(reply: GoalReply) -> str:
@@ -88,7 +113,7 @@ def notes(reply: GoalReply) -> str:
 
 
 def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> Result:
-    """Wait for a goal's end and show its progress."""
+    """Wait for a goal's end and show its progress. Ctrl-C stops it, a second one leaves: then raises ServiceError."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -97,14 +122,39 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
     )
     with Progress(*columns, console=out, transient=True, disable=not show) as progress:
         task = progress.add_task(plain(title) + notes(goal.reply), total=1.0, left="")
-        for state in robot.states(SILENT):
+
+        def until_its_end() -> Result:
+            for state in robot.states(SILENT):
+                if goal.result is not None:
+                    return goal.result
+                if state.goal is not None and state.goal.id == goal.id:
+                    progress.update(task, completed=state.goal.progress, left=left(state.goal))
             if goal.result is not None:
                 return goal.result
-            if state.goal is not None and state.goal.id == goal.id:
-                progress.update(task, completed=state.goal.progress, left=f"{state.goal.remaining:.1f} s left")
-    if goal.result is not None:
-        return goal.result
-    raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
+            raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
+
+        try:
+            return until_its_end()
+        except KeyboardInterrupt:
+            # Beside the waiting, so that a second Ctrl-C is heard at once.
+            threading.Thread(target=_cancel, args=(goal,), name="cancel", daemon=True).start()
+            progress.update(task, description="stopping; Ctrl-C again leaves")
+        try:
+            return until_its_end()
+        except KeyboardInterrupt as second:
+            raise ServiceError(
+                f"goal {goal.id} goes on: that it has stopped was not confirmed; trirail stop stops the robot"
+            ) from second
+
+
+def _cancel(goal: GoalHandle) -> None:
+    with contextlib.suppress(TrirailError):  # it has ended; or nobody answers, and then its end is not heard either
+        goal.cancel()
+
+
+def left(goal: GoalState) -> str:
+    """Say how long the path of a goal still takes, or that it has ended and the robot settles."""
+    return f"{goal.remaining:.1f} s left" if goal.progress < 1.0 else "settling"
 
 
 def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
@@ -124,14 +174,26 @@ def show(state: State, robot: str) -> None:
     out.print(_table(state, robot))
 
 
-def watch(robot: Robot) -> None:
-    """Show the state live until Ctrl-C or the service goes silent."""
-    with (
-        Live(console=out, refresh_per_second=10, transient=False) as live,
-        contextlib.suppress(KeyboardInterrupt),
-    ):
-        for state in robot.states(SILENT):
-            live.update(_table(state, robot.name))
+def missing(protections: Sequence[MissingProtection]) -> None:
+    """Print what drives do without, a line for what is so of several."""
+    drives: dict[str, list[str]] = {}
+    for each in protections:
+        drives.setdefault(f"{each.object}, {each.means}", []).append(each.drive)
+    for what, names in drives.items():
+        whose = f"drive{'s' * (len(names) > 1)} {', '.join(names)}"
+        out.print(f"[yellow]lacking[/]   {whose}: {plain(what)}", soft_wrap=True)
+
+
+def watch(robot: Robot, *, json_lines: bool) -> None:
+    """Show the state live, or as lines of JSON, until Ctrl-C; raises ServiceError when the service goes silent."""
+    with contextlib.suppress(KeyboardInterrupt):
+        if json_lines:
+            for state in robot.states(SILENT):
+                json(msgspec.to_builtins(state))
+        else:
+            with Live(console=out, refresh_per_second=10, transient=False) as live:
+                for state in robot.states(SILENT):
+                    live.update(_table(state, robot.name))
         raise ServiceError("the service has gone silent")
 
 
@@ -151,20 +213,20 @@ def checks(found: Sequence[Check]) -> None:
 
 
 def _table(state: State, robot: str) -> Table:
-    x, y, phi = state.pose
     grid = Table.grid(padding=(0, 2))
     grid.add_row("robot", f"[bold]{robot}[/]  {_coloured(state.mode)}  t {state.t:.2f} s")
     for fault in state.faults:
         grid.add_row("fault", f"[bold red]{plain(fault)}[/]")
-    grid.add_row("pose", f"x {x * 1e3:9.3f} mm   y {y * 1e3:9.3f} mm   φ {math.degrees(phi):9.4f}°")
+    grid.add_row("pose", units.pose(state.pose, 9))
     if state.goal:
-        grid.add_row("goal", f"{plain(state.goal.id)}  {state.goal.progress:4.0%}  {state.goal.remaining:.1f} s left")
+        grid.add_row("goal", f"{plain(state.goal.id)}  {state.goal.progress:4.0%}  {left(state.goal)}")
     sliders = state.sliders
     for index, name in enumerate("ABC"):
         grid.add_row(
             f"slider {name}",
-            f"{sliders.position[index] * 1e3:9.3f} mm {sliders.velocity[index] * 1e3:8.2f} mm/s "
-            f"{sliders.following_error[index] * 1e6:7.1f} µm error  {sliders.status[index]}",
+            f"{units.written(sliders.position[index], 'mm', 3, 9)} "
+            f"{units.written(sliders.velocity[index], 'mm/s', 2, 8)} "
+            f"{units.written(sliders.following_error[index], 'µm', 1, 7)} error  {sliders.status[index]}",
         )
         if said := [
             f"{name.replace('_', ' ')} {n}" for name, n in msgspec.to_builtins(sliders.traffic[index]).items() if n
@@ -197,8 +259,3 @@ def table(first: str, *others: str) -> Table:
     for name in others:
         made.add_column(name, justify="right" if name else "left")
     return made
-
-
-def number(value: float, digits: int) -> str:
-    """Write a number without the sign of a rounded zero."""
-    return f"{round(value, digits) + 0.0:.{digits}f}"

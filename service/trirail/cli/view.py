@@ -36,6 +36,8 @@ def run(
 
     Raises ServiceError where there is no display, no service, no live view, or no such file.
     """
+    if file is not None and not file.is_file():
+        raise ServiceError(f"{file} is no file; recordings are .rrd files in the service's telemetry.directory")
     if not web and not has_display():
         raise ServiceError(
             "no display for the viewer: DISPLAY and WAYLAND_DISPLAY are not set; trirail view --web shows it in a "
@@ -73,8 +75,6 @@ def is_local(locator: str) -> bool:
 def _source(file: Path | None, robot: str, connect: str, records: bool) -> Iterator[str]:
     """Yield the file, or the address of the live view: the service's own, or one that is drawn here from records."""
     if file is not None:
-        if not file.is_file():
-            raise ServiceError(f"{file} is no file; recordings are .rrd files in the service's telemetry.directory")
         yield str(file)
         return
     with Robot(robot, connect) as service:
@@ -131,9 +131,10 @@ def _rerun(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
         viewer = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
         try:
             yield viewer
-            if viewer.poll():
-                log.seek(0)
-                last = log.read().decode(errors="replace").strip().rpartition("\n")[2]
+            log.seek(0)
+            last = log.read().decode(errors="replace").strip().rpartition("\n")[2]
+            # Where it cannot open its window it says so, and its exit code is 0 all the same.
+            if viewer.poll() or (viewer.poll() == 0 and last.startswith("Error: ")):
                 raise ServiceError(f"the viewer failed: {last}; trirail view --web needs no graphics driver here")
         finally:
             with contextlib.suppress(ProcessLookupError):

@@ -6,12 +6,10 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter
-
-from trirail.cli import terminal
+from trirail.cli import terminal, units
 from trirail.cli.math_commands import robot_of
 from trirail.cli.options import DEFAULT, Flag, Offline
-from trirail.errors import KinematicsError, TrirailError
+from trirail.errors import TrirailError
 
 if TYPE_CHECKING:
     from trirail.config import Config
@@ -27,7 +25,7 @@ SLICES = 8
 def workspace(
     *,
     plot: Path | None = None,
-    phi: Annotated[tuple[float, ...], Parameter(consume_multiple=True, negative="", show_default=False)] = (),
+    phi: units.Angles = (),
     deg: Annotated[bool, Flag] = False,
     offline: Offline = DEFAULT,
 ) -> int:
@@ -43,16 +41,14 @@ def workspace(
     phi
         Angles of the slices [rad]; round numbers of degrees if absent.
     deg
-        The angles are in degrees.
+        Angles without a unit are in degrees.
     """
     from trirail.workspace.workspace import area, extent, permitted, reachable
 
     config, robot = robot_of(offline)
-    if not all(map(math.isfinite, phi)):
-        raise KinematicsError("phi: every angle must be finite")
     limits = config.limits
     service, reach = extent(robot, limits, permitted), extent(robot, limits, reachable)
-    angles = [math.radians(angle) if deg else angle for angle in phi] or _round_angles(*service.phi)
+    angles = [units.radians(angle, deg) for angle in phi] or _round_angles(*service.phi)
     slices = [(angle, permitted(robot, limits, angle), reachable(robot, limits, angle)) for angle in angles]
     at_zero = area(permitted(robot, limits, 0.0)), area(reachable(robot, limits, 0.0))
     if plot:
@@ -120,19 +116,19 @@ def _print_extents(service: Extent, reach: Extent, at_zero: tuple[float, float])
     table.add_row("x", *(_range(each.x, 1e3) for each in both), "mm")
     table.add_row("y", *(_range(each.y, 1e3) for each in both), "mm")
     table.add_row("φ", *(_range(each.phi, math.degrees(1.0)) for each in both), "°")
-    table.add_row("area at φ = 0", *(terminal.number(each, 6) for each in at_zero), "m²")
-    table.add_row("greatest area", *(terminal.number(each.best_area, 6) for each in both), "m²")
-    table.add_row("  at φ =", *(terminal.number(math.degrees(each.best_phi), 2) for each in both), "°")
-    table.add_row("volume", *(terminal.number(each.volume, 6) for each in both), "m² rad")
+    table.add_row("area at φ = 0", *(units.number(each, 6) for each in at_zero), "m²")
+    table.add_row("greatest area", *(units.number(each.best_area, 6) for each in both), "m²")
+    table.add_row("  at φ =", *(units.number(math.degrees(each.best_phi), 2) for each in both), "°")
+    table.add_row("volume", *(units.number(each.volume, 6) for each in both), "m² rad")
     terminal.out.print(table)
 
 
 def _print_slices(slices: list[tuple[float, float, float]]) -> None:
     table = terminal.table("slice at φ [°]", "permitted [m²]", "reached [m²]")
     for angle, inside, whole in slices:
-        table.add_row(terminal.number(math.degrees(angle), 2), terminal.number(inside, 6), terminal.number(whole, 6))
+        table.add_row(units.number(math.degrees(angle), 2), units.number(inside, 6), units.number(whole, 6))
     terminal.out.print(table)
 
 
 def _range(ends: tuple[float, float], scale: float) -> str:
-    return " to ".join(terminal.number(end * scale, 2) for end in ends)
+    return " to ".join(units.number(end * scale, 2) for end in ends)

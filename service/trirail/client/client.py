@@ -131,15 +131,17 @@ class Robot:
         points: Sequence[TrajectoryPoint],
         *,
         stretch: bool = False,
+        settle: bool = True,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> GoalHandle:
         """Send a timed trajectory that begins where the robot stands; return once it is accepted.
 
         A point is t [s], x, y [m] and phi [rad], and where it is known, velocity and acceleration of the three.
         Quintic between the points; where they have no velocity it is that between their neighbours, zero at the ends.
-        One that is too fast for a slider is refused, or slowed as a whole with `stretch`.
+        One that is too fast for a slider is refused, or slowed as a whole with `stretch`. With `settle` False it is
+        done when its path has ended, whether or not the robot is measured to be there.
         """
-        return self.send(lambda name: TrajectoryGoal(tuple(points), stretch=stretch, id=name), id)
+        return self.send(lambda name: TrajectoryGoal(tuple(points), stretch=stretch, settle=settle, id=name), id)
 
     def jog(self, *, x: float = 0.0, y: float = 0.0, phi: float = 0.0, timeout: float = 0.2) -> Jog:
         """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
@@ -147,7 +149,7 @@ class Robot:
         with robot.jog(x=0.01):
             wait_for_the_key_to_be_released()
         """
-        return Jog(self, (x, y, phi), timeout)
+        return Jog(self.send, (x, y, phi), timeout)
 
     def send(self, make: Callable[[str], Goal], id: str | None = None) -> GoalHandle:  # noqa: A002
         """Send the goal that `make` makes for an id, any of trirail.wire.messages.Goal; return once it is accepted."""
@@ -156,7 +158,7 @@ class Robot:
             message = make(goal_id)
         except ValueError as error:
             raise RefusedError(RefusalCode.MALFORMED, f"not a goal: {error}") from error
-        goal = GoalHandle(goal_id, self)
+        goal = GoalHandle(goal_id, self.command)
         with self._goals_lock:
             goal = self._goals.setdefault(goal_id, goal)
         try:
@@ -254,7 +256,8 @@ class Robot:
         with self._goals_lock:
             goal = self._goals.pop(event.id, None)
         if goal is not None:
-            goal.end(Result(event.id, event.outcome, event.message))
+            measured = event.settle, event.residual, event.overshoot
+            goal.end(Result(event.id, event.outcome, event.message, *measured))
 
 
 def _user() -> str:

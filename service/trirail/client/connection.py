@@ -133,6 +133,16 @@ class Connection:
         return zenoh_session.key(self._robot, *parts)
 
 
+def robots_at(connect: str) -> list[str]:
+    """Return the names of the robots whose services answer at a Zenoh locator. Raises ServiceError if none can."""
+    session = zenoh_session.open_client(connect)
+    try:
+        alive = session.liveliness().get(zenoh_session.key("*", "alive"), timeout=1.0)
+        return sorted({str(reply.ok.key_expr).split("/")[1] for reply in alive if reply.ok is not None})
+    finally:
+        zenoh_session.close(session)
+
+
 def _until_silent(received: queue.Queue[T], timeout: float | None) -> Iterator[T]:
     """Yield what is received, until nothing is for `timeout` seconds: only what is to be yielded may be put there."""
     while True:

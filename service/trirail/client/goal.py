@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import threading
 import uuid
-from typing import TYPE_CHECKING, NamedTuple, Self
+from collections.abc import Callable
+from typing import NamedTuple, Self
 
 import msgspec
 
 from trirail.errors import RefusalCode, RefusedError, TrirailError
-from trirail.wire.messages import GoalReply, Stop, VelocityGoal
+from trirail.wire.messages import Goal, GoalReply, Residual, Stop, VelocityGoal
 from trirail.wire.vocabulary import Command
-
-if TYPE_CHECKING:
-    from trirail.client.client import Robot
 
 STANDS_WITHIN = 10.0
 """How long the end of a jog may take beyond its own time-out [s]."""
@@ -24,19 +22,30 @@ class Result(NamedTuple):
 
     id: str
     outcome: str
-    """done, rejected, preempted, stopped, expired or faulted."""
+    """done, rejected, preempted, stopped, expired, faulted or unsettled."""
     message: str
     """One line for people: why."""
+    settle: float | None = None
+    """Where it is done: time from the end of its path until the robot was in position, to the first cycle of the dwell
+    [s]. None, as the two below, where it was not to settle: a jog, a goal that was passed on the way to the next, a
+    trajectory with `settle` False."""
+    residual: Residual | None = None
+    """How far the robot was from the target when it ended, done or unsettled: `sliders` [m], and `pose` [m, m, rad]."""
+    overshoot: tuple[float, float, float] | None = None
+    """How far the sliders A, B, C were beyond their targets at most since the end of the path [m]."""
 
 
 class GoalHandle:
-    """A goal that the service has accepted. It is the service's from then on: this object only follows it."""
+    """A goal that the service has accepted. It is the service's from then on: this object only follows it.
 
-    def __init__(self, goal_id: str, robot: Robot) -> None:
+    `command` sends a command with its content, as Robot.command does.
+    """
+
+    def __init__(self, goal_id: str, command: Callable[[Command, bytes], object]) -> None:
         self.id = goal_id
         self.reply = GoalReply(goal_id, 0.0)
         """What the service said of it."""
-        self._robot = robot
+        self._command = command
         self._ended = threading.Event()
         self._result: Result | None = None
 
@@ -47,7 +56,8 @@ class GoalHandle:
 
     @property
     def duration(self) -> float | None:
-        """Expected time from acceptance to arrival [s]; None while the override is zero."""
+        """Expected time from acceptance to the end of its path [s], to which settling adds; None while the override is
+        zero."""
         return self.reply.duration
 
     @property
@@ -61,7 +71,7 @@ class GoalHandle:
         Other goals go on, but those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
         ServiceError if nobody answers.
         """
-        self._robot.command(Command.STOP, msgspec.json.encode(Stop(self.id)))
+        self._command(Command.STOP, msgspec.json.encode(Stop(self.id)))
 
     def wait(self, timeout: float | None = None) -> Result:
         """Wait for its end, however it ends; look at `outcome` of the result.
@@ -86,11 +96,17 @@ class Jog:
     a new one. `error` tells whether it could not be renewed. Leaving the context waits for the standstill.
 
     `velocity` is that of x, y [m/s] and phi [rad/s] in the base frame, `timeout` in seconds. Entering the context
-    raises RefusedError where the service does not take it, leaving it TimeoutError where no end is heard.
+    raises RefusedError where the service does not take it, leaving it TimeoutError where no end is heard. `send` sends
+    a goal that it is given the id for, as Robot.send does.
     """
 
-    def __init__(self, robot: Robot, velocity: tuple[float, float, float], timeout: float) -> None:
-        self._robot = robot
+    def __init__(
+        self,
+        send: Callable[[Callable[[str], Goal], str], GoalHandle],
+        velocity: tuple[float, float, float],
+        timeout: float,
+    ) -> None:
+        self._send_goal = send
         self._velocity = velocity
         self._timeout = timeout
         self._id = uuid.uuid4().hex[:12]
@@ -118,7 +134,7 @@ class Jog:
 
     def _send(self) -> GoalHandle:
         x, y, phi = self._velocity
-        return self._robot.send(lambda name: VelocityGoal(x, y, phi, timeout=self._timeout, id=name), self._id)
+        return self._send_goal(lambda name: VelocityGoal(x, y, phi, timeout=self._timeout, id=name), self._id)
 
     def _renew(self) -> None:
         while not self._over.wait(self._timeout / 3.0):

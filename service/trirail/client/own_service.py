@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
@@ -22,7 +22,7 @@ from trirail.processes.interpreter import python
 PATIENT = {"max_overruns": "1000", "missed_syncs": "2000", "heartbeat": "1.0"}
 """Keys of a configuration with which neither the loop nor the drives give up on a machine that stalls for a second."""
 START_WITHIN = 300.0
-"""How long it may take to come up; the very first start compiles the kinematics [s]."""
+"""How long it may take to come up, or at the very first start to compile a function [s]."""
 END_WITHIN = 20.0
 """How long it may take to stop the robot and end [s]."""
 
@@ -30,8 +30,10 @@ Process = subprocess.Popen[bytes]
 
 
 @contextlib.contextmanager
-def service(config: Path, recording: Path) -> Iterator[Process]:
+def service(config: Path, recording: Path, told: Callable[[str], None] = lambda _: None) -> Iterator[Process]:
     """Run a service of a configuration file that is up, and records to a file; end it when the context ends.
+
+    `told` is called with what it says of its start: how far the very first one's compiling is.
 
     Raises ServiceError if it cannot start. Where the context ends with an error that is no refusal, what the service
     said goes to standard error first.
@@ -39,7 +41,7 @@ def service(config: Path, recording: Path) -> Iterator[Process]:
     with tempfile.TemporaryFile() as log:
         process = None
         try:
-            process = start(config, log, "--record", str(recording))
+            process = start(config, log, "--record", str(recording), told=told)
             yield process
         except RefusedError:
             raise  # it works, and has said why not
@@ -52,12 +54,14 @@ def service(config: Path, recording: Path) -> Iterator[Process]:
                 end(process)
 
 
-def start(config: Path, log: IO[bytes], *arguments: str, **environment: str) -> Process:
+def start(
+    config: Path, log: IO[bytes], *arguments: str, told: Callable[[str], None] = lambda _: None, **environment: str
+) -> Process:
     """Start a service, and wait until it is up; the caller has to `end` it.
 
     `arguments` are more of `trirail run`, `environment` more variables; what it says goes to `log`. It is up when it
     says so, as to systemd: asking on its port instead could find another service, and move that. Raises ServiceError
-    if it ends before it is up, or is not within START_WITHIN seconds; then it has been ended.
+    if it ends before it is up, or nothing goes on for START_WITHIN seconds; then it has been ended.
     """
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
         ready.bind(f"{folder}/ready")
@@ -70,7 +74,7 @@ def start(config: Path, log: IO[bytes], *arguments: str, **environment: str) -> 
             env=os.environ | {"NOTIFY_SOCKET": ready.getsockname()} | environment,
         )
         try:
-            _wait(process, ready)
+            _wait(process, ready, told)
         except BaseException:
             end(process)
             raise
@@ -103,12 +107,15 @@ def private(folder: Path, live_port: int = 0) -> tuple[Path, str]:
     return path, locator
 
 
-def _wait(process: Process, ready: socket.socket) -> None:
+def _wait(process: Process, ready: socket.socket, told: Callable[[str], None]) -> None:
     deadline = time.monotonic() + START_WITHIN
     while time.monotonic() < deadline:
         with contextlib.suppress(TimeoutError):
-            if ready.recv(1024) == b"READY=1":
+            said = ready.recv(1024).decode()
+            if said == "READY=1":
                 return
+            deadline = time.monotonic() + START_WITHIN
+            told(said.partition("STATUS=")[2].partition("\n")[0])
         if process.poll() is not None:
             raise ServiceError("the service could not start, see above")
     raise ServiceError(f"the service was not up within {START_WITHIN:g} s")

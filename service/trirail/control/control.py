@@ -65,7 +65,9 @@ class Control:
         self.goal_queue = GoalQueue(self.ledger, self._planner, self._schedule, config.motion.queue, config.period)
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
         self._following_error_limit = config.limits.slider.following_error
-        self.measured = Measured(legs, config.period, step_length, self._following_error_limit)
+        self.measured = Measured(
+            legs, config.period, step_length, self._following_error_limit, config.limits.in_position
+        )
         self.setpoints = Setpoints(legs, Bounds(config.limits, config.period, EDGE), self.measured, step_length)
         self._can_home = any(drive.homing is not None for drive in config.drives.each)
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
@@ -118,7 +120,7 @@ class Control:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
         self.cycles += 1
         before = self.measured.feedback
-        behind = self.measured.take(feedback)
+        behind = self.measured.take(feedback, self._stands)
         for warning in feedback.warnings:
             self.ledger.tell("service", "warning", warning)
         mode = self.state.mode
@@ -137,6 +139,7 @@ class Control:
                 )
             elif not feedback.homing:
                 self._homing_over()
+        self._judge_arrival()
         self.ledger.settle(self._verdict, self.state.mode)
 
     def handle(self, request: Request, now_ns: int) -> None:
@@ -323,6 +326,8 @@ class Control:
         before, self.state = self.state, decided.state
         if self.state.mode is not before.mode:
             self._entered = self.cycles
+        if goal is not None or not self.state.has_goal:
+            self.measured.settling.leave()
         if not self.state.has_goal:
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = "released" if before.released else "arrived"
@@ -340,9 +345,33 @@ class Control:
         self._schedule.stop_on_path()
         self._planner.run_at(0.0)
 
+    @property
+    def _stands(self) -> bool:
+        """Whether the robot has been commanded to stand where it does."""
+        return (self.state.mode is Mode.HOLDING and self.measured.homed) or self.measured.settling.under_way
+
     def _stand(self, run: Run) -> None:
-        """The motion has ended where it should, or its law has brought it to a standstill on the way."""
-        self._go(ModeEvent.ARRIVED if run.arrived else ModeEvent.STANDSTILL, "standstill")
+        """The motion has ended where it should, or its law has brought it to a standstill on the way.
+
+        A goal whose path has ended is under way until the robot is in position.
+        """
+        goal, settling = self.ledger.goal, self.measured.settling
+        if not run.arrived:
+            self._go(ModeEvent.STANDSTILL, "standstill")
+        elif goal is None or not goal.settles:
+            self._go(ModeEvent.ARRIVED, "standstill")
+        elif not settling.under_way:
+            settling.begin(self.cycles)
+
+    def _judge_arrival(self) -> None:
+        """End the goal whose path has ended once the robot is in position, or where that has taken too long."""
+        settling = self.measured.settling
+        settled = settling.over(self.cycles)
+        if settled is None:
+            return
+        outcome: Outcome = "done" if settled.settle is not None else "unsettled"
+        self.ledger.end(outcome, settling.said(settled), settled=settled)
+        self._go(ModeEvent.ARRIVED, "standstill")
 
     def _power_up(self) -> None:
         """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""

@@ -22,6 +22,7 @@ from numba import b1, f8, from_dtype, i8, typeof, void
 from numpy.typing import NDArray
 from trirail_drivers.interface import PowerState
 
+from trirail.control.in_position import MONITOR, monitor
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.closure import forward_into, inverse_motion
 from trirail.kinematics.compiled import compiled
@@ -56,12 +57,13 @@ SAID = struct.Struct("<3d3q10B")
 
 _LEGS = typeof(Geometry.symmetric().packed())  # type: ignore[no-untyped-call]
 _BOUNDS, _FEEDBACK, _RECORD = from_dtype(BOUNDS)[::1], from_dtype(FEEDBACK)[::1], from_dtype(DTYPE)[::1]
+_MONITOR = from_dtype(MONITOR)[::1]
 _MOTION, _SLIDERS = f8[:, :, ::1], f8[:, :, ::1]
 _KNOTS, _PIECES = f8[::1], f8[:, :, ::1]
 _ENABLED = int(PowerState.OPERATION_ENABLED)
 
 
-@compiled(i8(_LEGS, _FEEDBACK, f8[:, ::1], f8, f8, f8, b1[::1], f8[:, ::1], _RECORD))
+@compiled(i8(_LEGS, _FEEDBACK, f8[:, ::1], f8, f8, f8, b1, b1[::1], f8[:, ::1], _MONITOR, _RECORD))
 def observe(
     legs: Array,
     feedback: NDArray[np.void],
@@ -69,15 +71,18 @@ def observe(
     period: float,
     fastest: float,
     limit: float,
+    stands: bool,
     jumps: NDArray[np.bool],
     room: Array,
+    monitored: NDArray[np.void],
     record: NDArray[np.void],
 ) -> int:
     """Work out pose, velocities and following errors from feedback[0], and keep it as feedback[1].
 
     `fastest` [m/s] is the velocity above which a slider `jumps`: then the pose stays what it was, as it does where
-    the sliders belong to none; `room` (2, 3) is to seek it in. Returns 0, or 1 + i if the following error of
-    slider i is the first that is beyond `limit` [m].
+    the sliders belong to none; `room` (2, 3) is to seek it in. While the commanded motion `stands`, it is
+    `monitored` whether the robot is in position. Returns 0, or 1 + i if the following error of slider i is the first
+    that is beyond `limit` [m].
     """
     now, before, told = feedback[0], feedback[1], record[0]
     written[:-1] = written[1:]
@@ -98,8 +103,10 @@ def observe(
         told.drive_state[i], told.follows[i], told.homed[i] = now.drive_state[i], now.follows[i], now.homed[i]
         room[0, i], room[1, i] = now.position[i], told.pose[i]
     told.homing = now.homing
-    if not jumping and forward_into(legs, room[0], room[1], room[1]) == 0:
+    known = not jumping and forward_into(legs, room[0], room[1], room[1]) == 0
+    if known:
         told.pose[:] = room[1]
+    monitor(record, known, stands, monitored)
     feedback[1] = feedback[0]
     return beyond
 

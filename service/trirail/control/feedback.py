@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 from trirail_drivers.interface import Feedback, PowerState, Triple
 
+from trirail.config import InPosition
 from trirail.control import cycle
+from trirail.control.in_position import Settling
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.robot import forward_into
 from trirail.motion.runs import STILL
 from trirail.wire.records import DTYPE
 
+WINDOWS = InPosition()
 CAN_MOVE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 """States in which a drive can move its slider."""
 
@@ -18,10 +21,13 @@ CAN_MOVE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerSta
 class Measured:
     """The newest feedback, beside the setpoints that it answers; all of it in the cycle's record.
 
-    `step` [m] is how far a slider can go in a cycle, `limit` [m] what following errors are held against.
+    `step` [m] is how far a slider can go in a cycle, `limit` [m] what following errors are held against, `windows` what
+    residuals are held against where the robot is to stand.
     """
 
-    def __init__(self, legs: Array, period: float, step: float, limit: float = np.inf) -> None:
+    def __init__(
+        self, legs: Array, period: float, step: float, limit: float = np.inf, windows: InPosition = WINDOWS
+    ) -> None:
         self.feedback = Feedback(STILL, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
         self.record = np.zeros(1, DTYPE)
         """The cycle's record, (1,): what is measured here, what is commanded by the setpoints."""
@@ -29,6 +35,8 @@ class Measured:
         """The feedback's numbers, and those of the one before."""
         self.jumping = np.zeros(3, np.bool)
         """Which sliders were measured where none can be so soon: what they say is not followed."""
+        self.settling = Settling(windows, period)
+        """Whether the robot is in position."""
         self._legs = legs
         self._period = period
         self._fastest = 2.0 * step / period  # the age may be one off, and makes a step a double one
@@ -74,8 +82,11 @@ class Measured:
         self.numbers[1] = self.numbers[0]
         self._written[:] = self.record["commanded_position"] = feedback.position
 
-    def take(self, feedback: Feedback) -> int:
-        """Take the feedback of the next cycle; return 0, or 1 + i if slider i's following error is beyond its limit."""
+    def take(self, feedback: Feedback, stands: bool = False) -> int:
+        """Take the feedback of the next cycle; return 0, or 1 + i if slider i's following error is beyond its limit.
+
+        `stands` tells whether the motion that was commanded until now does.
+        """
         self._pack(feedback)
         return cycle.observe(
             self._legs,
@@ -84,8 +95,10 @@ class Measured:
             self._period,
             self._fastest,
             self._limit,
+            stands,
             self.jumping,
             self._room,
+            self.settling.monitored,
             self.record,
         )
 

@@ -61,6 +61,7 @@ class GoalQueue:
             if self._planner.busy and self._planned is not None:
                 self._ledger.check_id(self._planned.request)  # a jog may end while its renewal is being planned
                 self._check_age(self._planned, cycle)
+            at_end = self._planner.busy and self._schedule.ended
             taken = self._planner.think()
         except RefusedError as refusal:
             self._planner.give_up()
@@ -73,7 +74,7 @@ class GoalQueue:
         valid = request.goal.valid_for
         expires = sent + valid / self._period if valid is not None else math.inf
         same = [later for later in (self._planned, *self._waiting) if later.request.id == request.id]
-        self._ledger.begin(request, taken, expires, max(map(self._alive_until, same)))
+        self._ledger.begin(request, taken, expires, max(map(self._alive_until, same)), at_end=at_end)
         return request
 
     def withdraw(self, outcome: Withdrawal, reason: str) -> None:

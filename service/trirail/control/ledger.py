@@ -6,9 +6,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
+from trirail_drivers.interface import Triple
+
+from trirail.control.in_position import Settled
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.messages import Level, Outcome, PoseGoal, VelocityGoal
+from trirail.wire.messages import Level, Outcome, PoseGoal, Residual, TrajectoryGoal, VelocityGoal
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -27,7 +30,12 @@ REMEMBERED_IDS = 10_000
 """Goals whose ids may not be used again; older ones are forgotten."""
 
 
-_LEVELS: dict[Outcome, Level] = {"faulted": "error", "rejected": "warning", "expired": "warning"}
+_LEVELS: dict[Outcome, Level] = {
+    "faulted": "error",
+    "rejected": "warning",
+    "expired": "warning",
+    "unsettled": "warning",
+}
 
 
 class Notice(NamedTuple):
@@ -42,6 +50,9 @@ class Notice(NamedTuple):
     reason: str | None = None
     goal: str | None = None
     user: str | None = None
+    settle: float | None = None
+    residual: Residual | None = None
+    overshoot: Triple | None = None
 
 
 class ActiveGoal(NamedTuple):
@@ -60,6 +71,8 @@ class ActiveGoal(NamedTuple):
     """Whether that has happened: a jog that nobody renewed does not come back."""
     bound: str | None = None
     """The limit before which a jog comes to rest."""
+    settles: bool = True
+    """Whether it is done only when the robot is in position."""
 
 
 class Ledger:
@@ -108,32 +121,47 @@ class Ledger:
         self.goals[0] = goal._replace(released=True)
         return goal
 
-    def begin(self, request: GoalRequest, taken: AcceptedPlan, expires: float, alive_until: float) -> None:
-        """Accept a goal; those before it are preempted, unless it follows them or is the same jog afresh."""
+    def begin(
+        self, request: GoalRequest, taken: AcceptedPlan, expires: float, alive_until: float, *, at_end: bool = False
+    ) -> None:
+        """Accept a goal; those before it are preempted, unless it follows them or is the same jog afresh.
+
+        `at_end` tells whether the motion before it has ended: to a goal with a blend, that goal is done.
+        """
         self.answers.append(
             Accepted(request.ticket, request.id, taken.duration, taken.slowed, taken.stops_first, taken.queued)
         )
         if self.renewed_by(request):
             self.goals[0] = self.goals[0]._replace(bound=taken.bound)
             return
-        if not taken.queued:
+        goal, last = request.goal, self.goals[-1] if self.goals else None
+        passes = at_end and last is not None and last.blend is not None and isinstance(goal, PoseGoal)
+        if not taken.queued and not passes:
             self.end("preempted", f"preempted by goal {request.id}")
-        blend = request.goal.blend if isinstance(request.goal, PoseGoal) else None
-        is_jog = isinstance(request.goal, VelocityGoal)
-        self.goals.append(ActiveGoal(request.id, request.user, is_jog, blend, expires, alive_until, bound=taken.bound))
+        blend = goal.blend if isinstance(goal, PoseGoal) else None
+        is_jog = isinstance(goal, VelocityGoal)
+        settles = goal.settle if isinstance(goal, TrajectoryGoal) else not is_jog
+        self.goals.append(
+            ActiveGoal(
+                request.id, request.user, is_jog, blend, expires, alive_until, bound=taken.bound, settles=settles
+            )
+        )
+        if passes:
+            self.pass_on()
 
     def pass_on(self) -> None:
         """The first goal is reached, and the one that waited for it has begun."""
         goal = self.goals.popleft()
         self._ending(goal.id, goal.user, "done", f"passed on the way to goal {self.goals[0].id}")
 
-    def end(self, outcome: Outcome, reason: str, but: int = 0) -> None:
+    def end(self, outcome: Outcome, reason: str, but: int = 0, settled: Settled | None = None) -> None:
         """End the goals, but so many of the first."""
         kept = [self.goals.popleft() for _ in range(min(but, len(self.goals)))]
         while self.goals:
             goal = self.goals.popleft()
             bound = goal.bound if outcome == "done" and not goal.released else None
-            self._ending(goal.id, goal.user, outcome, f"at the limit of {bound}" if bound else reason, bound)
+            words = f"at the limit of {bound}" if bound else reason
+            self._ending(goal.id, goal.user, outcome, words, bound, settled)
         self.goals.extend(kept)
 
     def withdraw(self, request: GoalRequest, outcome: Withdrawal, reason: str) -> None:
@@ -171,13 +199,22 @@ class Ledger:
             and isinstance(request.goal, VelocityGoal)
         )
 
-    def _ending(self, goal_id: str, user: str, outcome: Outcome, reason: str, bound: str | None = None) -> None:
+    def _ending(
+        self,
+        goal_id: str,
+        user: str,
+        outcome: Outcome,
+        reason: str,
+        bound: str | None = None,
+        settled: Settled | None = None,
+    ) -> None:
         level = _LEVELS.get(outcome, "info")
         self._ended[goal_id] = bound
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]
         words = f"goal {goal_id} {outcome}: {reason}"
-        self.tell("goal", level, words, id=goal_id, outcome=outcome, reason=reason, user=user)
+        said = Notice("goal", level, words, id=goal_id, outcome=outcome, reason=reason, user=user)
+        self.notices.append(said._replace(**settled._asdict()) if settled is not None else said)
 
     # ------------------------------------------------------------------ commands
 

@@ -51,7 +51,7 @@ class AcceptedPlan(NamedTuple):
     """A goal is the robot's now."""
 
     duration: float
-    """Expected time from now to arrival [s]; infinite while the override is zero."""
+    """Expected time from now to the end of its path [s]; infinite while the override is zero."""
     slowed: float
     stops_first: bool
     queued: bool
@@ -172,7 +172,7 @@ class PlanRequests:
             (_triple(pose), _triple(velocity), _triple(acceleration)),
             tuple(map(pack_run, schedule.runs)),
             goal,
-            self._blend,
+            None if schedule.ended else self._blend,
         )
         self._times += 1
         self._since = self._since if self._since is not None else schedule.cycle

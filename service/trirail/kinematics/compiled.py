@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from numba import njit
 
-__all__ = ["compiled"]
+__all__ = ["compiled", "tell_of_compiling"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -20,13 +21,22 @@ ROOMS = ("kinematics", "motion", "control")
 """Where compiled functions stand: what is inlined, or fixed as a constant, goes across files and rooms."""
 
 
-def _fingerprint() -> str:
+def _sources() -> bytes:
     package = Path(__file__).parents[1]
     sources = [file.read_bytes() for room in ROOMS for file in sorted((package / room).glob("*.py"))]
-    return hashlib.sha256(b"".join(source for source in sources if b"compiled" in source)).hexdigest()
+    return b"".join(source for source in sources if b"compiled" in source)
 
 
-FINGERPRINT = _fingerprint()
+FINGERPRINT = hashlib.sha256(_sources()).hexdigest()
+FUNCTIONS = len(re.findall(rb"^@compiled\((?!\))", _sources(), re.MULTILINE))
+"""How many functions are compiled ahead of their first call, in all rooms."""
+
+_listeners: list[Callable[[str], None]] = []
+
+
+def tell_of_compiling(listener: Callable[[str], None]) -> None:
+    """Have `listener` called with the name of each function that is not kept, before it is compiled."""
+    _listeners.append(listener)
 
 
 @contextlib.contextmanager
@@ -57,6 +67,9 @@ def compiled(*signatures: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
         if signatures:
             # Processes that start together compile each function once: who comes second loads what the first has kept.
             with _alone(Path(kept._cache_path)):
+                if not kept._load_index():
+                    for listener in _listeners:
+                        listener(function.__qualname__)
                 for signature in signatures:
                     dispatcher.compile(signature)
             dispatcher.disable_compile()

@@ -17,7 +17,7 @@ from trirail.errors import KinematicsError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.recursion import Joint, serial_leg
 
-__all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "singular_angles"]
+__all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "gains", "singular_angles"]
 
 LEGS = ("A", "B", "C")
 PARALLEL = 1e-9  # |sin| of the angle between an edge and its rail up to which the leg counts as singular
@@ -111,6 +111,26 @@ def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)
         changes = np.flatnonzero(negative[1:] != negative[:-1]).tolist()
         found.extend(_bisect(geometry, centre, float(phi[k]), float(phi[k + 1])) for k in changes)
     return tuple(sorted(_wrapped(phi) for phi in found))
+
+
+def gains(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
+    """Return by how much x, y [m] and phi [rad] change for a metre of each slider: (3, 3), J2^-1 J1 at a pose.
+
+    From (11) without lambda_32: the sine between the edge and the way from the slider's pin to G + R(phi) edge_point
+    stays zero. LinAlgError where J2 is singular.
+    """
+    x, y, phi = pose
+    j1, j2 = np.zeros((3, 3)), np.zeros((3, 3))
+    for i, leg in enumerate(geometry.legs):
+        edge = _theta(phi + leg.edge_angle)[:2, :2]  # along the edge, and across it
+        rail, turn = _theta(leg.rail_angle)[0, :2], _theta(phi)[:2, :2].T
+        j1[i, i] = edge[1] @ rail
+        way = np.array([x, y]) + turn @ leg.edge_point - leg.anchor
+        pin = (edge[1] @ way) / j1[i, i] * rail
+        across = edge[1] @ turn @ np.array([-leg.edge_point[1], leg.edge_point[0]])
+        j2[i] = *edge[1], across - edge[0] @ (way - pin)
+    changes: Array = np.asarray(np.linalg.solve(j2, j1), dtype=np.float64)
+    return changes
 
 
 def _singular_angles_of_j1(geometry: Geometry) -> list[float]:

@@ -23,7 +23,8 @@ from trirail.wire.planning import Extended, NotPlanned, PackedRun, PlanAnswer, P
 
 def revision(config: Config) -> int:
     """Return a number that stands for all of a configuration on which plans depend."""
-    return zlib.crc32(msgspec.json.encode((config.geometry, config.limits, config.loop.rate_hz)))
+    limits = config.limits.platform, config.limits.slider, config.limits.singularity_margin
+    return zlib.crc32(msgspec.json.encode((config.geometry, limits, config.loop.rate_hz)))
 
 
 class MotionPlanner:

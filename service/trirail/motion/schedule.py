@@ -49,6 +49,11 @@ class Schedule:
         return len(self.runs) <= 1 and not (self.runs and self.runs[0].seams)
 
     @property
+    def ended(self) -> bool:
+        """Whether the end of the last path has been reached: nothing can follow it on the way."""
+        return len(self.runs) == 1 and self.runs[0].arrived
+
+    @property
     def progress(self) -> tuple[float, float]:
         """Share of the time of the goal under way that is over, and what remains of it [s]."""
         if not self.runs:

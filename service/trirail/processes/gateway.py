@@ -223,6 +223,7 @@ class Gateway:
             self._tell(quoted(f"the gateway could not read what the loop said, please report it: {error!r}"))
             return
         if isinstance(answer, Welcome):
+            self._info = msgspec.structs.replace(self._info, missing_protections=answer.missing_protections)
             self._inbox.declare()
             ready()
 

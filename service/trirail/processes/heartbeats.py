@@ -9,8 +9,8 @@ from __future__ import annotations
 import mmap
 import os
 
-PROCESSES = ("loop", "gateway", "planner")
-"""Those that beat. The recorder does not: nothing depends on it."""
+PROCESSES = ("loop", "gateway", "planner", "recorder")
+"""Those that beat."""
 BEAT_EVERY = 0.05
 """How often a process beats at least, while it waits for work as well [s]."""
 

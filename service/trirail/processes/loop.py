@@ -88,7 +88,7 @@ class Loop:
         self._period = config.period
         self._max_overruns = config.watchdogs.max_overruns
         self._epoch = time.time()
-        self._welcome = message(Welcome(lacking, drives.bus_load, self._epoch))
+        self._welcome = message(Welcome(lacking, drives.bus_load, self._epoch, drives.missing_protections))
         self._status = message(Status(None, 1.0, None))
         self._bitrate = config.can.bitrate
         self._bus_load = 0.0

@@ -1,7 +1,7 @@
 """What each child process of the service begins with: `trirail.processes.process NAME RUNTIME READY BEATS [SOCKETS…]`.
 
-Its order comes on standard input; READY is a descriptor on which the process says, once, that it is up;
-BEATS that of the heartbeats.
+Its order comes on standard input; READY is a descriptor on which it says, in lines of JSON, what it compiles, and once
+that it is up; BEATS that of the heartbeats.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import msgspec
 
 from trirail.config import Config
 from trirail.errors import TrirailError
+from trirail.kinematics.compiled import tell_of_compiling
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.realtime import die_with_parent
 from trirail.wire import links
@@ -29,6 +30,10 @@ class Order(msgspec.Struct, frozen=True):
     config: Config
     record: str | None
     """Recording file to write, None for one named by the time."""
+
+
+COMPILING = "compiling"
+"""The key of what is said of a function that is being compiled."""
 
 
 def _main(name: str, runtime: Path, heartbeats: Heartbeats, ready: Callable[[object], None], sockets: list[int]) -> int:
@@ -52,7 +57,7 @@ def _main(name: str, runtime: Path, heartbeats: Heartbeats, ready: Callable[[obj
         return gate.main(config, link, heartbeats.of("gateway").beat, ready)
     from trirail.processes import recording
 
-    return recording.main(config, order.record, link, ready)
+    return recording.main(config, order.record, link, heartbeats.of(name), ready)
 
 
 def main() -> int:
@@ -65,7 +70,9 @@ def main() -> int:
 
     def ready(content: object) -> None:
         # The descriptor stays open: its end is how the supervisor learns of this process's end.
-        os.write(int(descriptor), msgspec.json.encode(content))
+        os.write(int(descriptor), msgspec.json.encode(content) + b"\n")
+
+    tell_of_compiling(lambda function: ready({COMPILING: function}))
 
     try:
         return _main(name, Path(runtime), Heartbeats(int(beats)), ready, [int(number) for number in sockets])

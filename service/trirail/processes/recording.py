@@ -11,8 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from trirail.config import Config
+from trirail.processes.heartbeats import Heart
 from trirail.processes.last_words import LastWords
 from trirail.telemetry.blackbox import BlackBox
+from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.links import Closed, PacketLink
 from trirail.wire.messages import Level
@@ -75,8 +77,9 @@ class Intake:
                 recorder.given(said)
                 box.given(said)
             case Status():
-                recorder.target(said.target)
-                box.stands("target", said.target)
+                standing = Standing(said.goal, said.target, said.override, said.fault)
+                recorder.stands(standing)
+                box.stands("stands", standing)
             case Welcome():
                 recorder.bus_load(said.bus_load)
                 box.stands("bus_load", said.bus_load)
@@ -94,7 +97,7 @@ class Intake:
             self._link.send(message(Remark(level, words)))
 
 
-def main(config: Config, record: str | None, link: PacketLink, ready: Callable[[object], None]) -> int:
+def main(config: Config, record: str | None, link: PacketLink, heart: Heart, ready: Callable[[object], None]) -> int:
     """Record until the loop has gone or the process is told to end."""
     intake = Intake(config, record, link, ready)
     ending = False
@@ -108,13 +111,16 @@ def main(config: Config, record: str | None, link: PacketLink, ready: Callable[[
     poll.register(link.fileno(), select.POLLIN)
     try:
         while not ending:
+            heart.beat()
             poll.poll(500)
             time.sleep(GATHER)
             while (packet := link.receive()) is not None:
                 intake.take(packet)
+                heart.beat()
             intake.recorder.save()
     except Closed:
         intake.loop_gone()
     finally:
+        heart.rest()  # files take their time to be completed
         intake.close()
     return 0

@@ -99,6 +99,7 @@ class StateMaker:
             goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._status.target)
             if goal
             else None,
+            settled=bool(row["settled"]),
             override=self._status.override,
             faults=(self._status.fault,) if self._status.fault else (),
             loop=LoopState(

@@ -18,9 +18,10 @@ from msgspec import structs
 
 from trirail.config import Config
 from trirail.errors import ServiceError
+from trirail.processes.compiling import Progress
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
 from trirail.processes.interpreter import CHILD, python
-from trirail.processes.process import Order
+from trirail.processes.process import COMPILING, Order
 from trirail.processes.systemd import Watchdog, notify
 from trirail.wire import links
 
@@ -36,7 +37,7 @@ CONSEQUENCES = {
 }
 """What the death of a process means for the robot."""
 START_WITHIN = 300.0
-"""How long the processes may take to come up; the very first start compiles the kinematics [s]."""
+"""How long the processes may take to come up; the very first start may for each function that it compiles [s]."""
 END_WITHIN = 6.0
 """How long they may take to end before they are killed [s]."""
 RESTARTS = 5
@@ -45,6 +46,8 @@ TURN = 0.1
 """How often the supervisor looks whether the others are alive [s]."""
 SILENT = 0.7
 """A process that should give signs of life and gives none for so long is hung, and is killed [s]."""
+RECORDER_SILENT = 5.0
+"""The same of the recorder, which may wait for a disk: nothing that moves depends on it [s]."""
 LEAST_CYCLES = 3
 """So many cycles the loop may take for a sign of life, however long they are."""
 RETRY = 10.0
@@ -57,6 +60,7 @@ class _Child:
     def __init__(self, name: str, order: bytes, runtime: Path, beats: int, sockets: list[int]) -> None:
         self.name = name
         self.began = time.monotonic()
+        self.compiling: list[str] = []
         self.ready_with: dict[str, Any] | None = None
         self._hung_for = 0.0
         self.pipe, write = os.pipe()
@@ -71,9 +75,13 @@ class _Child:
 
     def listen(self) -> bool:
         """Read what the child says; False once it has ended."""
-        content = os.read(self.pipe, 65_536)
-        if content:
-            self.ready_with = msgspec.json.decode(content)
+        content = os.read(self.pipe, 65_536)  # whole lines: each is written at once, and shorter than PIPE_BUF
+        for line in content.splitlines():
+            said = msgspec.json.decode(line)
+            if COMPILING in said:
+                self.compiling.append(said[COMPILING])
+            else:
+                self.ready_with = said
         return bool(content)
 
     def wait(self, deadline: float) -> bool:
@@ -117,6 +125,7 @@ class Supervisor:
             "loop": loop_silent,
             "gateway": max(SILENT, config.watchdogs.gateway_timeout),
             "planner": SILENT,
+            "recorder": RECORDER_SILENT,
         }
         self._watches = {
             name: Watch(self._heartbeats.of(name), round(seconds / TURN)) for name, seconds in self._patience.items()
@@ -157,7 +166,8 @@ class Supervisor:
         self._selector.register(child.pipe, selectors.EVENT_READ, child)
 
     def _watch(self, up: Callable[[dict[str, dict[str, Any]]], None], signals: _Signals) -> None:
-        deadline = time.monotonic() + START_WITHIN
+        progress = Progress(self._say, START_WITHIN)
+        self._went_on = time.monotonic()
         is_up = False
         while not self._ending:
             heard: list[_Child | None] = [key.data for key, _ in self._selector.select(TURN)]
@@ -168,6 +178,9 @@ class Supervisor:
                     self._ending = True
                 elif not child.listen() and not self._ending:
                     self._on_end(child)
+                while child is not None and child.compiling:
+                    self._went_on = time.monotonic()
+                    progress.begin(child.compiling.pop(0))
             if self._ending:
                 continue
             self._start_due()
@@ -180,7 +193,7 @@ class Supervisor:
                 is_up = True
                 up(ready)
                 notify("READY=1")
-            elif time.monotonic() > deadline:
+            elif time.monotonic() - self._went_on > START_WITHIN:
                 missing = ", ".join(name for name in CHILDREN if name not in ready)
                 raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")
 
@@ -191,7 +204,7 @@ class Supervisor:
             return
         self._next_turn = now + TURN
         for child in self._children.values():
-            if child.ready_with is None and now - child.began > START_WITHIN:
+            if child.ready_with is None and now - max(child.began, self._went_on) > START_WITHIN:
                 child.kill_hung(START_WITHIN)
         for name, watch in self._watches.items():
             if watch.silent() and name in self._children:

@@ -1,4 +1,4 @@
-"""How the viewer is laid out: the robot large with mode and events below it, beside it the curves in two columns."""
+"""How the viewer is laid out: the robot large with mode and events below it, beside it the curves."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from trirail.telemetry import curves
+from trirail.telemetry import curves, readout
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.workspace.mechanism import Points
 
@@ -21,7 +21,7 @@ def layout(robot: ShownRobot, bounds: Points) -> rrb.Blueprint:
     window = rrb.TimeAxis(view_range=_last(WINDOW))
     error_mm = robot.limits.slider.following_error * 1e3
     sliders = rrb.Vertical(
-        _plot("Slider position λ  [mm]", curves.POSITION, window),
+        _plot("Slider position λ  [mm]", curves.POSITION, window, legend=True),
         _plot("Slider velocity  [mm/s]", curves.VELOCITY, window),
         _plot("Slider acceleration  [m/s²]", curves.ACCELERATION, window),
         _plot(f"Following error  [µm], limit ±{error_mm:g} mm", curves.ERROR, window),
@@ -37,15 +37,16 @@ def layout(robot: ShownRobot, bounds: Points) -> rrb.Blueprint:
         name="Events",
         origin="/events",
         columns=rrb.TextLogColumns(
-            timeline_columns=[rrb.encodings.TimelineColumn("t", visible=False)],
+            timeline_columns=[rrb.encodings.TimelineColumn("t")],
             text_log_columns=["LogLevel", "Body"],
         ),
     )
     left = rrb.Vertical(
         _robot(robot, bounds),
+        rrb.TextDocumentView(name="Now", origin=readout.PATH),
         rrb.StateTimelineView(name="Mode", origin="/mode", time_view=window),
         events,
-        row_shares=[66, 10, 24],
+        row_shares=[52, 26, 10, 19],
     )
     return rrb.Blueprint(
         rrb.Horizontal(left, sliders, platform, column_shares=[8, 6, 6]),

@@ -18,8 +18,8 @@ ERROR = "/sliders/following_error"
 CENTRE, PHI, SINGULARITY = "/pose/centre", "/pose/phi", "/pose/singularity"
 TIMING = "/loop/timing"
 
-NEAR = 0.1
-"""The limits of the following error are drawn where it reaches this share of them: else they would flatten it."""
+NEAR = 0.7
+"""Limits are drawn where a value reaches this share of them: else they would flatten the curves."""
 
 
 class Curve(NamedTuple):
@@ -43,7 +43,7 @@ class Lines(NamedTuple):
     moving: tuple[Curve, ...]
     still: tuple[Limit, ...] = ()
     near: float = 0.0
-    """Limits are drawn only where a value reaches this share of one."""
+    """A limit is drawn only where a value reaches this share of it; 0 for always."""
 
 
 def plots(robot: ShownRobot) -> dict[str, Lines]:
@@ -55,8 +55,8 @@ def plots(robot: ShownRobot) -> dict[str, Lines]:
         POSITION: _sliders(*(limit * 1e3 for limit in slider.position)),
         VELOCITY: _sliders(-slider.velocity * 1e3, slider.velocity * 1e3),
         ACCELERATION: _sliders(-slider.acceleration, slider.acceleration),
-        ERROR: _sliders(-error, error)._replace(near=NEAR),
-        CENTRE: Lines((Curve("x", palette.X), Curve("y", palette.Y)), _window(platform.x, platform.y)),
+        ERROR: _sliders(-error, error),
+        CENTRE: Lines((Curve("x", palette.X), Curve("y", palette.Y)), _window(platform.x, platform.y), NEAR),
         PHI: Lines((Curve("φ", palette.PHI),)),
         SINGULARITY: Lines((Curve("distance", palette.SINGULARITY),), (Limit("margin", margin),)),
         TIMING: timing(robot.rate_hz, float("nan")),
@@ -100,12 +100,11 @@ def values(
 def with_limits(moving: NDArray[np.float64], lines: Lines) -> NDArray[np.float64]:
     """Return the values of a plot, (N, k), with columns of its limits to their right."""
     rows, count = moving.shape
-    limits = [limit.value for limit in lines.still]
+    limits = np.array([limit.value for limit in lines.still])
     table = np.empty((rows, count + len(limits)))
     table[:, :count] = moving
-    table[:, count:] = limits
-    if lines.near and np.abs(moving).max() < lines.near * min(map(abs, limits)):
-        table[:, count:] = np.nan
+    highest = np.where(limits > 0.0, moving.max(initial=0.0), -moving.min(initial=0.0))
+    table[:, count:] = np.where(highest >= lines.near * np.abs(limits), limits, np.nan)
     return table
 
 
@@ -119,4 +118,4 @@ def _window(x: Range, y: Range) -> tuple[Limit, ...]:
 
 def _sliders(low: float, high: float) -> Lines:
     lines = tuple(Curve(leg, colour) for leg, colour in zip(LEGS, palette.SLIDERS, strict=True))
-    return Lines(lines, (Limit("min", low), Limit("max", high)))
+    return Lines(lines, (Limit("min", low), Limit("max", high)), NEAR)

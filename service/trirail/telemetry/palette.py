@@ -51,6 +51,7 @@ OUTCOMES: dict[str, Colour] = {
     "preempted": (140, 107, 177),
     "stopped": (140, 107, 177),
     "faulted": (200, 56, 56),
+    "unsettled": (168, 60, 160),
     "unknown": (123, 135, 148),
 }
 """How goals end: the colour of each outcome, on paper and in terminals; unknown is one that was not recorded."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.telemetry import provenance, retention
 from trirail.telemetry.candump import CandumpLog
+from trirail.telemetry.readout import Standing
 from trirail.telemetry.rotation import RotatedFiles, claim
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
@@ -143,9 +144,9 @@ class Recorder:
         """Take what the control was given."""
         self._streams.given(what)
 
-    def target(self, pose: Sequence[float] | None) -> None:
-        """Take the pose that the goal leads to; None for no goal."""
-        self._streams.target(pose)
+    def stands(self, standing: Standing) -> None:
+        """Take what holds from now on and records do not say."""
+        self._streams.stands(standing)
 
     def bus_load(self, share: float) -> None:
         """Take the load of the bus, 1 for a full one."""

@@ -15,8 +15,9 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from trirail.telemetry import columns, curves, drawing, palette
+from trirail.telemetry import columns, curves, drawing, palette, readout
 from trirail.telemetry.columns import FIELDS, RECORD, Column
+from trirail.telemetry.readout import Standing
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.vocabulary import MODES
 from trirail.workspace.mechanism import Mechanism
@@ -27,6 +28,8 @@ DRAWN_HZ = 100
 OUTLINES_HZ = 10
 """Outlines of the workspace a second, at most."""
 
+MARKDOWN = rr.components.MediaType.MARKDOWN
+TEXT = rr.TextDocument.descriptor_text()
 SCALARS = rr.Scalars.descriptor_scalars()
 STATE = rr.StateChange.descriptor_state()
 
@@ -49,6 +52,7 @@ class Scene:
         yield from drawing.still(self._parts)
         for path, lines in self._plots.items():
             yield path, _series(lines)
+        yield readout.PATH, rr.TextDocument.from_fields(media_type=MARKDOWN)
         yield (
             "/mode",
             rr.StateConfiguration(
@@ -67,8 +71,8 @@ class Scene:
         """Return records as they are."""
         return columns.chunks(self._timelines.of(records), [Column(RECORD, FIELDS, columns.structs(records))])
 
-    def drawn(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return records as people see them: one at least, in order."""
+    def drawn(self, records: NDArray[np.void], standing: Standing) -> list[Chunk]:
+        """Return records as people see them: one at least, in order. `standing` holds at the last of them."""
         starts, ends = _groups(records["cycle"], self._rate_hz // DRAWN_HZ)
         newest = records[ends]
         parts = drawing.moving(self._geometry, self._parts, records[starts], newest)
@@ -77,11 +81,15 @@ class Scene:
             table = curves.with_limits(values, self._plots[path])
             parts.append(Column(path, SCALARS, columns.scalars(table)))
         chunks = columns.chunks(self._timelines.of(newest), parts)
-        return chunks + self._status(records)
+        return chunks + self._status(records) + self._readout(records[-1], standing)
 
     def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
         """Return the pose that the goal leads to from the time of `record` on; None for no goal."""
         return columns.chunks(self._timelines.of(record.reshape(1)), [drawing.goal(self._parts, pose)])
+
+    def _readout(self, record: np.void, standing: Standing) -> list[Chunk]:
+        text = pa.array([[readout.markdown(record, standing)]])
+        return columns.chunks(self._timelines.of(record.reshape(1)), [Column(readout.PATH, TEXT, text)])
 
     def _status(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return mode and outline of the workspace at the first record, where the mode changes, and as φ changes."""

@@ -154,6 +154,7 @@ def _serves(descriptor: int, port: int) -> bool:
 def live_server(port: int, memory_mb: float) -> rr.GrpcServerSink:
     """Return a server for viewers on this machine, that keeps so much of the past for those who connect late.
 
+    They get the newest first: the present is there at once, and the past fills in behind it.
     Raises ServiceError if the port is taken.
     """
     with socket.socket() as probe:  # the sink would only log it, and discard all that it is sent
@@ -165,7 +166,7 @@ def live_server(port: int, memory_mb: float) -> rr.GrpcServerSink:
                 f"live view: cannot listen on {HOST}:{port}: {error.strerror}; "
                 "set telemetry.live_port to a free port, or to 0 for no live view"
             ) from error
-    return rr.GrpcServerSink(HOST, port, server_memory_limit=f"{memory_mb:.0f}MB")
+    return rr.GrpcServerSink(HOST, port, server_memory_limit=f"{memory_mb:.0f}MB", newest_first=True)
 
 
 def live_relay(stream: rr.RecordingStream) -> Relay:

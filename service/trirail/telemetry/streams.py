@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Protocol
 
@@ -15,6 +15,7 @@ from rerun.chunk import Chunk
 from trirail.telemetry import blueprint, journal
 from trirail.telemetry.columns import SECOND
 from trirail.telemetry.journal import EVENTS, Entry
+from trirail.telemetry.readout import Standing
 from trirail.telemetry.scene import Scene
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.messages import Event, Level
@@ -51,8 +52,8 @@ class Streams:
         self._paces: dict[Sink, int] = {}
         self._batches: dict[int, Batches] = {}
         self._newest = bytes(DTYPE.itemsize)
-        self._target: Sequence[float] | None = None
-        self._shown: Sequence[float] | None = None
+        self._standing = Standing()
+        self._goal_drawn = True
 
     def open(self, sink: rr.FileSink | rr.GrpcServerSink) -> rr.RecordingStream:
         """Return a stream of this recording to a sink of Rerun's, with what stands still and the layout in it."""
@@ -82,16 +83,17 @@ class Streams:
 
     def records(self, batch: bytes) -> None:
         """Take packed records."""
-        if self._target != self._shown:
-            self._shown = self._target
-            self._waiting += self.scene.goal(unpack(batch)[0], self._target)
+        if not self._goal_drawn:
+            self._goal_drawn = True
+            self._waiting += self.scene.goal(unpack(batch)[0], self._standing.target)
         for batches in self._batches.values():
             batches.add(batch)
         self._newest = batch[-DTYPE.itemsize :]
 
-    def target(self, pose: Sequence[float] | None) -> None:
-        """Take the pose that the goal leads to from the next record on; None for no goal."""
-        self._target = pose
+    def stands(self, standing: Standing) -> None:
+        """Take what holds from the next record on."""
+        self._goal_drawn = self._goal_drawn and standing.target == self._standing.target
+        self._standing = standing
 
     def bus_load(self, share: float) -> None:
         """Take the load of the bus, 1 for a full one."""
@@ -114,7 +116,7 @@ class Streams:
 
     def begin_anew(self) -> None:
         """Say with the next records again what else is said only when it changes: a sink has begun a new file."""
-        self._shown = None
+        self._goal_drawn = self._standing.target is None
 
     def drop(self, stream: rr.RecordingStream) -> None:
         """Let go of a stream: it is complete."""
@@ -140,7 +142,7 @@ class Streams:
         return newest
 
     def _draw(self, hz: int, records: NDArray[np.void]) -> None:
-        chunks = self.scene.drawn(records)
+        chunks = self.scene.drawn(records, self._standing)
         for sink, pace in self._paces.items():
             if pace == hz:
                 sink.send(chunks)

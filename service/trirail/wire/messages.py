@@ -11,6 +11,7 @@ import math
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
+from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode
 from trirail.wire.sizes import MAX_NAME, MAX_POINTS
@@ -24,7 +25,7 @@ LOWEST_OVERRIDE = 1.0
 
 Identifier = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
 Level = Literal["info", "warning", "error"]
-Outcome = Literal["done", "rejected", "preempted", "stopped", "expired", "faulted"]
+Outcome = Literal["done", "rejected", "preempted", "stopped", "expired", "faulted", "unsettled"]
 # Floors and ceilings: far beyond what a robot does, far from where numbers lose their digits.
 Coordinate = Annotated[float, Meta(ge=-1e3, le=1e3)]
 """x, y or a slider's position [m], phi [rad], or their velocities."""
@@ -141,6 +142,9 @@ class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
     """As of a pose goal."""
     stretch: bool = False
     """Slow a trajectory that is too fast for a slider or the platform, instead of refusing it."""
+    settle: bool = True
+    """Whether it is done only when the robot is measured to be in position, as any other goal; else when its path has
+    ended."""
     valid_for: Validity | None = None
     """As of a pose goal [s]."""
 
@@ -200,7 +204,8 @@ class GoalReply(Struct, frozen=True):
     id: str
     """The goal's own, or the one that was made for it."""
     duration: float | None
-    """Expected time from now to arrival [s]; None while the override is zero: then it has no expected end."""
+    """Expected time from now to the end of its path [s]; None while the override is zero: then it has no expected end.
+    It is done when the robot has been in position for the dwell of [limits.in_position] after that."""
     slowed: float = 1.0
     """How many times slower it is than was asked for, since a slider or the platform may not move so fast."""
     stops_first: bool = False
@@ -235,6 +240,15 @@ class ErrorReply(Struct, frozen=True, omit_defaults=True):
     """What is allowed, in SI units."""
 
 
+class Residual(Struct, frozen=True):
+    """Where the robot was to be, less where it was measured."""
+
+    sliders: Triple
+    """Of the sliders A, B, C [m]."""
+    pose: Triple
+    """Of x, y [m] and phi [rad]."""
+
+
 class Event(Struct, frozen=True, omit_defaults=True):
     """Something that happened, in order, numbered without gaps by the loop."""
 
@@ -264,3 +278,12 @@ class Event(Struct, frozen=True, omit_defaults=True):
     """The id of the goal that set the robot in motion, with kind mode."""
     user: str | None = None
     """Who sent the goal, or what was refused."""
+    settle: float | None = None
+    """With outcome done: time from the end of the path until the robot was in position, to the first cycle of the dwell
+    [s]. None of a goal that was not to settle: a jog, one that was passed on the way to the next."""
+    residual: Residual | None = None
+    """How far it was from its target when it ended, with outcomes done and unsettled; None of a goal that was not to
+    settle."""
+    overshoot: Triple | None = None
+    """Likewise, how far each of the sliders A, B, C was beyond its target at most since the end of the path, in the
+    direction in which it was last commanded to move; of one that was not to move, to either side [m]."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 from msgspec import Struct, msgpack, structs
-from trirail_drivers.interface import Counts, Triple
+from trirail_drivers.interface import Counts, MissingProtection, Triple
 
 from trirail.errors import RefusalCode
 from trirail.wire.messages import Event, Goal, Level
@@ -62,7 +62,7 @@ class Accepted(Struct, frozen=True, tag=True):
     ticket: int
     id: str
     duration: float
-    """Expected time from now to arrival [s]; infinite at override 0."""
+    """Expected time from now to the end of its path [s]; infinite at override 0."""
     slowed: float
     """As in trirail.wire.messages.GoalReply, and the two below."""
     stops_first: bool
@@ -97,6 +97,8 @@ class Welcome(Struct, frozen=True, tag=True):
     """Worst-case share of the bus that the cycle takes; 1 is full."""
     epoch: float
     """Wall clock of nominal time zero [s since 1970]."""
+    missing_protections: tuple[MissingProtection, ...] = ()
+    """What the drives do without."""
 
 
 class Happened(Struct, frozen=True, tag=True):

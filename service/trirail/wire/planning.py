@@ -67,7 +67,7 @@ class Planned(Struct, frozen=True, tag=True):
     """The cycle in whose commanded state it begins; None where the robot stands, and it may begin at any time."""
     run: PackedRun
     duration: float
-    """From when it begins to arrival [s]; infinite at override zero."""
+    """From when it begins to its end [s]; infinite at override zero."""
     slowed: float
     """How many times slower than was asked for, for the limits' sake."""
     stops_first: bool = False

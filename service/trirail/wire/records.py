@@ -42,6 +42,7 @@ FIELDS: tuple[tuple[str, str, int], ...] = (
     ("follows", "B", 3),  # whether A, B, C follow setpoints: not while they are being homed
     ("homed", "B", 3),  # whether it is known from where the positions of A, B, C are counted
     ("homing", "B", 1),  # whether the drives are being homed
+    ("settled", "B", 1),  # whether the robot stands where it is commanded to, by [limits.in_position]
     ("pose", "d", 3),  # measured: forward kinematics of the measured sliders; x, y [m], phi [rad]
     ("commanded_pose", "d", 3),
     ("commanded_pose_velocity", "d", 3),

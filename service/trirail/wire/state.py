@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import msgspec
 from msgspec import Struct
-from trirail_drivers.interface import Triple
+from trirail_drivers.interface import MissingProtection, Triple
 
 
 class Commanded(Struct, frozen=True):
@@ -64,9 +64,9 @@ class GoalState(Struct, frozen=True):
     id: str
     """As it was sent, or as the service made it."""
     progress: float
-    """Share of its time that is over, 0 to 1."""
+    """Share of its path's time that is over, 0 to 1; 1 while it settles."""
     remaining: float
-    """Time to its end [s]."""
+    """Time to the end of its path [s]; 0 while it settles."""
     target: Triple | None = None
     """The pose that it leads to; None for a jog."""
 
@@ -126,6 +126,8 @@ class State(Struct, frozen=True):
     """What the drives say."""
     goal: GoalState | None
     """The goal under way, or paused; None where there is none."""
+    settled: bool
+    """Whether the robot stands where it is commanded to, by what was measured for the dwell of [limits.in_position]."""
     override: float
     """The share of full speed at which motions are to run, 0 to 2."""
     faults: tuple[str, ...]
@@ -155,3 +157,5 @@ class Info(Struct, frozen=True):
     """Where a Rerun viewer on the service's machine finds the live view; "" for nowhere."""
     versions: dict[str, str] = msgspec.field(default_factory=dict)
     """Of Python and the libraries that matter, by name."""
+    missing_protections: tuple[MissingProtection, ...] = ()
+    """What the drives do without; none where they have all."""

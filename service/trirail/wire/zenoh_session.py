@@ -76,8 +76,11 @@ def close(opened: zenoh.Session) -> None:
 def _open(settings: dict[str, Any], failure: str, remedy: str) -> zenoh.Session:
     zenoh.init_log_from_env_or("off")  # what zenoh would print is in the error below
     config = zenoh.Config()
-    for name, value in (_ALWAYS | settings).items():
-        config.insert_json5(name, json.dumps(value))
+    try:
+        for name, value in (_ALWAYS | settings).items():
+            config.insert_json5(name, json.dumps(value))
+    except zenoh.ZError as error:
+        raise ServiceError(f"{failure}: a locator is protocol/address, tcp/192.168.1.7:7447 for one") from error
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

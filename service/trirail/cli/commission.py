@@ -1,0 +1,173 @@
+"""`trirail commission`: the guide for the first hour with real drives, at a terminal, from a script, or by itself."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from trirail.cli import terminal
+from trirail.cli.options import Flag
+from trirail.errors import ConfigError
+
+if TYPE_CHECKING:
+    from trirail.commissioning.judgement import Judged
+    from trirail.commissioning.person import Question
+
+VERDICTS = {"ok": "green", "wrong": "bold red", "failed": "red", "skipped": "yellow"}
+
+
+def commission(
+    config: Path,
+    /,
+    *,
+    out: Path | None = None,
+    report: Path | None = None,
+    yes: Annotated[bool, Flag] = False,
+    fault: Annotated[tuple[str, ...], Parameter(negative="", consume_multiple=False)] = (),
+    json: Annotated[bool, Flag] = False,
+) -> int:
+    """Guide through the first hour with drives: one at a time, 1 mm at 5 mm/s, each step asked for and judged.
+
+    Who is on the bus, set-up, each slider by hand, power on one drive alone, 1 mm there and back, homing, watchdogs, a
+    square of the platform; then a new configuration with what was found. Every step can be refused and repeated, Ctrl-C
+    stops all drives at once, and a report is kept. Answers are lines of standard input, of a person or a script.
+    Exit 0 only if nothing that was done was found wrong. Not while the service runs.
+
+    Parameters
+    ----------
+    config
+        Configuration file; it is never changed.
+    out
+        Configuration to write; one with a free name beside CONFIG if absent.
+    report
+        Report to write (JSON; the same in words beside it, .txt); commission-ROBOT-TIME.json if absent.
+    yes
+        Give every answer that simulated drives propose, ask nothing. Only with simulated drives.
+    fault
+        A fault on demand of simulated drives, as "A reversed" or "B scale 0.5"; may be repeated.
+    json
+        Print the report as one JSON object; what is said meanwhile goes to standard error.
+    """
+    from trirail.commissioning import report as reports
+    from trirail.commissioning.guide import Guide
+    from trirail.commissioning.opening import opened
+    from trirail.commissioning.person import Quit
+    from trirail.config import load
+    from trirail.telemetry.provenance import software
+
+    settings = load(config)
+    simulated = settings.can.interface == "simulated"
+    if (yes or fault) and not simulated:
+        option = "--yes" if yes else "--fault"
+        raise ConfigError(f"{option} is for simulated drives: what real ones do a person has to look at")
+    if out is not None and out.exists():
+        raise ConfigError(f"{out} exists already: name another file with --out")
+    name = f"commission-{settings.robot.name}-{time.strftime('%Y%m%d-%H%M%S')}.json"
+    made = reports.Report(settings.robot.name, str(config), reports.now(), simulated, str(software()))
+    keeper = reports.Keeper(made, report or Path(name))
+    person = Console(by_itself=yes, quiet=json)
+    with interruption() as interrupted, opened(settings, fault, person, interrupted) as steps:
+        guide = Guide(settings, config, steps, person, keeper)
+        with contextlib.suppress(Quit):
+            guide.run()
+        guide.write(out)
+    person.tell(f"Report: {keeper.path} (for people: {keeper.text.name})")
+    if json:
+        terminal.json(reports.content(made))
+    return 0 if made.ok else 1
+
+
+@contextlib.contextmanager
+def interruption() -> Iterator[Callable[[], bool]]:
+    """Note Ctrl-C and SIGTERM instead of ending: the drives are stopped first. A second one does end."""
+    came = False
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        nonlocal came
+        if came and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        came = True
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class Console:
+    """A person at a terminal, a script's lines, or nobody, where every proposed answer is taken."""
+
+    def __init__(self, *, by_itself: bool, quiet: bool) -> None:
+        """`quiet` leaves standard output to the report."""
+        self._by_itself = by_itself
+        self._shown = terminal.err if quiet else terminal.out
+        self._typed = b""
+        self._open = sys.stdin is not None and not sys.stdin.closed
+        self._echoes = not (self._open and sys.stdin.isatty())
+
+    def tell(self, line: str) -> None:
+        """Print a line."""
+        self._shown.print(terminal.plain(line), soft_wrap=True)
+
+    def judged(self, judged: Judged) -> None:
+        """Print a verdict with its words, and under it what to do."""
+        first, *others = judged.words
+        verdict = f"[{VERDICTS[judged.verdict]}]{judged.verdict:8}[/]"
+        self._shown.print(f"  {verdict} {terminal.plain(first)}", soft_wrap=True)
+        for word in others:
+            self._shown.print(f"  {'':8} {terminal.plain(word)}", soft_wrap=True)
+        if judged.remedy:
+            self._shown.print(f"  {'':8} -> {terminal.plain(judged.remedy)}", soft_wrap=True)
+
+    def ask(self, question: Question, idle: Callable[[], object]) -> str:
+        """Print a question and take the next line; at the end of the input the person has left."""
+        from trirail.commissioning.person import Quit
+
+        proposed = f" \\[{terminal.plain(question.default)}]" if question.default is not None else ""
+        self._shown.print(f"  {terminal.plain(question.text.strip())}{proposed} ", end="", soft_wrap=True)
+        while True:
+            answer = self._next()
+            if answer is None:
+                idle()
+                continue
+            if self._echoes:
+                self._shown.print(terminal.plain(answer or (question.default or "")))
+            if answer or question.default is not None:
+                return answer or question.default or ""
+            if not self._open and not self._typed:
+                raise Quit
+            self._shown.print("  an answer is wanted here, or q to leave: ", end="")
+
+    def _next(self) -> str | None:
+        """Return the next line that was typed; None where none is there yet."""
+        if self._by_itself:
+            return ""
+        if b"\n" not in self._typed and self._open and select.select([sys.stdin], [], [], 0.0)[0]:
+            chunk = os.read(sys.stdin.fileno(), 4096)
+            self._open = bool(chunk)
+            self._typed += chunk
+        if b"\n" not in self._typed:
+            return None if self._open else self._last()
+        line, _, self._typed = self._typed.partition(b"\n")
+        return line.decode(errors="replace").strip()
+
+    def _last(self) -> str:
+        """Return what stands after the last line's end; where that was nothing, the person has left."""
+        from trirail.commissioning.person import Quit
+
+        line, self._typed = self._typed.decode(errors="replace").strip(), b""
+        if not line:
+            raise Quit
+        return line

@@ -1,0 +1,30 @@
+"""Tab completion of bash, zsh and fish: `trirail completion`, and the names that a running service knows."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Literal
+
+from trirail.cli import terminal
+from trirail.errors import TrirailError
+
+if TYPE_CHECKING:
+    from cyclopts import App
+
+Shell = Literal["bash", "zsh", "fish"]
+
+
+def script(app: App, shell: Shell | None, *, install: bool) -> int:
+    """Print the script for a shell, that in use if none is named, or install it for this user."""
+    from cyclopts.completion.detect import ShellDetectionError
+
+    try:
+        if install:
+            terminal.say(f"installed: {app.install_completion(shell=shell)}; new shells complete trirail")
+        else:
+            sys.stdout.write(app.generate_completion(shell=shell))
+    except ShellDetectionError as error:
+        raise TrirailError("cannot tell which shell this is: name bash, zsh or fish") from error
+    except OSError as error:
+        raise TrirailError(f"cannot install: {error}") from error
+    return 0

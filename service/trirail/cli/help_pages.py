@@ -1,0 +1,78 @@
+"""How `trirail --help` is arranged: groups of commands in the order in which they are needed, examples for each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from cyclopts import App, Group
+
+Examples = tuple[str, ...]
+
+GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
+    "Begin": {
+        "demo": ("trirail demo", "trirail demo --stay"),
+        "doctor": ("trirail doctor", "trirail doctor robot.toml"),
+        "config": ("trirail config", "trirail config copy socketcan robot.toml", "trirail config show robot.toml"),
+        "drives": ("trirail drives robot.toml", "trirail drives robot.toml --apply"),
+        "commission": ("trirail commission robot.toml", "trirail commission robot.toml --yes --fault 'A reversed'"),
+        "run": ("trirail run", "trirail run robot.toml", "trirail run robot.toml --record session.rrd"),
+        "completion": ("trirail completion bash --install", "trirail completion zsh"),
+    },
+    "Power and stops": {
+        "enable": ("trirail enable", "trirail enable --connect tcp/192.168.1.7:7447 --robot left"),
+        "disable": ("trirail disable",),
+        "stop": ("trirail stop",),
+        "quick-stop": ("trirail quick-stop",),
+        "reset": ("trirail reset",),
+        "home": ("trirail home",),
+    },
+    "Motion": {
+        "goto": (
+            "trirail goto 30mm 20mm 10deg --wait",
+            "trirail goto -0.05 0 0 --speed 0.2",
+            "trirail goto 50mm 0 0 --blend 10mm",
+        ),
+        "sliders": ("trirail sliders 20mm 0 -10mm --wait",),
+        "jog": ("trirail jog 10mm/s 0 0", "trirail jog 0 0 -2deg/s --seconds 3"),
+        "follow": ("trirail follow path.csv --wait", "trirail follow path.csv --stretch"),
+        "pause": ("trirail pause",),
+        "resume": ("trirail resume",),
+        "override": ("trirail override 50",),
+    },
+    "Look": {
+        "status": ("trirail status", "trirail status --json"),
+        "watch": ("trirail watch",),
+        "events": ("trirail events", "trirail events --json"),
+        "view": (
+            "trirail view",
+            "trirail view --web",
+            "trirail view session.rrd",
+            "trirail view --connect tcp/192.168.1.7:7447",
+        ),
+    },
+    "Recordings": {
+        "report": ("trirail report session.rrd", "trirail report session.rrd --plot session.png"),
+        "replay": (
+            "trirail replay session.rrd",
+            "trirail replay session.rrd --config other.toml",
+            "trirail replay session.rrd --to tcp/127.0.0.1:7447",
+        ),
+    },
+    "Mathematics": {
+        "ik": ("trirail ik 20mm -10mm 10deg", "trirail ik 20mm 0 0 --velocity 50mm/s 0 5deg/s"),
+        "fk": ("trirail fk 10mm 0 -10mm",),
+        "workspace": ("trirail workspace", "trirail workspace --plot workspace.png --phi -20deg 0 20deg"),
+    },
+}
+"""The commands by group, with lines that can be typed."""
+
+
+def arrange(app: App) -> None:
+    """Put the commands of the command line into their groups, each with its examples."""
+    for name, commands in GROUPS.items():
+        group = Group.create_ordered(name)
+        for position, (command, examples) in enumerate(commands.items()):
+            page = app[command]
+            page.group, page.sort_key = (group,), position
+            page.help_epilogue = "```\n" + "\n".join(examples) + "\n```"

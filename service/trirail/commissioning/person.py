@@ -1,0 +1,66 @@
+"""The person beside the robot, as the guide needs one: hears lines, answers questions, may refuse or leave."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from trirail.commissioning.judgement import Judged
+
+
+class Quit(Exception):
+    """The person wants to go no further."""
+
+
+class Question(NamedTuple):
+    """What a person is asked."""
+
+    text: str
+    default: str | None = None
+    """What an empty answer means; None where there is no such thing."""
+
+
+class Person(Protocol):
+    """Who answers. Raises Quit where there are no answers left."""
+
+    def tell(self, line: str) -> None:
+        """Show a line."""
+
+    def judged(self, judged: Judged) -> None:
+        """Show what is thought of a step."""
+
+    def ask(self, question: Question, idle: Callable[[], object]) -> str:
+        """Return the answer, stripped and never empty where there is a default; `idle` is called all the while.
+
+        It keeps the drives alive: it must be called at least once a cycle, and itself waits for the next.
+        """
+
+
+def choose(person: Person, idle: Callable[[], object], question: Question, choices: dict[str, str]) -> str:
+    """Return which of the choices, each with what it means, is taken; asks until it is one of them. Raises Quit."""
+    while True:
+        answer = person.ask(question, idle).lower()
+        if answer in ("q", "quit"):
+            raise Quit
+        found = [choice for choice in choices if choice.lower() == answer]
+        if found:
+            return found[0]
+        told = ", ".join(f"{choice} ({means})" for choice, means in choices.items())
+        person.tell(f'  "{answer}" is no answer here; wanted: {told}, or q to leave')
+
+
+def number(
+    person: Person, idle: Callable[[], object], question: Question, low: float = -10_000.0, high: float = 10_000.0
+) -> float:
+    """Return the number that is answered; asks until it is one from `low` to `high`. Raises Quit."""
+    while True:
+        answer = person.ask(question, idle)
+        if answer.lower() in ("q", "quit"):
+            raise Quit
+        try:
+            value = float(answer.replace(",", ".").removesuffix("mm"))
+        except ValueError:
+            value = float("nan")
+        if low <= value <= high:
+            return value
+        person.tell(f'  "{answer}" is no number from {low:g} to {high:g}; as in: 12.35 (or q to leave)')

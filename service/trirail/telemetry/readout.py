@@ -1,0 +1,51 @@
+"""The numbers beside the drawing: mode and what is wrong in words, pose, goal, override, sliders."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from trirail.wire.vocabulary import MODES
+
+PATH = "/readout"
+_SPECIAL = str.maketrans({letter: f"\\{letter}" for letter in "\\`*_{}[]<>()#+-.!|~$&:"})
+"""ASCII punctuation that means something in Markdown is plain behind a backslash (CommonMark 2.4)."""
+
+_HEAD = f"| | x [mm] | y [mm] | φ [°] | | A | B | C |\n|---|{'--:|' * 3}---|{'--:|' * 3}"
+
+
+class Standing(NamedTuple):
+    """What holds until it is said anew, and records do not say."""
+
+    goal: str | None = None
+    """The id of the goal under way."""
+    target: Sequence[float] | None = None
+    """The pose that the goal leads to: x, y [m], phi [rad]; None for no goal or a jog."""
+    override: float = 1.0
+    """The rate at which motions are to run, 0 to 2."""
+    fault: str | None = None
+    """Why the robot is in fault."""
+
+
+def markdown(record: np.void, standing: Standing) -> str:
+    """Return what holds at a record, of wire.records.DTYPE, for people: millimetres, degrees, micrometres."""
+    head = f"**{MODES[record['mode']].upper()}**   override {standing.override:.0%}"
+    if standing.goal is not None:
+        share, left = float(record["progress"]), float(record["remaining"])
+        head += f"   goal **{standing.goal.translate(_SPECIAL)}**: {share:.0%}, {left:.1f} s left"
+    wrong = [f"**{standing.fault.translate(_SPECIAL)}**"] if standing.fault else []
+    target = ["–"] * 3 if standing.target is None else _pose(standing.target)
+    rows = [
+        ("measured", *_pose(record["pose"]), "λ [mm]", *(f"{value * 1e3:.3f}" for value in record["position"])),
+        ("commanded", *_pose(record["commanded_pose"]), "v [mm/s]", *(f"{v * 1e3:.1f}" for v in record["velocity"])),
+        ("goal", *target, "error [µm]", *(f"{value * 1e6:.0f}" for value in record["following_error"])),
+    ]
+    table = "\n".join([_HEAD, *(f"| {' | '.join(row)} |" for row in rows)])
+    return "\n\n".join([head, *wrong, table])
+
+
+def _pose(pose: Sequence[float]) -> list[str]:
+    x, y, phi = pose
+    return [f"{x * 1e3:.3f}", f"{y * 1e3:.3f}", f"{np.degrees(phi):.3f}"]

@@ -1,0 +1,229 @@
+"""The manners of the command line: pages of help, errors, tab completion, and what is said where nobody answers."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+from cyclopts import App
+from trirail.cli import commands, help_pages, terminal, units, view
+from trirail.client import connection
+from trirail.client.goal import Result
+from trirail.config import SIM, load
+from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.wire.messages import GoalReply
+
+Run = Callable[..., tuple[int, str, str]]
+NOBODY = "tcp/127.0.0.1:1"
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Call a command as from a terminal; return its exit code and what it printed."""
+
+    def call(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["trirail", *words])
+        with pytest.raises(SystemExit) as ended:
+            commands.main()
+        printed = capsys.readouterr()
+        assert isinstance(ended.value.code, int)
+        return ended.value.code, printed.out, printed.err
+
+    return call
+
+
+def pages(app: App = commands.app, *path: str) -> Iterator[tuple[str, App]]:
+    """Yield every command with what is typed to call it."""
+    for name in app:
+        if not name.startswith("-"):
+            yield " ".join((*path, name)), app[name]
+            yield from pages(app[name], *path, name)
+
+
+def test_every_command_is_in_a_group_with_examples_that_can_be_typed() -> None:
+    listed = [name for group in help_pages.GROUPS.values() for name in group]
+    assert sorted(listed) == sorted(name for name, _ in pages() if " " not in name)
+    for group in help_pages.GROUPS.values():
+        for name, examples in group.items():
+            assert examples
+            for line in examples:
+                program, command, *words = shlex.split(line)
+                assert (program, command) == ("trirail", name)
+                commands.app.parse_args(units.numbers([command, *words]), exit_on_error=False, print_error=False)
+
+
+@pytest.mark.parametrize(("name", "page"), list(pages()))
+def test_every_argument_is_described(name: str, page: App, run: Run) -> None:
+    for argument in page.assemble_argument_collection(parse_docstring=True):
+        if argument.show:
+            assert argument.parameter.help, f"{name} {argument.name}"
+
+
+def test_help_shows_groups_and_examples(run: Run) -> None:
+    code, out, _ = run("--help")
+    assert code == 0
+    titles = [out.index(f"─ {name} ─") for name in help_pages.GROUPS]
+    assert titles == sorted(titles)
+    assert "trirail goto 30mm 20mm 10deg --wait" in run("goto", "--help")[1]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("status --connect nowhere", "a locator is protocol/address, tcp/192.168.1.7:7447 for one"),
+        ("status --connect tcp/127.0.0.1:x", "no service at tcp/127.0.0.1:x"),
+        (f"watch --connect {NOBODY}", f"no service at {NOBODY}"),
+        ("status --robot a/b", "robot 'a/b' cannot be in a key"),
+        ("status --robot *", "robot '*' cannot be in a key"),
+        ("view no.rrd", "no.rrd is no file"),
+        ("report no.rrd", "no.rrd: No such file or directory"),
+        ("replay no.rrd", "no.rrd: No such file or directory"),
+        ("run no.toml", "no.toml: No such file or directory"),
+        ("follow no.csv", "no.csv: No such file or directory"),
+        ("config copy nothing", "no configuration 'nothing' is shipped"),
+        ("ik 0 0 0 --config no.toml", "no.toml: No such file or directory"),
+        ("goto 0 0 0 --connect nowhere", "a locator is protocol/address"),
+    ],
+)
+def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said: str, run: Run) -> None:
+    code, out, err = run(*line.split())
+    assert (code, out) == (1, "")
+    assert said in err
+    assert err.count("\n") == 1
+    if "follow" in line or "status" in line or "report" in line:
+        code, out, err = run(*line.split(), "--json")
+        assert (code, err) == (1, "")
+        assert out.count("\n") == 1
+        found = json.loads(out)
+        assert found["ok"] is False
+        assert said in found["message"]
+
+
+WRONG = ["report", "replay", "goto", "goto 1 2", "nothing", "watch extra", "status --wat", "config wat"]
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_wrong_usage_is_one_line_and_exit_2(line: str, run: Run) -> None:
+    code, out, err = run(*line.split())
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+
+
+def test_a_refusal_is_json_with_its_code_and_what_is_allowed(capsys: pytest.CaptureFixture[str]) -> None:
+    terminal.failed(RefusedError(RefusalCode.OUT_OF_WORKSPACE, "x: 0.5 m", slider="A", value=0.5, limit=0.15))
+    assert json.loads(capsys.readouterr().out) == {
+        "ok": False,
+        "error": "RefusedError",
+        "code": "out_of_workspace",
+        "message": "x: 0.5 m",
+        "slider": "A",
+        "value": 0.5,
+        "limit": 0.15,
+    }
+    terminal.failed(ServiceError("no robot"))
+    assert json.loads(capsys.readouterr().out) == {"ok": False, "error": "ServiceError", "message": "no robot"}
+
+
+def test_a_viewer_that_finds_no_display_is_an_error(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+    """Rerun's viewer says so and exits with 0."""
+    monkeypatch.setenv("DISPLAY", ":77")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(view, "python", lambda *_: [sys.executable, "-c", "print('Error: no X server')"])
+    code, _, err = run("view", str(SIM))
+    assert code == 1
+    assert "the viewer failed: Error: no X server" in err
+
+
+def test_the_banner_names_the_next_command_where_it_reaches_the_service(capsys: pytest.CaptureFixture[str]) -> None:
+    ready: dict[str, dict[str, Any]] = {
+        "loop": {"lacking": [], "bus_load": 0.5},
+        "recorder": {"live": "", "recording": "x.rrd"},
+    }
+    config = load(SIM)
+    terminal.up(config, ready)
+    assert "next       trirail enable\n" in capsys.readouterr().out
+    zenoh = msgspec.structs.replace(config.zenoh, listen=("tcp/0.0.0.0:7999",))
+    robot = msgspec.structs.replace(config.robot, name="left")
+    terminal.up(msgspec.structs.replace(config, zenoh=zenoh, robot=robot), ready)
+    said = capsys.readouterr().out
+    assert "next       trirail enable --robot left --connect tcp/127.0.0.1:7999\n" in said
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_completion_script_knows_commands_and_options(shell: str, run: Run) -> None:
+    code, out, err = run("completion", shell)
+    assert (code, err) == (0, "")
+    for word in ("quick-stop", "override", "robot", "blend"):
+        assert word in out
+
+
+def test_bash_completes_commands_options_and_robots(run: Run) -> None:
+    _, script, _ = run("completion", "bash")
+    asks = """
+trirail() { [ "$1" = __complete ] && printf '\\x1fbegin\\nleft\\nright\\n'; }
+type() { return 0; }
+complete_words() { COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=(); _trirail; echo "${COMPREPLY[@]}"; }
+complete_words trirail qui
+complete_words trirail goto --bl
+complete_words trirail status --robot l
+"""
+    done = subprocess.run(
+        ["bash", "--norc"], input=script + asks, capture_output=True, text=True, timeout=30, check=True
+    )
+    assert done.stdout.splitlines() == ["quick-stop", "--blend", "left"]
+
+
+def test_the_names_of_robots_are_asked_for_where_the_line_says(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+    monkeypatch.setattr(connection, "robots_at", lambda connect: [f"at-{connect}"])
+    code, out, _ = run("__complete", "status", "--connect", "tcp/1.2.3.4:5", "--robot", "")
+    assert code == 0
+    assert out.splitlines()[-1] == "at-tcp/1.2.3.4:5"
+
+
+class Interrupted:
+    """A robot and its goal under way, while Ctrl-C is pressed a number of times; it ends once it is told to stop."""
+
+    def __init__(self, presses: int, heard: bool) -> None:
+        self.id, self.reply, self.name = "g-1", GoalReply("g-1", 1.0), "demo"
+        self.result: Result | None = None
+        self._left, self._heard = presses, heard
+        self.cancelled = threading.Event()
+
+    def cancel(self) -> None:
+        if self._heard:
+            self.result = Result("g-1", "stopped", "stopped as asked")
+        self.cancelled.set()
+
+    def states(self, timeout: float) -> Iterator[SimpleNamespace]:
+        while True:
+            yield SimpleNamespace(goal=None)
+            if self.cancelled.is_set() or self._left == 2:
+                self._press()
+            elif self._left == 1:
+                self._press()
+                assert self.cancelled.wait(10.0)
+
+    def _press(self) -> None:
+        if self._left:
+            self._left -= 1
+            raise KeyboardInterrupt
+
+
+def test_ctrl_c_stops_the_goal_that_is_waited_for() -> None:
+    goal: Any = Interrupted(presses=1, heard=True)
+    assert terminal.follow(goal, goal, "away", show=False) == Result("g-1", "stopped", "stopped as asked")
+
+
+def test_a_second_ctrl_c_leaves_and_says_that_the_goal_goes_on() -> None:
+    goal: Any = Interrupted(presses=2, heard=False)
+    with pytest.raises(ServiceError, match="goal g-1 goes on"):
+        terminal.follow(goal, goal, "away", show=False)
+    assert goal.cancelled.wait(10.0)

@@ -1,0 +1,143 @@
+"""Quantities of the command line: what is printed can be typed, whatever else is no quantity is refused in a line."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.cli import commands, units
+from trirail.cli.units import ANGLE, DIMENSIONS, LENGTH, Dimension, quantity, written
+
+Run = Callable[..., tuple[int, str, str]]
+a_unit = st.sampled_from([(dimension, unit) for dimension in DIMENSIONS for unit in dimension.units])
+a_value = st.floats(-1e3, 1e3)
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Call a command as from a terminal; return its exit code and what it printed."""
+
+    def call(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["trirail", *words])
+        with pytest.raises(SystemExit) as ended:
+            commands.main()
+        printed = capsys.readouterr()
+        assert isinstance(ended.value.code, int)
+        return ended.value.code, printed.out, printed.err
+
+    return call
+
+
+@given(a_unit, a_value, st.integers(0, 9), st.integers(0, 12))
+def test_what_is_printed_is_taken_again_to_its_digits(
+    kind: tuple[Dimension, str], value: float, digits: int, width: int
+) -> None:
+    dimension, unit = kind
+    printed = written(value, unit, digits, width)
+    size = float(dimension.units[unit])
+    assert abs(quantity(printed, dimension) - value) <= (0.5000001 * 10.0**-digits + 1e-12 * abs(value) / size) * size
+    assert quantity(printed.replace(" ", ""), dimension) == quantity(printed, dimension)
+
+
+@given(a_value, a_value, st.floats(-math.pi, math.pi))
+def test_a_printed_pose_is_one_that_can_be_typed(x: float, y: float, phi: float) -> None:
+    words = re.fullmatch(r"x(.*mm) {3}y(.*mm) {3}φ(.*°)", units.pose((x, y, phi), 9))
+    assert words is not None
+    assert quantity(words[1], LENGTH) == pytest.approx(x, abs=0.51e-6)
+    assert quantity(words[2], LENGTH) == pytest.approx(y, abs=0.51e-6)
+    assert quantity(words[3], ANGLE) == pytest.approx(phi, abs=math.radians(0.51e-4))
+
+
+@given(st.decimals(-1000, 1000, places=3))
+def test_a_unit_and_the_bare_number_are_the_same_number(number: object) -> None:
+    assert quantity(f"{number}mm", LENGTH) == float(f"{number}e-3")
+    assert quantity(f"{number} um", LENGTH) == quantity(f"{number}µm", LENGTH) == float(f"{number}e-6")
+    assert quantity(f"{number}", LENGTH) == float(f"{number}")
+    assert quantity(f"{number}deg", ANGLE) == pytest.approx(math.radians(float(f"{number}")), rel=1e-15)
+
+
+def test_an_inch_is_exact() -> None:
+    assert quantity("-0.2in", LENGTH) == -0.00508
+
+
+@given(st.text(), st.sampled_from(DIMENSIONS))
+def test_junk_is_no_quantity(text: str, dimension: Dimension) -> None:
+    try:
+        value = quantity(text, dimension)
+    except ValueError as error:
+        said = str(error)
+        assert f"is not {dimension.name} such as {dimension.examples}" in said
+        assert said.isprintable()
+    else:
+        assert math.isfinite(value)
+        assert text.strip()[0] in "+-.0123456789"
+
+
+WRONG = ["", "mm", "5 parsec", "1e400", "inf", "nan", "0x10", "1_000", "٣mm", "5mm5", "--5", "5°"]
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_what_is_no_length(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a length such as 5mm"):
+        quantity(text, LENGTH)
+
+
+def test_negative_quantities_are_no_options(run: Run) -> None:
+    code, out, err = run("fk", "-5mm", "-.1in", "-0.01", "--json")
+    assert (code, err) == (0, "")
+    same = run("fk", "--json", "--", "-0.005", "-0.00254", "-0.01")
+    assert same == (code, out, err)
+
+
+def test_an_angle_has_the_unit_that_is_said_or_that_of_deg(run: Run) -> None:
+    def phi(*words: str) -> float:
+        code, out, err = run("ik", "20mm", "-10mm", *words, "--json")
+        assert (code, err) == (0, "")
+        found = json.loads(out)["pose"]
+        assert found[:2] == [0.02, -0.01]
+        return float(found[2])
+
+    assert phi("-0.1") == phi("-100mrad") == phi("-100mrad", "--deg") == -0.1
+    assert phi("-5deg") == phi("-5°") == phi("-5", "--deg") == pytest.approx(math.radians(-5), rel=1e-15)
+
+
+def test_what_ik_and_fk_print_is_what_they_take(run: Run) -> None:
+    _, printed, _ = run("ik", "20mm", "-10mm", "5deg")
+    words = printed.splitlines()[0].replace(" mm", "mm").split()
+    pose = [words[1], words[3], words[5]]
+    assert run("ik", *pose)[1] == printed
+    sliders = re.findall(r"slider +(\S+) +(\S+) +(\S+) +mm", printed)[0]
+    assert run("fk", *(f"{at}mm" for at in sliders))[1].startswith("x 20.000 mm   y -10.000 mm   φ 5.000")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("goto 5parsec 0 0", "Invalid value for X: '5parsec' is not a length such as 5mm"),
+        ("goto -5parsec 0 0", "Invalid value for X: '-5parsec' is not a length such as 5mm"),
+        ("goto 0 0 3mm", "Invalid value for PHI: '3mm' is not an angle such as 1.5deg"),
+        ("goto 0 0 0 --blend junk", "Invalid value for --blend: 'junk' is not a length"),
+        ("jog 5mm 0 0", "'5mm' is not a velocity such as 5mm/s"),
+        ("jog 0 0 1deg", "'1deg' is not an angular velocity such as 1.5deg/s"),
+        ("jog 0 0 0 --seconds x", "'x' is not a time such as 2s"),
+        ("override fast", "'fast' is not a percentage such as 50%"),
+        ("ik 0 0 0 --velocity 1 2 x", "Invalid value for velocity: 'x' is not an angular velocity"),
+        ("workspace --phi 1mm", "'1mm' is not an angle"),
+        ("goto -- -0.06 0 0 --speed 0.5", "--speed stands behind --"),
+        ("goto -- -0.06 0 0 --speed=0.5", "--speed stands behind --"),
+        ("goto 0 0 0 --sped 0.5", "Did you mean --speed?"),
+        ("goto 0 0", "PHI requires an argument"),
+    ],
+)
+def test_what_is_wrong_is_one_line_that_says_what_would_be_right(line: str, said: str, run: Run) -> None:
+    code, out, err = run(*line.split())
+    assert (code, out) == (2, "")
+    assert said in err
+    assert err.count("\n") == 1
+    assert err.endswith(f"(trirail {line.split(maxsplit=1)[0]} --help tells the usage)\n")

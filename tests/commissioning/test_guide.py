@@ -1,0 +1,354 @@
+"""The guide on simulated drives, with somebody beside them who sees what rules show: clean, and with every fault."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import can
+import msgspec
+import pytest
+from conftest import CONFIG
+from trirail.commissioning import bench as benches
+from trirail.commissioning.guide import Guide
+from trirail.commissioning.judgement import Judged
+from trirail.commissioning.opening import opened
+from trirail.commissioning.person import Question, Quit
+from trirail.commissioning.report import Entry, Keeper, Report
+from trirail.commissioning.steps import Steps
+from trirail.config import SIM, Config, load
+from trirail_drivers import config
+from trirail_drivers.interface import NAMES, PowerState
+from trirail_drivers.simulated import SimulatedBus, SimulatedDrive
+
+HOMING = config.Homing(method=19, speed_switch=0.02, speed_zero=0.005, acceleration=0.5, timeout=10.0)
+ODRIVE_COUNTS = 200.0
+
+
+class Beside:
+    """Somebody who answers what simulated drives propose, skips some steps, and has answers of their own."""
+
+    def __init__(self, skip: Sequence[str] = (), answers: dict[str, list[str]] | None = None) -> None:
+        """`answers`: those to questions that begin so, one after the other, before the proposed ones."""
+        self.lines: list[str] = []
+        self.asked: list[str] = []
+        self._skip = skip
+        self._answers = answers or {}
+        self._title = ""
+
+    def tell(self, line: str) -> None:
+        self.lines.append(line)
+        if title := re.match(r"\d+/\d+  (.*)", line):
+            self._title = title[1]
+
+    def judged(self, judged: Judged) -> None:
+        self.lines += judged.words
+
+    def ask(self, question: Question, idle: Callable[[], object]) -> str:
+        idle()
+        text = question.text.strip()
+        self.asked.append(text)
+        for begin, own in self._answers.items():
+            if text.startswith(begin) and own:
+                return own.pop(0)
+        if text.startswith("Do it?") and any(re.search(word, self._title) for word in self._skip):
+            return "s"
+        if question.default is None:
+            raise Quit
+        return question.default
+
+
+class Run:
+    """A commissioning that was carried out."""
+
+    def __init__(
+        self,
+        folder: Path,
+        robot: Config = CONFIG,
+        faults: Sequence[str] = (),
+        person: Beside | None = None,
+        source: Path = SIM,
+    ) -> None:
+        self.person = person or Beside()
+        self.keeper = Keeper(Report(robot.robot.name, str(source), "now", True, "tests"), folder / "report.json")
+        self.path = folder / "robot.toml"
+        if not self.path.exists():
+            self.path.write_text(source.read_text(encoding="utf-8"), encoding="utf-8")
+        self.written: Path | None = None
+        with opened(robot, faults, self.person, lambda: False, sleep=lambda _: None) as steps:
+            self.steps: Steps = steps
+            guide = Guide(robot, self.path, steps, self.person, self.keeper)
+            guide.run()
+            self.written = guide.write(None)
+
+    def of(self, step: str, drive: str = "") -> Entry:
+        return self.keeper.report.latest[step, drive]
+
+
+def only(name: str) -> list[str]:
+    """Skip what other drives do, and sliders pushed by hand."""
+    others = "".join(set(NAMES) - {name})
+    return ["by hand", f"(drive|Drive|slider) [{others}]"]
+
+
+def found(run: Run, step: str, name: str, words: str, remedy: str) -> None:
+    entry = run.of(step, name)
+    assert entry.verdict == "wrong", entry
+    assert re.search(words, " ".join(entry.words)), entry.words
+    assert re.search(remedy, entry.remedy), entry.remedy
+
+
+def with_drives(robot: Config, **keys: object) -> Config:
+    drives = robot.drives
+    for name in NAMES:
+        drives = msgspec.structs.replace(drives, **{name: msgspec.structs.replace(getattr(drives, name), **keys)})
+    return msgspec.structs.replace(robot, drives=drives)
+
+
+def odrives() -> Config:
+    robot = with_drives(CONFIG, counts_per_metre=ODRIVE_COUNTS)
+    return msgspec.structs.replace(robot, drives=msgspec.structs.replace(robot.drives, protocol="odrive"))
+
+
+@pytest.mark.parametrize(
+    "robot", [CONFIG, with_drives(CONFIG, direction=-1), odrives()], ids=["sim", "reversed", "odrive"]
+)
+def test_a_sound_robot_passes_every_step(robot: Config, tmp_path: Path) -> None:
+    run = Run(tmp_path, robot)
+    report = run.keeper.report
+    assert [entry for entry in report.steps if entry.verdict != "ok"] == []
+    steps = ["bus", "setup", *(["push"] * 3), *(["power"] * 3), *(["move"] * 3), *(["watchdog"] * 3), "square"]
+    assert [entry.step for entry in report.steps] == steps
+    assert (report.ok, report.complete, report.changes, run.written) == (True, True, {}, None)
+    for name in NAMES:
+        assert run.of("move", name).measured["out"] == pytest.approx(0.001, abs=1e-6)
+        assert run.of("move", name).measured["slider"] == name
+    assert run.of("square").measured["deviation"] < 1e-4  # type: ignore[operator]
+
+
+def test_drives_that_are_to_be_homed_are_homed_one_by_one(tmp_path: Path) -> None:
+    robot = with_drives(CONFIG, homing=HOMING)
+    start = msgspec.structs.replace(robot.can.simulated, start=(0.01, 0.02, 0.03))
+    robot = msgspec.structs.replace(robot, can=msgspec.structs.replace(robot.can, simulated=start))
+    run = Run(tmp_path, robot)
+    assert run.keeper.report.complete, run.person.lines
+    for name, way in zip(NAMES, (-0.02, -0.03, -0.04), strict=True):  # pushed by 10 mm before
+        assert run.of("home", name).measured["way"] == pytest.approx(way, abs=2e-3)
+
+
+# ---------------------------------------------------------------------- faults, found and named
+
+
+MOVED = {
+    "A reversed": ("wrong direction", r"drives\.A\.direction = -1", {"drives.A.direction": -1}),
+    "A scale 0.5": ("wrong scale: .* 2 times", r"counts_per_metre = 2e\+07", {"drives.A.counts_per_metre": 2e7}),
+    "A scale 4": ("wrong scale: .* 0.25 times", r"counts_per_metre", {"drives.A.counts_per_metre": 2.5e6}),
+    "A loose": ("loose encoder", "fasten the encoder of drive A", {}),
+    "A slips 0.5": ("slipping encoder", "fasten encoder and coupling of drive A", {}),
+    "A against": ("counts against its motor", "motor phases", {}),
+}
+
+
+@pytest.mark.parametrize(
+    ("fault", "words", "remedy", "changes"), [(f, *each) for f, each in MOVED.items()], ids=list(MOVED)
+)
+def test_a_fault_is_found_by_1_mm_under_power(
+    fault: str, words: str, remedy: str, changes: dict[str, float], tmp_path: Path
+) -> None:
+    run = Run(tmp_path, faults=[fault], person=Beside(only("A")))
+    found(run, "move", "A", words, remedy)
+    assert run.of("move", "A").changes == changes
+    assert run.keeper.report.ok is False
+    assert run.of("square").verdict == "skipped"
+
+
+PUSHED = {fault: MOVED[fault] for fault in ("A reversed", "A scale 0.5", "A loose")} | {
+    "A scale 0.1": ("wrong scale: .* 10 times", "counts_per_metre", {"drives.A.counts_per_metre": 1e8}),
+}
+
+
+@pytest.mark.parametrize(
+    ("fault", "words", "remedy", "changes"), [(f, *each) for f, each in PUSHED.items()], ids=list(PUSHED)
+)
+def test_a_fault_is_found_by_hand_before_anything_has_power(
+    fault: str, words: str, remedy: str, changes: dict[str, float], tmp_path: Path
+) -> None:
+    run = Run(tmp_path, faults=[fault], person=Beside(["Power on drive [BC]"]))
+    found(run, "push", "A", words, remedy)
+    assert run.of("push", "A").changes == changes
+    assert (run.of("power", "A").verdict, run.of("move", "A").verdict) == ("skipped", "skipped")
+
+
+@pytest.mark.parametrize("step", ["push", "move"])
+def test_swapped_nodes_are_found_and_exchanged_in_a_new_file(step: str, tmp_path: Path) -> None:
+    skip = ["by hand", "drive C", "Watchdog"] if step == "move" else ["Power"]
+    run = Run(tmp_path, faults=["A swapped B", "B swapped A"], person=Beside(skip))
+    found(run, step, "A", "swapped nodes: drive [AB], node [12], has slider [AB]", r"drives\.[AB]\.node = [12]")
+    assert run.keeper.report.changes == {"drives.A.node": 2, "drives.B.node": 1}
+    assert run.written is not None
+    written = load(run.written)
+    assert (written.drives.A.node, written.drives.B.node, written.drives.C.node) == (2, 1, 3)
+
+
+def test_a_ring_of_three_is_found_too(tmp_path: Path) -> None:
+    run = Run(tmp_path, faults=["A swapped B", "B swapped C", "C swapped A"], person=Beside(["Power"]))
+    assert run.keeper.report.changes == {"drives.A.node": 3, "drives.B.node": 1, "drives.C.node": 2}
+
+
+def test_a_slider_that_does_not_move_is_told_from_a_loose_encoder(tmp_path: Path) -> None:
+    run = Run(tmp_path, faults=["A stuck"], person=Beside(only("A")))
+    found(run, "move", "A", "no slider moved.*following error", "motor phases, brake")
+
+
+def test_a_motor_that_moves_nothing(tmp_path: Path) -> None:
+    answers = {"Which slider moved": ["n"]}
+    run = Run(tmp_path, person=Beside(only("A"), answers))
+    found(run, "move", "A", "coupling to the slider is loose", "coupling between motor A")
+
+
+def test_a_drive_that_breaks_down_is_named_and_the_step_can_be_repeated(tmp_path: Path) -> None:
+    answers = {"Go on with the next?": ["y"]}
+    run = Run(tmp_path, faults=["when A enabled A fault 4310"], person=Beside(only("A"), answers))
+    tries = [entry for entry in run.keeper.report.steps if entry.step == "power"]
+    assert [entry.verdict for entry in tries if entry.drive == "A"] == ["failed", "ok"]
+    assert "4310" in tries[0].words[0]
+    assert run.of("move", "A").verdict == "ok"
+
+
+def test_a_wrong_geometry_is_seen_in_the_square(tmp_path: Path) -> None:
+    run = Run(tmp_path, person=Beside(["by hand"], {"Did the platform go": ["n"]}))
+    found(run, "square", "", "did as they were told", r"\[geometry\]")
+
+
+def test_a_drive_that_does_not_answer_is_named(tmp_path: Path) -> None:
+    run = Run(tmp_path, faults=["B silent"])
+    found(run, "bus", "", "drive B: .*no answer|drive B: .*within", "supply, wiring")
+    assert run.of("setup").verdict == "skipped"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_drive_without_a_watch_on_sync_is_told_from_one_without_any(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others = "".join(set(NAMES) - {name})
+    skip = ["by hand", f"(drive|Drive) [{others}]"]
+    monkeypatch.setattr(SimulatedDrive, "sync_timeout", lambda self: math.inf)
+    run = Run(tmp_path, person=Beside(skip))
+    watch = run.of("watchdog", name)
+    assert watch.verdict == "ok", watch
+    assert "8130" in watch.words[0]
+    assert "watch on heartbeats" in watch.words[1]
+
+    (tmp_path / "report.json").unlink()
+    monkeypatch.setattr(SimulatedDrive, "_master_lost", lambda self: None)
+    run = Run(tmp_path, person=Beside(skip))
+    found(run, "watchdog", name, f"drive {name} kept its power without SYNC and heartbeat", "1006h")
+
+
+# ---------------------------------------------------------------------- what it promises
+
+
+def test_every_step_can_be_refused_and_nothing_moves(tmp_path: Path) -> None:
+    run = Run(tmp_path, person=Beside(["by hand", "Power"]))
+    assert {entry.verdict for entry in run.keeper.report.steps} == {"ok", "skipped"}
+    assert (run.keeper.report.ok, run.keeper.report.complete) == (True, False)
+    assert run.steps._place.rules is not None
+    assert run.steps._place.rules.read() == (0.0, 0.0, 0.0)
+
+
+def test_only_the_drive_of_the_step_ever_has_power(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    powered: list[set[str]] = []
+    turn = benches.Bench.cycle
+
+    def watched(self: benches.Bench, *rates: object) -> object:
+        fed = turn(self, *rates)  # type: ignore[arg-type]
+        on = {name for name, state in zip(NAMES, fed.state, strict=True) if state is PowerState.OPERATION_ENABLED}
+        if on and (not powered or powered[-1] != on):
+            powered.append(on)
+        return fed
+
+    monkeypatch.setattr(benches.Bench, "cycle", watched)
+    Run(tmp_path)
+    assert powered[-1] == {"A", "B", "C"}
+    assert all(len(on) == 1 for on in powered[:-1])
+
+
+def test_the_sliders_never_go_faster_than_5_mm_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fastest, send = [0.0], SimulatedBus.send
+
+    def watched(self: SimulatedBus, msg: can.Message, timeout: float | None = None) -> None:
+        fastest[0] = max(fastest[0], *(abs(drive.servo.velocity) / 1e7 for drive in self.drives))
+        send(self, msg, timeout)
+
+    monkeypatch.setattr(SimulatedBus, "send", watched)
+    assert Run(tmp_path, person=Beside(["by hand", "square"])).keeper.report.ok
+    assert 0.0049 < fastest[0] < 0.0051
+
+
+def noted(name: str, do: Callable[[], None], told: list[str]) -> Callable[[], None]:
+    """Return the same call, that notes its name."""
+
+    def doing() -> None:
+        told.append(name)
+        do()
+
+    return doing
+
+
+def test_ctrl_c_stops_in_that_cycle_and_ends_without_power(monkeypatch: pytest.MonkeyPatch) -> None:
+    pressed = [False]
+    told: list[str] = []
+    with opened(CONFIG, [], Beside(), lambda: pressed[0], sleep=lambda _: None) as steps:
+        steps.set_up()
+        bench = steps._ready()
+        for name in ("sync", "quick_stop"):
+            do = getattr(bench._drives, name)
+            monkeypatch.setattr(bench._drives, name, noted(name, do, told))
+        with contextlib.ExitStack() as power:
+            power.enter_context(bench.power("A"))
+            bench.wait(0.2)
+            assert bench.feedback.state[0] is PowerState.OPERATION_ENABLED
+            told.clear()
+            pressed[0] = True
+            with pytest.raises(KeyboardInterrupt):
+                bench.cycle()
+        assert told[:2] == ["sync", "quick_stop"]
+        assert bench.feedback.state == (PowerState.SWITCH_ON_DISABLED,) * 3
+
+
+def test_the_report_is_in_its_files_after_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    person = Beside()
+    seen = person.judged
+
+    def look(judged: Judged) -> None:
+        told = json.loads((tmp_path / "report.json").read_text())
+        assert told["steps"][-1]["words"] == list(judged.words)
+        seen(judged)
+
+    monkeypatch.setattr(person, "judged", look)
+    run = Run(tmp_path, faults=["C reversed"], person=person)
+    told = json.loads((tmp_path / "report.json").read_text())
+    assert told["changes"] == {"drives.C.direction": -1}
+    assert (told["ok"], told["written"]) == (False, str(run.written))
+    words = (tmp_path / "report.txt").read_text()
+    assert "push C: wrong" in words
+    assert "remedy: in the configuration drives.C.direction = -1" in words
+
+
+def test_a_rule_that_is_read_coarsely_tells_no_scale_from_1_mm(tmp_path: Path) -> None:
+    answers = {"To how many mm": ["0.2"]}
+    run = Run(tmp_path, faults=["A scale 0.8"], person=Beside(only("A"), answers))
+    assert run.of("move", "A").verdict == "ok"
+    assert "does not tell the scale" in " ".join(run.of("move", "A").words)
+
+
+def test_no_rule_is_asked_for_what_was_answered_wrongly(tmp_path: Path) -> None:
+    answers = {"What does the rule": ["ten", "1e9", "nan", "0,00 mm"], "Which slider": ["x"]}
+    run = Run(tmp_path, person=Beside(only("A"), answers))
+    assert run.of("move", "A").verdict == "ok"
+    assert sum("is no number" in line for line in run.person.lines) == 3
+    assert sum("is no answer here" in line for line in run.person.lines) == 1

@@ -1,0 +1,193 @@
+"""Verdicts, for ways and rules of any size: what is right passes, each defect is named, and its cure is right."""
+
+from __future__ import annotations
+
+import itertools
+
+import msgspec
+import pytest
+from conftest import CONFIG
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from trirail.commissioning.judgement import (
+    COARSE,
+    SCALE,
+    Judged,
+    MoveSeen,
+    PushSeen,
+    judge_move,
+    judge_push,
+    judge_square,
+    judge_watchdog,
+    merged,
+)
+from trirail.commissioning.moves import DISTANCE
+from trirail_drivers.config import Drives
+from trirail_drivers.interface import NAMES
+
+sliders = st.sampled_from(NAMES)
+signs = st.sampled_from((1.0, -1.0))
+ways = st.floats(0.002, 0.1)
+
+
+def drives(direction: int = 1, counts: float = 1e6) -> Drives:
+    found = CONFIG.drives
+    for name in NAMES:
+        drive = msgspec.structs.replace(getattr(found, name), direction=direction, counts_per_metre=counts)
+        found = msgspec.structs.replace(found, **{name: drive})
+    return found
+
+
+def moved(name: str = "A", **keys: object) -> MoveSeen:
+    usual = MoveSeen(name, DISTANCE, DISTANCE, 1e-5, "", name, DISTANCE, 0.0, 1e-5, 1e-7)
+    return usual._replace(**keys)  # type: ignore[arg-type]
+
+
+def said(judged: Judged) -> str:
+    return " ".join(judged.words)
+
+
+@given(
+    name=sliders,
+    sign=signs,
+    share=st.floats(-0.9, 0.9),
+    read_to=st.floats(1e-6, 2e-4),
+    direction=st.sampled_from((1, -1)),
+)
+def test_what_a_rule_cannot_tell_apart_is_right(
+    name: str, sign: float, share: float, read_to: float, direction: int
+) -> None:
+    asked = sign * DISTANCE
+    rule = asked + share * 1.9 * read_to
+    assume(abs(rule) > 2.0 * read_to)
+    seen = moved(name, asked=asked, out=asked, rule_out=rule, rule_back=share * read_to, read_to=read_to)
+    judged = judge_move(seen, drives(direction))
+    assert (judged.verdict, judged.changes, judged.remedy) == ("ok", {}, "")
+
+
+@given(
+    slider=sliders,
+    drive=sliders,
+    rule=ways,
+    sign=signs,
+    ratio=st.floats(0.05, 20.0),
+    turned=signs,
+    direction=st.sampled_from((1, -1)),
+)
+def test_the_configuration_that_comes_of_it_measures_what_the_rule_reads(
+    slider: str, drive: str, rule: float, sign: float, ratio: float, turned: float, direction: int
+) -> None:
+    """Whatever is swapped, turned and scaled: with the changes the same counts are the rule's way."""
+    before = drives(direction)
+    way = turned * ratio * sign * rule
+    counted = [0.0, 0.0, 0.0]
+    counted[NAMES.index(drive)] = way
+    a, b, c = counted
+    judged = judge_push(PushSeen(slider, sign * rule, (a, b, c), 1e-5, 1e-6), before)
+    after = getattr(before, slider)
+    for key, value in judged.changes.items():
+        _, name, field = key.split(".")
+        assert name == slider
+        after = msgspec.structs.replace(after, **{field: value})
+    old = getattr(before, drive)
+    counts = way * old.direction * old.counts_per_metre
+    measured = counts / (after.direction * after.counts_per_metre)
+    assert measured == pytest.approx(sign * rule, rel=max(SCALE, 2.0 * 1.1e-5 / rule) * 1.1)
+    assert after.node == old.node
+    right = drive == slider and turned > 0 and abs(ratio - 1.0) <= SCALE
+    assert judged.verdict == ("ok" if right else judged.verdict)
+    assert ("swapped nodes" in said(judged)) is (drive != slider)
+    assert ("wrong direction" in said(judged)) is (turned < 0)
+    assert bool(judged.remedy) is (judged.verdict == "wrong")
+
+
+@given(name=sliders, rule=st.floats(2e-4, 0.01), sign=signs, counted=st.floats(-0.01, 0.19))
+def test_an_encoder_that_does_not_go_along_is_loose(name: str, rule: float, sign: float, counted: float) -> None:
+    asked = sign * DISTANCE
+    out = counted * sign * min(rule, DISTANCE)
+    seen = moved(name, asked=asked, out=out, rule_out=sign * rule, stopped="slider A: following error")
+    judged = judge_move(seen, drives())
+    assert judged.verdict == "wrong"
+    assert "loose encoder" in said(judged)
+    assert judged.changes == {}
+
+
+@given(name=sliders, lost=st.floats(0.11, 0.9), sign=signs)
+def test_one_that_comes_back_elsewhere_slips(name: str, lost: float, sign: float) -> None:
+    rule = sign * DISTANCE / (1.0 - lost)
+    seen = moved(name, asked=sign * DISTANCE, out=sign * DISTANCE, rule_out=rule, rule_back=rule - sign * DISTANCE)
+    judged = judge_move(seen, drives())
+    assert (judged.verdict, judged.changes) == ("wrong", {})
+    assert "slip" in said(judged)
+
+
+@given(name=sliders, away=st.floats(0.06, 5.0), sign=signs)
+def test_one_that_counts_backwards_runs_away(name: str, away: float, sign: float) -> None:
+    asked = sign * DISTANCE
+    seen = moved(name, asked=asked, out=-away * asked, rule_out=away * asked, stopped="following error")
+    judged = judge_move(seen, drives())
+    assert judged.verdict == "wrong"
+    assert "against its motor" in said(judged)
+    assert judged.changes == {}  # `direction` would only hide it
+
+
+@given(read_to=st.floats(1e-5, 5e-3), ratio=st.floats(0.3, 3.0))
+def test_no_scale_is_changed_by_what_a_rule_cannot_tell(read_to: float, ratio: float) -> None:
+    rule = DISTANCE / ratio
+    judged = judge_move(moved(rule_out=rule, read_to=read_to), drives())
+    unread = 2.0 * (read_to + 1e-7) / rule
+    if unread > COARSE:
+        assert "drives.A.counts_per_metre" not in judged.changes
+
+
+@given(moves=st.permutations(NAMES))
+def test_nodes_go_where_their_sliders_are(moves: list[str]) -> None:
+    before = drives()
+    changes = [
+        judge_move(moved(name, slider=slider), before).changes for name, slider in zip(NAMES, moves, strict=True)
+    ]
+    together, conflict = merged(changes, before)
+    assert conflict == ""
+    after = {name: together.get(f"drives.{name}.node", getattr(before, name).node) for name in NAMES}
+    assert after == {slider: getattr(before, name).node for name, slider in zip(NAMES, moves, strict=True)}
+
+
+@given(number=st.integers(1, 2), moves=st.permutations(NAMES))
+def test_nodes_stay_different_where_only_some_were_looked_at(number: int, moves: list[str]) -> None:
+    before = drives()
+    seen = [
+        judge_move(moved(name, slider=slider), before)
+        for name, slider in zip(NAMES[:number], moves[:number], strict=True)
+    ]
+    together, _ = merged([judged.changes for judged in seen], before)
+    nodes = [together.get(f"drives.{name}.node", getattr(before, name).node) for name in NAMES]
+    assert sorted(nodes) == sorted(drive.node for drive in before.each)
+
+
+def test_two_drives_on_one_slider_are_no_exchange() -> None:
+    before = drives()
+    seen = [judge_move(moved(name, slider="C"), before).changes for name in ("A", "B")]
+    together, conflict = merged([*seen, {"drives.A.direction": -1}], before)
+    nodes = [together.get(f"drives.{name}.node", getattr(before, name).node) for name in NAMES]
+    assert len(set(nodes)) == 3
+    assert together["drives.A.direction"] == -1
+    assert conflict == "" or "one slider" in conflict
+
+
+@given(
+    seconds=st.one_of(st.none(), st.floats(0.001, 2.0)),
+    by=st.sampled_from(("", *NAMES)),
+    heartbeat=st.floats(0.01, 0.5),
+)
+def test_a_drive_that_keeps_its_power_never_passes(seconds: float | None, by: str, heartbeat: float) -> None:
+    judged = judge_watchdog("B", seconds, by, "said", heartbeat)
+    assert (judged.verdict == "ok") is (seconds is not None)
+    assert bool(judged.remedy) is (judged.verdict != "ok")
+
+
+def test_a_square_that_nobody_saw_is_wrong() -> None:
+    verdicts = [
+        judge_square(1e-5, (0.0, 0.0, 0.0), seen, stopped).verdict
+        for seen, stopped in itertools.product((True, False), ("", "slider A: following error"))
+    ]
+    assert verdicts == ["ok", "failed", "wrong", "failed"]
