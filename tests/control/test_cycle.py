@@ -12,6 +12,7 @@ from conftest import CONFIG, Followers, Rig, what_memory_takes
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from trirail.config import geometry
+from trirail.control.cycle import PASSED, STANDS
 from trirail.control.feedback import Measured
 from trirail.control.setpoints import Setpoints
 from trirail.errors import KinematicsError
@@ -100,6 +101,25 @@ def test_what_is_commanded_is_what_everybody_elses_mathematics_says(
     assert bits([record["progress"], record["remaining"]]) == bits([run.progress, run.remaining])
     assert bool(found) is (run.stands or (seam is not None and run.at.s >= seam))
     assert schedule.end_cycle(run) == (seam is not None and run.at.s >= seam)
+
+
+@pytest.mark.parametrize(
+    ("rate", "change", "target", "stands"),
+    [(0.0, 0.0, 0.0, True), (0.1, 0.0, 0.0, False), (0.0, 0.1, 0.0, False), (0.0, 0.0, 0.5, False)],
+)
+def test_a_motion_stands_on_its_way_where_its_law_does(rate: float, change: float, target: float, stands: bool) -> None:
+    path = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
+    law = Path(np.array([0.0, FOR_EVER]), np.zeros((1, 1, 6)))
+    law.pieces[0, 0, :3] = 0.5, rate, change / 2.0
+    run = Run(LEGS, path, law, target)
+    schedule = Schedule(rest((0.0, 0.0, 0.0)), PERIOD)
+    schedule.take(deque([run]))
+    setpoints = Setpoints(LEGS, boundless(), Measured(LEGS, PERIOD, STEP), STEP)
+    found = setpoints.solve(schedule, schedule.begin_cycle())
+    assert setpoints.refusal(found) is None
+    assert run.stands is stands
+    assert bool(found & STANDS) is stands
+    assert not found & PASSED
 
 
 @given(start=PLACES, terms=TERMS)

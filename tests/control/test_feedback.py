@@ -103,6 +103,34 @@ def test_sliders_that_belong_to_no_pose_leave_the_pose_as_it_was() -> None:
     assert measured.pose == before
 
 
+THREE = st.tuples(*[st.booleans()] * 3)
+
+
+@given(
+    state=st.tuples(*[st.sampled_from(PowerState)] * 3),
+    age=st.tuples(*[st.integers(0, 3)] * 3),
+    follows=THREE,
+    homed=THREE,
+    homing=st.booleans(),
+)
+def test_the_record_has_what_each_drive_said(
+    state: tuple[PowerState, PowerState, PowerState],
+    age: tuple[int, int, int],
+    follows: tuple[bool, bool, bool],
+    homed: tuple[bool, bool, bool],
+    homing: bool,
+) -> None:
+    measured = standing((0.0, 0.0, 0.0))
+    measured.take(Feedback((1e-4, 2e-4, 3e-4), state, None, age=age, follows=follows, homed=homed, homing=homing))
+    record = measured.record[0]
+    assert record["position"].tolist() == [1e-4, 2e-4, 3e-4]
+    assert tuple(record["drive_state"].tolist()) == state
+    assert tuple(record["age"].tolist()) == age
+    assert tuple(record["follows"].tolist()) == follows
+    assert tuple(record["homed"].tolist()) == homed
+    assert bool(record["homing"]) is homing
+
+
 @pytest.mark.parametrize("index", range(3))
 def test_a_robot_is_powered_while_any_drive_can_move_its_slider(index: int) -> None:
     measured = standing((0.0, 0.0, 0.0))

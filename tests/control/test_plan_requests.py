@@ -21,7 +21,7 @@ from trirail.motion.rate_change import FEWEST_KNOTS, KNOTS_A_SECOND
 from trirail.motion.runs import nominal
 from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.messages import Goal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
-from trirail.wire.packets import Accepted, CommandRequest, PlannerLost, Refused
+from trirail.wire.packets import Accepted, CommandRequest, GoalRequest, PlannerLost, Refused
 from trirail.wire.planning import (
     MAX_PLANNING,
     Extended,
@@ -264,6 +264,21 @@ def test_a_goal_that_is_planned_too_late_for_its_time_expires(rig: Rig, meddler:
     rig.post("g1", PoseGoal(0.05, 0.0, 0.0, valid_for=0.1))
     rig.cycles(400)
     assert rig.outcomes() == [("g1", "expired")]
+
+
+def test_a_goal_may_begin_for_as_long_as_it_is_valid_and_not_a_cycle_longer(rig: Rig, meddler: Meddler) -> None:
+    valid = 100  # cycles
+    begun, refused = [], []
+    for number, delay in enumerate(range(valid - 5, valid + 5)):
+        meddler.delays = [delay]
+        goal = PoseGoal(0.001 * (1 + number % 2), 0.0, 0.0, valid_for=valid * PERIOD)
+        rig.cycle(GoalRequest(900 + number, "ann", f"g{number}", goal, round((rig.now + PERIOD) * 1e9)))
+        sent, answered = rig.control.cycles, len(rig.answers)
+        rig.until(lambda answered=answered: len(rig.answers) > answered)
+        (begun if isinstance(rig.answers[-1], Accepted) else refused).append(rig.control.cycles - sent)
+        rig.until(rig.holds)
+    assert max(begun) == valid
+    assert set(refused) == {valid + 1}
 
 
 def test_a_jog_is_over_in_time_though_its_renewals_are_never_answered(rig: Rig, meddler: Meddler) -> None:

@@ -143,6 +143,24 @@ def test_stop_of_a_goal_that_has_not_begun_leaves_the_others(slow: Rig, waiting:
         ("g2", "done" if waiting == "planned" else "stopped"),
         ("running", "preempted"),
     ]
+    answered = [answer.ticket for answer in slow.answers if isinstance(answer, Accepted | Refused)]
+    assert len(answered) == len(set(answered)) == 3  # each goal once
+
+
+@pytest.mark.parametrize("name", ["g2", "g3", "g4", "never"])
+def test_stop_of_one_of_several_goals_that_wait_for_the_planner_is_of_that_one_alone(slow: Rig, name: str) -> None:
+    slow.goal("g0", 0.001, 0.0, 0.0)
+    slow.until(slow.holds)
+    places = {"g1": 0.01, "g2": 0.02, "g3": 0.03, "g4": 0.04}
+    for goal, x in places.items():
+        slow.post(goal, PoseGoal(x, 0.0, 0.0))
+    slow.cycle(CommandRequest(99, "ann", Command.STOP, goal=name))
+    slow.until(lambda: answer_to(slow, 99) is not None)
+    assert isinstance(answer_to(slow, 99), Refused if name == "never" else Confirmed)
+    slow.until(lambda: slow.holds() and slow.control.goal_queue.idle)
+    assert [goal for goal, outcome in slow.outcomes() if outcome == "stopped"] == [name] * (name in places)
+    last = [x for goal, x in places.items() if goal != name][-1]
+    assert slow.control.commanded.pose == pytest.approx((last, 0.0, 0.0))
 
 
 def test_a_goal_that_has_ended_cannot_be_stopped(rig: Rig) -> None:

@@ -231,6 +231,21 @@ def test_the_gates_slack(
     assert BOUNDS.setpoint(rows(leg, **{quantity: math.nan})) is not None
 
 
+@pytest.mark.parametrize("n", range(3))
+@pytest.mark.parametrize("end", range(2))
+def test_a_limit_itself_is_within(n: int, end: int) -> None:
+    exact = Bounds(LIMITS, PERIOD, 0.0)
+    for name, limits in (("position", SLIDER.position), ("passive", SLIDER.passive)):
+        assert exact.setpoint(rows(n, **{name: limits[end]})) is None
+        assert exact.setpoint(rows(n, **{name: np.nextafter(limits[end], (-1.0, 1.0)[end])})) is not None
+    pose = np.zeros(3)
+    limits = (LIMITS.platform.x, LIMITS.platform.y, LIMITS.platform.phi)[n]
+    pose[n] = limits[end]
+    assert exact.pose(pose) is None
+    pose[n] = np.nextafter(limits[end], math.copysign(9.0, end - 0.5))
+    assert exact.pose(pose) is not None
+
+
 @pytest.mark.parametrize("coordinate", range(3))
 @pytest.mark.parametrize("end", range(2))
 def test_the_controls_own_gate_has_the_slack_of_rounding(rig: Rig, coordinate: int, end: int) -> None:
