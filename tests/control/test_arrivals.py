@@ -27,7 +27,7 @@ from trirail.motion.runs import MotionState
 from trirail.wire.messages import Goal, PoseGoal, SlidersGoal
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers.interface import Feedback, MissingProtection, PowerState, Triple
+from trirail_drivers.interface import DriveFault, Feedback, MissingProtection, PowerState, Triple
 
 log = logging.getLogger(__name__)
 
@@ -79,6 +79,7 @@ class Sliders:
     bus_load = 0.0
     traffic = 0
     missing_protections: tuple[MissingProtection, ...] = ()
+    told: tuple[DriveFault | None, ...] = (None, None, None)
 
     def __init__(self, chance: random.Random) -> None:
         self._chance = chance
@@ -109,8 +110,9 @@ class Sliders:
         """See trirail_drivers.interface.DriveGroup."""
         self._next = position
 
-    def enable(self) -> None:
+    def enable(self, alone: str | None = None) -> None:
         """Have power at once."""
+        assert alone is None
         self._said = self._said._replace(state=ON)
 
     def configure(self, period: float) -> None:

@@ -13,7 +13,7 @@ from conftest import CONFIG, Delay, Rig, changed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from trirail.config import Config, geometry
+from trirail.config import SIM, Config, geometry, load
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState, rest
@@ -129,7 +129,8 @@ def test_a_goal_arrives_and_ends_once(rig: Rig) -> None:
     answer = rig.goal("g1", 0.05, -0.02, 0.3)
     assert isinstance(answer, Accepted)
     taken = rig.until(lambda: rig.mode is Mode.HOLDING)
-    assert taken <= math.ceil(answer.duration / PERIOD) + 2
+    dwell = load(SIM).limits.in_position.dwell
+    assert taken <= math.ceil((answer.duration + dwell) / PERIOD) + 2
     rig.cycles(50)
     assert rig.outcomes() == [("g1", "done")]
     assert rig.control.commanded.pose == pytest.approx((0.05, -0.02, 0.3), abs=1e-9)

@@ -171,12 +171,20 @@ def test_a_jerk_too_short_to_be_seen_before_it_is_slowed(rig: Rig) -> None:
     assert_within_limits(rig)
 
 
-def test_too_fast_says_for_what_and_what_would_be_right(rig: Rig) -> None:
+@pytest.mark.parametrize("coordinate", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_too_fast_says_for_what_and_what_would_be_right(rig: Rig, coordinate: int, sign: float) -> None:
     rig.enable()
-    answer = refusal(rig.send("g1", TrajectoryGoal(points((0.0, 0.0), (0.5, 0.1)))))
+    x, y, phi = sign * np.eye(3)[coordinate] * (0.1, 0.1, 0.4)
+    made = TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(0.4, x, y, phi)
+    answer = refusal(rig.send("g1", TrajectoryGoal(made)))
     assert answer.code == "too_fast"
     assert answer.value is not None
-    assert f"times too fast for the platform's x: let it take {0.5 * answer.value:.3g} s" in answer.message
+    name = ("x", "y", "phi")[coordinate]
+    assert f"times too fast for the platform's {name}: let it take {0.4 * answer.value:.3g} s" in answer.message
+    peaks = np.array((1.875 / 0.4, 10.0 / math.sqrt(3.0) / 0.4**2, 60.0 / 0.4**3))  # of a quintic from rest to rest
+    used = peaks * (0.1, 0.1, 0.4)[coordinate] / PLATFORM[:, coordinate]
+    assert answer.value == pytest.approx((used ** (1.0, 1.0 / 2.0, 1.0 / 3.0)).max(), rel=0.01)
 
 
 # ---------------------------------------------------------------------- the last gate

@@ -126,25 +126,46 @@ def test_the_very_end_of_a_sliders_travel(rig: Rig, leg: int, beyond: float) -> 
         assert "platform" in refusal(answer).message or "passive" in refusal(answer).message
 
 
+@pytest.mark.parametrize(("coordinate", "end"), [(0, 0), (0, 1), (1, 1)])
 @pytest.mark.parametrize("at", [1.38, 1.40, 1.42, 1.44])  # of these at most one peak can be where it is looked anyway
-def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(rig: Rig, at: float) -> None:
+def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(rig: Rig, at: float, coordinate: int, end: int) -> None:
     """Both ends inside, and by how much the middle is outside is less than what lies between two looks."""
     rig.enable()
-    low = CONFIG.limits.platform.x[1]
+    limit = (CONFIG.limits.platform.x, CONFIG.limits.platform.y)[coordinate][end]
     ends = TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(3.0, 0.0, 0.0, 0.0)
 
-    def through(x: float) -> tuple[TrajectoryPoint, ...]:
-        middle = TrajectoryPoint(at, x, 0.0, 0.0, velocity=(0.3 * x, 0.0, 0.0), acceleration=(-2.0 * x, 0.0, 0.0))
-        return ends[0], middle, ends[1]
+    def through(place: float) -> tuple[TrajectoryPoint, ...]:
+        x, y, phi = (np.eye(3)[coordinate] * place).tolist()
+        velocity, acceleration = (0.3 * x, 0.3 * y, 0.0), (-2.0 * x, -2.0 * y, 0.0)
+        return ends[0], TrajectoryPoint(at, x, y, phi, velocity=velocity, acceleration=acceleration), ends[1]
 
     points = [Point(p.t, (p.x, p.y, p.phi), p.velocity, p.acceleration) for p in through(1.0)]
     path, t = quintic(points, (0.0, 0.0, 0.0)), np.linspace(0.0, 3.0 - at, 200_001)
-    highest = float((path.pieces[1, 0] @ t ** np.arange(6.0)[:, None]).max())  # a while after the point
-    beyond = refusal(rig.send("g1", TrajectoryGoal(through((low + 2e-6) / highest))))
-    assert (beyond.code, "platform x: position" in beyond.message) == ("out_of_workspace", True)
-    accepted(rig.send("g2", TrajectoryGoal(through((low - 2e-6) / highest))))
+    highest = float((path.pieces[1, coordinate] @ t ** np.arange(6.0)[:, None]).max())  # a while after the point
+    room = math.copysign(2e-6, limit)
+    beyond = refusal(rig.send("g1", TrajectoryGoal(through((limit + room) / highest))))
+    assert (beyond.code, f"platform {'xy'[coordinate]}: position" in beyond.message) == ("out_of_workspace", True)
+    accepted(rig.send("g2", TrajectoryGoal(through((limit - room) / highest))))
     rig.until(rig.holds)
     assert rig.control.fault is None
+
+
+@pytest.mark.parametrize("by", [1.002, 1.005, 1.009])
+@pytest.mark.parametrize("quantity", ["velocity", "acceleration"])
+def test_a_path_that_is_hardly_too_fast_is_slowed(quantity: str, by: float) -> None:
+    """For sliders whose limit is so many times less than what it takes at the platform's own."""
+    row = ("velocity", "acceleration").index(quantity)
+
+    def used(config: Config) -> float:
+        rig = Rig(config)
+        rig.enable()
+        rig.goal("g1", 0.1, 0.02, 0.2)
+        rig.until(rig.holds)
+        rig.bus.shutdown()
+        return float(np.abs(rig.setpoints()[:, 1 + row]).max())
+
+    planned = used(CONFIG) / by ** (1 + row)
+    assert used(slower(CONFIG, **{quantity: planned / 0.98})) <= planned * (1.0 + 1e-3)
 
 
 def test_slowed_is_said(rig: Rig) -> None:

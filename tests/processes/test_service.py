@@ -410,6 +410,54 @@ def test_goals_that_wait_at_override_zero_keep_no_command_waiting(service: Servi
     assert service.end() == 0
 
 
+def test_done_is_said_when_the_robot_is_measured_to_be_there(tmp_path: Path) -> None:
+    """Servos 0.2 s behind: not before, and where that takes too long, what is left to go; a replay judges the same."""
+    lagging = Service(
+        tmp_path,
+        **{
+            "time_constant = 0.004": "time_constant = 0.2",
+            "feed_forward_gain = 0.95": "feed_forward_gain = 0.0",
+            "\nfollowing_error = 0.004": "\nfollowing_error = 0.05",
+            "\nfollowing_error = 0.005": "\nfollowing_error = 0.06",
+            "timeout = 2.0": "timeout = 0.3",
+        },
+    )
+    windows = load(tmp_path / "robot.toml").limits.in_position
+    lagging.wait_up()
+    with lagging.robot() as robot:
+        robot.enable()
+        near = robot.move_to(x=0.0003, y=-0.0002, phi=0.0).wait(timeout=10.0)
+        assert near.outcome == "done"
+        assert near.settle is not None
+        assert near.settle > 0.02
+        assert near.residual is not None
+        assert (np.abs(near.residual.pose) <= windows.pose).all()
+        assert near.overshoot == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+        until(robot, lambda state: state.settled)
+        far = trirail("goto", 0.006, -0.004, 0.02, "--wait", locator=lagging.locator)
+        assert far.returncode == 1
+        assert "unsettled: not in position 0.3 s after the end of its path; left to go: slider A " in far.stdout
+        said = json.loads(trirail("goto", 0.05, 0.0, 0.0, "--wait", "--json", locator=lagging.locator).stdout)
+        assert (said["outcome"], said["settle"]) == ("unsettled", None)
+        assert max(np.abs(said["residual"]["pose"]) / windows.pose) > 1.0
+        state = robot.state()
+        assert (state.mode, state.faults) == ("holding", ())
+        until(robot, lambda state: state.settled)
+        there = trirail("goto", 0.05, 0.0, 0.0, "--wait", locator=lagging.locator)
+        assert (there.returncode, "done: arrived, settled in 1 ms" in there.stdout) == (0, True)
+    assert lagging.end() == 0
+    (file,) = (tmp_path / "recordings").glob("*.rrd")
+    recording = read(file)
+    (done,) = [line.event for line in recording.events if line.event is not None and line.event.id == near.id]
+    last = int(np.searchsorted(recording.records["cycle"], done.cycle))
+    dwell = recording.records[last + 1 - round(windows.dwell * 1000) : last + 1]
+    assert (np.abs(dwell["pose"] - (0.0003, -0.0002, 0.0)) <= windows.pose).all()
+    report = trirail("report", file)
+    assert "unsettled" in report.stdout
+    assert f"settled in {near.settle * 1e3:g} ms" in report.stdout
+    assert trirail("replay", file).returncode == 0
+
+
 def test_goals_wait_blend_and_are_cancelled(service: Service) -> None:
     with service.robot() as robot:
         robot.enable()

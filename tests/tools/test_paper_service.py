@@ -85,14 +85,16 @@ def test_the_cycle_that_takes_the_goal_is_one_period_into_it(rig: conftest.Rig, 
     assert isinstance(rig.send("g", TrajectoryGoal(tuple(points(example)))), Accepted)
     first = len(rig.rows) - 1
     assert rig.control.measured.record["progress"][0] == pytest.approx(PERIOD / DURATION)
-    moving = 1
+    moving = round(DURATION / PERIOD)
+    modes = [rig.mode]
     measured, error = [rig.control.measured.feedback.position], [rig.control.measured.following_error]
-    for _ in range(round(DURATION / PERIOD) + REACHED):
+    for _ in range(moving + REACHED):
         rig.cycle()
-        moving += rig.mode is Mode.MOVING
+        modes.append(rig.mode)
         measured.append(rig.control.measured.feedback.position)
         error.append(rig.control.measured.following_error)
-    assert moving == round(DURATION / PERIOD)
+    assert set(modes[:moving]) == {Mode.MOVING}
+    assert rig.control.measured.record["progress"][0] == 1.0
     setpoints = rig.setpoints()[first : first + moving]
     _, *exact = computed(example, np.arange(1.0, moving + 1.0) * PERIOD)
     for row, values in enumerate(exact):

@@ -31,6 +31,8 @@ class GoalSummary(msgspec.Struct, frozen=True):
     given: float
     ended: float | None
     message: str
+    settle: float | None = None
+    """From the end of its path until the robot was in position; None of one that did not settle."""
 
 
 class Incident(msgspec.Struct, frozen=True):
@@ -162,10 +164,10 @@ def _goals(recording: Recording, period: float) -> Iterator[GoalSummary]:
         yield GoalSummary(name, end.user or "", UNKNOWN, *_end(end, end.t))
 
 
-def _end(event: Event | None, given: float) -> tuple[str, float, float | None, str]:
+def _end(event: Event | None, given: float) -> tuple[str, float, float | None, str, float | None]:
     if event is None:
-        return UNKNOWN, given, None, "its end is not in the recording"
-    return event.outcome or UNKNOWN, given, event.t, event.reason or event.message
+        return UNKNOWN, given, None, "its end is not in the recording", None
+    return event.outcome or UNKNOWN, given, event.t, event.reason or event.message, event.settle
 
 
 def _is_fault(line: Line) -> bool:

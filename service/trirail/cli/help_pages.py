@@ -15,7 +15,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "doctor": ("trirail doctor", "trirail doctor robot.toml"),
         "config": ("trirail config", "trirail config copy socketcan robot.toml", "trirail config show robot.toml"),
         "drives": ("trirail drives robot.toml", "trirail drives robot.toml --apply"),
-        "commission": ("trirail commission robot.toml", "trirail commission robot.toml --out robot-ready.toml"),
+        "commission": ("trirail commission robot.toml", "trirail commission robot.toml --yes --fault 'A reversed'"),
         "run": ("trirail run", "trirail run robot.toml", "trirail run robot.toml --record session.rrd"),
         "completion": ("trirail completion bash --install", "trirail completion zsh"),
     },

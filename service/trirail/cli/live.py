@@ -13,7 +13,7 @@ from rich.table import Table
 from trirail_drivers.interface import NAMES, MissingProtection
 
 from trirail.cli import units
-from trirail.cli.terminal import COLOURS, SILENT, json, out, percentiles, plain
+from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain
 from trirail.client.client import Jog, Robot
 from trirail.config import Limits
 from trirail.errors import ServiceError
@@ -127,7 +127,7 @@ def _mode(state: State) -> str:
 
 
 def _add_goal(grid: Table, goal: GoalState, pose: Sequence[float]) -> None:
-    grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {units.written(goal.remaining, 's', 1)} left")
+    grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {left(goal)}")
     if goal.target is not None:
         grid.add_row("  target", units.pose(goal.target, 9))
         grid.add_row("  to go", units.pose([end - at for end, at in zip(goal.target, pose, strict=True)], 9))

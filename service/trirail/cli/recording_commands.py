@@ -201,6 +201,8 @@ def _print_goals(goals: list[GoalSummary]) -> None:
         colour = palette.code(palette.OUTCOMES[goal.outcome])
         name = terminal.plain(f"{goal.id:{longest}}")
         words = "" if goal.outcome == "done" else f": {terminal.plain(goal.message)}"
+        if goal.settle is not None:
+            words = f", settled in {goal.settle * 1e3:g} ms"
         line = f"  {goal.given:9.3f} s  {took:>9}  [{colour}]{goal.outcome:9}[/]  {name}  {goal.kind} of "
         terminal.out.print(f"{line}{terminal.plain(goal.user)}{words}", soft_wrap=True)
 

@@ -21,7 +21,7 @@ from trirail.client.client import GoalHandle, Result, Robot
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.telemetry import palette
 from trirail.wire.messages import Event, GoalReply
-from trirail.wire.state import Percentiles
+from trirail.wire.state import GoalState, Percentiles
 from trirail.wire.text import json_printable, printable, wall_clock
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
                 if goal.result is not None:
                     return goal.result
                 if state.goal is not None and state.goal.id == goal.id:
-                    progress.update(task, completed=state.goal.progress, left=f"{state.goal.remaining:.1f} s left")
+                    progress.update(task, completed=state.goal.progress, left=left(state.goal))
             if goal.result is not None:
                 return goal.result
             raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
@@ -145,6 +145,11 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
 def _cancel(goal: GoalHandle) -> None:
     with contextlib.suppress(TrirailError):  # it has ended; or nobody answers, and then its end is not heard either
         goal.cancel()
+
+
+def left(goal: GoalState) -> str:
+    """Say how long the path of a goal still takes, or that it has ended and the robot settles."""
+    return f"{goal.remaining:.1f} s left" if goal.progress < 1.0 else "settling"
 
 
 def event(happened: Event) -> None:
