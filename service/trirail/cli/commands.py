@@ -152,6 +152,7 @@ app.command(math_commands.fk)
 app.command(workspace_command.workspace)
 app.command(recording_commands.replay)
 app.command(recording_commands.report)
+app.command(recording_commands.export)
 
 
 @app.command

@@ -56,6 +56,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
     },
     "Recordings": {
         "report": ("trirail report session.rrd", "trirail report session.rrd --plot session.png"),
+        "export": ("trirail export session.rrd", "trirail export session.rrd --out session.parquet"),
         "replay": (
             "trirail replay session.rrd",
             "trirail replay session.rrd --config other.toml",

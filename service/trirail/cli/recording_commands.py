@@ -99,6 +99,30 @@ def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Fl
     return 0
 
 
+def export(*file: Recordings, out: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
+    """Write a recorded session as a table, a row a cycle, in SI units: CSV or Parquet.
+
+    Parameters
+    ----------
+    file
+        Recording, or all files of one that was rotated.
+    out
+        File to write, never over one that exists; its suffix is its format: .csv, .parquet. Beside the recording, as
+        CSV, if absent.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail.analysis.export import write
+
+    path = out or file[0].with_suffix(".csv")
+    rows = write(_read(file), path)
+    if json:
+        terminal.json({"file": str(path), "rows": rows})
+    else:
+        terminal.say(f"{rows} cycles written to {path}")
+    return 0
+
+
 def _resend(recording: Recording, name: str, locator: str, json: bool) -> int:
     from trirail.analysis.resend import resend
     from trirail.client.client import Robot
