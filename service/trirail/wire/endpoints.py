@@ -28,17 +28,23 @@ def reach(endpoint: str) -> Reach:
 
 def socket_file(endpoint: str) -> Path | None:
     """Return the file of an endpoint that is a Unix socket, None of any other."""
-    protocol, _, path = endpoint.partition("/")
-    return Path(path) if protocol == "unixsock-stream" else None
+    protocol, address = _parts(endpoint)
+    return Path(address) if protocol == "unixsock-stream" else None
 
 
 def is_local(endpoint: str) -> bool:
     """Whether an endpoint, protocol/address, stays on this machine."""
-    protocol, _, rest = endpoint.partition("/")
-    host = rest.partition("#")[0].partition("?")[0].rpartition(":")[0].removeprefix("[").removesuffix("]")
+    protocol, address = _parts(endpoint)
+    host = address.rpartition(":")[0].removeprefix("[").removesuffix("]")
     if protocol in {"unixsock-stream", "unixpipe"} or host == "localhost":
         return True
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def _parts(endpoint: str) -> tuple[str, str]:
+    """The protocol and the address of `protocol/address?metadata#settings`."""
+    protocol, _, rest = endpoint.partition("/")
+    return protocol, rest.partition("#")[0].partition("?")[0]
