@@ -21,6 +21,7 @@ from trirail.wire.vocabulary import Mode
 from trirail_drivers.errors import LONGEST, BusError
 
 TEXT = SIM.read_text()
+LISTEN, TLS = 'listen = ["tcp/127.0.0.1:7447"]', 'listen = ["tls/0.0.0.0:7447"]\n[zenoh.tls]'
 CONFIGS = sorted(SIM.parent.rglob("*.toml"))
 
 
@@ -41,6 +42,23 @@ def test_shipped_configurations_load(path: Path) -> None:
             "loop.rate_hz = 999: a cycle must be a whole number of microseconds",
         ),
         ("rate_hz = 1000", "", "loop.rate_hz: missing key"),
+        (LISTEN, 'listen = ["tcp/0.0.0.0:7447"]', "zenoh.listen[0] = 'tcp/0.0.0.0:7447': whoever reaches it can move"),
+        (LISTEN, 'listen = ["tcp/127.0.0.1:1", "tcp/[::]:2"]', "zenoh.listen[1] = 'tcp/[::]:2': whoever reaches it"),
+        (LISTEN, 'listen = ["tls/0.0.0.0:7447"]', "zenoh.listen[0] = 'tls/0.0.0.0:7447': it needs [zenoh.tls]"),
+        (LISTEN, f"{LISTEN}\n[zenoh.tls]", "with [zenoh.tls] every endpoint is tls/ADDRESS:PORT"),
+        (LISTEN, f"{TLS.replace(':7447', ':7447#enable_mtls=false')}", "settings after # would go round [zenoh.tls]"),
+        (LISTEN, f'{LISTEN}\n[zenoh.users]\nann = "viewer"', "zenoh.users: without [zenoh.tls] nobody's name is known"),
+        (
+            LISTEN,
+            f'{TLS}\n[zenoh.users]\nbob = "viewer"\nann = "boss"',
+            "zenoh.users.ann = 'boss': allowed are 'viewer'",
+        ),
+        (LISTEN, f"{TLS}\n[zenoh.users]\nann = 3", "zenoh.users.ann = 3: expected str, got int"),
+        (
+            LISTEN,
+            f'{TLS}\n[zenoh.users]\n"a b" = "viewer"',
+            "zenoh.users: 'a b' is no name here: expected str matching",
+        ),
         ("[watchdogs]", "[watchdog]", "watchdog: unknown section; did you mean watchdogs?"),
         ("[zenoh]", "[drives.zenoh]", "drives.zenoh: unknown key; allowed are protocol"),
         ("[loop]", "[loop", "not TOML"),
@@ -382,3 +400,16 @@ def test_every_number_has_a_floor_and_a_ceiling() -> None:
         assert meta is not None, path
         assert meta.ge is not None, path
         assert meta.le is not None, path
+
+
+def test_an_open_door_is_taken_where_it_is_written_out() -> None:
+    config = parse(TEXT.replace(LISTEN, 'listen = ["tcp/0.0.0.0:7447"]\ninsecure = true'))
+    assert config.zenoh.insecure
+
+
+def test_certificates_are_looked_for_beside_the_configuration(tmp_path: Path) -> None:
+    (tmp_path / "robot.toml").write_text(TEXT.replace(LISTEN, f'{TLS}\n[zenoh.users]\nann = "operator"'))
+    zenoh = load(tmp_path / "robot.toml").zenoh
+    assert zenoh.tls is not None
+    assert zenoh.tls.directory == str(tmp_path / "keys")
+    assert zenoh.users == {"ann": "operator"}

@@ -98,6 +98,8 @@ def allowed(kind: mi.Type) -> str:
     match kind:
         case mi.UnionType(types=types):
             return " or ".join(allowed(part) for part in types if not isinstance(part, mi.NoneType))
+        case mi.EnumType(cls=cls):
+            return ", ".join(f"`{json.dumps(member.value)}`" for member in cls)
         case mi.LiteralType(values=values):
             return ", ".join(f"`{json.dumps(value)}`" for value in values)
         case mi.IntType() | mi.FloatType():

@@ -32,6 +32,7 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "error-reply": (messages.ErrorReply, "The error reply to a goal or command that is refused, or that fails."),
     "state": (state.State, "What is published on state."),
     "event": (messages.Event, "What is published on event."),
+    "role": (messages.RoleReply, "The reply to a query on role/<user>."),
     "info": (state.Info, "The reply to a query on info."),
 }
 """By file: the type, and where the message is met."""

@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 import numpy as np
@@ -22,6 +22,8 @@ from trirail_drivers.interface import NAMES
 
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles
+from trirail.wire.endpoints import Reach, reach
+from trirail.wire.vocabulary import Role
 
 _PACKAGED = Path(__file__).parent / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[2] / "configs") / "sim.toml"
@@ -34,6 +36,8 @@ Jerk = Annotated[float, Meta(ge=1e-3, le=1e6)]
 BASE, PLATFORM = "base", "platform"
 """Frames that every robot has."""
 FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+UserName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+"""The <user> of Zenoh keys."""
 Point = tuple[Coordinate, Coordinate]
 Range = tuple[Coordinate, Coordinate]
 
@@ -158,11 +162,26 @@ class LoopTable(Struct, frozen=True, forbid_unknown_fields=True):
     """The processor to stay on; the last one that the process may use when absent."""
 
 
+class Tls(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [zenoh.tls]: who has no certificate cannot open a session, who has no role cannot do anything."""
+
+    directory: Name = "keys"
+    """Folder with ca.pem, cert.pem and key.pem, as `trirail keys init` makes it, relative to the configuration file;
+    who is in its file revoked.txt has no role."""
+
+
 class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [zenoh]."""
 
     listen: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=64)] = ("tcp/127.0.0.1:7447",)
-    """Zenoh locators at which clients find the service; the loopback's is for this machine alone."""
+    """Zenoh locators at which clients find the service: tcp on the loopback for every user of this machine,
+    unixsock-stream for those whom the socket's file lets, tls with [zenoh.tls] for the network."""
+    insecure: bool = False
+    """Listen beyond this machine without certificates: whoever reaches the address can move the robot."""
+    tls: Tls | None = None
+    users: dict[UserName, Role] = {}
+    """The role of each user, whose name is the common name of his certificate: a viewer sees all and may stop, an
+    operator also moves the robot, a maintainer also resets and homes."""
 
 
 class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
@@ -253,13 +272,17 @@ def parse(text: str) -> Config:
 
 
 def _beside(path: Path, config: Config) -> Config:
-    """The configuration with its drives' EDS files where they lie: relative to the configuration file."""
+    """The configuration with EDS files and certificates where they lie: relative to the configuration file."""
     drives = config.drives
     for name, drive in zip(NAMES, drives.each, strict=True):
         if drive.eds is not None:
             found = msgspec.structs.replace(drive, eds=str(path.parent / drive.eds))
             drives = msgspec.structs.replace(drives, **{name: found})
-    return msgspec.structs.replace(config, drives=drives)
+    zenoh = config.zenoh
+    if zenoh.tls is not None:
+        tls = msgspec.structs.replace(zenoh.tls, directory=str(path.parent / zenoh.tls.directory))
+        zenoh = msgspec.structs.replace(zenoh, tls=tls)
+    return msgspec.structs.replace(config, drives=drives, zenoh=zenoh)
 
 
 def geometry(table: GeometryTable) -> Geometry:
@@ -286,7 +309,7 @@ def _leaves(value: object, key: str = "") -> Iterator[tuple[str, object]]:
         yield key, value
 
 
-_AT = re.compile(r"^(?P<what>.*?)(?: - at (?:`key` in )?`\$(?P<path>[^`]*)`)?$", re.DOTALL)
+_AT = re.compile(r"^(?P<what>.*?)(?: - at (?P<key>`key` in )?`\$(?P<path>[^`]*)`)?$", re.DOTALL)
 NAMED = "[...]"
 """What msgspec says in the place of a key of a table whose keys are names."""
 _FIELD = re.compile(r"^Object (?P<how>contains unknown|missing required) field `(?P<name>[^`]*)`")
@@ -304,12 +327,18 @@ def _explain(error: str, raw: dict[str, Any]) -> str:
         close = difflib.get_close_matches(field["name"], allowed, n=1)
         hint = f"did you mean {close[0]}?" if close else f"allowed are {', '.join(allowed)}"
         return f"{key}: unknown {'key' if path else 'section'}; {hint}"
-    if NAMED in path:
-        table = path.split(NAMED)[0]
-        path = path.replace(NAMED, f".{_culprit(_at(table, raw), get_args(_type_at(table))[1])}")
+    keys = bool(found and found["key"])
+    if keys or NAMED in path:
+        table, _, rest = path.partition(NAMED)
+        name = _culprit(_at(table, raw), get_args(_type_at(table))[0 if keys else 1], of_keys=keys)
+        if keys:
+            return f"{table}: {name!r} is no name here: {what[0].lower()}{what[1:].replace('`', '')}"
+        path = f"{table}.{name}{rest}"
     value = _at(path, raw)
     if what.startswith("Invalid enum value"):
-        return f"{path} = {value!r}: allowed are {', '.join(map(repr, get_args(_type_at(path))))}"
+        kind = _type_at(path)
+        values = [str(each) for each in kind] if kind is Role else get_args(kind)
+        return f"{path} = {value!r}: allowed are {', '.join(map(repr, values))}"
     return f"{path} = {value!r}: {what[0].lower()}{what[1:].replace('`', '')}"
 
 
@@ -321,11 +350,11 @@ def _at(path: str, raw: dict[str, Any]) -> object:
     return value
 
 
-def _culprit(table: Any, kind: Any) -> str:
-    """The name in a table of names whose value is not of a type."""
+def _culprit(table: Any, kind: Any, *, of_keys: bool) -> str:
+    """The first name in a table of names whose key, or value, is not of a type: msgspec does not say which."""
     for name, value in table.items():
         try:
-            msgspec.convert(value, kind)
+            msgspec.convert(name if of_keys else value, kind)
         except msgspec.ValidationError:
             return str(name)
     return NAMED
@@ -341,6 +370,8 @@ def _type_at(path: str) -> Any:
     for part in _parts(path):
         if part.isdigit():
             kind = get_args(kind)[0]
+        elif get_origin(kind) is dict:
+            kind = get_args(kind)[1]
         else:
             kind = next(field.type for field in msgspec.structs.fields(kind) if field.name == part)
         if isinstance(kind, UnionType):
@@ -382,6 +413,7 @@ def _check(config: Config) -> None:
                 f"to the singular angle {angle:.4f}: keep {'below ' if angle > 0 else 'above '}"
                 f"{angle - math.copysign(margin, angle):.4f}"
             )
+    _check_reach(config.zenoh)
     settling = config.limits.in_position
     if settling.timeout <= settling.dwell:
         raise ConfigError(
@@ -415,3 +447,22 @@ def _check(config: Config) -> None:
         checks.check(config.drives, required)
     except DriveError as error:
         raise ConfigError(str(error)) from error
+
+
+def _check_reach(zenoh: Zenoh) -> None:
+    """Refuse a door that is open by accident, and certificates or users that would not be looked at."""
+    if zenoh.users and zenoh.tls is None:
+        raise ConfigError("zenoh.users: without [zenoh.tls] nobody's name is known: add it, or leave users out")
+    for index, endpoint in enumerate(zenoh.listen):
+        key, by = f"zenoh.listen[{index}] = {endpoint!r}", reach(endpoint)
+        if zenoh.tls is not None and by is not Reach.CERTIFICATE:
+            raise ConfigError(f"{key}: with [zenoh.tls] every endpoint is tls/ADDRESS:PORT, or it would go round it")
+        if zenoh.tls is not None and "#" in endpoint:
+            raise ConfigError(f"{key}: settings after # would go round [zenoh.tls]")
+        if zenoh.tls is None and by is Reach.CERTIFICATE:
+            raise ConfigError(f"{key}: it needs [zenoh.tls], with the certificates that `trirail keys init` makes")
+        if by is Reach.NETWORK and not zenoh.insecure:
+            raise ConfigError(
+                f"{key}: whoever reaches it can move the robot: use tls/ with [zenoh.tls] (trirail keys init), "
+                "an address of the loopback, or write insecure = true if that is what you want"
+            )

@@ -66,6 +66,13 @@ class RefusalCode(StrEnum):
     DUPLICATE_ID = "duplicate_id", "the goal's id has been used", "give every goal an id of its own, or none"
     UNKNOWN_FRAME = "unknown_frame", "no tool or frame of that name in [frames]", "use one of those that info tells"
 
+    # Who sent it.
+    NOT_ALLOWED = (
+        "not_allowed",
+        "the user's role does not allow it, or he has none",
+        "ask for a role that does: [zenoh.users] of the robot's configuration",
+    )
+
     # What the robot's mode allows.
     NOT_ENABLED = "not_enabled", "the drives have no power yet", "send enable, and wait for it"
     NOT_HOMED = "not_homed", "where the sliders are is not known", "send home"

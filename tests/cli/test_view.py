@@ -22,11 +22,11 @@ import screenshot
 from chromium import chromium, needs_chromium
 from PIL import Image
 from rerun.chunk import Chunk, RrdReader
-from trirail.cli import view
 from trirail.config import SIM, load
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.sinks import free_port
+from trirail.wire.endpoints import is_local
 
 VIEWS = {
     "demo: 3-PRP planar robot",
@@ -147,7 +147,7 @@ def test_what_serves_the_browser_listens_on_the_loopback_alone(recording: Path) 
     ],
 )
 def test_which_locators_stay_on_this_machine(locator: str, local: bool) -> None:
-    assert view.is_local(locator) is local
+    assert is_local(locator) is local
 
 
 def test_a_frozen_viewer_is_skipped_counted_and_does_not_stop_the_file(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -266,15 +267,20 @@ def test_a_goal_that_is_planned_too_late_for_its_time_expires(rig: Rig, meddler:
     assert rig.outcomes() == [("g1", "expired")]
 
 
+def answers_more_than(rig: Rig, before: int) -> bool:
+    return len(rig.answers) > before
+
+
 def test_a_goal_may_begin_for_as_long_as_it_is_valid_and_not_a_cycle_longer(rig: Rig, meddler: Meddler) -> None:
     valid = 100  # cycles
-    begun, refused = [], []
+    begun: list[int] = []
+    refused: list[int] = []
     for number, delay in enumerate(range(valid - 5, valid + 5)):
         meddler.delays = [delay]
         goal = PoseGoal(0.001 * (1 + number % 2), 0.0, 0.0, valid_for=valid * PERIOD)
         rig.cycle(GoalRequest(900 + number, "ann", f"g{number}", goal, round((rig.now + PERIOD) * 1e9)))
         sent, answered = rig.control.cycles, len(rig.answers)
-        rig.until(lambda answered=answered: len(rig.answers) > answered)
+        rig.until(partial(answers_more_than, rig, answered))
         (begun if isinstance(rig.answers[-1], Accepted) else refused).append(rig.control.cycles - sent)
         rig.until(rig.holds)
     assert max(begun) == valid

@@ -18,6 +18,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.errors import RefusedError
 from trirail.processes.gateway import Gateway
+from trirail.processes.guard import Guard
 from trirail.processes.inbox import Incoming, Kind
 from trirail.wire import boundary, links, packets, text, zenoh_session
 from trirail.wire.links import Port, TooLarge
@@ -171,10 +172,15 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gateway,
     folder = tmp_path_factory.mktemp("zenoh")
     link = FakeLink()
     with zenoh_session.open_service([f"unixsock-stream/{folder}/z"]) as opened:
-        yield Gateway(CONFIG, link, lambda: None, opened), link  # type: ignore[arg-type]
+        yield Gateway(CONFIG, link, lambda: None, opened, Guard(CONFIG)), link  # type: ignore[arg-type]
 
 
-@given(kind=st.sampled_from(("goal", "cmd", "info")), key=keys, payload=payloads, encoding=st.sampled_from(ENCODINGS))
+@given(
+    kind=st.sampled_from(("goal", "cmd", "info", "role")),
+    key=keys,
+    payload=payloads,
+    encoding=st.sampled_from(ENCODINGS),
+)
 def test_the_gateway_takes_any_message(
     gateway: tuple[Gateway, FakeLink], kind: Kind, key: str, payload: bytes, encoding: str
 ) -> None:

@@ -14,6 +14,7 @@ import pytest
 from conftest import CONFIG
 from trirail.processes.backlog import PATIENCE
 from trirail.processes.gateway import UNDER_WAY, Gateway
+from trirail.processes.guard import Guard
 from trirail.processes.inbox import Incoming
 from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, RefusedRequest, Request, Welcome
@@ -40,7 +41,7 @@ Rig = tuple[Gateway, FakeLink]
 def rig(tmp_path: Path) -> Iterator[Rig]:
     link = FakeLink()
     with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
-        yield Gateway(CONFIG, link, lambda: None, opened), link  # type: ignore[arg-type]
+        yield Gateway(CONFIG, link, lambda: None, opened, Guard(CONFIG)), link  # type: ignore[arg-type]
 
 
 def goal(gateway: Gateway, name: str) -> None:

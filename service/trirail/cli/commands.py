@@ -15,6 +15,7 @@ from trirail.cli import (
     config_commands,
     drives_command,
     help_pages,
+    keys_command,
     math_commands,
     panel_command,
     recording_commands,
@@ -134,7 +135,7 @@ def view(
     def say(content: dict[str, str], words: str) -> None:
         robot_commands.show(service, content, words)
 
-    return viewer.run(file, service.robot, service.connect, web=web, records=records, say=say)
+    return viewer.run(file, service.robot, service.connect, service.tls, web=web, records=records, say=say)
 
 
 app.command(drives_command.drives)
@@ -147,6 +148,7 @@ for each in Command:
     if each is not Command.OVERRIDE:
         app.command(robot_commands.telling(each), name=each.replace("_", "-"), help=each.help)
 app.command(config_commands.app)
+app.command(keys_command.app)
 app.command(math_commands.ik)
 app.command(math_commands.fk)
 app.command(workspace_command.workspace)

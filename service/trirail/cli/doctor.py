@@ -13,6 +13,8 @@ from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.config import Config
 from trirail.processes.clock import Tick
+from trirail.processes.guard import Guard
+from trirail.wire.endpoints import Reach, reach
 
 Verdict = Literal["ok", "warning", "failure"]
 
@@ -66,6 +68,8 @@ class Machine(Struct, frozen=True):
     """What passed on the CAN interface meanwhile."""
     adapter: str = ""
     """What python-can's interface would lack, with the remedy; "" for nothing."""
+    guard: Guard | str | None = None
+    """Who may do what over the network, or why its certificates cannot be used."""
 
 
 def examine(config: Config, machine: Machine) -> list[Check]:
@@ -80,6 +84,7 @@ def examine(config: Config, machine: Machine) -> list[Check]:
         *can_interface(config, machine),
         *protections(config),
         load(config),
+        *network(config, machine),
         lateness(machine.ticks, config),
     ]
 
@@ -237,6 +242,29 @@ def load(config: Config) -> Check:
         return Check("bus load", "ok", found)
     remedy = f"loop.rate_hz below {HIGH * traffic.highest_rate(bitrate, drives.heartbeat):.0f}, or a higher bitrate"
     return Check("bus load", "failure" if share > 1.0 else "warning", found, remedy)
+
+
+def network(config: Config, machine: Machine) -> list[Check]:
+    """Who can command the robot, endpoint by endpoint, and what is to be said of certificates and users."""
+    remedies = {
+        Reach.MACHINE: "where others log in too: unixsock-stream/PATH lets in the socket's owner and group alone",
+        Reach.NETWORK: "trirail keys init makes certificates for [zenoh.tls]",
+    }
+    found = []
+    for endpoint in config.zenoh.listen:
+        by = reach(endpoint)
+        verdict: Verdict = "warning" if by is Reach.NETWORK else "ok"
+        found.append(Check("network", verdict, f"{endpoint}: {by} can command", remedies.get(by, "")))
+    if config.zenoh.tls is None:
+        return found
+    if isinstance(machine.guard, str):
+        return [*found, Check("certificates", "failure", machine.guard)]
+    if machine.guard is not None:
+        users = ", ".join(f"{user} {role}" for user, role in machine.guard.users.items())
+        found.append(Check("users", "ok" if users else "warning", users or "none, so nobody can do anything"))
+        warnings = machine.guard.certificate_warnings()
+        found += [Check("certificates", "warning", warning) for warning in warnings]
+    return found
 
 
 def lateness(ticks: Sequence[Tick], config: Config) -> Check:

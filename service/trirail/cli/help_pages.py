@@ -17,6 +17,11 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "drives": ("trirail drives robot.toml", "trirail drives robot.toml --apply"),
         "commission": ("trirail commission robot.toml", "trirail commission robot.toml --yes --fault 'A reversed'"),
         "run": ("trirail run", "trirail run robot.toml", "trirail run robot.toml --record session.rrd"),
+        "keys": (
+            "trirail keys init --address 192.168.1.7",
+            "trirail keys add ann --role operator",
+            "trirail keys list",
+        ),
         "completion": ("trirail completion bash --install", "trirail completion zsh"),
     },
     "Power and stops": {

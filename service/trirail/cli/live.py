@@ -87,6 +87,8 @@ def table(state: State, robot: str, limits: Limits | None = None) -> Table:
     grid.add_row("cycle", percentiles(loop.cycle_us))
     for lack in loop.lacking:
         grid.add_row("[yellow]without[/]", plain(lack))
+    for warning in state.warnings:
+        grid.add_row("[yellow]warning[/]", plain(warning))
     return grid
 
 

@@ -33,6 +33,8 @@ class Service:
     "Name of the robot, as in its configuration."
     connect: Annotated[str, Parameter(env_var="TRIRAIL_CONNECT")] = DEFAULT_LOCATOR
     "Zenoh locator of the service or of a router."
+    tls: Annotated[Path | None, Parameter(env_var="TRIRAIL_TLS")] = None
+    "Folder with ca.pem, cert.pem and key.pem, for a locator tls/HOST:PORT; ~/.config/trirail/<robot> if absent."
     json: Annotated[bool, Flag] = False
     "Print one JSON object instead of words."
 

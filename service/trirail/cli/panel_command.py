@@ -34,7 +34,7 @@ def panel(
     from trirail.panel.server import Panel
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with Robot(service.robot, service.connect) as robot, Panel(robot, port) as served:
+    with Robot(service.robot, service.connect, tls=service.tls) as robot, Panel(robot, port) as served:
         show(
             service,
             {"url": served.url},

@@ -19,6 +19,7 @@ from trirail.config import Config, LoopTable
 from trirail.errors import ServiceError
 from trirail.processes import realtime
 from trirail.processes.clock import Tick, Ticker
+from trirail.processes.guard import Guard
 
 SYSTEM = Path("/sys")
 MEASURED = 2.0
@@ -47,7 +48,16 @@ def machine(config: Config) -> Machine:
         ticks=ticked,
         passed=passed(before, counted(channel)),
         adapter=adapters.lacking(config.can.interface),
+        guard=guard(config),
     )
+
+
+def guard(config: Config) -> Guard | str:
+    """Read the certificates, or say why they cannot be used."""
+    try:
+        return Guard(config)
+    except ServiceError as error:
+        return str(error)
 
 
 def processors(text: str) -> tuple[int, ...]:

@@ -16,6 +16,7 @@ from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import free_port, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, Shortfall, Streams
 from trirail.wire import zenoh_session
+from trirail.wire.credentials import Credentials
 from trirail.wire.messages import Event
 from trirail.wire.records import unpack
 from trirail.wire.state import Info, State
@@ -33,12 +34,12 @@ class RemoteView:
     The wall clock is this machine's at the first record, so it is late by the way through the network.
     """
 
-    def __init__(self, info: Info, connect: str) -> None:
+    def __init__(self, info: Info, connect: str, credentials: Credentials | None = None) -> None:
         self._queue: queue.SimpleQueue[Event | State | bytes | None] = queue.SimpleQueue()
         self._lost = 0
         self._cycle: int | None = None
         self._bus_load: float | None = None
-        self._session = zenoh_session.open_client(connect)
+        self._session = zenoh_session.open_client(connect, credentials)
         self._reader = SampleReader()
         try:
             self._subscribe(info.robot)

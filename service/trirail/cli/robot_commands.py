@@ -57,7 +57,7 @@ def goto(
     from trirail.client.client import Robot
 
     angle = units.radians(phi, deg)
-    with Robot(service.robot, service.connect) as robot:
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
         goal = robot.move_to(x=x, y=y, phi=angle, speed=speed, blend=blend, tool=tool, frame=frame)
         return _follow(service, robot, goal, wait, units.pose((x, y, angle)))
 
@@ -102,7 +102,7 @@ def move(
     from trirail.client.client import Robot
 
     angle = units.radians(dphi, deg)
-    with Robot(service.robot, service.connect) as robot:
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
         origin: Literal["commanded", "measured"] = "measured" if measured else "commanded"
         goal = robot.move(x=dx, y=dy, phi=angle, speed=speed, tool=tool, frame=frame, origin=origin)
         return _follow(service, robot, goal, wait, f"by {units.pose((dx, dy, angle))}")
@@ -135,7 +135,7 @@ def sliders(
     """
     from trirail.client.client import Robot
 
-    with Robot(service.robot, service.connect) as robot:
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
         goal = robot.move_sliders(a, b, c, speed=speed)
         return _follow(service, robot, goal, wait, _sliders(a, b, c))
 
@@ -167,11 +167,11 @@ def jog(
     if vx is None:
         from trirail.cli import pendant
 
-        with Robot(service.robot, service.connect) as robot:
+        with Robot(service.robot, service.connect, tls=service.tls) as robot:
             return pendant.run(robot)
     if vy is None or w is None:
         raise CycloptsError(msg="jog takes VX, VY and W, or none of them: then keys move the robot while they are held")
-    with Robot(service.robot, service.connect) as robot:
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
         try:
             with robot.jog(x=vx, y=vy, phi=w) as jogging:
                 live.jogging(robot, jogging, seconds, show=not service.json)
@@ -207,7 +207,7 @@ def follow(
     from trirail.client.trajectory import read
 
     points = read(file)
-    with Robot(service.robot, service.connect) as robot:
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
         goal = robot.follow(points, stretch=stretch)
         return _follow(service, robot, goal, wait, f"{file.name}: {len(points)} points")
 
@@ -222,7 +222,7 @@ def override(percent: units.Percentage, /, *, service: Service = HERE) -> int:
     """
     from trirail.client.client import Robot
 
-    with Robot(service.robot, service.connect) as robot:
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
         robot.override(percent)
     show(service, {"override": percent}, f"override: {percent:g} %")
     return 0
@@ -232,7 +232,7 @@ def status(*, service: Service = HERE) -> int:
     """Print the present state."""
     from trirail.client.client import Robot
 
-    with Robot(service.robot, service.connect) as robot:
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
         state, info = robot.state(), robot.info()
     if service.json:
         missing = msgspec.to_builtins(info.missing_protections)
@@ -246,7 +246,7 @@ def watch(*, service: Service = HERE) -> int:
     """Show the state live until Ctrl-C."""
     from trirail.client.client import Robot
 
-    with Robot(service.robot, service.connect) as robot:
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
         live.watch(robot, json_lines=service.json)
     return 0
 
@@ -255,7 +255,7 @@ def events(*, service: Service = HERE) -> int:
     """Print past events and those to come until Ctrl-C."""
     from trirail.client.client import Robot
 
-    with Robot(service.robot, service.connect) as robot:
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
         robot.state()  # so that a missing service is said, not waited for
         for event in robot.events(history=True):
             if service.json:
@@ -275,7 +275,7 @@ def telling(name: Command) -> Callable[..., int]:
     def tell(*, service: Service = HERE) -> int:
         from trirail.client.client import Robot
 
-        with Robot(service.robot, service.connect) as robot:
+        with Robot(service.robot, service.connect, tls=service.tls) as robot:
             reply = robot.command(name)
         show(service, msgspec.to_builtins(reply), f"{name}: done, the robot is {reply.mode}")
         return 0

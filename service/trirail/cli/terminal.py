@@ -82,6 +82,8 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
         out.print(f"    [yellow]warning[/] {warning}", soft_wrap=True)
     for lack in loop["lacking"]:
         out.print(f"    [yellow]without[/] {plain(lack)}", soft_wrap=True)
+    for warning in ready["gateway"]["warnings"]:
+        out.print(f"    [yellow]warning[/] {plain(warning)}", soft_wrap=True)
 
 
 def _reach(config: Config) -> list[str]:

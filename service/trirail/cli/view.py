@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import os
 import signal
 import socket
@@ -20,17 +19,24 @@ from trirail.client.client import Robot
 from trirail.errors import ServiceError
 from trirail.processes.interpreter import python
 from trirail.telemetry.sinks import HOST, free_port
+from trirail.wire.credentials import credentials_for
+from trirail.wire.endpoints import is_local
 
 WEB_PORT = 9090
 """The web viewer's port, where it is free."""
 START_WITHIN = 20.0
 """How long the web viewer may take to answer [s]."""
-LOCAL = ("unixsock-stream", "unixpipe")
-"""Protocols that do not leave the machine."""
 
 
 def run(
-    file: Path | None, robot: str, connect: str, *, web: bool, records: bool, say: Callable[[dict[str, str], str], None]
+    file: Path | None,
+    robot: str,
+    connect: str,
+    tls: Path | None,
+    *,
+    web: bool,
+    records: bool,
+    say: Callable[[dict[str, str], str], None],
 ) -> int:
     """Open a viewer and wait until it is closed, or for Ctrl-C or SIGTERM; return the exit code.
 
@@ -44,7 +50,7 @@ def run(
             "browser, and from a machine with a display trirail view --connect tcp/<this machine>:7447 shows it there"
         )
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with _source(file, robot, connect, records) as source, contextlib.suppress(KeyboardInterrupt):
+    with _source(file, robot, connect, tls, records) as source, contextlib.suppress(KeyboardInterrupt):
         if web:
             _browse(source, say)
         else:
@@ -59,30 +65,18 @@ def has_display() -> bool:
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def is_local(locator: str) -> bool:
-    """Whether a Zenoh locator, protocol/address, stays on this machine."""
-    protocol, _, address = locator.partition("/")
-    host = address.partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
-    if protocol in LOCAL or host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
 @contextlib.contextmanager
-def _source(file: Path | None, robot: str, connect: str, records: bool) -> Iterator[str]:
+def _source(file: Path | None, robot: str, connect: str, tls: Path | None, records: bool) -> Iterator[str]:
     """Yield the file, or the address of the live view: the service's own, or one that is drawn here from records."""
     if file is not None:
         yield str(file)
         return
-    with Robot(robot, connect) as service:
+    with Robot(robot, connect, tls=tls) as service:
         info = service.info()
     if records or not is_local(connect):
         from trirail.cli.remote_view import RemoteView
 
-        with RemoteView(info, connect) as drawn:
+        with RemoteView(info, connect, credentials_for(robot, connect, tls)) as drawn:
             yield drawn.url
         return
     if not info.live:

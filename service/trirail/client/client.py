@@ -12,6 +12,7 @@ import re
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
@@ -22,6 +23,7 @@ from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import GoalHandle, Jog, Result
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
+from trirail.wire.credentials import credentials_for
 from trirail.wire.messages import (
     CommandReply,
     Event,
@@ -38,6 +40,7 @@ from trirail.wire.messages import (
 )
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.state import Info, State
+from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command
 
 __all__ = ["GoalHandle", "Jog", "Result", "Robot"]
@@ -50,17 +53,29 @@ class Robot:
     """A connection to one robot's service; several threads may share it.
 
     `name` is that of the robot's configuration, `connect` the Zenoh locator of its service or of a router, `user` who
-    is told to have sent goals and commands (the login name if absent). Poses are x, y [m] of the platform's centre in
+    is told to have sent goals and commands (the login name if absent). At a locator tls/HOST:PORT the folder `tls`,
+    ~/.config/trirail/<name> if absent, has ca.pem, cert.pem and key.pem, and the user is whom the certificate names;
+    RefusedError not_allowed says which role would be needed. Poses are x, y [m] of the platform's centre in
     the base frame and its angle phi [rad], counterclockwise. Any call raises ServiceError where nobody answers and
     RefusedError, with code, slider, value and limit, where the service says no; nothing moves because of that call.
     """
 
     def __init__(
-        self, name: str = "demo", connect: str = zenoh_session.DEFAULT_LOCATOR, user: str | None = None
+        self,
+        name: str = "demo",
+        connect: str = zenoh_session.DEFAULT_LOCATOR,
+        user: str | None = None,
+        tls: Path | str | None = None,
     ) -> None:
         self.name = boundary.check_name(name, "robot")
-        self.user = boundary.check_name(user or _user(), "user")
-        self._connection = Connection(self.name, connect)
+        credentials = credentials_for(self.name, connect, tls)
+        known_as = credentials.name if credentials is not None else ""
+        self.user = boundary.check_name(user or known_as or _user(), "user")
+        if credentials is not None and known_as != self.user:
+            whose = f"in the name of {quoted(known_as)}" if known_as else "without a common name"
+            problem = f"the certificate in {credentials.folder} is {whose}: {self.user} cannot send with it"
+            raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
+        self._connection = Connection(self.name, connect, credentials)
         self._goals: dict[str, GoalHandle] = {}
         self._goals_lock = threading.Lock()
         self._results = self._connection.subscribe_to_events(self._on_event, history=True)
@@ -285,7 +300,7 @@ class Robot:
         """
         for state in self.states(timeout):
             return state
-        raise self._connection.nobody()
+        raise self._connection.nobody("state")
 
     def states(self, timeout: float | None = None) -> Iterator[State]:
         """Yield states as they come, the newest where this is too slow; end after `timeout` seconds without one."""

@@ -13,12 +13,17 @@ import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.samples import SampleReader
-from trirail.errors import RefusedError, ServiceError
+from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.messages import ErrorReply, Event
+from trirail.wire.access import least_role
+from trirail.wire.credentials import Credentials
+from trirail.wire.messages import ErrorReply, Event, RoleReply
 from trirail.wire.state import State
-from trirail.wire.text import quoted
+from trirail.wire.text import is_name, quoted
+from trirail.wire.vocabulary import Role
 
+ROLE_WITHIN = 0.8
+"""How long the answer may take which role a user has [s]."""
 REPLY_WITHIN = 20.0
 """How long a command may take to be carried out [s]."""
 
@@ -28,10 +33,11 @@ T = TypeVar("T", bound=msgspec.Struct)
 class Connection:
     """A session to the service of a robot at a Zenoh locator. Raises ServiceError where that cannot be reached."""
 
-    def __init__(self, robot: str, connect: str) -> None:
+    def __init__(self, robot: str, connect: str, credentials: Credentials | None = None) -> None:
         self._robot = robot
         self._connect = connect
-        self._session = zenoh_session.open_client(connect)
+        self._credentials = credentials
+        self._session = zenoh_session.open_client(connect, credentials)
         # Also at the end of a program that does not close it: Zenoh's threads must not outlive the interpreter.
         self.close = weakref.finalize(self, zenoh_session.close, self._session)
         """End it; calls after the first do nothing."""
@@ -76,14 +82,36 @@ class Connection:
                 if isinstance(refused, RefusedError):
                     raise refused
                 unreadable = refused
-        raise unreadable or self.nobody()
+        raise unreadable or self.nobody(*parts)
 
-    def nobody(self) -> ServiceError:
-        """Return what to raise where nobody answers."""
+    def nobody(self, *parts: str) -> ServiceError | RefusedError:
+        """Return what to raise where nobody answers on the key of these parts.
+
+        Zenoh drops what a role does not allow without a word, as it does what nobody listens to. Every certificate
+        may ask for its role: the answer, within ROLE_WITHIN, tells which it was.
+        """
+        if self._credentials is not None and (refused := self._denied(self._credentials.name, parts)) is not None:
+            return refused
         return ServiceError(
-            f"no robot {self._robot!r} answers at {self._connect}: is its service running, is the name right "
-            "(--robot), may this user ask it?"
+            f"no robot {self._robot!r} answers at {self._connect}: is its service running, is the name right (--robot)?"
         )
+
+    def _denied(self, user: str, parts: tuple[str, ...]) -> RefusedError | None:
+        """Return the refusal where the user's role does not allow to use the key of these parts."""
+        if not is_name(user) or parts[0] == "role":
+            return None
+        try:
+            role = self.ask(("role", user), RoleReply, within=ROLE_WITHIN).role
+        except (ServiceError, RefusedError):
+            return None
+        needed = least_role(*parts)
+        if role is None:
+            problem = f"{user} has no role at {self._robot}: its [zenoh.users] does not name him, or he is revoked"
+        elif not Role(role).includes(needed):
+            problem = f"{user} is a {role} at {self._robot}: {'/'.join(parts)} needs {needed}"
+        else:
+            return None
+        return RefusedError(RefusalCode.NOT_ALLOWED, problem)
 
     # ------------------------------------------------------------------ hearing
 

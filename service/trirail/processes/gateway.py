@@ -16,6 +16,7 @@ import zenoh
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.backlog import Backlog
+from trirail.processes.guard import Guard
 from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox, Incoming
 from trirail.processes.info import info
@@ -25,7 +26,18 @@ from trirail.processes.replies import Replies
 from trirail.processes.state import StateMaker
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.links import Closed, PacketLink
-from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Event, Goal, GoalReply, NoContent, Override, Stop
+from trirail.wire.messages import (
+    CONTENT,
+    CommandReply,
+    ErrorReply,
+    Event,
+    Goal,
+    GoalReply,
+    NoContent,
+    Override,
+    RoleReply,
+    Stop,
+)
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -72,6 +84,7 @@ class Gateway:
         link: PacketLink,
         beat: Callable[[], None],
         opened: zenoh.Session,
+        guard: Guard,
         log: Callable[[Event], None] = lambda _: None,
     ) -> None:
         self._log = log
@@ -80,6 +93,7 @@ class Gateway:
         self._home_within = REPLY_WITHIN + sum(homing)
         self._link = link
         self._beat = beat
+        self._guard = guard
         self._last_words = LastWords(config.period)
         self._info = info(config)
         self._states = StateMaker(config)
@@ -137,6 +151,9 @@ class Gateway:
             boundary.check_size(incoming.size)
             if incoming.kind == "info":
                 self._replies.send(incoming, self._info)
+            elif incoming.kind == "role":
+                (user,) = boundary.names(incoming.key, self._key("role"), ("user",))
+                self._replies.send(incoming, RoleReply(user, self._guard.role(user)))
             elif incoming.kind == "goal":
                 self._goal(incoming)
             else:
@@ -257,7 +274,7 @@ class Gateway:
         now = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
-            self._publications.state(self._states.newest())
+            self._publications.state(self._states.newest(self._guard.warnings()))
 
     def _happened(self, event: Event) -> None:
         """Tell everyone of an event, and the service's log."""
@@ -298,8 +315,9 @@ def main(
     log: Callable[[Event], None],
 ) -> int:
     """Run the gateway's process; `ready` is called once it can be reached, `log` with each event."""
-    with zenoh_session.open_service(config.zenoh.listen) as opened:
-        gateway = Gateway(config, link, beat, opened, log)
+    guard = Guard(config)
+    with guard.open() as opened:
+        gateway = Gateway(config, link, beat, opened, guard, log)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
-        gateway.serve(lambda: ready({}))
+        gateway.serve(lambda: ready({"warnings": guard.warnings()}))
     return 0

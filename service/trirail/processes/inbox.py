@@ -18,7 +18,7 @@ UNREAD = 8192
 """Messages that may wait to be read; beyond that they are refused, commands at twice as many: a flood of goals must not
 keep a stop out."""
 
-Kind = Literal["goal", "cmd", "info"]
+Kind = Literal["goal", "cmd", "info", "role"]
 
 
 class Incoming(NamedTuple):
@@ -69,6 +69,7 @@ class Inbox:
             declare(key("goal", "*"), queries("goal")),
             declare(key("cmd", "*", "*"), queries("cmd")),
             declare(key("info"), queries("info")),
+            declare(key("role", "*"), queries("role")),
             self._session.declare_subscriber(key("goal", "*"), on_sample),
             self._session.liveliness().declare_token(key("alive")),
         ]

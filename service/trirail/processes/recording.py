@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import signal
 import sys
@@ -26,6 +27,9 @@ GATHER = 0.14
 
 A killed recorder loses what it has not written: that much, and the batch that the loop holds. It is less than 0.2 s.
 """
+
+NOT_FOR_OTHERS = 0o027
+"""Least umask of what is recorded: files are written by their owner, read by the group, and by nobody else."""
 
 
 class Intake:
@@ -99,6 +103,7 @@ class Intake:
 
 def main(config: Config, record: str | None, link: PacketLink, heart: Heart, ready: Callable[[object], None]) -> int:
     """Record until the loop has gone or the process is told to end."""
+    os.umask(NOT_FOR_OTHERS | os.umask(NOT_FOR_OTHERS))
     intake = Intake(config, record, link, ready)
     ending = False
 

@@ -67,8 +67,8 @@ class StateMaker:
         """Cycle of the newest record; 0 for none."""
         return 0 if self._newest is None else int(self._newest["cycle"])
 
-    def newest(self) -> State:
-        """Make the state of the newest record."""
+    def newest(self, warnings: tuple[str, ...] = ()) -> State:
+        """Make the state of the newest record; with what people should know of how the service is run."""
         row = self._newest
         lateness, cycle = self._statistics
         goal = self._status.goal
@@ -102,6 +102,7 @@ class StateMaker:
             settled=bool(row["settled"]),
             override=self._status.override,
             faults=(self._status.fault,) if self._status.fault else (),
+            warnings=warnings,
             loop=LoopState(
                 rate_hz=self._rate_hz,
                 cycles=int(row["cycle"]),

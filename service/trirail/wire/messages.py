@@ -268,6 +268,15 @@ class CommandReply(Struct, frozen=True):
     ok: Literal[True] = True
 
 
+class RoleReply(Struct, frozen=True):
+    """What a user is to the robot, asked on …/role/<user>; answered to every certificate of the robot's authority."""
+
+    user: str
+    """The name in the key."""
+    role: str | None
+    """A trirail.wire.vocabulary.Role, None for who has none; where nobody is asked for a certificate, maintainer."""
+
+
 class ErrorReply(Struct, frozen=True, omit_defaults=True):
     """A goal or command was refused, and nothing moved because of it, or a command could not be carried out."""
 

@@ -135,6 +135,9 @@ class State(Struct, frozen=True):
     """Why the robot is in fault, one line each; empty otherwise."""
     loop: LoopState
     """How well the loop keeps its time."""
+    warnings: tuple[str, ...] = ()
+    """What people should know of how the service is run, one line each: that it is open to a network, or that its
+    certificate expires soon."""
 
 
 class Info(Struct, frozen=True):

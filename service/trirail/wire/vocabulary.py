@@ -61,3 +61,16 @@ class Command(StrEnum):
         member._value_ = name
         member.help, member.stops, member.content = help, stops, content
         return member
+
+
+class Role(StrEnum):
+    """What a user is to a robot; each may what those before it may."""
+
+    VIEWER = "viewer"
+    OPERATOR = "operator"
+    MAINTAINER = "maintainer"
+
+    def includes(self, other: Role) -> bool:
+        """Whether it may all that another role may."""
+        roles = tuple(Role)
+        return roles.index(self) >= roles.index(other)

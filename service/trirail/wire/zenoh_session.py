@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import zenoh
 
 from trirail.errors import ServiceError
+from trirail.wire.credentials import Credentials
 from trirail.wire.sizes import MAX_TRANSPORT
 
 DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
@@ -30,8 +31,14 @@ def key(robot: str, *parts: str) -> str:
     return "/".join(("trirail", robot, *parts))
 
 
-def open_service(listen: Sequence[str]) -> zenoh.Session:
-    """Open the service's session: a peer that listens on the given locators and nowhere else."""
+def open_service(
+    listen: Sequence[str], credentials: Credentials | None = None, access_control: Mapping[str, Any] | None = None
+) -> zenoh.Session:
+    """Open the service's session: a peer that listens on the given locators and nowhere else.
+
+    With credentials it asks every client for a certificate of the same authority; `access_control`, that section of
+    Zenoh's configuration, is what each may do.
+    """
     return _open(
         {
             "mode": "peer",
@@ -45,14 +52,16 @@ def open_service(listen: Sequence[str]) -> zenoh.Session:
             "transport/link/tx/queue/congestion_control/block/wait_before_close": round(GIVEN_UP_AFTER * 1e6),
             "transport/link/tx/queue/size/data_high": 16,
             "transport/link/tx/queue/size/real_time": 16,  # answers come in bursts
+            **_tls(credentials),
+            **({"access_control": access_control} if access_control is not None else {}),
         },
         f"cannot listen on {', '.join(listen)}",
         "another service may hold it: end that, or set zenoh.listen to another address",
     )
 
 
-def open_client(locator: str) -> zenoh.Session:
-    """Open a client's session to a service or router."""
+def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.Session:
+    """Open a client's session to a service or router, with credentials where that asks for them."""
     return _open(
         {
             "mode": "client",
@@ -61,6 +70,7 @@ def open_client(locator: str) -> zenoh.Session:
             "connect/exit_on_failure": True,
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
             "listen/endpoints": [],
+            **_tls(credentials),
         },
         f"no service at {locator}",
         "start one with: trirail run configs/sim.toml, or name its address with --connect",
@@ -71,6 +81,25 @@ def close(opened: zenoh.Session) -> None:
     """Close a session; one that is stuck is left to the end of the process."""
     with contextlib.suppress(zenoh.ZError):
         opened.close()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
+
+
+def _tls(credentials: Credentials | None) -> dict[str, Any]:
+    """Both sides show a certificate, each believes only its authority, and neither outlives the other's."""
+    if credentials is None:
+        return {}
+    authority, certificate, key_file = map(str, credentials.files)
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": authority,
+            "enable_mtls": True,
+            "listen_certificate": certificate,
+            "listen_private_key": key_file,
+            "connect_certificate": certificate,
+            "connect_private_key": key_file,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+    }
 
 
 def _open(settings: dict[str, Any], failure: str, remedy: str) -> zenoh.Session:

@@ -1,0 +1,170 @@
+"""The folder of an authority: its certificate and key, the robot's, and one folder for each user to take away.
+
+    ca.pem  ca-key.pem    the authority: whoever has the key can make any user, so it need not be on the robot
+    cert.pem  key.pem     the robot's own; with ca.pem and revoked.txt they are all that [zenoh.tls] reads here
+    revoked.txt           users that have no role any more, whatever [zenoh.users] says
+    users/<user>/         ca.pem, cert.pem, key.pem: what the user needs; the key may be deleted here once he has it
+
+Private keys are readable by their owner alone. A file or folder is there whole or not at all: each is written beside
+its place and renamed. What is renewed is a certificate; its key stays.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from shutil import rmtree
+from typing import NamedTuple
+
+from cryptography import x509
+
+from trirail.errors import ServiceError
+from trirail.wire.certificates import Pair, authority, common_name, issue, renew
+from trirail.wire.credentials import AUTHORITY, CERTIFICATE, KEY, REVOKED, Credentials, revoked
+
+AUTHORITY_KEY = "ca-key.pem"
+USERS = "users"
+PRIVATE, PUBLIC = 0o600, 0o644
+
+
+class Issued(NamedTuple):
+    """A certificate that the authority has made."""
+
+    name: str
+    is_robot: bool
+    expires: datetime
+    folder: Path
+
+
+class KeyFolder:
+    """An authority's files. Every call raises ServiceError, with the file and what would be right."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def create(self, robot: str, addresses: Sequence[str], days: float) -> Credentials:
+        """Make a new authority, and the certificate of its robot for the addresses at which clients find it."""
+        if self.folder.exists():
+            raise ServiceError(f"{self.folder} exists already: name another folder, or renew what is in it")
+        by = authority(robot)
+        with _made_whole(self.folder) as made:
+            _write(made / AUTHORITY, by.certificate, PUBLIC)
+            _write(made / AUTHORITY_KEY, by.key, PRIVATE)
+            _write_pair(made, issue(by, robot, days, addresses, serves=True))
+        return Credentials.read(self.folder)
+
+    def add(self, user: str, days: float) -> Credentials:
+        """Make a user's folder. A name that was revoked is never given again: the old certificate would be good too."""
+        folder = self.folder / USERS / user
+        if user in revoked(self.folder):
+            raise ServiceError(f"{user} was revoked, and what was lost has that name: choose another one")
+        if user == self._robot().name:
+            raise ServiceError(f"{user} is the robot itself: choose another name")
+        if folder.exists():
+            raise ServiceError(f"{folder} exists already: trirail keys renew {user} makes it good for longer")
+        by = self._authority()
+        with _made_whole(folder) as made:
+            _write(made / AUTHORITY, by.certificate, PUBLIC)
+            _write_pair(made, issue(by, user, days))
+        return Credentials.read(folder)
+
+    def renew(self, name: str, days: float) -> Issued:
+        """Make a new certificate for the key of a user, or of the robot."""
+        there = self._find(name)
+        file = there.folder / CERTIFICATE
+        try:
+            certificate = renew(self._authority(), _read(file), days)
+        except (ValueError, x509.ExtensionNotFound) as error:
+            raise ServiceError(f"{file}: {error}") from error
+        _write(file, certificate, PUBLIC)
+        return self._find(name)
+
+    def revoke(self, user: str) -> None:
+        """Put a user among those that have no role, and delete what there is of him."""
+        there = self._find(user)
+        if there.is_robot:
+            raise ServiceError(f"{user} is the robot itself: a new authority makes its certificate worthless")
+        names = sorted({*revoked(self.folder), user})
+        _write(self.folder / REVOKED, "".join(f"{name}\n" for name in names).encode(), PUBLIC)
+        with _said():
+            rmtree(there.folder)
+
+    def issued(self) -> list[Issued]:
+        """Return what has been issued and not been revoked: the robot's first, then those of users, by name."""
+        folder = self.folder / USERS
+        users = sorted(each for each in folder.iterdir() if each.name[0] != ".") if folder.exists() else []
+        return [self._robot(), *(_issued(each, is_robot=False) for each in users)]
+
+    def _find(self, name: str) -> Issued:
+        found = [each for each in self.issued() if each.name == name]
+        if not found:
+            raise ServiceError(f"{self.folder}: nobody is called {name}; trirail keys list shows who there is")
+        return found[0]
+
+    def _robot(self) -> Issued:
+        return _issued(self.folder, is_robot=True)
+
+    def _authority(self) -> Pair:
+        return Pair(_read(self.folder / AUTHORITY), _read(self.folder / AUTHORITY_KEY))
+
+
+def _issued(folder: Path, *, is_robot: bool) -> Issued:
+    file = folder / CERTIFICATE
+    try:
+        certificate = x509.load_pem_x509_certificate(_read(file))
+    except ValueError as error:
+        raise ServiceError(f"{file}: not a certificate as PEM") from error
+    return Issued(common_name(certificate), is_robot, certificate.not_valid_after_utc, folder)
+
+
+def _write_pair(folder: Path, pair: Pair) -> None:
+    _write(folder / CERTIFICATE, pair.certificate, PUBLIC)
+    _write(folder / KEY, pair.key, PRIVATE)
+
+
+@contextmanager
+def _made_whole(folder: Path) -> Iterator[Path]:
+    """Give a folder to write to, that nobody else can open; it gets its name when the context ends without an error."""
+    with _said():
+        folder.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        try:
+            yield made
+            made.rename(folder)
+        except BaseException:
+            rmtree(made, ignore_errors=True)
+            raise
+
+
+def _write(file: Path, content: bytes, mode: int) -> None:
+    """Write a file beside its place, on the disk, with its rights from the beginning; then rename it."""
+    with _said():
+        descriptor, name = tempfile.mkstemp(prefix=f".{file.name}-", dir=file.parent)  # 0600
+        try:
+            with os.fdopen(descriptor, "wb") as opened:
+                opened.write(content)
+                os.fchmod(descriptor, mode)
+                opened.flush()
+                os.fsync(descriptor)
+            Path(name).rename(file)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+
+
+def _read(file: Path) -> bytes:
+    with _said():
+        return file.read_bytes()
+
+
+@contextmanager
+def _said() -> Iterator[None]:
+    """Say what the system says of a file in one line."""
+    try:
+        yield
+    except OSError as error:
+        raise ServiceError(f"{error.filename}: {error.strerror}; trirail keys init makes an authority") from error

@@ -1,0 +1,192 @@
+"""`trirail keys`: certificates by which robot and users know each other, for [zenoh.tls] of the configuration."""
+
+from __future__ import annotations
+
+import socket
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
+from trirail.cli import terminal
+from trirail.cli.options import Flag
+from trirail.wire.boundary import check_name
+from trirail.wire.vocabulary import Role
+
+app = App(name="keys", help="Make, list, renew and revoke the certificates of a robot and its users, for zenoh.tls.")
+
+Folder = Annotated[Path, Parameter(name="--folder")]
+Days = Annotated[float, Parameter(validator=lambda _kind, days: _check_days(days))]
+HERE = Path("keys")
+LOCAL = ("localhost", "127.0.0.1", "::1")
+"""Addresses that every robot's certificate has: those of its own machine."""
+LONGEST = 3650.0
+"""For how many days a certificate is made at most: the authority itself is good for no longer."""
+
+
+def _check_days(days: float) -> None:
+    if not 0.0 < days <= LONGEST:
+        raise ValueError(f"above 0, at most {LONGEST:g}")
+
+
+@app.command
+def init(
+    *,
+    robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT")] = "demo",
+    address: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    days: Days = 365.0,
+    folder: Folder = HERE,
+    json: Annotated[bool, Flag] = False,
+) -> int:
+    """Make an authority of your own, and the robot's certificate.
+
+    Parameters
+    ----------
+    robot
+        Name of the robot, as in its configuration.
+    address
+        Host names and IP addresses at which clients find the robot; those of its own machine and its host name are
+        always among them.
+    days
+        How long the robot's certificate is good.
+    folder
+        Folder to make, beside the configuration.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail.cli.key_folder import KeyFolder
+
+    addresses = tuple(dict.fromkeys((*LOCAL, socket.gethostname(), *address)))
+    made = KeyFolder(folder).create(check_name(robot, "robot"), addresses, days)
+    if json:
+        terminal.json({"folder": str(folder), "robot": robot, "addresses": addresses, "expires": made.expires})
+        return 0
+    terminal.say(f"{folder}: an authority, and the certificate of {robot} at {', '.join(addresses)}")
+    terminal.say(f"good until {made.expires:%Y-%m-%d}; keep ca-key.pem where only you can read it")
+    terminal.say("in the robot's configuration:")
+    for line in ("[zenoh]", 'listen = ["tls/0.0.0.0:7447"]', "[zenoh.tls]", f'directory = "{folder}"'):
+        terminal.say(f"    {line}")
+    return 0
+
+
+@app.command
+def add(
+    user: str,
+    /,
+    *,
+    role: Role,
+    days: Days = 365.0,
+    folder: Folder = HERE,
+    json: Annotated[bool, Flag] = False,
+) -> int:
+    """Make a user's certificate, in a folder to give to him.
+
+    Parameters
+    ----------
+    user
+        The name in which he sends goals and commands.
+    role
+        What he is to be: a viewer sees all and may stop, an operator also moves the robot, a maintainer also resets
+        and homes. It counts once it is in the configuration.
+    days
+        How long the certificate is good.
+    folder
+        That of the authority.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail.cli.key_folder import KeyFolder
+
+    made = KeyFolder(folder).add(check_name(user, "user"), days)
+    if json:
+        terminal.json({"user": user, "role": role, "folder": str(made.folder), "expires": made.expires})
+        return 0
+    terminal.say(f"{made.folder}: {user}'s certificate, good until {made.expires:%Y-%m-%d}")
+    terminal.say("give it to nobody else; on the user's machine it belongs in ~/.config/trirail/<robot>/")
+    terminal.say("in the robot's configuration, then start the service again while the robot stands:")
+    for line in ("[zenoh.users]", f'{user} = "{role}"'):
+        terminal.say(f"    {line}")
+    return 0
+
+
+@app.command(name="list")
+def show(*, folder: Folder = HERE, json: Annotated[bool, Flag] = False) -> int:
+    """List the certificates and until when they are good, and who is revoked; roles are in the configuration.
+
+    Parameters
+    ----------
+    folder
+        That of the authority.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail.cli.key_folder import KeyFolder
+    from trirail.wire.credentials import revoked
+
+    issued, gone = KeyFolder(folder).issued(), sorted(revoked(folder))
+    if json:
+        found = [{"name": each.name, "robot": each.is_robot, "expires": each.expires} for each in issued]
+        terminal.json({"folder": str(folder), "certificates": found, "revoked": gone})
+        return 0
+    table = terminal.table("name", "", "until", "days left")
+    now = datetime.now(UTC)
+    for each in issued:
+        left = (each.expires - now).days
+        table.add_row(each.name, "robot" if each.is_robot else "user", f"{each.expires:%Y-%m-%d}", str(max(0, left)))
+    for name in gone:
+        table.add_row(name, "revoked")
+    terminal.out.print(table)
+    return 0
+
+
+@app.command
+def renew(name: str, /, *, days: Days = 365.0, folder: Folder = HERE, json: Annotated[bool, Flag] = False) -> int:
+    """Make a new certificate for the key of a user, or of the robot by its name.
+
+    A user's counts when his next session opens. The robot's counts when the service starts again: do that while the
+    robot stands.
+
+    Parameters
+    ----------
+    name
+        That of the user, or of the robot.
+    days
+        How long it is good from now.
+    folder
+        That of the authority.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail.cli.key_folder import KeyFolder
+
+    made = KeyFolder(folder).renew(name, days)
+    if json:
+        terminal.json({"name": name, "folder": str(made.folder), "expires": made.expires})
+        return 0
+    then = "start the service again while the robot stands" if made.is_robot else "give its cert.pem to the user"
+    terminal.say(f"{made.folder}: good until {made.expires:%Y-%m-%d}; {then}")
+    return 0
+
+
+@app.command
+def revoke(user: str, /, *, folder: Folder = HERE, json: Annotated[bool, Flag] = False) -> int:
+    """Take a user's role away, for good: it counts when the service starts again. Do that while the robot stands.
+
+    Parameters
+    ----------
+    user
+        The name, which is never given again.
+    folder
+        That of the authority; its revoked.txt must be where the robot reads it.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail.cli.key_folder import KeyFolder
+
+    KeyFolder(folder).revoke(user)
+    if json:
+        terminal.json({"user": user, "revoked": True})
+        return 0
+    terminal.say(f"{user} has no role any more, once the service starts again with this {folder / 'revoked.txt'}")
+    return 0

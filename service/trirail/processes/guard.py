@@ -1,0 +1,65 @@
+"""Who may open the gateway's session and what each may do there, from [zenoh] of the configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import zenoh
+
+from trirail.config import Config
+from trirail.wire import zenoh_session
+from trirail.wire.access import access_control
+from trirail.wire.credentials import Credentials, revoked
+from trirail.wire.endpoints import Reach, reach, socket_file
+from trirail.wire.vocabulary import Role
+
+SOCKET_MODE = 0o660
+"""Of a Unix socket: its owner and its group may connect, which takes the right to write; nobody else."""
+
+
+class Guard:
+    """The door to the robot. Raises ServiceError where its certificates cannot be used."""
+
+    def __init__(self, config: Config) -> None:
+        self._robot = config.robot.name
+        self._listen = config.zenoh.listen
+        self._credentials: Credentials | None = None
+        self.users: dict[str, Role] = {}
+        """The role of each user who has one."""
+        self._gone: list[str] = []
+        if config.zenoh.tls is not None:
+            folder = Path(config.zenoh.tls.directory)
+            self._credentials = Credentials.read(folder)
+            without = revoked(folder)
+            self.users = {user: role for user, role in config.zenoh.users.items() if user not in without}
+            self._gone = [user for user in config.zenoh.users if user in without]
+
+    def open(self) -> zenoh.Session:
+        """Open the session. Raises ServiceError where an address cannot be listened on."""
+        if self._credentials is None:
+            opened = zenoh_session.open_service(self._listen)
+        else:
+            rules = access_control(self._robot, self.users)
+            opened = zenoh_session.open_service(self._listen, self._credentials, rules)
+        for path in filter(None, map(socket_file, self._listen)):
+            path.chmod(SOCKET_MODE)
+        return opened
+
+    def role(self, user: str) -> Role | None:
+        """Return what a user may: all where nobody is asked for a certificate, nothing where he is not named."""
+        return Role.MAINTAINER if self._credentials is None else self.users.get(user)
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what people should know of the door, one line each, with the remedy."""
+        insecure = [
+            f"insecure: whoever reaches {endpoint} can move the robot; trirail keys init makes certificates"
+            for endpoint in self._listen
+            if reach(endpoint) is Reach.NETWORK
+        ]
+        return (*insecure, *self.certificate_warnings())
+
+    def certificate_warnings(self) -> tuple[str, ...]:
+        """Return which certificate expires soon, and who is revoked though a role is given to him."""
+        soon = [] if self._credentials is None else [self._credentials.warning()]
+        gone = [f"{user} is revoked and has no role; take him out of [zenoh.users]" for user in self._gone]
+        return (*filter(None, soon), *gone)

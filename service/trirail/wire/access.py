@@ -1,0 +1,103 @@
+"""Who may do what on the network: the roles, and Zenoh's access control made of them.
+
+Zenoh has one set of rules for each certificate's common name and one for every certificate; what no rule allows is
+dropped, without a word to whoever sent it. Each direction is a rule of its own: what the robot publishes may leave and
+not come in, so nobody else's state, event or answer reaches a client; what clients ask may come in and not leave.
+A rule holds where its key includes the message's: who asks for `goal/*` is not allowed for being allowed `goal/ann`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from trirail.wire.vocabulary import Command, Role
+from trirail.wire.zenoh_session import key
+
+GOALS = Role.OPERATOR
+"""The least role that may send goals."""
+COMMANDS: dict[Command, Role] = {
+    Command.STOP: Role.VIEWER,
+    Command.ENABLE: Role.OPERATOR,
+    Command.DISABLE: Role.OPERATOR,
+    Command.QUICK_STOP: Role.OPERATOR,
+    Command.PAUSE: Role.OPERATOR,
+    Command.RESUME: Role.OPERATOR,
+    Command.OVERRIDE: Role.OPERATOR,
+    Command.RESET: Role.MAINTAINER,
+    Command.HOME: Role.MAINTAINER,
+}
+"""The least role that may send each command."""
+
+_Rule = dict[str, Any]
+
+
+def least_role(*parts: str) -> Role:
+    """Return the least role that may use the resource of these parts of a robot's key, as ("cmd", user, "enable")."""
+    if parts[0] == "goal":
+        return GOALS
+    return COMMANDS[Command(parts[2])] if parts[0] == "cmd" else Role.VIEWER
+
+
+def access_control(robot: str, users: Mapping[str, Role]) -> dict[str, Any]:
+    """Return section access_control of Zenoh's configuration for the service of a robot with these users.
+
+    A user sends in his own name only: the key has it, and the rule is for the certificate of that common name. Every
+    certificate may ask for its role, so that who is denied all else can learn why.
+    """
+    asking, using = list(_of_every_certificate(robot)), list(_of_every_user(robot))
+    rules, policies = asking + using, [_policy("every certificate", asking)]
+    for user, role in users.items():
+        own = list(_of_user(robot, user, role))
+        rules += own
+        policies.append(_policy(user, using + own))
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [
+            {"id": "every certificate", "link_protocols": ["tls"]},  # no user is called so: his name has no space
+            *({"id": user, "link_protocols": ["tls"], "cert_common_names": [user]} for user in users),
+        ],
+        "policies": policies,
+    }
+
+
+def _of_every_certificate(robot: str) -> Iterator[_Rule]:
+    role = key(robot, "role", "*")
+    yield _rule("ask for a role", "ingress", ("query",), role)
+    yield _rule("answer with a role", "egress", ("declare_queryable", "reply"), role)
+
+
+def _of_every_user(robot: str) -> Iterator[_Rule]:
+    """Yield what a viewer may, but for what has his name in its key; and what the robot may send to him."""
+    published = [key(robot, name) for name in ("state", "event", "records")]
+    # Of the advanced publisher: its past, that it is there, and the number of its last event.
+    past, alive, own = key(robot, "event", "@adv", "**"), key(robot, "alive"), key(robot, "info")
+    asked = [key(robot, "goal", "*"), key(robot, "cmd", "*", "*"), own]
+    yield _rule("publish", "egress", ("put",), *published, past)
+    yield _rule("subscribe", "ingress", ("declare_subscriber",), *published, past)
+    yield _rule("ask", "ingress", ("query",), own, past)
+    yield _rule("listen", "egress", ("declare_queryable",), *asked, past)
+    yield _rule("listen to puts", "egress", ("declare_subscriber",), key(robot, "goal", "*"))
+    yield _rule("answer", "egress", ("reply",), *asked, past, *published)
+    # Clients look for every robot's at once; what they then see of this one is its own.
+    looked = ("liveliness_query", "declare_liveliness_subscriber")
+    yield _rule("look who is there", "ingress", looked, key("*", "alive"), past)
+    yield _rule("be there", "egress", ("liveliness_token", "reply"), alive, past)
+
+
+def _of_user(robot: str, user: str, role: Role) -> Iterator[_Rule]:
+    """Yield what has a user's name in its key."""
+    commands = [key(robot, "cmd", user, command) for command, least in COMMANDS.items() if role.includes(least)]
+    yield _rule(f"{user} commands", "ingress", ("query",), *commands)
+    if role.includes(GOALS):
+        yield _rule(f"{user} sends goals", "ingress", ("query", "put"), key(robot, "goal", user))
+
+
+def _rule(name: str, flow: str, messages: tuple[str, ...], *keys: str) -> _Rule:
+    return {"id": name, "permission": "allow", "flows": [flow], "messages": list(messages), "key_exprs": list(keys)}
+
+
+def _policy(subject: str, rules: Iterable[_Rule]) -> dict[str, list[str]]:
+    return {"rules": [rule["id"] for rule in rules], "subjects": [subject]}

@@ -1,0 +1,160 @@
+"""Certificates by which robot and users know each other: an authority of one's own, and what it signs. X.509, P-256.
+
+A user's certificate is good for a client and no more: nobody can pass himself off as the robot with one. A robot's
+names the addresses at which clients find it, and is good for both sides, since a robot may dial as well.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from typing import NamedTuple
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+AUTHORITY_DAYS = 3650
+"""How long an authority is good [days]."""
+CLOCKS_APART = timedelta(minutes=10)
+"""A certificate is good from so long before it was made: the clocks of two machines differ."""
+
+
+class Pair(NamedTuple):
+    """A certificate and its private key, as PEM."""
+
+    certificate: bytes
+    key: bytes
+
+
+def authority(robot: str, now: datetime | None = None) -> Pair:
+    """Make an authority: what it signs is known by its certificate."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name(f"{robot} authority")
+    builder = (
+        _builder(name, key.public_key(), now or datetime.now(UTC), AUTHORITY_DAYS)
+        .issuer_name(name)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(signs_certificates=True), critical=True)
+    )
+    return Pair(_pem(builder.sign(key, hashes.SHA256())), _key_pem(key))
+
+
+def issue(
+    by: Pair,
+    name: str,
+    days: float,
+    addresses: Sequence[str] = (),
+    *,
+    serves: bool = False,
+    now: datetime | None = None,
+) -> Pair:
+    """Make a private key and its certificate in this name, good for so many days, signed by an authority.
+
+    Only one that `serves` is good for a robot; `addresses` are the host names and IP addresses where clients find it.
+    """
+    key = ec.generate_private_key(ec.SECP256R1())
+    return Pair(_certificate(by, name, key.public_key(), days, addresses, serves, now), _key_pem(key))
+
+
+def renew(by: Pair, certificate: bytes, days: float, now: datetime | None = None) -> bytes:
+    """Make a certificate like another one, for the same key, good for so many days from now. Raises ValueError."""
+    old = x509.load_pem_x509_certificate(certificate)
+    key = old.public_key()
+    if not isinstance(key, ec.EllipticCurvePublicKey):
+        raise ValueError("the certificate's key is none of an elliptic curve")  # noqa: TRY004 - content of a file
+    purposes = old.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    serves = ExtendedKeyUsageOID.SERVER_AUTH in purposes
+    return _certificate(by, common_name(old), key, days, addresses_of(old), serves, now)
+
+
+def common_name(certificate: x509.Certificate) -> str:
+    """Return in whose name a certificate is: that of its common name, "" where it has none or several."""
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if len(names) == 1 else ""
+
+
+def addresses_of(certificate: x509.Certificate) -> list[str]:
+    """Return the host names and IP addresses of a robot's certificate."""
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return []
+    return [*map(str, names.get_values_for_type(x509.IPAddress)), *names.get_values_for_type(x509.DNSName)]
+
+
+def _builder(subject: x509.Name, key: ec.EllipticCurvePublicKey, now: datetime, days: float) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - CLOCKS_APART)
+        .not_valid_after(now + timedelta(days=days))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+    )
+
+
+def _certificate(
+    by: Pair,
+    name: str,
+    key: ec.EllipticCurvePublicKey,
+    days: float,
+    addresses: Sequence[str],
+    serves: bool,
+    now: datetime | None,
+) -> bytes:
+    issuer = x509.load_pem_x509_certificate(by.certificate)
+    issuer_key = serialization.load_pem_private_key(by.key, password=None)
+    if not isinstance(issuer_key, ec.EllipticCurvePrivateKey):
+        raise ValueError("the authority's key is none of an elliptic curve")  # noqa: TRY004 - content of a file
+    identifier = issuer.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
+    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if serves else [])]
+    builder = (
+        _builder(_name(name), key, now or datetime.now(UTC), days)
+        .issuer_name(issuer.subject)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(signs_certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(identifier), critical=False)
+    )
+    if addresses:
+        builder = builder.add_extension(x509.SubjectAlternativeName([_address(each) for each in addresses]), False)
+    return _pem(builder.sign(issuer_key, hashes.SHA256()))
+
+
+def _pem(certificate: x509.Certificate) -> bytes:
+    return certificate.public_bytes(serialization.Encoding.PEM)
+
+
+def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+
+
+def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)] if common else [])
+
+
+def _address(text: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(text))
+    except ValueError:
+        return x509.DNSName(text)

@@ -1,0 +1,104 @@
+"""The folder by which a robot or a user is known on the network: ca.pem, cert.pem and key.pem, read and checked."""
+
+from __future__ import annotations
+
+import os
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import NamedTuple, Self
+
+from trirail.errors import ServiceError
+from trirail.wire.endpoints import Reach, reach
+
+AUTHORITY, CERTIFICATE, KEY, REVOKED = "ca.pem", "cert.pem", "key.pem", "revoked.txt"
+WARNED = timedelta(days=30)
+"""So long before a certificate expires it is told."""
+
+
+class Credentials(NamedTuple):
+    """What was found in such a folder."""
+
+    folder: Path
+    name: str
+    """In whose name the certificate is: a user's, or a robot's; "" where it names nobody."""
+    expires: datetime
+    """When it, or that of its authority, ends, whichever is first."""
+    addresses: tuple[str, ...]
+    """At which host names and IP addresses clients find a robot; none for a user's."""
+
+    @property
+    def files(self) -> tuple[Path, Path, Path]:
+        """The authority's certificate, one's own, and its private key."""
+        return self.folder / AUTHORITY, self.folder / CERTIFICATE, self.folder / KEY
+
+    @classmethod
+    def read(cls, folder: Path, now: datetime | None = None) -> Self:
+        """Read and check a folder. Raises ServiceError, with file and remedy, for what cannot open a session."""
+        # Not at the top: whoever needs no certificates does not wait for it.
+        from cryptography import x509
+        from cryptography.exceptions import InvalidSignature
+        from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+        from trirail.wire.certificates import addresses_of, common_name
+
+        authority_file, certificate_file, key_file = (folder / name for name in (AUTHORITY, CERTIFICATE, KEY))
+        authority_pem, certificate_pem, key_pem = map(_content, (authority_file, certificate_file, key_file))
+        try:
+            authority, certificate = map(x509.load_pem_x509_certificate, (authority_pem, certificate_pem))
+            key = load_pem_private_key(key_pem, password=None)
+        except (ValueError, TypeError) as error:
+            raise ServiceError(f"{folder}: {AUTHORITY}, {CERTIFICATE} and {KEY} must be PEM: {error}") from error
+        if key.public_key() != certificate.public_key():
+            raise ServiceError(f"{folder}: {KEY} is not the key of {CERTIFICATE}: copy the whole folder again")
+        try:
+            certificate.verify_directly_issued_by(authority)
+        except (ValueError, TypeError, InvalidSignature) as error:
+            raise ServiceError(f"{folder}: {CERTIFICATE} is not signed by the authority of {AUTHORITY}") from error
+        now = now or datetime.now(UTC)
+        if now < certificate.not_valid_before_utc:
+            raise ServiceError(
+                f"{certificate_file}: not valid before {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC: "
+                "is this machine's clock right?"
+            )
+        expires = min(certificate.not_valid_after_utc, authority.not_valid_after_utc)
+        if now > expires:
+            raise ServiceError(f"{certificate_file}: expired on {expires:%Y-%m-%d}; trirail keys renew makes a new one")
+        return cls(folder, common_name(certificate), expires, tuple(addresses_of(certificate)))
+
+    def warning(self, now: datetime | None = None) -> str:
+        """Say that it expires soon; "" where it does not."""
+        left = self.expires - (now or datetime.now(UTC))
+        if left > WARNED:
+            return ""
+        return f"the certificate in {self.folder} expires in {left.days} days; trirail keys renew makes a new one"
+
+
+def revoked(folder: Path) -> frozenset[str]:
+    """Return the users whose certificates are no longer good, from the file of an authority's folder, one a line.
+
+    Raises ServiceError for one that is there and cannot be read.
+    """
+    file = folder / REVOKED
+    return frozenset(_content(file).decode().split()) if file.exists() else frozenset()
+
+
+def credentials_for(robot: str, locator: str, folder: Path | str | None = None) -> Credentials | None:
+    """Read what a client needs at a locator: its folder, by default ~/.config/trirail/<robot>; None where nothing is.
+
+    Raises ServiceError for credentials that are no good, or that would not be used.
+    """
+    if reach(locator) is Reach.CERTIFICATE:
+        base = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+        return Credentials.read(Path(folder) if folder is not None else base / "trirail" / robot)
+    if folder is not None:
+        raise ServiceError(f"{locator}: credentials are for tls/HOST:PORT; nothing else is encrypted")
+    return None
+
+
+def _content(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise ServiceError(
+            f"{file}: {error.strerror}; trirail keys makes {AUTHORITY}, {CERTIFICATE} and {KEY}"
+        ) from error

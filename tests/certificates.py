@@ -1,0 +1,52 @@
+"""A robot on TLS with users of every kind, each with real certificates, for tests."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+from conftest import CONFIG
+from trirail.cli.key_folder import AUTHORITY_KEY, KeyFolder
+from trirail.config import Config, Tls, Zenoh
+from trirail.telemetry.sinks import free_port
+from trirail.wire.certificates import Pair, authority, issue
+from trirail.wire.vocabulary import Role
+
+ROLES = {"eva": Role.VIEWER, "ann": Role.OPERATOR, "max": Role.MAINTAINER}
+
+
+def tls_config(folder: Path) -> Config:
+    """Make every certificate below a folder; return the configuration of their robot."""
+    keys = KeyFolder(folder / "keys")
+    keys.create("demo", ["127.0.0.1", "localhost"], 100.0)
+    for name in (*ROLES, "una", "gone"):
+        keys.add(name, 100.0)
+    gone = {path.name: path.read_bytes() for path in user(folder, "gone").iterdir()}
+    keys.revoke("gone")
+    for name, content in gone.items():  # what was lost, in other hands
+        _file(user(folder, "gone") / name, content)
+    by = Pair((keys.folder / "ca.pem").read_bytes(), (keys.folder / AUTHORITY_KEY).read_bytes())
+    put(folder, "nobody", by, issue(by, "", 100.0))
+    put(folder, "late", by, issue(by, "ann", 1.0, now=datetime.now(UTC) - timedelta(days=2)))
+    put(folder, "early", by, issue(by, "ann", 9.0, now=datetime.now(UTC) + timedelta(days=2)))
+    put(folder, "foreign", by, issue(authority("demo"), "ann", 100.0))
+    users = ROLES | {"gone": Role.OPERATOR}
+    zenoh = Zenoh(listen=(f"tls/127.0.0.1:{free_port()}",), tls=Tls(str(keys.folder)), users=users)
+    return msgspec.structs.replace(CONFIG, zenoh=zenoh)
+
+
+def user(folder: Path, name: str) -> Path:
+    """Where a user's credentials are."""
+    return folder / "keys" / "users" / name
+
+
+def put(folder: Path, name: str, by: Pair, own: Pair) -> None:
+    """Write credentials as a user who trusts this authority has them."""
+    for file, content in (("ca.pem", by.certificate), ("cert.pem", own.certificate), ("key.pem", own.key)):
+        _file(user(folder, name) / file, content)
+
+
+def _file(path: Path, content: bytes) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content)

@@ -1,0 +1,179 @@
+"""`trirail keys`: what it makes is good for what it says, private, whole or not there, and never given twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from trirail.cli import commands, key_folder
+from trirail.cli.key_folder import KeyFolder
+from trirail.errors import ServiceError
+from trirail.wire.credentials import Credentials, revoked
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def keys(*arguments: str) -> int:
+    return int(commands.app(["keys", *arguments], exit_on_error=False, print_error=False, result_action="return_value"))
+
+
+def test_robot_and_user_get_what_they_need(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert keys("init", "--robot", "demo", "--address", "192.0.2.7", "--address", "robot.example.org") == 0
+    assert keys("add", "ann", "--role", "operator", "--days", "90") == 0
+    said = capsys.readouterr().out
+    assert '[zenoh.users]\n    ann = "operator"' in said
+    robot, ann = Credentials.read(here / "keys"), Credentials.read(here / "keys/users/ann")
+    assert robot.name == "demo"
+    assert {"192.0.2.7", "robot.example.org", "127.0.0.1", "localhost"} <= set(robot.addresses)
+    assert (ann.name, ann.addresses) == ("ann", ())
+    assert abs(ann.expires - datetime.now(UTC) - timedelta(days=90)) < timedelta(minutes=1)
+
+
+def test_openssl_finds_each_good_for_its_purpose_and_no_other(here: Path) -> None:
+    keys("init")
+    keys("add", "ann", "--role", "viewer")
+
+    def good(folder: str, purpose: str) -> bool:
+        command = ("openssl", "verify", "-x509_strict", "-CAfile", "keys/ca.pem", "-purpose", purpose)
+        return subprocess.run([*command, f"{folder}/cert.pem"], capture_output=True, check=False).returncode == 0
+
+    assert good("keys", "sslserver")
+    assert good("keys", "sslclient")
+    assert good("keys/users/ann", "sslclient")
+    assert not good("keys/users/ann", "sslserver")  # nobody passes himself off as the robot
+
+
+def test_private_keys_are_for_their_owner_alone(here: Path) -> None:
+    before = os.umask(0)
+    try:
+        keys("init")
+        keys("add", "ann", "--role", "viewer")
+        keys("renew", "ann")
+    finally:
+        os.umask(before)
+    private = sorted(here.rglob("*key.pem"))
+    assert len(private) == 3
+    assert {path.stat().st_mode & 0o777 for path in private} == {0o600}
+    assert {path.stat().st_mode & 0o022 for path in here.rglob("*")} == {0}
+
+
+def test_renewing_keeps_the_key_and_the_addresses(here: Path) -> None:
+    keys("init", "--address", "192.0.2.7", "--days", "20")
+    keys("add", "ann", "--role", "viewer", "--days", "20")
+    (here / "keys/users/ann/key.pem").rename(here / "kept.pem")  # he has it, so it need not be here
+    for name, folder in (("ann", here / "keys/users/ann"), ("demo", here / "keys")):
+        assert keys("renew", name, "--days", "300") == 0
+        if name == "ann":
+            (here / "kept.pem").rename(folder / "key.pem")
+        credentials = Credentials.read(folder)
+        assert credentials.expires - datetime.now(UTC) > timedelta(days=299)
+        assert credentials.warning() == ""
+    assert "192.0.2.7" in Credentials.read(here / "keys").addresses
+
+
+def test_who_is_revoked_is_never_made_again(here: Path) -> None:
+    keys("init")
+    keys("add", "ann", "--role", "viewer")
+    keys("add", "eva", "--role", "viewer")
+    assert keys("revoke", "ann") == 0
+    assert keys("revoke", "eva") == 0
+    assert revoked(here / "keys") == {"ann", "eva"}
+    with pytest.raises(ServiceError, match="ann was revoked"):
+        keys("add", "ann", "--role", "viewer")
+
+
+def test_what_there_is_is_listed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keys("init", "--robot", "demo")
+    keys("add", "ann", "--role", "viewer")
+    keys("add", "eva", "--role", "viewer")
+    keys("revoke", "eva")
+    capsys.readouterr()
+    assert keys("list", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [(each["name"], each["robot"]) for each in found["certificates"]] == [("demo", True), ("ann", False)]
+    assert found["revoked"] == ["eva"]
+    assert keys("list") == 0
+    assert "eva    revoked" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("init",), "keys exists already"),
+        (("add", "ann", "--role", "viewer"), "users/ann exists already: trirail keys renew ann"),
+        (("add", "demo", "--role", "viewer"), "demo is the robot itself"),
+        (("renew", "bob"), "nobody is called bob"),
+        (("revoke", "bob"), "nobody is called bob"),
+        (("revoke", "demo"), "demo is the robot itself"),
+        (("list", "--folder", "none"), "none/cert.pem: No such file or directory"),
+        (("add", "bob", "--role", "viewer", "--folder", "none"), "none/cert.pem: No such file or directory"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(here: Path, arguments: tuple[str, ...], said: str) -> None:
+    keys("init", "--robot", "demo")
+    keys("add", "ann", "--role", "viewer")
+    before = {path: path.read_bytes() for path in here.rglob("*.*") if path.is_file()}
+    with pytest.raises(ServiceError) as caught:
+        keys(*arguments)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert {path: path.read_bytes() for path in here.rglob("*.*") if path.is_file()} == before
+
+
+def test_a_folder_is_whole_or_not_there(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[Path] = []
+    write = key_folder._write
+
+    def full_disk(file: Path, content: bytes, mode: int) -> None:
+        written.append(file)
+        if len(written) == 3:
+            raise OSError(28, "No space left on device", str(file))
+        write(file, content, mode)
+
+    monkeypatch.setattr(key_folder, "_write", full_disk)
+    with pytest.raises(ServiceError, match="No space left on device"):
+        KeyFolder(here / "keys").create("demo", ["localhost"], 10.0)
+    assert list(here.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("key.pem", None, "key.pem: No such file or directory; trirail keys makes"),
+        ("cert.pem", b"not PEM", "must be PEM"),
+        ("key.pem", "other", "key.pem is not the key of cert.pem"),
+        ("ca.pem", "other", "cert.pem is not signed by the authority of ca.pem"),
+    ],
+)
+def test_credentials_that_do_not_fit_are_refused(here: Path, name: str, content: bytes | str | None, said: str) -> None:
+    keys("init")
+    keys("init", "--folder", "others")
+    keys("add", "ann", "--role", "viewer")
+    file = here / "keys/users/ann" / name
+    file.unlink()
+    if content is not None:
+        file.write_bytes(content if isinstance(content, bytes) else (here / "others" / name).read_bytes())
+    with pytest.raises(ServiceError) as caught:
+        Credentials.read(here / "keys/users/ann")
+    assert said in str(caught.value)
+
+
+def test_the_end_is_told_thirty_days_before(here: Path) -> None:
+    keys("init")
+    keys("add", "ann", "--role", "viewer", "--days", "100")
+    credentials = Credentials.read(here / "keys/users/ann")
+    assert credentials.warning(credentials.expires - timedelta(days=30, minutes=1)) == ""
+    said = credentials.warning(credentials.expires - timedelta(days=29, hours=23))
+    assert said.endswith("users/ann expires in 29 days; trirail keys renew makes a new one")
+    with pytest.raises(ServiceError, match="expired on"):
+        Credentials.read(here / "keys/users/ann", credentials.expires + timedelta(seconds=1))
+    with pytest.raises(ServiceError, match="is this machine's clock right"):
+        Credentials.read(here / "keys/users/ann", datetime.now(UTC) - timedelta(days=1))

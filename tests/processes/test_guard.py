@@ -1,0 +1,319 @@
+"""The gateway among users with certificates, without, and with the wrong ones: what each is told, and what passes."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from certificates import tls_config, user
+from conftest import CONFIG
+from trirail.cli import doctor, terminal
+from trirail.cli.key_folder import KeyFolder
+from trirail.client.client import Robot
+from trirail.config import Config, Tls, Zenoh
+from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.processes.gateway import Gateway
+from trirail.processes.guard import Guard
+from trirail.telemetry.sinks import free_port
+from trirail.wire import packets, zenoh_session
+from trirail.wire.credentials import Credentials
+from trirail.wire.messages import Event
+from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Request
+from trirail.wire.vocabulary import Command
+
+
+class Loop:
+    """Confirms every command and accepts every goal, and keeps what it was asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[Request] = []
+        self.answers: list[bytes] = []
+
+    def send(self, packet: bytes) -> bool:
+        request = packets.decode_request(packet[1:])
+        self.asked.append(request)
+        if isinstance(request, CommandRequest):
+            self.answers.append(packets.message(Confirmed(request.ticket, request.name, "holding")))
+        elif isinstance(request, GoalRequest):
+            self.answers.append(packets.message(Accepted(request.ticket, request.id, 1.0, 1.0, False, False)))
+        return True
+
+
+Served = tuple[Config, Path, Loop, Gateway]
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A gateway that serves users of every kind, before a loop that does all it is told."""
+    folder = tmp_path_factory.mktemp("tls")
+    config, loop, over = tls_config(folder), Loop(), threading.Event()
+    guard = Guard(config)
+    with guard.open() as opened:
+        gateway = Gateway(config, loop, lambda: None, opened, guard)  # type: ignore[arg-type]
+        gateway._inbox.declare()
+
+        def serve() -> None:
+            while not over.wait(0.001):
+                for incoming in gateway._inbox.take(100):
+                    gateway._handle(incoming)
+                while loop.answers:
+                    gateway._hear(loop.answers.pop(0), lambda: None)
+
+        serving = threading.Thread(target=serve)
+        serving.start()
+        try:
+            yield config, folder, loop, gateway
+        finally:
+            over.set()
+            serving.join()
+
+
+def robot(served: Served, name: str, **more: str) -> Robot:
+    config, folder, *_ = served
+    return Robot("demo", config.zenoh.listen[0], tls=user(folder, name), **more)
+
+
+def pose(robot: Robot) -> None:
+    robot.move_to(x=0.01, y=0.0, phi=0.0)
+
+
+DOES: dict[str, Callable[[Robot], object]] = {
+    "goal": pose,
+    **{name: lambda robot, name=name: robot.command(name) for name in Command if name is not Command.OVERRIDE},  # type: ignore[misc]
+    "override": lambda robot: robot.override(50),
+    "info": lambda robot: robot.info(),
+}
+NEEDS = {"stop": "viewer", "info": "viewer", "reset": "maintainer", "home": "maintainer"}  # all else: operator
+RANK = ["viewer", "operator", "maintainer"]
+
+
+@pytest.mark.parametrize("does", DOES)
+@pytest.mark.parametrize(("name", "role"), [("eva", "viewer"), ("ann", "operator"), ("max", "maintainer")])
+def test_a_role_does_what_it_may_and_is_told_of_the_rest(served: Served, name: str, role: str, does: str) -> None:
+    loop, needed = served[2], NEEDS.get(does, "operator")
+    with robot(served, name) as asking:
+        assert asking.user == name
+        before = len(loop.asked)
+        if RANK.index(role) >= RANK.index(needed):
+            DOES[does](asking)
+            if does != "info":
+                assert loop.asked[before].user == name
+            return
+        began = time.monotonic()
+        with pytest.raises(RefusedError) as caught:
+            DOES[does](asking)
+        assert time.monotonic() - began < 1.0
+        key = f"goal/{name}" if does == "goal" else f"cmd/{name}/{does}"
+        assert caught.value.code is RefusalCode.NOT_ALLOWED
+        assert str(caught.value) == f"{name} is a {role} at demo: {key} needs {needed}"
+        assert len(loop.asked) == before
+
+
+@pytest.mark.parametrize("does", ["goal", "stop", "info"])
+@pytest.mark.parametrize("name", ["una", "gone"])
+def test_who_has_no_role_does_nothing_and_is_told(served: Served, name: str, does: str) -> None:
+    with robot(served, name) as asking, pytest.raises(RefusedError) as caught:
+        DOES[does](asking)
+    assert caught.value.code is RefusalCode.NOT_ALLOWED
+    said = f"{name} has no role at demo: its [zenoh.users] does not name him, or he is revoked"
+    assert str(caught.value) == said
+
+
+def test_nobody_sends_in_the_name_of_another(served: Served) -> None:
+    config, folder, loop, _ = served
+    with pytest.raises(RefusedError, match="is in the name of ann: max cannot send with it") as caught:
+        robot(served, "ann", user="max")
+    assert caught.value.code is RefusalCode.NOT_ALLOWED
+    before = len(loop.asked)
+    with zenoh_session.open_client(config.zenoh.listen[0], Credentials.read(user(folder, "ann"))) as ann:
+        assert list(ann.get("trirail/demo/cmd/max/stop", timeout=5.0)) == []
+        assert list(ann.get("trirail/demo/cmd/*/stop", timeout=5.0)) == []
+    assert len(loop.asked) == before
+
+
+def test_a_strangers_event_reaches_nobody_and_the_robots_do_with_their_past(served: Served) -> None:
+    config, folder, _, gateway = served
+    for number in range(1, 6):
+        gateway._publications.event(Event(number, 0.0, number, float(number), "service", "info", f"e{number}"))
+    with (
+        robot(served, "eva") as eva,
+        zenoh_session.open_client(config.zenoh.listen[0], Credentials.read(user(folder, "max"))) as stranger,
+    ):
+        heard = eva.events(history=True, timeout=20.0)
+        assert [next(heard).message for _ in range(5)] == [f"e{number}" for number in range(1, 6)]
+        lie = Event(99, 9.0, 9, 99.0, "goal", "info", "done: arrived", id="g", outcome="done")
+        for key in ("trirail/demo/event", "trirail/demo/state"):
+            stranger.put(key, msgspec.json.encode(lie), encoding="application/json")
+        (reply,) = stranger.get("trirail/demo/role/max", timeout=10.0)  # so that what was put has arrived before
+        assert reply.ok is not None
+        gateway._publications.event(Event(6, 0.0, 6, 6.0, "service", "info", "e6"))
+        assert next(heard).message == "e6"
+        assert eva.skipped == 0
+
+
+def test_a_certificate_without_a_name_asks_nothing(served: Served) -> None:
+    with pytest.raises(RefusedError, match="is without a common name"):
+        robot(served, "nobody")
+    config, folder, *_ = served
+    with zenoh_session.open_client(config.zenoh.listen[0], Credentials.read(user(folder, "nobody"))) as nobody:
+        for key in ("info", "cmd/ann/stop", "goal/ann"):
+            assert list(nobody.get(f"trirail/demo/{key}", timeout=5.0)) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("late", "expired on"),
+        ("early", "is this machine's clock right"),
+        ("foreign", "not signed by the authority of ca.pem"),
+        ("none", "none/ca.pem: No such file or directory"),
+    ],
+)
+def test_credentials_that_are_no_good_are_told_before_anybody_is_asked(served: Served, name: str, said: str) -> None:
+    with pytest.raises(ServiceError, match=said):
+        robot(served, name)
+
+
+@pytest.mark.parametrize("name", ["late", "early", "foreign"])
+def test_the_robot_itself_opens_to_none_of_them(served: Served, name: str) -> None:
+    config, folder, *_ = served
+    credentials = Credentials(user(folder, name), name, datetime.now(UTC), ())  # not looked at by the client
+    with pytest.raises(ServiceError, match="no service at tls/"):
+        zenoh_session.open_client(config.zenoh.listen[0], credentials)
+
+
+def test_nobody_without_a_certificate_opens_a_session(served: Served) -> None:
+    address = served[0].zenoh.listen[0].removeprefix("tls/")
+    for protocol in ("tls", "tcp"):
+        with pytest.raises(ServiceError, match="no service at"):
+            zenoh_session.open_client(f"{protocol}/{address}")
+
+
+@pytest.mark.parametrize("name", ["eva", "elsewhere", "foreign"])
+def test_nobody_passes_himself_off_as_the_robot(served: Served, tmp_path: Path, name: str) -> None:
+    """Neither with a user's certificate, nor with a robot's for another address, nor with another authority's."""
+    folder = user(served[1], "eva")
+    if name != "eva":
+        folder = KeyFolder(tmp_path / name).create("demo", ["192.0.2.1"], 10.0).folder
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    trusted = Credentials.read(folder if name == "elsewhere" else user(served[1], "ann"))
+    with zenoh_session.open_service([endpoint], Credentials.read(folder)), pytest.raises(ServiceError, match="no serv"):
+        zenoh_session.open_client(endpoint, trusted)
+
+
+def test_the_folder_of_the_user_is_found_by_default(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, folder, *_ = served
+    place = folder / "config/trirail"
+    place.mkdir(parents=True, exist_ok=True)
+    if not (place / "demo").exists():
+        (place / "demo").symlink_to(user(folder, "ann"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(folder / "config"))
+    with Robot("demo", config.zenoh.listen[0]) as found:
+        assert found.user == "ann"
+        found.enable()
+
+
+def test_what_would_not_be_encrypted_takes_no_credentials(served: Served) -> None:
+    with pytest.raises(ServiceError, match="credentials are for tls/HOST:PORT"):
+        Robot("demo", "tcp/127.0.0.1:1", tls=user(served[1], "ann"))
+
+
+def test_who_is_revoked_while_named_is_told_at_the_start(served: Served) -> None:
+    guard = Guard(served[0])
+    assert guard.warnings() == ("gone is revoked and has no role; take him out of [zenoh.users]",)
+    assert guard.role("gone") is None
+
+
+def test_a_service_does_not_start_with_certificates_that_are_no_good(tmp_path: Path) -> None:
+    zenoh = Zenoh(("tls/127.0.0.1:1",), tls=Tls(str(tmp_path / "none")))
+    with pytest.raises(ServiceError, match=r"none/ca\.pem: No such file"):
+        Guard(msgspec.structs.replace(CONFIG, zenoh=zenoh))
+
+
+def test_an_open_door_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(("tcp/0.0.0.0:7447",), insecure=True))
+    (said,) = Guard(config).warnings()
+    assert said == "insecure: whoever reaches tcp/0.0.0.0:7447 can move the robot; trirail keys init makes certificates"
+    loop = {"lacking": [], "bus_load": 0.1}
+    ready: dict[str, dict[str, Any]] = {
+        "loop": loop,
+        "recorder": {"live": "", "recording": "r"},
+        "gateway": {"warnings": [said]},
+    }
+    terminal.up(config, ready)
+    assert f"warning {said}" in capsys.readouterr().out
+
+
+# ------------------------------------------------------------------ a socket of the machine's
+
+CONNECT = """
+import os, sys
+from trirail.wire import zenoh_session
+os.setgroups([int(sys.argv[3])])
+os.setgid(int(sys.argv[3]))
+os.setuid(int(sys.argv[2]))
+zenoh_session.open_client(sys.argv[1]).close()
+"""
+OTHER, GROUP = 65_534, 54_321
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
+def test_a_socket_lets_its_owner_and_group_in_and_nobody_else(tmp_path: Path) -> None:
+    for folder in (tmp_path, *tmp_path.parents):
+        if folder.stat().st_uid == os.getuid() and folder.is_relative_to("/tmp/") and folder != Path("/tmp"):
+            folder.chmod(0o755)
+    os.chown(tmp_path, -1, GROUP)
+    tmp_path.chmod(0o2755)  # what is made in there belongs to the folder's group
+    endpoint = f"unixsock-stream/{tmp_path}/z"
+    config = msgspec.structs.replace(CONFIG, zenoh=Zenoh((endpoint,)))
+    with Guard(config).open():
+        assert stat.S_IMODE((tmp_path / "z").stat().st_mode) == 0o660
+
+        def opens(group: int) -> bool:
+            command = (sys.executable, "-c", CONNECT, endpoint, str(OTHER), str(group))
+            done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+            assert done.returncode == 0 or "no service at" in done.stderr, done.stderr
+            return done.returncode == 0
+
+        assert opens(GROUP)
+        assert not opens(OTHER)
+
+
+def test_the_doctor_tells_who_can_reach_it(served: Served, tmp_path: Path) -> None:
+    def said(zenoh: Zenoh, guard: Guard | str | None = None) -> list[tuple[str, str, str]]:
+        config = msgspec.structs.replace(CONFIG, zenoh=zenoh)
+        machine = doctor.Machine("", True, True, (), None, 0.0, 0, None, (), None, (), guard=guard)
+        return [(check.name, check.verdict, check.found) for check in doctor.network(config, machine)]
+
+    reached = "tcp/127.0.0.1:7447: every user of this machine can command"
+    assert said(Zenoh()) == [("network", "ok", reached)]
+    assert said(Zenoh(("tcp/0.0.0.0:1",))) == [
+        ("network", "warning", "tcp/0.0.0.0:1: everybody in the network can command")
+    ]
+    socket = "unixsock-stream//run/z"
+    assert said(Zenoh((socket,))) == [("network", "ok", f"{socket}: who may write to the socket's file can command")]
+    tls = Zenoh(("tls/0.0.0.0:1",), tls=Tls())
+    open_to = ("network", "ok", "tls/0.0.0.0:1: who has a role, by his certificate, can command")
+    assert said(tls, "no certificates") == [open_to, ("certificates", "failure", "no certificates")]
+    assert said(tls, Guard(served[0])) == [
+        open_to,
+        ("users", "ok", "eva viewer, ann operator, max maintainer"),
+        ("certificates", "warning", "gone is revoked and has no role; take him out of [zenoh.users]"),
+    ]
+
+
+def test_a_certificate_that_ends_soon_is_told(tmp_path: Path) -> None:
+    KeyFolder(tmp_path / "keys").create("demo", ["localhost"], 10.0)
+    config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(("tls/127.0.0.1:1",), tls=Tls(str(tmp_path / "keys"))))
+    (said,) = Guard(config).warnings()
+    assert said.endswith("keys expires in 9 days; trirail keys renew makes a new one")

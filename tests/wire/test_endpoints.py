@@ -1,0 +1,50 @@
+"""Who reaches an endpoint: never thought to be fewer than can."""
+
+from __future__ import annotations
+
+import ipaddress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.wire.endpoints import Reach, reach
+
+ENDS = ("", "#iface=eth0", "?rel=1", "?rel=1#so_sndbuf=65000")
+
+
+@given(st.ip_addresses(), st.integers(1, 65535), st.sampled_from(("tcp", "udp", "ws")), st.sampled_from(ENDS))
+def test_an_address_is_for_this_machine_if_it_is_the_loopbacks(
+    address: ipaddress.IPv4Address | ipaddress.IPv6Address, port: int, protocol: str, end: str
+) -> None:
+    host = f"[{address}]" if address.version == 6 else str(address)
+    own = address in ipaddress.ip_network("127.0.0.0/8" if address.version == 4 else "::1/128")
+    mapped = getattr(address, "ipv4_mapped", None)
+    if mapped is None:
+        assert reach(f"{protocol}/{host}:{port}{end}") is (Reach.MACHINE if own else Reach.NETWORK)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "by"),
+    [
+        ("tcp/127.0.0.1:7447", Reach.MACHINE),
+        ("tcp/127.9.9.9:7447", Reach.MACHINE),
+        ("tcp/[::1]:7447", Reach.MACHINE),
+        ("tcp/localhost:7447", Reach.MACHINE),
+        ("tcp/0.0.0.0:7447", Reach.NETWORK),
+        ("tcp/[::]:7447", Reach.NETWORK),
+        ("tcp/[::ffff:192.0.2.1]:7447", Reach.NETWORK),
+        ("tcp/localhost.example.org:7447", Reach.NETWORK),
+        ("tcp/127.0.0.1.example.org:7447", Reach.NETWORK),
+        ("tcp/127.0.0.1@192.0.2.1:7447", Reach.NETWORK),
+        ("tcp/127.0.0.1", Reach.NETWORK),
+        ("tcp/:7447", Reach.NETWORK),
+        ("quic/192.0.2.1:7447", Reach.NETWORK),
+        ("serial//dev/ttyUSB0", Reach.NETWORK),
+        ("vsock/-1:7447", Reach.NETWORK),
+        ("", Reach.NETWORK),
+        ("unixsock-stream//run/trirail/zenoh", Reach.FILE),
+        ("tls/0.0.0.0:7447", Reach.CERTIFICATE),
+    ],
+)
+def test_who_reaches_it(endpoint: str, by: Reach) -> None:
+    assert reach(endpoint) is by
