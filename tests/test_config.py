@@ -81,7 +81,7 @@ def test_shipped_configurations_load(path: Path) -> None:
         (
             "[loop]",
             "[frames.tool]\n'my camera' = [0.1, 0.0]\n[loop]",
-            "'my camera': [0.1, 0.0]}: expected str matching",
+            "frames.tool: 'my camera' is no name here: expected str matching",
         ),
         (
             "[loop]",

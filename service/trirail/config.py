@@ -22,7 +22,7 @@ from trirail_drivers.interface import NAMES
 
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles
-from trirail.wire.endpoints import Reach, reach
+from trirail.wire.endpoints import ReachableBy, reach
 from trirail.wire.vocabulary import Role
 
 _PACKAGED = Path(__file__).parent / "configs"
@@ -455,13 +455,13 @@ def _check_reach(zenoh: Zenoh) -> None:
         raise ConfigError("zenoh.users: without [zenoh.tls] nobody's name is known: add it, or leave users out")
     for index, endpoint in enumerate(zenoh.listen):
         key, by = f"zenoh.listen[{index}] = {endpoint!r}", reach(endpoint)
-        if zenoh.tls is not None and by is not Reach.CERTIFICATE:
+        if zenoh.tls is not None and by is not ReachableBy.CERTIFICATE:
             raise ConfigError(f"{key}: with [zenoh.tls] every endpoint is tls/ADDRESS:PORT, or it would go round it")
         if zenoh.tls is not None and "#" in endpoint:
             raise ConfigError(f"{key}: settings after # would go round [zenoh.tls]")
-        if zenoh.tls is None and by is Reach.CERTIFICATE:
+        if zenoh.tls is None and by is ReachableBy.CERTIFICATE:
             raise ConfigError(f"{key}: it needs [zenoh.tls], with the certificates that `trirail keys init` makes")
-        if by is Reach.NETWORK and not zenoh.insecure:
+        if by is ReachableBy.NETWORK and not zenoh.insecure:
             raise ConfigError(
                 f"{key}: whoever reaches it can move the robot: use tls/ with [zenoh.tls] (trirail keys init), "
                 "an address of the loopback, or write insecure = true if that is what you want"

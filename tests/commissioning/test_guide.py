@@ -18,7 +18,7 @@ from trirail.commissioning.guide import Guide
 from trirail.commissioning.judgement import Judged
 from trirail.commissioning.opening import opened
 from trirail.commissioning.person import Question, Quit
-from trirail.commissioning.report import Entry, Keeper, Report
+from trirail.commissioning.report import CommissioningReport, Keeper, StepReport
 from trirail.commissioning.steps import Steps
 from trirail.config import SIM, Config, load
 from trirail_drivers import config
@@ -74,7 +74,9 @@ class Run:
         source: Path = SIM,
     ) -> None:
         self.person = person or Beside()
-        self.keeper = Keeper(Report(robot.robot.name, str(source), "now", True, "tests"), folder / "report.json")
+        self.keeper = Keeper(
+            CommissioningReport(robot.robot.name, str(source), "now", True, "tests"), folder / "report.json"
+        )
         self.path = folder / "robot.toml"
         if not self.path.exists():
             self.path.write_text(source.read_text(encoding="utf-8"), encoding="utf-8")
@@ -85,7 +87,7 @@ class Run:
             guide.run()
             self.written = guide.write(None)
 
-    def of(self, step: str, drive: str = "") -> Entry:
+    def of(self, step: str, drive: str = "") -> StepReport:
         return self.keeper.report.latest[step, drive]
 
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import Config, FramesTable
 from trirail.errors import RefusedError
-from trirail.motion.frames import Frames
+from trirail.motion.frames import NamedFrames
 from trirail.wire.messages import Goal, MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode
@@ -46,7 +46,7 @@ def arrive(rig: Rig, name: str, goal: Goal) -> Pose:
 def test_a_move_is_along_the_axes_of_its_frame_about_its_tool(
     place: Pose, step: Pose, frame: str, tool: str | tuple[float, float] | None
 ) -> None:
-    goal = Frames(TABLE).planned(MoveGoal(*step, frame=frame, tool=tool, speed=0.5), lambda _: place)
+    goal = NamedFrames(TABLE).planned(MoveGoal(*step, frame=frame, tool=tool, speed=0.5), lambda _: place)
     assert isinstance(goal, PoseGoal)
     u, v = TABLE.tool["camera"] if tool == "camera" else tool if isinstance(tool, tuple) else (0.0, 0.0)
     begins = complex(place[0], place[1]) + turned(u, v, place[2])
@@ -59,7 +59,7 @@ def test_a_move_is_along_the_axes_of_its_frame_about_its_tool(
 
 @given(STEPS, TOOLS)
 def test_a_pose_in_a_work_frame_is_where_the_frame_is(pose: Pose, tool: str | tuple[float, float] | None) -> None:
-    goal = Frames(TABLE).planned(PoseGoal(*pose, frame="part", tool=tool), lambda _: pose)
+    goal = NamedFrames(TABLE).planned(PoseGoal(*pose, frame="part", tool=tool), lambda _: pose)
     assert isinstance(goal, PoseGoal)
     assert complex(goal.x, goal.y) == pytest.approx(complex(0.02, 0.01) + turned(pose[0], pose[1], math.pi / 2.0))
     assert goal.phi == pytest.approx(math.pi / 2.0 + pose[2])
@@ -87,7 +87,7 @@ def test_a_name_that_there_is_not_is_refused_with_those_that_there_are(goal: Goa
 
 def test_without_tools_a_point_is_asked_for() -> None:
     with pytest.raises(RefusedError, match=r"give a point, \[u, v\]"):
-        Frames(FramesTable()).planned(PoseGoal(0.0, 0.0, 0.0, tool="camera"), lambda _: (0.0, 0.0, 0.0))
+        NamedFrames(FramesTable()).planned(PoseGoal(0.0, 0.0, 0.0, tool="camera"), lambda _: (0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(

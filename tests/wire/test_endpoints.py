@@ -7,7 +7,7 @@ import ipaddress
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.wire.endpoints import Reach, reach
+from trirail.wire.endpoints import ReachableBy, reach
 
 ENDS = ("", "#iface=eth0", "?rel=1", "?rel=1#so_sndbuf=65000")
 
@@ -20,31 +20,31 @@ def test_an_address_is_for_this_machine_if_it_is_the_loopbacks(
     own = address in ipaddress.ip_network("127.0.0.0/8" if address.version == 4 else "::1/128")
     mapped = getattr(address, "ipv4_mapped", None)
     if mapped is None:
-        assert reach(f"{protocol}/{host}:{port}{end}") is (Reach.MACHINE if own else Reach.NETWORK)
+        assert reach(f"{protocol}/{host}:{port}{end}") is (ReachableBy.MACHINE if own else ReachableBy.NETWORK)
 
 
 @pytest.mark.parametrize(
     ("endpoint", "by"),
     [
-        ("tcp/127.0.0.1:7447", Reach.MACHINE),
-        ("tcp/127.9.9.9:7447", Reach.MACHINE),
-        ("tcp/[::1]:7447", Reach.MACHINE),
-        ("tcp/localhost:7447", Reach.MACHINE),
-        ("tcp/0.0.0.0:7447", Reach.NETWORK),
-        ("tcp/[::]:7447", Reach.NETWORK),
-        ("tcp/[::ffff:192.0.2.1]:7447", Reach.NETWORK),
-        ("tcp/localhost.example.org:7447", Reach.NETWORK),
-        ("tcp/127.0.0.1.example.org:7447", Reach.NETWORK),
-        ("tcp/127.0.0.1@192.0.2.1:7447", Reach.NETWORK),
-        ("tcp/127.0.0.1", Reach.NETWORK),
-        ("tcp/:7447", Reach.NETWORK),
-        ("quic/192.0.2.1:7447", Reach.NETWORK),
-        ("serial//dev/ttyUSB0", Reach.NETWORK),
-        ("vsock/-1:7447", Reach.NETWORK),
-        ("", Reach.NETWORK),
-        ("unixsock-stream//run/trirail/zenoh", Reach.FILE),
-        ("tls/0.0.0.0:7447", Reach.CERTIFICATE),
+        ("tcp/127.0.0.1:7447", ReachableBy.MACHINE),
+        ("tcp/127.9.9.9:7447", ReachableBy.MACHINE),
+        ("tcp/[::1]:7447", ReachableBy.MACHINE),
+        ("tcp/localhost:7447", ReachableBy.MACHINE),
+        ("tcp/0.0.0.0:7447", ReachableBy.NETWORK),
+        ("tcp/[::]:7447", ReachableBy.NETWORK),
+        ("tcp/[::ffff:192.0.2.1]:7447", ReachableBy.NETWORK),
+        ("tcp/localhost.example.org:7447", ReachableBy.NETWORK),
+        ("tcp/127.0.0.1.example.org:7447", ReachableBy.NETWORK),
+        ("tcp/127.0.0.1@192.0.2.1:7447", ReachableBy.NETWORK),
+        ("tcp/127.0.0.1", ReachableBy.NETWORK),
+        ("tcp/:7447", ReachableBy.NETWORK),
+        ("quic/192.0.2.1:7447", ReachableBy.NETWORK),
+        ("serial//dev/ttyUSB0", ReachableBy.NETWORK),
+        ("vsock/-1:7447", ReachableBy.NETWORK),
+        ("", ReachableBy.NETWORK),
+        ("unixsock-stream//run/trirail/zenoh", ReachableBy.FILE),
+        ("tls/0.0.0.0:7447", ReachableBy.CERTIFICATE),
     ],
 )
-def test_who_reaches_it(endpoint: str, by: Reach) -> None:
+def test_who_reaches_it(endpoint: str, by: ReachableBy) -> None:
     assert reach(endpoint) is by

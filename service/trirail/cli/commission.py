@@ -74,7 +74,7 @@ def commission(
     if out is not None and out.exists():
         raise ConfigError(f"{out} exists already: name another file with --out")
     name = f"commission-{settings.robot.name}-{time.strftime('%Y%m%d-%H%M%S')}.json"
-    made = reports.Report(settings.robot.name, str(config), reports.now(), simulated, str(software()))
+    made = reports.CommissioningReport(settings.robot.name, str(config), reports.now(), simulated, str(software()))
     keeper = reports.Keeper(made, report or Path(name))
     person = Console(by_itself=yes, quiet=json)
     with interruption() as interrupted, opened(settings, fault, person, interrupted) as steps:

@@ -14,7 +14,7 @@ from trirail_drivers.protocols import PROTOCOLS
 from trirail.config import Config
 from trirail.processes.clock import Tick
 from trirail.processes.guard import Guard
-from trirail.wire.endpoints import Reach, reach
+from trirail.wire.endpoints import ReachableBy, reach
 
 Verdict = Literal["ok", "warning", "failure"]
 
@@ -247,13 +247,13 @@ def load(config: Config) -> Check:
 def network(config: Config, machine: Machine) -> list[Check]:
     """Who can command the robot, endpoint by endpoint, and what is to be said of certificates and users."""
     remedies = {
-        Reach.MACHINE: "where others log in too: unixsock-stream/PATH lets in the socket's owner and group alone",
-        Reach.NETWORK: "trirail keys init makes certificates for [zenoh.tls]",
+        ReachableBy.MACHINE: "where others log in too: unixsock-stream/PATH lets in the socket's owner and group alone",
+        ReachableBy.NETWORK: "trirail keys init makes certificates for [zenoh.tls]",
     }
     found = []
     for endpoint in config.zenoh.listen:
         by = reach(endpoint)
-        verdict: Verdict = "warning" if by is Reach.NETWORK else "ok"
+        verdict: Verdict = "warning" if by is ReachableBy.NETWORK else "ok"
         found.append(Check("network", verdict, f"{endpoint}: {by} can command", remedies.get(by, "")))
     if config.zenoh.tls is None:
         return found

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
 
-from trirail.commissioning.moves import Way
+from trirail.commissioning.moves import SlowMove
 from trirail.config import Config
 from trirail.kinematics.algebra import Array
 
@@ -162,7 +162,7 @@ class Bench:
         if (fault := self.feedback.fault) is not None:
             raise Stopped(fault.message)
 
-    def play(self, way: Way) -> Travelled:
+    def play(self, way: SlowMove) -> Travelled:
         """Move powered sliders along a way from where they are held, and let them settle."""
         begin = tuple(self._target)
         measured = []

@@ -20,7 +20,7 @@ from trirail.commissioning.steps import Steps
 from trirail.config import Config
 
 
-class Step(NamedTuple):
+class GuideStep(NamedTuple):
     """One step of the guide."""
 
     name: str
@@ -35,17 +35,17 @@ class Step(NamedTuple):
     """Steps that must not have found anything wrong before."""
 
 
-def plan(steps: Steps, config: Config) -> list[Step]:
+def plan(steps: Steps, config: Config) -> list[GuideStep]:
     """Return the steps in their order."""
     made = [
-        Step(
+        GuideStep(
             "bus",
             "",
             "Who is on the bus",
             "Reads who each drive is. Writes nothing, no drive gets power.",
             steps.session.bus,
         ),
-        Step(
+        GuideStep(
             "setup",
             "",
             "Set-up",
@@ -55,7 +55,7 @@ def plan(steps: Steps, config: Config) -> list[Step]:
         ),
     ]
     made += [
-        Step(
+        GuideStep(
             "push",
             name,
             f"Slider {name} by hand",
@@ -66,7 +66,7 @@ def plan(steps: Steps, config: Config) -> list[Step]:
         for name in NAMES
     ]
     made += [
-        Step(
+        GuideStep(
             "power",
             name,
             f"Power on drive {name} alone",
@@ -78,7 +78,7 @@ def plan(steps: Steps, config: Config) -> list[Step]:
         for name in NAMES
     ]
     made += [
-        Step(
+        GuideStep(
             "move",
             name,
             f"Drive {name} moves 1 mm",
@@ -90,7 +90,7 @@ def plan(steps: Steps, config: Config) -> list[Step]:
         for name in NAMES
     ]
     made += [
-        Step(
+        GuideStep(
             "switches",
             name,
             f"Switches of slider {name}",
@@ -102,7 +102,7 @@ def plan(steps: Steps, config: Config) -> list[Step]:
         if steps.session.tells_inputs
     ]
     made += [
-        Step(
+        GuideStep(
             "home",
             name,
             f"Home of slider {name}",
@@ -115,7 +115,7 @@ def plan(steps: Steps, config: Config) -> list[Step]:
         if config.drives.each[NAMES.index(name)].homing is not None
     ]
     made += [
-        Step(
+        GuideStep(
             "watchdog",
             name,
             f"Watchdog of drive {name}",
@@ -128,7 +128,7 @@ def plan(steps: Steps, config: Config) -> list[Step]:
     ]
     needed = [(step.name, step.drive) for step in made if step.name in ("move", "home")]
     made.append(
-        Step(
+        GuideStep(
             "square",
             "",
             "All three: a square of 1 mm",
@@ -198,7 +198,7 @@ class Guide:
         self._keeper.conclude(changes, written)
         return written
 
-    def _done(self, step: Step, at: int) -> int:
+    def _done(self, step: GuideStep, at: int) -> int:
         """Do a step as the person wants it; return where to go on."""
         choices = {"y": "do it", "s": "skip it", "b": "back to the step before"}
         choice = self._choice("  Do it? Enter or y, s skip, b back, q quit:", "y", choices)
@@ -221,12 +221,12 @@ class Guide:
         return choose(self._person, self._steps.session.idle, Question(text, default), choices)
 
     def _keep(
-        self, step: Step, judged: Judged, measured: dict[str, float | int | str | bool | None] | None = None
+        self, step: GuideStep, judged: Judged, measured: dict[str, float | int | str | bool | None] | None = None
     ) -> None:
         self._keeper.add(step.name, step.drive, judged, measured or {})
         self._person.judged(judged)
 
-    def _lacks(self, step: Step) -> str:
+    def _lacks(self, step: GuideStep) -> str:
         latest = self._keeper.report.latest
         missing = [
             f"{name} {drive}".rstrip()

@@ -24,7 +24,7 @@ JERK = 1.0
 """Greatest jerk [m/s³]."""
 
 
-class Way(NamedTuple):
+class SlowMove(NamedTuple):
     """A motion of the three sliders from where they stand, a row for each cycle."""
 
     position: Array
@@ -51,15 +51,15 @@ def profile(distance: float, limits: SliderLimits, period: float) -> tuple[Array
     return rows[:, 0, 0], rows[:, 1, 0]
 
 
-def of_slider(index: int, distance: float, limits: SliderLimits, period: float) -> Way:
+def of_slider(index: int, distance: float, limits: SliderLimits, period: float) -> SlowMove:
     """Return the way of one slider over `distance` [m]; the others stand."""
     along, rate = profile(distance, limits, period)
     position, velocity = np.zeros((len(along), 3)), np.zeros((len(along), 3))
     position[:, index], velocity[:, index] = along, rate
-    return Way(position, velocity)
+    return SlowMove(position, velocity)
 
 
-def square(config: Config, sliders: tuple[float, float, float]) -> tuple[Way, Array]:
+def square(config: Config, sliders: tuple[float, float, float]) -> tuple[SlowMove, Array]:
     """Return the sliders' way for a square of the platform from where it stands, and its poses, (N, 3).
 
     Along x, along y, and back, `DISTANCE` each. Raises KinematicsError where the sliders belong to no pose, ValueError
@@ -90,4 +90,4 @@ def square(config: Config, sliders: tuple[float, float, float]) -> tuple[Way, Ar
         ):
             if outside:
                 raise ValueError(beyond(name, float(value), float(limit), unit))
-    return Way(motion.position - np.array(sliders), motion.velocity), path
+    return SlowMove(motion.position - np.array(sliders), motion.velocity), path

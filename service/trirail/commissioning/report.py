@@ -15,7 +15,7 @@ from trirail.commissioning.judgement import Changes, Judged, Verdict
 Number = float | int | str | bool | None
 
 
-class Entry(Struct, frozen=True):
+class StepReport(Struct, frozen=True):
     """A step that was carried out, or left out."""
 
     step: str
@@ -32,7 +32,7 @@ class Entry(Struct, frozen=True):
     """When it ended, by the wall clock (ISO 8601)."""
 
 
-class Report(Struct):
+class CommissioningReport(Struct):
     """All steps in the order in which they were done; of one that was repeated the last counts."""
 
     robot: str
@@ -42,14 +42,14 @@ class Report(Struct):
     software: str
     plan: tuple[tuple[str, str], ...] = ()
     """The steps that there are, each with its drive."""
-    steps: list[Entry] = []
+    steps: list[StepReport] = []
     changes: dict[str, int | float] = {}
     """What the configuration should say otherwise, all steps together."""
     written: str | None = None
     """The configuration that was written."""
 
     @property
-    def latest(self) -> dict[tuple[str, str], Entry]:
+    def latest(self) -> dict[tuple[str, str], StepReport]:
         """Of each step the last time that it was done."""
         return {(entry.step, entry.drive): entry for entry in self.steps}
 
@@ -77,7 +77,7 @@ class Report(Struct):
 class Keeper:
     """Keeps a report in a file of its own, and the same in words beside it."""
 
-    def __init__(self, report: Report, path: Path) -> None:
+    def __init__(self, report: CommissioningReport, path: Path) -> None:
         """Raises FileError where there is such a file already, or none can be made."""
         self.report = report
         self.path = path
@@ -95,7 +95,9 @@ class Keeper:
 
     def add(self, step: str, drive: str, judged: Judged, measured: dict[str, Number]) -> None:
         """Note a step and write the file anew."""
-        entry = Entry(step, drive, judged.verdict, judged.words, judged.remedy, measured, dict(judged.changes), now())
+        entry = StepReport(
+            step, drive, judged.verdict, judged.words, judged.remedy, measured, dict(judged.changes), now()
+        )
         self.report.steps.append(entry)
         self.save()
 
@@ -110,12 +112,12 @@ class Keeper:
         _replace(self.text, "\n".join(words(self.report)) + "\n")
 
 
-def content(report: Report) -> dict[str, object]:
+def content(report: CommissioningReport) -> dict[str, object]:
     """Return a report as plain values, with what it comes to."""
     return {"ok": report.ok, "complete": report.complete, **msgspec.to_builtins(report)}
 
 
-def words(report: Report) -> list[str]:
+def words(report: CommissioningReport) -> list[str]:
     """Return a report as lines for people."""
     lines = [f"Commissioning of robot {report.robot}, {report.config}", f"begun {report.began}, {report.software}"]
     if report.simulated:

@@ -198,9 +198,9 @@ class Steps:
         corner = rules
         try:
             with bench.power():
-                first = bench.play(moves.Way(way.position[:half], way.velocity[:half]))
+                first = bench.play(moves.SlowMove(way.position[:half], way.velocity[:half]))
                 corner = self._see.rules()
-                rest = moves.Way(way.position[half:] - way.position[half - 1], way.velocity[half:])
+                rest = moves.SlowMove(way.position[half:] - way.position[half - 1], way.velocity[half:])
                 second = bench.play(rest)
             poses = forward(robot, np.concatenate([first.measured, second.measured]))[:, :2]
             apart = np.linalg.norm(poses[:, None, :] - path[None, ::4, :2], axis=2).min(axis=1)

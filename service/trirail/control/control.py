@@ -21,7 +21,7 @@ from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeStat
 from trirail.control.plan_requests import PlannerPort, PlanRequests
 from trirail.control.setpoints import Setpoints
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.frames import Frames
+from trirail.motion.frames import NamedFrames
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
@@ -64,7 +64,7 @@ class Control:
         self._schedule = Schedule(rest(STILL), config.period)
         self._planner = PlanRequests(config, planner, self._schedule)
         self.ledger = Ledger()
-        frames, queue = Frames(config.frames), config.motion.queue
+        frames, queue = NamedFrames(config.frames), config.motion.queue
         self.goal_queue = GoalQueue(self.ledger, self._planner, self._schedule, frames, queue, config.period)
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
         self._following_error_limit = config.limits.slider.following_error

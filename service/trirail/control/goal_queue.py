@@ -10,7 +10,7 @@ from typing import NamedTuple
 from trirail.control.ledger import Ledger, Withdrawal
 from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.frames import Frames, Place
+from trirail.motion.frames import NamedFrames, Place
 from trirail.motion.schedule import Schedule
 from trirail.wire.messages import Outcome, PoseGoal, VelocityGoal
 from trirail.wire.packets import GoalRequest
@@ -27,7 +27,7 @@ class GoalQueue:
     """Takes goals in their order to the planner, and to the ledger what becomes of them."""
 
     def __init__(
-        self, ledger: Ledger, planner: PlanRequests, schedule: Schedule, frames: Frames, queue: int, period: float
+        self, ledger: Ledger, planner: PlanRequests, schedule: Schedule, frames: NamedFrames, queue: int, period: float
     ) -> None:
         self._ledger = ledger
         self._planner = planner

@@ -28,7 +28,7 @@ Place = Callable[[Literal["commanded", "measured"]], Sequence[float]]
 """The pose of the platform's centre from which a move begins."""
 
 
-class Frames:
+class NamedFrames:
     """The tools and work frames of one robot."""
 
     def __init__(self, table: FramesTable) -> None:

@@ -10,7 +10,7 @@ from trirail.config import Config
 from trirail.wire import zenoh_session
 from trirail.wire.access import access_control
 from trirail.wire.credentials import Credentials, revoked
-from trirail.wire.endpoints import Reach, reach, socket_file
+from trirail.wire.endpoints import ReachableBy, reach, socket_file
 from trirail.wire.vocabulary import Role
 
 SOCKET_MODE = 0o660
@@ -54,7 +54,7 @@ class Guard:
         insecure = [
             f"insecure: whoever reaches {endpoint} can move the robot; trirail keys init makes certificates"
             for endpoint in self._listen
-            if reach(endpoint) is Reach.NETWORK
+            if reach(endpoint) is ReachableBy.NETWORK
         ]
         return (*insecure, *self.certificate_warnings())
 

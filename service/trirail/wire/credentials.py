@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 from trirail.errors import ServiceError
-from trirail.wire.endpoints import Reach, reach
+from trirail.wire.endpoints import ReachableBy, reach
 
 AUTHORITY, CERTIFICATE, KEY, REVOKED = "ca.pem", "cert.pem", "key.pem", "revoked.txt"
 WARNED = timedelta(days=30)
@@ -87,7 +87,7 @@ def credentials_for(robot: str, locator: str, folder: Path | str | None = None) 
 
     Raises ServiceError for credentials that are no good, or that would not be used.
     """
-    if reach(locator) is Reach.CERTIFICATE:
+    if reach(locator) is ReachableBy.CERTIFICATE:
         base = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
         return Credentials.read(Path(folder) if folder is not None else base / "trirail" / robot)
     if folder is not None:

@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 
 
-class Reach(StrEnum):
+class ReachableBy(StrEnum):
     """Who can open a session on an endpoint, by what he must have."""
 
     FILE = "who may write to the socket's file"
@@ -16,14 +16,14 @@ class Reach(StrEnum):
     NETWORK = "everybody in the network"
 
 
-def reach(endpoint: str) -> Reach:
+def reach(endpoint: str) -> ReachableBy:
     """Return who reaches an endpoint; the whole network where that is not sure, as for a host name."""
     protocol = endpoint.partition("/")[0]
     if protocol == "tls":
-        return Reach.CERTIFICATE
+        return ReachableBy.CERTIFICATE
     if protocol == "unixsock-stream":
-        return Reach.FILE
-    return Reach.MACHINE if is_local(endpoint) else Reach.NETWORK
+        return ReachableBy.FILE
+    return ReachableBy.MACHINE if is_local(endpoint) else ReachableBy.NETWORK
 
 
 def socket_file(endpoint: str) -> Path | None:
