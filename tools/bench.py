@@ -31,6 +31,14 @@ def latency(*, goals: int = 100, json: bool = False) -> None:
 
 
 @app.command
+def settle(*, goals: int = 100, json: bool = False) -> None:
+    """Time from the end of a goal's path until the robot is measured to be there, on simulated drives."""
+    import bench_settle
+
+    bench_settle.main(goals, json)
+
+
+@app.command
 def frames(*, cycles: int = 3000, json: bool = False) -> None:
     """Time one cycle's frames by python-can, and on the bus's own socket."""
     import bench_frames

@@ -20,6 +20,7 @@ COMMANDS = {
     "loop": ("--rates", "1000", "--rates", "4000", "--seconds", "60", "--runs", "5"),
     "peers": ("--seconds", "5"),
     "recorder": ("--seconds", "15"),
+    "settle": ("--goals", "40"),
 }
 """The measurements, with what they take: together under ten minutes."""
 BRIEF = {
@@ -28,6 +29,7 @@ BRIEF = {
     "loop": ("--rates", "1000", "--seconds", "2", "--runs", "1"),
     "peers": ("--seconds", "1"),
     "recorder": ("--seconds", "2"),
+    "settle": ("--goals", "3"),
 }
 """What they take for a look."""
 
@@ -136,6 +138,8 @@ def _show(results: Results) -> None:
     for row in results["aims"]:
         measured, aim = (" / ".join(f"{value:.4g}" for value in row[key]) for key in ("measured", "aim"))
         print(f"{row['name']:68}{row['before']:>26}{measured:>26}{aim:>20}   {'yes' if row['met'] else 'NO'}")
+    if "settle" in results:
+        print("settling, p50 / p99 / max [ms]: " + " / ".join(f"{ms:.0f}" for ms in results["settle"]["settle_ms"]))
     if "peers" in results:
         off = results["peers"]["deviation_us"]
         print("SYNC's interval off its period, p99.9 [µs]: " + ", ".join(f"{k} {v[2]:.0f}" for k, v in off.items()))

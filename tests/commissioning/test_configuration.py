@@ -21,7 +21,7 @@ changes = st.fixed_dictionaries(
         for name in NAMES
         for key, values in (
             ("direction", st.sampled_from((1, -1))),
-            ("counts_per_metre", st.floats(1e6, 1e8)),
+            ("counts_per_metre", st.floats(5e6, 1e8)),
         )
     },
 )

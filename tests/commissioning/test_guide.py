@@ -317,7 +317,7 @@ def test_the_sliders_never_go_faster_than_5_mm_a_second(tmp_path: Path, monkeypa
 
 
 def test_a_drive_that_keeps_its_power_when_stopped_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    taken = []
+    taken: list[PowerState] = []
 
     def deaf(self: SimulatedDrive, state: PowerState) -> None:
         if self.node == 1 and self.state is PowerState.OPERATION_ENABLED:

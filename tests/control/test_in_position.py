@@ -104,6 +104,15 @@ def test_it_settles_at_once_where_the_drives_follow(rig: Rig) -> None:
     assert ends(rig)[0].settle == pytest.approx(PERIOD)
 
 
+def test_a_goal_to_where_the_robot_stands_dwells_too(rig: Rig) -> None:
+    """The time before the goal does not count: it settles after the end of its path, however short."""
+    rig.enable()
+    rig.cycles(2 * round(WINDOWS.dwell / PERIOD))
+    rig.goal("g1", *rig.control.commanded.pose)
+    assert rig.until(rig.holds) >= round(WINDOWS.dwell / PERIOD) - 1
+    assert ends(rig)[0].settle == pytest.approx(PERIOD)
+
+
 def test_what_leaves_its_window_begins_anew(late: Rig) -> None:
     late.until(lambda: away(late) <= 1.0)
     late.cycles(round(WINDOWS.dwell / PERIOD) // 2)

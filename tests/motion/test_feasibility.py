@@ -72,18 +72,19 @@ def test_where_a_path_leaves_the_workspace_is_said_to_the_moment(share: float) -
 
 # ---------------------------------------------------------------------- shares of the limits
 
-# The code's own margins, written down once more: of the sliders, x, y and phi; velocity, acceleration and jerk.
-PLANS = np.array([(0.98, 0.98, 0.93), *[(1.0, 1.0, 1.0)] * 3])
+# The code's own margins, written down once more: of the sliders, x, y, phi, x and y of the centre on a tool's path;
+# velocity, acceleration and jerk.
+PLANS = np.array([(0.98, 0.98, 0.93), *[(1.0, 1.0, 1.0)] * 5])
 """Shares of the limits that plans make use of."""
-CHANGES = np.array([(0.99, 0.99, 0.98), *[(1.0, 1.01, 1.05)] * 3])
+CHANGES = np.array([(0.99, 0.99, 0.98), *[(1.0, 1.01, 1.05)] * 5])
 """Shares of the limits that a motion may use while its rate changes."""
 
 
-@pytest.mark.parametrize("row", range(4))
+@pytest.mark.parametrize("row", range(6))
 @pytest.mark.parametrize("quantity", range(3))
 def test_what_a_motion_may_use_of_each_limit_while_its_rate_changes(row: int, quantity: int) -> None:
     for share, borne in ((1.0 - 1e-5, True), (1.0 + 1e-5, False)):
-        worst = np.zeros((4, 3))
+        worst = np.zeros((6, 3))
         worst[row, quantity] = share * CHANGES[row, quantity] / PLANS[row, quantity]
         assert CHECKER.bears(worst) is borne
 

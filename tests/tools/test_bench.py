@@ -61,6 +61,15 @@ def test_the_time_from_a_goal_to_its_first_setpoint_is_measured() -> None:
 
 
 @pytest.mark.slow
+def test_settling_is_measured() -> None:
+    told = measured("settle")
+    assert told["outcomes"] == {"done": 3}
+    for what in ("settle_ms", "residual_um", "overshoot_um"):
+        assert is_spread(told[what], told["quantiles"])
+    assert told["settle_ms"][0] > 0.0
+
+
+@pytest.mark.slow
 def test_sync_is_measured_beside_python_canopens() -> None:
     told = measured("peers")
     assert set(told["deviation_us"]) == {"trirail, moving", "python-canopen", "python-canopen, SCHED_FIFO"}

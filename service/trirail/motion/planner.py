@@ -338,7 +338,7 @@ class Planner:
         length = np.subtract(target, begin)
         farthest = float(np.abs(length).max())
         shares = length / farthest if farthest else np.zeros(3)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", over="ignore"):  # a coordinate that stays where it is bounds nothing
             velocity, acceleration, jerk = (np.array(limits) / np.abs(shares)).min(axis=1)
         request, trajectory = InputParameter(1), Trajectory(1)
         request.target_position = [farthest]
