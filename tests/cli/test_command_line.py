@@ -44,7 +44,8 @@ def pages(app: App = commands.app, *path: str) -> Iterator[tuple[str, App]]:
     """Yield every command with what is typed to call it."""
     for name in app:
         if not name.startswith("-"):
-            yield " ".join((*path, name)), app[name]
+            if app[name].default_command is not None or not path:
+                yield " ".join((*path, name)), app[name]
             yield from pages(app[name], *path, name)
 
 
@@ -62,7 +63,7 @@ def test_every_command_is_in_a_group_with_examples_that_can_be_typed() -> None:
 
 @pytest.mark.parametrize(("name", "page"), list(pages()))
 def test_every_argument_is_described(name: str, page: App, run: Run) -> None:
-    for argument in page.assemble_argument_collection(parse_docstring=True):
+    for argument in page.assemble_argument_collection(parse_docstring=True) if page.default_command else ():
         if argument.show:
             assert argument.parameter.help, f"{name} {argument.name}"
 
@@ -146,6 +147,7 @@ def test_the_banner_names_the_next_command_where_it_reaches_the_service(capsys: 
     ready: dict[str, dict[str, Any]] = {
         "loop": {"lacking": [], "bus_load": 0.5},
         "recorder": {"live": "", "recording": "x.rrd"},
+        "gateway": {"warnings": []},
     }
     config = load(SIM)
     terminal.up(config, ready)

@@ -96,7 +96,8 @@ def test_no_later_than_ruckig_itself(rig: Rig, end: tuple[float, float, float]) 
     answer = accepted(rig.goal("g1", *end))
     assert answer.slowed == 1.0
     taken = 1 + rig.until(rig.holds)
-    assert taken <= math.ceil(bare((0.0, 0.0, 0.0), end) / PERIOD) + 2
+    dwell = CONFIG.limits.in_position.dwell
+    assert taken <= math.ceil((bare((0.0, 0.0, 0.0), end) + dwell) / PERIOD) + 2
 
 
 @pytest.mark.parametrize("config", [CONFIG, SLOW], ids=["as shipped", "slow sliders"])

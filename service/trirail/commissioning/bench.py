@@ -62,6 +62,8 @@ class Silence(NamedTuple):
     """The drive that spoke, "" where none did."""
     said: str
     """What it said of it, "" where it said nothing."""
+    code: int = 0
+    """The code that it said, as of an EMCY; 0 for none."""
 
 
 class Bench:
@@ -218,7 +220,7 @@ class Bench:
             return Silence(after, NAMES[index], str(state))
         own = own or fault
         by_itself = own.drive == NAMES[index] and own.cause in _OF_ITS_OWN
-        return Silence(after if by_itself else None, own.drive, own.message)
+        return Silence(after if by_itself else None, own.drive, own.message, own.code)
 
     def clear(self) -> None:
         """Reset a fault, if there is one. Raises Stopped where it does not go."""

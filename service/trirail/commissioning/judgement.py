@@ -17,6 +17,8 @@ Changes = Mapping[str, int | float]
 SWITCHES: Final = {1: "negative limit switch", 2: "positive limit switch", 4: "home switch"}
 """Bits of the digital inputs 60FDh (CiA 402-2)."""
 LIMITS: Final = (1, 2)
+HEARTBEAT_MISSING: Final = 0x8130
+"""What the EMCY of a drive says that does not hear its master (CiA 301, emergency error codes)."""
 
 
 class Judged(NamedTuple):
@@ -80,13 +82,13 @@ def judge_homing(drive: str, way: float, position: float, seen: bool, stopped: s
     )
 
 
-def judge_watchdog(drive: str, seconds: float | None, by: str, said: str, heartbeat: float) -> Judged:
-    """Judge what a powered drive did that heard neither SYNC nor heartbeat, which is for 3 `heartbeat` [s] at most."""
+def judge_watchdog(drive: str, seconds: float | None, by: str, said: str, code: int) -> Judged:
+    """Judge what a powered drive did that heard neither SYNC nor heartbeat, `code` is that of its EMCY."""
     if seconds is not None:
         words = (f"drive {drive} let go {seconds * 1e3:.0f} ms after the last SYNC: {said}",)
-        if seconds < 2.5 * heartbeat:
-            return Judged("ok", words)
-        return Judged("ok", (*words, "that was its watch on heartbeats: it has none on SYNC, or a slower one"))
+        if code == HEARTBEAT_MISSING:
+            return Judged("ok", (*words, "that was its watch on heartbeats: it has none on SYNC, or a slower one"))
+        return Judged("ok", words)
     if by and by != drive:
         return Judged("failed", (f"another drive spoke first: {said}",), "repeat this step")
     return Judged(

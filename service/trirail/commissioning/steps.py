@@ -179,7 +179,7 @@ class Steps:
                 silence = bench.silence(3.0 * heartbeat + HOLD)
         except Stopped as why:
             return Judged("failed", (str(why),), "repeat this step"), {}
-        judged = judge_watchdog(name, silence.seconds, silence.by, silence.said, heartbeat)
+        judged = judge_watchdog(name, silence.seconds, silence.by, silence.said, silence.code)
         return judged, {"seconds": silence.seconds, "said": silence.said}
 
     # All three.
