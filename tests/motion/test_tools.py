@@ -264,3 +264,8 @@ def test_from_tool_to_tool_in_motion_nothing_jumps(
         # From motion Ruckig's own ends are off by up to ten nanometres.
         assert rig.control.commanded.pose == pytest.approx(goals[-1][0], abs=2e-8)
     rig.bus.shutdown()
+
+
+def test_a_coordinate_that_hardly_moves_bounds_nothing(goals: dict[bool, Goals]) -> None:
+    poses = planned(goals[False], (0.0, 0.0, 0.0), PoseGoal(1e-310, 0.05, -1e-200))
+    assert poses[-1] == pytest.approx((0.0, 0.05, 0.0), abs=NANOMETRE)
