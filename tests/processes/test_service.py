@@ -238,7 +238,7 @@ def test_what_a_drive_does_without_stands_in_every_place_where_one_looks(tmp_pat
     missing = json.loads(trirail("status", "--json", locator=service.locator).stdout)["missing_protections"]
     assert missing == [{"drive": name, "object": "1006", "means": words} for name in "BC"]
     with service.robot() as robot:
-        told = [event.message for event in itertools.islice(robot.events(history=True), 1)]
+        told = [event.message for event in robot.events(history=True, timeout=2.0)]
         assert robot.info().missing_protections == tuple(MissingProtection(**each) for each in missing)
     assert any("drives B, C: lacks 1006" in message for message in told), told
     assert service.end() == 0
