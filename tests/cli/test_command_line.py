@@ -146,6 +146,7 @@ def test_the_banner_names_the_next_command_where_it_reaches_the_service(capsys: 
     ready: dict[str, dict[str, Any]] = {
         "loop": {"lacking": [], "bus_load": 0.5},
         "recorder": {"live": "", "recording": "x.rrd"},
+        "gateway": {"warnings": []},
     }
     config = load(SIM)
     terminal.up(config, ready)
