@@ -110,6 +110,7 @@ def add(
     return 0
 
 
+@app.default
 @app.command(name="list")
 def show(*, folder: Folder = HERE, json: Annotated[bool, Flag] = False) -> int:
     """List the certificates and until when they are good, and who is revoked; roles are in the configuration.
