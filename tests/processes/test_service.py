@@ -618,7 +618,7 @@ def test_a_recording_that_suffers_is_told_to_everyone(service: Service) -> None:
     with service.robot() as robot:
         in_motion(robot)
         recorder = service.child("recorder")
-        resource.prlimit(recorder, resource.RLIMIT_FSIZE, (1000, 1000))
+        resource.prlimit(recorder, resource.RLIMIT_FSIZE, (50_000, 50_000))  # more than the log has, less than a second
         told = (event for event in robot.events(history=True, timeout=10.0) if event.level == "warning")
         assert "takes no more" in next(told).message
         assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)

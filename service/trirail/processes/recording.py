@@ -92,7 +92,8 @@ class Intake:
 
     def _warn(self, words: str) -> None:
         """Say it in the service's log, and to everyone."""
-        print(f"trirail: recorder: {words}", file=sys.stderr, flush=True)  # noqa: T201 - the log
+        with contextlib.suppress(OSError):  # the log may be on the disk that takes no more
+            print(f"trirail: recorder: {words}", file=sys.stderr, flush=True)  # noqa: T201 - the log
         self._tell("warning", words)
 
     def _tell(self, level: Level, words: str) -> None:
