@@ -295,10 +295,10 @@ def test_a_configuration_that_loads_can_be_run(text: str) -> None:
 
 
 def run_a_little(config: Config) -> str:
-    """Power up, begin to move and stop; return why the bus is too slow for the configuration, if it is."""
+    """Power up, begin to move and stop; return why the bus is too slow, or a drive cannot take it, where that is so."""
     try:
         rig = Rig(config)
-    except BusError as error:
+    except (BusError, DriveError) as error:
         return str(error)
     rig.order("enable")
     rig.until(lambda: rig.mode is not Mode.ENABLING, 5000)
