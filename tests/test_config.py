@@ -18,7 +18,7 @@ from trirail.errors import ConfigError
 from trirail.telemetry import provenance
 from trirail.wire.messages import PoseGoal
 from trirail.wire.vocabulary import Mode
-from trirail_drivers.errors import LONGEST, BusError
+from trirail_drivers.errors import LONGEST, BusError, DriveError
 
 TEXT = SIM.read_text()
 LISTEN, TLS = 'listen = ["tcp/127.0.0.1:7447"]', 'listen = ["tls/0.0.0.0:7447"]\n[zenoh.tls]'
