@@ -118,14 +118,14 @@ class Control:
         self.setpoints.start()
         self._follow_measured()
         self._planner.warm_up()
+        self._tell_warnings(feedback)
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
         self.cycles += 1
         before = self.measured.feedback
         behind = self.measured.take(feedback, self._stands)
-        for warning in feedback.warnings:
-            self.ledger.tell("service", "warning", warning)
+        self._tell_warnings(feedback)
         mode = self.state.mode
         if feedback.fault is not None:
             if mode is Mode.FAULT and feedback.fault != before.fault:
@@ -144,6 +144,11 @@ class Control:
                 self._homing_over()
         self._judge_arrival()
         self.ledger.settle(self._verdict, self.state.mode)
+
+    def _tell_warnings(self, feedback: Feedback) -> None:
+        """Tell what people should know of the drives: they say it in one feedback only, some in the first."""
+        for warning in feedback.warnings:
+            self.ledger.tell("service", "warning", warning)
 
     def handle(self, request: Request, now_ns: int) -> None:
         """Take a request at a time of the monotonic clock: a command at once, a goal behind those before it."""
