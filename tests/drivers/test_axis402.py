@@ -7,6 +7,7 @@ import math
 import pytest
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.axis import REGISTER_TIME, Cia402Axis
+from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
@@ -18,12 +19,14 @@ OPERATIONAL, PRE_OPERATIONAL, BOOT_UP = b"\x05", b"\x7f", b"\0"
 WANTED: frames.Wanted = P.OPERATION_ENABLED
 OFF: frames.Wanted = P.SWITCH_ON_DISABLED
 T = 50.0
+EACH = Drive(1, 1e6)
+UNHURRIED = Drives("cia402", EACH, EACH, EACH, heartbeat=100.0)
 COOL = "let it cool down; look at load and air"
 
 
 def made() -> Cia402Axis:
     """A drive that is heard and follows setpoints."""
-    axis = Cia402Axis("B", 2, Scale(-1e6, 0.1), heartbeat=100.0)
+    axis = Cia402Axis("B", 2, Scale(-1e6, 0.1), UNHURRIED)
     axis.on_heartbeat(OPERATIONAL, T)
     axis.on_status(ENABLED, T)
     axis.on_position(frames.POSITION.pack(1000), T)
@@ -62,7 +65,7 @@ def test_a_fault_reset_has_the_time_of_two_statuswords() -> None:
 
 @pytest.mark.parametrize("wanted", [OFF, WANTED, P.QUICK_STOP_ACTIVE])
 def test_a_fault_from_before_the_start_is_told_and_left_alone_until_it_is_to_be_reset(wanted: frames.Wanted) -> None:
-    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), heartbeat=100.0)
+    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), UNHURRIED)
     axis.on_heartbeat(OPERATIONAL, T)
     axis.on_status(FAULT, T)
     assert axis.fault(T, wanted) == ("B", "fault", 0, "drive B: fault")
@@ -106,7 +109,7 @@ def test_a_drive_that_has_left_its_fault_has_no_code_of_it() -> None:
 
 @pytest.mark.parametrize("told_by", ["heartbeat", "position"])
 def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -> None:
-    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), heartbeat=100.0)
+    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), UNHURRIED)
     axis.on_status(ENABLED, T)
     axis.on_heartbeat(PRE_OPERATIONAL, T)  # from before it was started
     assert axis.fault(T, WANTED) is None
