@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.axis import REGISTER_TIME, Cia402Axis
@@ -193,3 +194,17 @@ def test_what_is_no_state_of_cia_402_is_a_fault() -> None:
     assert axis.fault(T, WANTED) == ("B", "state", 0, "drive B: statusword 002A is that of no CiA 402 state")
     assert state_of(axis) is P.OPERATION_ENABLED
     assert axis.heard < math.inf
+
+
+@pytest.mark.parametrize("most", [1, 3, 40])
+def test_as_many_positions_may_be_missed_as_the_configuration_says(most: int) -> None:
+    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), msgspec.structs.replace(UNHURRIED, missed_positions=most))
+    axis.on_heartbeat(OPERATIONAL, T)
+    axis.on_status(ENABLED, T)
+    for cycle in range(most + 1):
+        assert axis.fault(T, WANTED) is None, cycle
+        axis.answers.sync_sent()
+        if cycle == 0:
+            axis.on_position(frames.POSITION.pack(1000), T)
+        axis.answers.read_over()
+    assert axis.fault(T, WANTED) == ("B", "silent", 0, f"drive B: no position for {most} cycles in a row")
