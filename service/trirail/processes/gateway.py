@@ -55,6 +55,7 @@ from trirail.wire.packets import (
     message,
 )
 from trirail.wire.records import unpack
+from trirail.wire.state import summary_of
 from trirail.wire.text import is_name, quoted
 from trirail.wire.vocabulary import Command, Mode
 
@@ -67,6 +68,8 @@ UNDER_WAY = 32
 """Commands that the loop has at once; beyond that they are refused, but for those that stop the robot."""
 REPLY_WITHIN = 15.0
 """A command that the loop has not carried out by then is answered with an error [s]."""
+SUMMARY_EVERY = 1.0
+"""How often the summary is published [s]."""
 REFUSALS_PER_SECOND = 10
 """Unreadable goals that are told to everyone; the others only get their error reply."""
 
@@ -101,7 +104,7 @@ class Gateway:
         self._states = StateMaker(config)
         self._meter = Meter(measured) if config.telemetry.metrics_port else None
         self._state_every = 1.0 / config.telemetry.state_hz
-        self._state_due = 0.0
+        self._state_due = self._summary_due = self._heard = 0.0
         self._replies = Replies(self._robot)
         self._inbox = Inbox(opened, self._robot, self._too_much)
         self._backlog = Backlog()
@@ -131,6 +134,7 @@ class Gateway:
                     self._last_words.heard()
                     self._hear(packet, ready)
                 self._give_up_late()
+                self._summarize()
         except Closed:
             self._tell_of_its_end()
         finally:
@@ -278,10 +282,17 @@ class Gateway:
         if self._meter is not None:
             self._meter.records(rows)
             self._meter.tell(self._states.newest)
-        now = time.monotonic()
+        now = self._heard = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
             self._publications.state(self._states.newest(self._guard.warnings()))
+
+    def _summarize(self) -> None:
+        """Publish the summary when it is time, also while the loop says nothing: then it tells since when."""
+        now = time.monotonic()
+        if now >= self._summary_due and self._states.cycle:
+            self._summary_due = now + SUMMARY_EVERY
+            self._publications.summary(summary_of(self._states.newest(), now - self._heard, self._info.version))
 
     def _happened(self, event: Event) -> None:
         """Tell everyone of an event, and the service's log."""
