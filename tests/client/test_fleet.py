@@ -65,14 +65,17 @@ def test_who_needs_somebody_stands_first(hub: tuple[str, zenoh.Session]) -> None
         said |= {"odd": b"\xff nonsense", "later": b'{"mode": "holding"}'}
         until(lambda: len(fleet.members()) == 4, lambda: publish(said))
         assert [member.robot for member in fleet.members()] == ["c", "a", "b", "d"]
+        last = {"z": msgspec.json.encode(OK)}  # behind all that was said before
+        until(lambda: len(fleet.members()) == 5, lambda: publish(last))
         now[0] += SILENT - 0.5
-        until(
-            lambda: sum(m.heard == now[0] for m in fleet.members()) == 3, lambda: publish({n: said[n] for n in "acd"})
-        )
+        again = {name: said[name] for name in "acd"} | last
+        until(lambda: sum(member.heard == now[0] for member in fleet.members()) == 4, lambda: publish(again))
         now[0] += 1.0
-        assert [(m.robot, m.need(now[0]).name) for m in fleet.members()] == [
-            ("b", "SILENT"), ("c", "FAULT"), ("a", "NOTHING"), ("d", "NOTHING"),
-        ]  # fmt: skip
+        assert [(member.robot, member.need(now[0])) for member in fleet.members()] == [
+            ("b", Need.SILENT),
+            ("c", Need.FAULT),
+            *((name, Need.NOTHING) for name in "adz"),
+        ]
 
 
 def test_one_look_as_json(

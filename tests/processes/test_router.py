@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import pytest
@@ -72,7 +72,7 @@ def routed(net: Net) -> Iterator[Net]:
         yield net
 
 
-def listening(session: zenoh.Session, key: str) -> zenoh.Subscriber[zenoh.handlers.RingHandler[zenoh.Sample]]:
+def listening(session: zenoh.Session, key: str) -> Any:
     return session.declare_subscriber(key, zenoh.handlers.RingChannel(100))
 
 

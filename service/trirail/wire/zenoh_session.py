@@ -105,7 +105,8 @@ def serving(
     return {
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
-        "connect/timeout_ms": 0,  # begin without a router that is not there, and go on trying
+        # Begin without a router that is not there, and try again and again: with 0 in place of -1 it is tried once.
+        "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         # Connections on which nothing comes must not keep others out.
