@@ -23,6 +23,7 @@ from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox, Incoming
 from trirail.processes.info import info
 from trirail.processes.last_words import LastWords
+from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications
 from trirail.processes.replies import Replies
 from trirail.processes.state import StateMaker
@@ -34,12 +35,12 @@ from trirail.wire.messages import (
     CommandReply,
     ErrorReply,
     Event,
-    Goal,
     GoalReply,
     NoContent,
     Override,
     ReleaseLease,
     RoleReply,
+    SentGoal,
     Stop,
 )
 from trirail.wire.packets import (
@@ -50,6 +51,7 @@ from trirail.wire.packets import (
     GoalRequest,
     Happened,
     Kind,
+    PoseChanged,
     Refused,
     RefusedRequest,
     Status,
@@ -115,6 +117,7 @@ class Gateway:
         self._state_due = 0.0
         self._replies = Replies(self._robot)
         self._inbox = Inbox(opened, self._robot, self._too_much)
+        self._poses = Poses(config, self._replies.send, self._refuse, self._tell_of_pose, self._inbox.wake)
         self._backlog = Backlog()
         self._ahead: dict[int, str] = {}
         """The tickets of the goals that the loop has, and whose they are."""
@@ -144,17 +147,24 @@ class Gateway:
                     self._beat()
                     self._last_words.heard()
                     self._hear(packet, ready)
+                self._send_goals()  # those for which there was no room
+                self._poses.settle()
                 self._give_up_late()
                 self._tell_of_overruns()
         except Closed:
             self._tell_of_its_end()
         finally:
+            self._poses.close()
             for incoming in [
                 *(waiting.incoming for waiting in self._waiting.values()),
                 *(goal.incoming for goal in self._backlog),
             ]:
                 self._replies.send(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
             self._replies.close()
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what people should know of how the service is run, one line each."""
+        return (*self._guard.warnings(), *self._poses.warnings())
 
     def end(self) -> None:
         """End soon; safe from a signal handler."""
@@ -174,6 +184,10 @@ class Gateway:
                 self._replies.send(incoming, RoleReply(user, self._guard.role(user)))
             elif incoming.kind == "goal":
                 self._goal(incoming)
+            elif incoming.kind == "poses":
+                self._replies.send(incoming, self._poses.table())
+            elif incoming.kind in ("teach", "forget"):
+                self._poses.take(incoming)
             else:
                 self._command(incoming)
         except RefusedError as refusal:
@@ -185,7 +199,8 @@ class Gateway:
 
     def _goal(self, incoming: Incoming) -> None:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
-        goal: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
+        sent: SentGoal = boundary.decode(incoming.payload, SentGoal, "not a goal", incoming.encoding)
+        goal = self._poses.stated(sent)
         self._backlog.check_room(user, incoming.size)
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
@@ -273,6 +288,9 @@ class Gateway:
         self._replies.send(incoming, ErrorReply(refusal.code, text))
         self._tell(text, incoming.user if is_name(incoming.user) else "")
 
+    def _tell_of_pose(self, changed: PoseChanged) -> None:
+        self._link.send(message(changed))
+
     def _tell(self, text: str, user: str = "") -> None:
         """Have the loop tell everyone, but not too often."""
         now = time.monotonic()
@@ -322,11 +340,13 @@ class Gateway:
     def _publish(self, batch: memoryview) -> None:
         """Take in a batch of records and pass it on; publish the newest state when it is time."""
         self._publications.records(bytes(batch))
-        self._states.records(unpack(batch))
+        records = unpack(batch)
+        self._states.records(records)
+        self._poses.measure(records[-1])
         now = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
-            self._publications.state(self._states.newest(self._guard.warnings()))
+            self._publications.state(self._states.newest(self.warnings()))
 
     def _happened(self, event: Event) -> None:
         """Tell everyone of an event, and the service's log; what others have sent under a new holder does not begin."""
@@ -373,5 +393,5 @@ def main(
     with guard.open() as opened:
         gateway = Gateway(config, link, beat, opened, guard, log)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
-        gateway.serve(lambda: ready({"warnings": guard.warnings()}))
+        gateway.serve(lambda: ready({"warnings": gateway.warnings()}))
     return 0

@@ -25,7 +25,7 @@ keep a stop out."""
 UNREAD_OF_ONE = 2048
 """Of them those of one user, and likewise."""
 
-Kind = Literal["goal", "cmd", "info", "role"]
+Kind = Literal["goal", "cmd", "info", "role", "poses", "teach", "forget"]
 
 _STOPS = frozenset(name for name in Command if name.stops and name.everybodys)
 
@@ -101,6 +101,9 @@ class Inbox:
             declare(key("cmd", "*", "*"), queries("cmd")),
             declare(key("info"), queries("info")),
             declare(key("role", "*"), queries("role")),
+            declare(key("poses"), queries("poses")),
+            declare(key("teach", "*", "*"), queries("teach")),
+            declare(key("forget", "*", "*"), queries("forget")),
             self._session.declare_subscriber(key("goal", "*"), on_sample),
             self._session.liveliness().declare_token(key("alive")),
         ]
