@@ -24,7 +24,7 @@ from trirail_drivers.interface import NAMES
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles, travels
 from trirail.wire.endpoints import ReachableBy, endpoint_of, is_local, reach
-from trirail.wire.vocabulary import Role
+from trirail.wire.vocabulary import LeasePolicy, Role
 
 _PACKAGED = Path(__file__).parent / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[2] / "configs") / "sim.toml"
@@ -142,6 +142,15 @@ class MotionTable(Struct, frozen=True, forbid_unknown_fields=True):
     """How many goals may wait for the one under way, where that has a `blend`."""
 
 
+class ControlTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [control]: who may move the robot, beside what his role allows."""
+
+    lease: LeasePolicy = "optional"
+    """Whether the robot moves while nobody holds the lease; while somebody does, it moves for him alone."""
+    takeover: Role = Role.MAINTAINER
+    """The least role that may take the lease over from who holds it."""
+
+
 class FramesTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [frames]: points and frames that goals may name."""
 
@@ -238,6 +247,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     watchdogs: Watchdogs
     motion: MotionTable = MotionTable()
     frames: FramesTable = FramesTable()
+    control: ControlTable = ControlTable()
     poses: dict[PoseName, tuple[Coordinate, Coordinate, Angle]] = {}
     """Poses by name: x, y [m] of the platform's centre and phi [rad], in the base frame. The others that goals may name
     are taught, and kept by the service."""

@@ -16,6 +16,7 @@ from trirail.config import Config, geometry
 from trirail.control.completion import still_powered, verdict
 from trirail.control.feedback import Measured
 from trirail.control.goal_queue import GoalQueue
+from trirail.control.lease import LeaseArbiter, LeaseChange
 from trirail.control.ledger import Ledger
 from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeState, Refusal, step
 from trirail.control.plan_requests import PlannerPort, PlanRequests
@@ -57,7 +58,11 @@ _GO_ON = (
     ModeEvent.ARRIVED,
     ModeEvent.POWERED,
     # Homing moves the sliders: what was sent before would not begin from where it was meant to.
-    *(ModeEvent[name.name] for name in Command if not name.stops and name not in (Command.OVERRIDE, Command.HOME)),
+    *(
+        ModeEvent[name.name]
+        for name in Command
+        if not name.stops and name.name in ModeEvent.__members__ and name is not Command.HOME
+    ),
 )
 """Events that leave alone what has been sent but not begun."""
 
@@ -73,7 +78,10 @@ class Control:
         self._planner = PlanRequests(config, planner, self._schedule)
         self.ledger = Ledger()
         frames, queue = NamedFrames(config.frames), config.motion.queue
-        self.goal_queue = GoalQueue(self.ledger, self._planner, self._schedule, frames, queue, config.period)
+        self.lease = LeaseArbiter(config.control.lease, config.period)
+        self.goal_queue = GoalQueue(
+            self.ledger, self.lease, self._planner, self._schedule, frames, queue, config.period
+        )
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
         self._following_error_limit = config.limits.slider.following_error
         self.measured = Measured(
@@ -185,10 +193,12 @@ class Control:
         self._withdraw(event, reason)
 
     def advance(self) -> None:
-        """End a jog that nobody renews, begin what has been planned, and go on to the motion of this cycle."""
+        """End a lease or a jog that nobody renews, begin what is planned, and go on to the motion of this cycle."""
+        if (over := self.lease.silent(self.cycles)) is not None:
+            self._change_lease(over)
         released = self.ledger.release(self.cycles) if self.state.mode is Mode.MOVING else None
         if released is not None:
-            self._go(ModeEvent.RELEASE, f"goal {released.id} of {released.user} is not renewed")
+            self._go(ModeEvent.JOG_OVER, f"goal {released.id} of {released.user} is not renewed")
         beginning = self.goal_queue.think(self.cycles, self._admit, self._place)
         if beginning is not None:
             self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
@@ -283,6 +293,11 @@ class Control:
             self.goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason)
 
     def _take_command(self, request: CommandRequest) -> None:
+        if request.name in (Command.ACQUIRE, Command.RELEASE):
+            self._take_lease(request)
+            return
+        if not request.name.everybodys:
+            self.lease.check(request.user)
         if request.name is Command.OVERRIDE:
             self._take_override(request)
             return
@@ -318,6 +333,24 @@ class Control:
             self._planner.run_at(self.override)
         self.ledger.tell("service", "info", f"override {self.override:.0%} by {request.user}", user=request.user)
         self.ledger.undertake(request, self.cycles)
+
+    def _take_lease(self, request: CommandRequest) -> None:
+        """Let a user have the lease, keep it, or give it back."""
+        if request.name is Command.ACQUIRE:
+            change = self.lease.acquire(request, self.cycles)
+        else:
+            change = self.lease.release(request)
+        if change is not None:
+            self._change_lease(change)
+        self.ledger.undertake(request, self.cycles)
+
+    def _change_lease(self, change: LeaseChange) -> None:
+        """Tell who holds the lease from now on; what others have under way stops, and does not begin any more."""
+        user = self.lease.user
+        self.ledger.tell("lease", change.level, change.message, user=user)
+        if user is None or not self.ledger.is_all_of(user):
+            self._go(ModeEvent.STOP, change.message)
+            self._withdraw(ModeEvent.STOP, change.message)
 
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message

@@ -174,6 +174,12 @@ class Ledger:
         if not self.renewed_by(request):
             self._ending(request.id, request.user, outcome, reason)
 
+    def is_all_of(self, user: str | None) -> bool:
+        """Whether the goals and commands under way that need the lease are all a user's."""
+        commands = (request for under_way in self._commands.values() for request, _ in under_way)
+        senders = [goal.user for goal in self.goals] + [one.user for one in commands if not one.name.everybodys]
+        return all(sender == user for sender in senders)
+
     def refuse(self, request: Request, refusal: RefusedError) -> None:
         """Answer that a request is not carried out. A goal that is refused has ended; a used id has its own ending."""
         if isinstance(request, RefusedRequest | PoseChanged):

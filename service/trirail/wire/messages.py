@@ -245,11 +245,41 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
     """Its id; none for the robot as a whole."""
 
 
+LeaseTimeout = Annotated[float, Meta(ge=0.1, le=10.0)]
+
+
+class AcquireLease(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content, if any, of the command acquire. The same one again, within its timeout, is a sign of life."""
+
+    id: Identifier | None = None
+    """A new one for every lease, the same in every sign of life: a lease that has ended does not come back by one.
+    Without it, each one asks anew."""
+    timeout: LeaseTimeout = 1.0
+    """Real time after which a lease without a sign of life ends, with a controlled stop [s]."""
+    force: bool = False
+    """Take it over from who holds it, by a role of [control] `takeover`."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+class ReleaseLease(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content, if any, of the command release: which lease is given back."""
+
+    id: Identifier | None = None
+    """As in its acquire; without it the user's own, whichever that is."""
+
+
 class NoContent(Struct, frozen=True, forbid_unknown_fields=True):
     """The content of the other commands."""
 
 
-CONTENT: dict[Command, Any] = {Command.OVERRIDE: Override, Command.STOP: Stop | None}
+CONTENT: dict[Command, Any] = {
+    Command.OVERRIDE: Override,
+    Command.STOP: Stop | None,
+    Command.ACQUIRE: AcquireLease | None,
+    Command.RELEASE: ReleaseLease | None,
+}
 """What commands carry, with None where they may come without; those that are not here, NoContent | None."""
 
 
@@ -346,9 +376,9 @@ class Event(Struct, frozen=True, omit_defaults=True):
     """Its cycle, as in records."""
     time: float
     """Wall clock [s since 1970]."""
-    kind: Literal["goal", "mode", "fault", "refused", "pose", "service"]
+    kind: Literal["goal", "mode", "fault", "refused", "pose", "lease", "service"]
     """What it is about: the end of a goal, a new mode, a fault, something refused, a named pose that was taught or
-    removed, the service itself."""
+    removed, a new holder of the lease, the service itself."""
     level: Level
     """How much it matters to people."""
     message: str
@@ -364,7 +394,8 @@ class Event(Struct, frozen=True, omit_defaults=True):
     goal: str | None = None
     """The id of the goal that set the robot in motion, with kind mode."""
     user: str | None = None
-    """Who sent the goal, or what was refused, or has taught or removed the pose."""
+    """Who sent the goal, or what was refused, or has taught or removed the pose; with kind lease who holds it from now
+    on, None for nobody."""
     settle: float | None = None
     """With outcome done: time from the end of the path until the robot was in position, to the first cycle of the dwell
     [s]. None of a goal that was not to settle: a jog, one that was passed on the way to the next."""
