@@ -224,6 +224,9 @@ def test_an_id_is_used_once(rig: Rig) -> None:
     assert refusal(rig.goal("g1", 0.01, 0.0, 0.0)).code == "duplicate_id"
     rig.until(lambda: rig.mode is Mode.HOLDING)
     assert refusal(rig.goal("g1", 0.01, 0.0, 0.0)).code == "duplicate_id"
+    for order in ("disable", "quick_stop"):  # no goal is taken then; this one has ended all the same, and once
+        rig.command(order)
+        assert refusal(rig.goal("g1", 0.01, 0.0, 0.0)).code == "duplicate_id"
     assert rig.outcomes() == [("g1", "done")]
 
 
