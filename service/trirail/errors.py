@@ -79,6 +79,10 @@ class RefusalCode(StrEnum):
         "ask for a role that does: [zenoh.users] of the robot's configuration",
     )
 
+    LEASED = "leased", "another user holds the lease", "wait until it is free, or take it over"
+    NO_LEASE = "no_lease", "nobody holds the lease, and this robot moves for its holder alone", "send acquire"
+    LEASE_OVER = "lease_over", "the lease was released, taken over, or kept by no sign of life", "acquire a new one"
+
     # What the robot's mode allows.
     NOT_ENABLED = "not_enabled", "the drives have no power yet", "send enable, and wait for it"
     NOT_HOMED = "not_homed", "where the sliders are is not known", "send home"

@@ -16,8 +16,10 @@ import pytest
 import zenoh
 from trirail.client.async_client import AsyncRobot
 from trirail.client.async_goal import AsyncGoalHandle, AsyncJog
+from trirail.client.async_lease import AsyncLease
 from trirail.client.client import Robot
 from trirail.client.goal import GoalHandle, Jog
+from trirail.client.lease import Lease
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import zenoh_session
 from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply
@@ -41,12 +43,12 @@ def test_every_public_name_of_robot_has_its_twin(name: str) -> None:
         return
     assert list(inspect.signature(ours).parameters.values()) == list(inspect.signature(theirs).parameters.values())
     assert inspect.getdoc(ours)
-    waits = not (inspect.isgeneratorfunction(theirs) or name in ("jog", "states", "events", "records"))
+    waits = not (inspect.isgeneratorfunction(theirs) or name in ("jog", "lease", "states", "events", "records"))
     assert inspect.iscoroutinefunction(ours) == waits
 
 
-@pytest.mark.parametrize(("ours", "theirs"), [(AsyncGoalHandle, GoalHandle), (AsyncJog, Jog)])
-def test_goals_and_jogs_have_the_same_names_too(ours: type, theirs: type) -> None:
+@pytest.mark.parametrize(("ours", "theirs"), [(AsyncGoalHandle, GoalHandle), (AsyncJog, Jog), (AsyncLease, Lease)])
+def test_goals_jogs_and_leases_have_the_same_names_too(ours: type, theirs: type) -> None:
     assert {name for name in dir(ours) if name[0] != "_"} == {name for name in dir(theirs) if name[0] != "_"}
 
 

@@ -99,6 +99,19 @@ def test_a_jog_lasts_while_its_context_does(locator: str) -> None:
     run(locator, work)
 
 
+def test_a_lease_is_kept_by_a_task_and_given_back(locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        async with AsyncRobot("demo", locator, user="bob") as bob:
+            async with robot.lease(timeout=0.5) as lease:
+                assert not await lease.wait(1.5)  # three time-outs long: it is kept
+                with pytest.raises(RefusedError, match="ann"):
+                    await bob.move_to(x=0.01, y=0.0, phi=0.0)
+                assert (await (await robot.move_to(x=0.01, y=0.0, phi=0.0)).wait()).outcome == "done"
+            assert (await (await bob.move_to(x=0.0, y=0.0, phi=0.0)).wait()).outcome == "done"
+
+    run(locator, work)
+
+
 def test_a_task_that_is_cancelled_while_it_jogs_moves_nothing_any_more(locator: str) -> None:
     async def work(robot: AsyncRobot) -> None:
         async def jog() -> None:

@@ -11,6 +11,7 @@ from typing import cast
 
 import msgspec
 from trirail.client.client import GoalHandle, Result, Robot
+from trirail.client.lease import Lease
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry
@@ -50,6 +51,7 @@ class FakeRobot:
         self.goal: GoalState | None = None
         self.faults: tuple[str, ...] = ()
         self.share = 1.0
+        self.holder: str | None = None
         self.named = {"park": (0.0, 0.05, 0.0)}
         self.gone_to: list[str] = []
         self.sent: list[VelocityGoal] = []
@@ -104,7 +106,10 @@ class FakeRobot:
         self.gone_to.append(name)
         return GoalHandle(name, self.robot().command)
 
-    def command(self, name: str) -> CommandReply:
+    def lease(self) -> Lease:
+        return Lease(self.command, force=False, timeout=0.2)
+
+    def command(self, name: str, _content: bytes = b"") -> CommandReply:
         with self._lock:
             self.commands.append(name)
         if name in self._hanging:
@@ -117,6 +122,7 @@ class FakeRobot:
                 self._stand("stopped", "stop of ann")
             self.mode = {"enable": "holding", "disable": "disabled", "reset": "disabled"}.get(name, self.mode)
             self.faults = () if name == "reset" else self.faults
+            self.holder = {"acquire": self.user, "release": None}.get(name, self.holder)
             return CommandReply(name, self.mode)
 
     def stop(self) -> None:
@@ -193,6 +199,7 @@ class FakeRobot:
             faults=self.faults,
             loop=LOOP,
             settled=True,
+            lease=self.holder,
         )
 
     def _advance(self) -> None:

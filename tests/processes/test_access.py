@@ -23,7 +23,7 @@ MESSAGES = ("put", "delete", "query", "reply", "declare_subscriber", "declare_qu
 FLOWS = ("ingress", "egress")
 
 PUBLISHED = {"state", "event", "records"}
-OPERATORS = {"enable", "disable", "quick_stop", "pause", "resume", "override"}
+OPERATORS = {"enable", "disable", "quick_stop", "pause", "resume", "override", "acquire", "release"}
 MAINTAINERS = {"reset", "home"}
 
 KEYS = [

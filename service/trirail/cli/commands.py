@@ -144,8 +144,9 @@ app.command(panel_command.panel)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)
+app.command(robot_commands.acquire, name=Command.ACQUIRE, help=Command.ACQUIRE.help)
 for each in Command:
-    if each is not Command.OVERRIDE:
+    if each not in (Command.OVERRIDE, Command.ACQUIRE):
         app.command(robot_commands.telling(each), name=each.replace("_", "-"), help=each.help)
 app.command(config_commands.app)
 app.command(keys_command.app)

@@ -31,6 +31,8 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "quick-stop": ("trirail quick-stop",),
         "reset": ("trirail reset",),
         "home": ("trirail home",),
+        "acquire": ("trirail acquire", "trirail acquire --force"),
+        "release": ("trirail release",),
     },
     "Motion": {
         "goto": (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -291,6 +292,25 @@ def override(percent: units.Percentage, /, *, service: Service = HERE) -> int:
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         robot.override(percent)
     show(service, {"override": percent}, f"override: {percent:g} %")
+    return 0
+
+
+def acquire(*, force: Annotated[bool, Flag] = False, service: Service = HERE) -> int:
+    """Hold the lease until Ctrl-C, or until it is lost.
+
+    Parameters
+    ----------
+    force
+        Take it over from who holds it: a maintainer's, if [control] takeover does not say otherwise.
+    """
+    from trirail.client.client import Robot
+
+    with Robot(service.robot, service.connect, tls=service.tls) as robot, robot.lease(force=force) as lease:
+        show(service, {"lease": robot.user}, f"{robot.user} holds the lease until Ctrl-C")
+        with contextlib.suppress(KeyboardInterrupt):
+            lease.wait()
+    if lease.lost is not None:
+        raise lease.lost
     return 0
 
 

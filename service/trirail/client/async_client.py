@@ -20,12 +20,13 @@ import msgspec
 
 from trirail.client.async_connection import AsyncConnection
 from trirail.client.async_goal import AsyncGoalHandle, AsyncJog
+from trirail.client.async_lease import AsyncLease
 from trirail.client.client import HOME_WITHIN, Robot, identity, message_of, result_of
 from trirail.client.connection import REPLY_WITHIN
 from trirail.client.goal import GoalHandle
 from trirail.errors import ServiceError
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.messages import CommandReply, Event, Goal, GoalReply, Stop
+from trirail.wire.messages import AcquireLease, CommandReply, Event, Goal, GoalReply, Stop
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.vocabulary import Command
 
@@ -125,6 +126,7 @@ class AsyncRobot:
     pause = _order(Robot.pause)
     resume = _order(Robot.resume)
     override = _order(Robot.override)
+    release = _order(Robot.release)
 
     def jog(self, *, x: float = 0.0, y: float = 0.0, phi: float = 0.0, timeout: float = 0.2) -> AsyncJog:
         """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
@@ -154,6 +156,18 @@ class AsyncRobot:
         """Send a command by its name on the wire, as Robot.command does."""
         within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
         return await self._connection.ask(("cmd", self.user, name), CommandReply, content, within)
+
+    def lease(self, *, force: bool = False, timeout: float = 1.0) -> AsyncLease:
+        """Have the robot for oneself while the context lasts, as Robot.lease does.
+
+        async with robot.lease():
+            await robot.enable()
+        """
+        return AsyncLease(self.command, force=force, timeout=timeout)
+
+    async def acquire(self, lease: AcquireLease | None = None) -> CommandReply:
+        """Take the lease, or keep it by one sign of life; `lease` keeps it for as long as signs come."""
+        return await self.command(Command.ACQUIRE, msgspec.json.encode(lease) if lease is not None else None)
 
     async def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""

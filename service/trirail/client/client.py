@@ -21,10 +21,12 @@ import zenoh
 
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import GoalHandle, Jog, Result
+from trirail.client.lease import Lease
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.credentials import Credentials, credentials_for
 from trirail.wire.messages import (
+    AcquireLease,
     CommandReply,
     Event,
     Goal,
@@ -44,7 +46,7 @@ from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command
 
-__all__ = ["GoalHandle", "Jog", "Result", "Robot"]
+__all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot"]
 
 HOME_WITHIN = 600.0
 """How long homing may take [s]: three drives of the greatest time-out there is."""
@@ -297,10 +299,31 @@ class Robot:
             raise RefusedError(RefusalCode.MALFORMED, f"no override: {error}") from error
         self.command(Command.OVERRIDE, msgspec.json.encode(content))
 
+    def lease(self, *, force: bool = False, timeout: float = 1.0) -> Lease:
+        """Have the robot for oneself while the context lasts: only this user's goals and commands move it.
+
+        It is kept by signs of life, from a thread of its own. Where these cease for `timeout` [s], and where the
+        context ends, the robot stops within its limits and the lease is free. `force` takes it over from who holds it,
+        by a role that may. Entering raises RefusedError `leased` where somebody else holds it. Stop, quick_stop and
+        disable are everybody's all the same.
+
+        with robot.lease():
+            robot.move_to(x=0.02, y=0.0, phi=0.0).wait()
+        """
+        return Lease(self.command, force=force, timeout=timeout)
+
+    def acquire(self, lease: AcquireLease | None = None) -> CommandReply:
+        """Take the lease, or keep it by one sign of life; `lease` keeps it for as long as signs come."""
+        return self.command(Command.ACQUIRE, msgspec.json.encode(lease) if lease is not None else None)
+
+    def release(self) -> None:
+        """Give the lease back that this user holds, whichever of his clients keeps it; return when the robot stands."""
+        self.command(Command.RELEASE)
+
     def command(self, name: str, content: bytes | None = None) -> CommandReply:
         """Send a command by its name on the wire; return once the service confirms that it has been carried out.
 
-        `content` is its JSON, where it has any: Override or Stop of trirail.wire.messages.
+        `content` is its JSON, where it has any: one of trirail.wire.messages.CONTENT.
         """
         within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
         return self._connection.ask(("cmd", self.user, name), CommandReply, content, within)

@@ -13,6 +13,7 @@ from websockets.sync.server import ServerConnection
 
 from trirail.client.client import Robot
 from trirail.client.held_jog import HeldJog
+from trirail.client.lease import Lease
 from trirail.errors import TrirailError
 from trirail.panel.feed import Feed, now
 from trirail.panel.messages import FromPage, GoTo, Hold, Release, Seen, SetOverride, Tell
@@ -41,6 +42,7 @@ class Tab:
         self._outbox: list[bytes] = []
         self._unseen: deque[int] = deque()
         self._under_way: set[Command] = set()
+        self._lease: Lease | None = None
         self._open = True
 
     def serve(self) -> None:
@@ -56,6 +58,7 @@ class Tab:
             with self._feed.changed:
                 self._open = False
                 self._feed.changed.notify_all()
+            self._give_back()
 
     def _take(self, text: str | bytes) -> None:
         try:
@@ -93,11 +96,30 @@ class Tab:
 
         def tell() -> None:
             try:
-                self._robot.command(name)
+                if name is Command.ACQUIRE:
+                    self._acquire()
+                elif name is Command.RELEASE and self._lease is not None:
+                    self._give_back()
+                else:
+                    self._robot.command(name)
             finally:
                 self._under_way.discard(name)
 
         self._begin(tell, name)
+
+    def _acquire(self) -> None:
+        """Hold the lease for as long as this tab is open: with it go its signs of life."""
+        if self._lease is None or self._lease.lost is not None:
+            lease = self._robot.lease()
+            lease.__enter__()
+            self._lease = lease
+        if not self._open:
+            self._give_back()
+
+    def _give_back(self) -> None:
+        lease, self._lease = self._lease, None
+        if lease is not None:
+            lease.__exit__()
 
     def _begin(self, do: Callable[[], object], what: str, then: str = "done") -> None:
         def run() -> None:

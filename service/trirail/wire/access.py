@@ -26,6 +26,8 @@ COMMANDS: dict[Command, Role] = {
     Command.PAUSE: Role.OPERATOR,
     Command.RESUME: Role.OPERATOR,
     Command.OVERRIDE: Role.OPERATOR,
+    Command.ACQUIRE: Role.OPERATOR,
+    Command.RELEASE: Role.OPERATOR,
     Command.RESET: Role.MAINTAINER,
     Command.HOME: Role.MAINTAINER,
 }

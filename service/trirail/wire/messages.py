@@ -243,11 +243,41 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
     """Its id; none for the robot as a whole."""
 
 
+LeaseTimeout = Annotated[float, Meta(ge=0.1, le=10.0)]
+
+
+class AcquireLease(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content, if any, of the command acquire. The same one again, within its timeout, is a sign of life."""
+
+    id: Identifier | None = None
+    """A new one for every lease, the same in every sign of life: a lease that has ended does not come back by one.
+    Without it, each one asks anew."""
+    timeout: LeaseTimeout = 1.0
+    """Real time after which a lease without a sign of life ends, with a controlled stop [s]."""
+    force: bool = False
+    """Take it over from who holds it, by a role of [control] `takeover`."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+class ReleaseLease(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content, if any, of the command release: which lease is given back."""
+
+    id: Identifier | None = None
+    """As in its acquire; without it the user's own, whichever that is."""
+
+
 class NoContent(Struct, frozen=True, forbid_unknown_fields=True):
     """The content of the other commands."""
 
 
-CONTENT: dict[Command, Any] = {Command.OVERRIDE: Override, Command.STOP: Stop | None}
+CONTENT: dict[Command, Any] = {
+    Command.OVERRIDE: Override,
+    Command.STOP: Stop | None,
+    Command.ACQUIRE: AcquireLease | None,
+    Command.RELEASE: ReleaseLease | None,
+}
 """What commands carry, with None where they may come without; those that are not here, NoContent | None."""
 
 
@@ -322,6 +352,17 @@ class Residual(Struct, frozen=True):
     """Of x, y [m] and phi [rad]."""
 
 
+class Fault(Struct, frozen=True, omit_defaults=True):
+    """What a fault is about, for programs."""
+
+    cause: str
+    """A trirail.wire.vocabulary.FaultCause, or a cause of trirail_drivers.interface.DriveFault: emcy, silent, bus, …"""
+    drive: str = ""
+    """A, B or C, where it is about one."""
+    code: int = 0
+    """The drive's own: EMCY or 603Fh error code, or an ODrive's error bits; 0 where there is none."""
+
+
 class Event(Struct, frozen=True, omit_defaults=True):
     """Something that happened, in order, numbered without gaps by the loop."""
 
@@ -333,9 +374,9 @@ class Event(Struct, frozen=True, omit_defaults=True):
     """Its cycle, as in records."""
     time: float
     """Wall clock [s since 1970]."""
-    kind: Literal["goal", "mode", "fault", "refused", "pose", "service"]
+    kind: Literal["goal", "mode", "fault", "refused", "pose", "lease", "service"]
     """What it is about: the end of a goal, a new mode, a fault, something refused, a named pose that was taught or
-    removed, the service itself."""
+    removed, a new holder of the lease, the service itself."""
     level: Level
     """How much it matters to people."""
     message: str
@@ -351,7 +392,8 @@ class Event(Struct, frozen=True, omit_defaults=True):
     goal: str | None = None
     """The id of the goal that set the robot in motion, with kind mode."""
     user: str | None = None
-    """Who sent the goal, or what was refused, or has taught or removed the pose."""
+    """Who sent the goal, or what was refused, or has taught or removed the pose; with kind lease who holds it from now
+    on, None for nobody."""
     settle: float | None = None
     """With outcome done: time from the end of the path until the robot was in position, to the first cycle of the dwell
     [s]. None of a goal that was not to settle: a jog, one that was passed on the way to the next."""
@@ -361,3 +403,5 @@ class Event(Struct, frozen=True, omit_defaults=True):
     overshoot: Triple | None = None
     """Likewise, how far each of the sliders A, B, C was beyond its target at most since the end of the path, in the
     direction in which it was last commanded to move; of one that was not to move, to either side [m]."""
+    fault: Fault | None = None
+    """What it is about, with kind fault."""

@@ -10,6 +10,8 @@ import msgspec
 from msgspec import Struct
 from trirail_drivers.interface import MissingProtection, Triple
 
+from trirail.wire.vocabulary import LeasePolicy
+
 
 class Commanded(Struct, frozen=True):
     """What the robot was told: platform, then sliders."""
@@ -138,6 +140,8 @@ class State(Struct, frozen=True):
     warnings: tuple[str, ...] = ()
     """What people should know of how the service is run, one line each: that it is open to a network, or that its
     certificate expires soon."""
+    lease: str | None = None
+    """The user who holds the lease: his goals and commands alone move the robot; None where nobody does."""
 
 
 class Info(Struct, frozen=True):
@@ -161,6 +165,8 @@ class Info(Struct, frozen=True):
     """The folder of the service's recordings, on its machine."""
     live: str
     """Where a Rerun viewer on the service's machine finds the live view; "" for nowhere."""
+    lease: LeasePolicy = "optional"
+    """Whether the robot can be moved while nobody holds the lease."""
     homes: tuple[str, ...] = ()
     """The sliders whose encoders are not absolute: they have no position until the command home."""
     versions: dict[str, str] = msgspec.field(default_factory=dict)

@@ -132,13 +132,15 @@ function lost(why) {
 
 // Whether each button may be pressed now; what is pressed all the same is refused by the service.
 function allow() {
-  const { mode, goal } = contact ? state.state : {};
+  const { mode, goal, lease } = contact ? state.state : {};
   const may = {
     enable: mode === "disabled",
     disable: Boolean(mode) && mode !== "disabled" && mode !== "fault",
     home: mode === "holding",
     reset: mode === "fault",
     pause: mode === "moving",
+    acquire: Boolean(mode) && !lease,
+    release: Boolean(mode) && lease === robot?.user,
     resume: Boolean(goal) && (mode === "holding" || mode === "stopping"),
   };
   for (const button of document.querySelectorAll("[data-command]")) button.disabled = !may[button.dataset.command];
