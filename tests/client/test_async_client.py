@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import inspect
+import json
 import queue
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
@@ -205,6 +206,29 @@ def test_a_goal_is_waited_for_and_cancelling_the_wait_does_not_stop_it(silent: S
         assert {(await each).outcome for each in waiting} == {"done"}
         assert goal.result is not None
         assert goal.result.settle == 0.01
+
+    run(locator, work)
+    assert silent.asked.empty()
+
+
+def test_a_jog_that_is_left_while_it_is_renewed_hears_its_end_and_is_not_stopped(silent: Silent, locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        jog = robot.jog(x=0.01)
+        entering = asyncio.ensure_future(jog.__aenter__())
+        await asyncio.to_thread(silent.answer, GoalReply("any", 1.0))
+        await entering
+        renewal = await asyncio.to_thread(silent.asked.get, timeout=WITHIN)
+        leaving = asyncio.ensure_future(jog.__aexit__())
+        await asyncio.sleep(0)
+        with renewal:
+            assert renewal.payload is not None
+            name = json.loads(renewal.payload.to_string())["id"]
+            renewal.reply(renewal.key_expr, msgspec.json.encode(GoalReply(name, 1.0)))
+        end = Event(7, 0.0, 0, 5.0, "goal", "info", "goal done: not renewed", id=name, outcome="done")
+        await asyncio.to_thread(silent.publish, "event", end)
+        await leaving
+        assert jog.result is not None
+        assert jog.result.outcome == "done"
 
     run(locator, work)
     assert silent.asked.empty()

@@ -24,7 +24,7 @@ from trirail.client.async_lease import AsyncLease
 from trirail.client.client import HOME_WITHIN, Robot, identity, message_of, result_of
 from trirail.client.connection import REPLY_WITHIN
 from trirail.client.goal import GoalHandle
-from trirail.errors import ServiceError
+from trirail.errors import RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import AcquireLease, CommandReply, Event, Goal, GoalReply, Stop
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
@@ -140,14 +140,16 @@ class AsyncRobot:
         """Send the goal that `make` makes for an id, as Robot.send does."""
         goal_id = id or uuid.uuid4().hex[:12]
         message = message_of(make, goal_id)
+        renews = goal_id in self._goals  # a jog: what it has is not forgotten or stopped for one renewal's sake
         goal = self._goals.setdefault(goal_id, AsyncGoalHandle(goal_id, self.command))
         try:
             goal.reply = await self._connection.ask(("goal", self.user), GoalReply, message)
         except asyncio.CancelledError:
-            self._goals.pop(goal_id, None)
-            self._connection.tell(("cmd", self.user, Command.STOP), msgspec.json.encode(Stop(goal_id)))
+            if not renews:
+                self._goals.pop(goal_id, None)
+                self._connection.tell(("cmd", self.user, Command.STOP), msgspec.json.encode(Stop(goal_id)))
             raise
-        except BaseException:
+        except (RefusedError, ServiceError):
             self._goals.pop(goal_id, None)
             raise
         return goal

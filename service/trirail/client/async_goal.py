@@ -63,6 +63,7 @@ class AsyncJog:
         self._timeout = timeout
         self._id = uuid.uuid4().hex[:12]
         self._goal: AsyncGoalHandle | None = None
+        self._over = asyncio.Event()
         self._renewing: asyncio.Task[None] | None = None
         self.error: Exception | None = None
         """Why it could not be renewed any more."""
@@ -78,19 +79,25 @@ class AsyncJog:
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        self._over.set()
         if self._renewing is not None:
-            self._renewing.cancel()
-            await asyncio.wait([self._renewing])
+            await self._renewing  # a renewal that is on its way is not taken back
         if self._goal is not None and self.error is None:
             await self._goal.wait(self._timeout + STANDS_WITHIN)
+
+    async def _is_over(self, within: float) -> bool:
+        try:
+            async with asyncio.timeout(within):
+                return await self._over.wait()
+        except TimeoutError:
+            return False
 
     async def _send(self) -> AsyncGoalHandle:
         x, y, phi = self._velocity
         return await self._send_goal(lambda name: VelocityGoal(x, y, phi, timeout=self._timeout, id=name), self._id)
 
     async def _renew(self) -> None:
-        while True:
-            await asyncio.sleep(self._timeout / 3.0)
+        while not await self._is_over(self._timeout / 3.0):
             try:
                 await self._send()
             except TrirailError as error:
