@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from motion.test_runs import ROBOT, way
 from numpy.typing import NDArray
@@ -132,6 +132,8 @@ def test_when_a_path_is_first_out_of_reach_is_known_for_every_limit(
 
 
 @settings(max_examples=150)
+@example((0.0, 0.0, -0.3), (0.0, 0.0, 0.3), 2, 1, (0.0, 0.0))
+@example((0.0, 0.0, 0.3), (0.0, 0.0, -0.3), 2, 0, (0.0, 0.0))
 @given(POSES, POSES, st.integers(0, 4), st.integers(0, 1), TOOLS)
 def test_a_turn_beyond_a_limit_between_two_looks_is_seen(
     begin: Pose, middle: Pose, column: int, side: int, tool: tuple[float, float]
