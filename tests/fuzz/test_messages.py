@@ -22,7 +22,7 @@ from trirail.processes.guard import Guard
 from trirail.processes.inbox import Incoming, Kind
 from trirail.wire import boundary, links, packets, text, zenoh_session
 from trirail.wire.links import Port, TooLarge
-from trirail.wire.messages import CommandReply, Event, Goal, Override, PoseGoal, SentGoal, Stop, TrajectoryGoal
+from trirail.wire.messages import CommandReply, Event, Goal, Override, PoseGoal, Stop, TrajectoryGoal
 from trirail.wire.messages import TrajectoryPoint as Point
 from trirail.wire.packets import Accepted, GoalRequest, Happened, RefusedRequest
 from trirail.wire.records import DTYPE, SIZE
@@ -30,7 +30,7 @@ from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_PACKET, MAX_POINTS
 from trirail.wire.state import Info, State
 from trirail.wire.vocabulary import Mode
 
-KINDS: tuple[Any, ...] = (SentGoal, Stop | None, Override, State, Event, Info, CommandReply)
+KINDS: tuple[Any, ...] = (Goal, Stop | None, Override, State, Event, Info, CommandReply)
 ENCODINGS = ("", "zenoh/bytes", "application/json;v=1", boundary.JSON, boundary.MSGPACK)
 OPENINGS = (b"[", b'{"a":', b'{"kind":', b"\x91", b"\x81\xa1a")
 NUMBERS = ("x", "y", "phi", "speed", "timeout", "blend", "valid_for", "stretch", "z")

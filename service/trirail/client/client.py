@@ -29,13 +29,13 @@ from trirail.wire.messages import (
     AcquireLease,
     CommandReply,
     Event,
+    Goal,
     GoalReply,
     MoveGoal,
     NamedGoal,
     Override,
     OwnLimits,
     PoseGoal,
-    SentGoal,
     SlidersGoal,
     Tool,
     TrajectoryGoal,
@@ -243,8 +243,8 @@ class Robot:
         """
         return Jog(self.send, (x, y, phi), timeout)
 
-    def send(self, make: Callable[[str], SentGoal], id: str | None = None) -> GoalHandle:  # noqa: A002
-        """Send the goal that `make` makes for an id, a trirail.wire.messages.SentGoal; return once it is accepted."""
+    def send(self, make: Callable[[str], Goal], id: str | None = None) -> GoalHandle:  # noqa: A002
+        """Send the goal that `make` makes for an id, a trirail.wire.messages.Goal; return once it is accepted."""
         goal_id = id or uuid.uuid4().hex[:12]
         message = message_of(make, goal_id)
         goal = GoalHandle(goal_id, self.command)
@@ -404,7 +404,7 @@ def result_of(event: Event) -> Result | None:
     return Result(event.id, event.outcome, event.message, event.settle, event.residual, event.overshoot)
 
 
-def message_of(make: Callable[[str], SentGoal], goal_id: str) -> bytes:
+def message_of(make: Callable[[str], Goal], goal_id: str) -> bytes:
     """Return the goal that `make` makes for an id, as JSON. Raises RefusedError for one that cannot be."""
     try:
         return msgspec.json.encode(make(goal_id))

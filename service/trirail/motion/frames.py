@@ -16,6 +16,7 @@ from trirail.motion.runs import of_tool, rest
 from trirail.wire.messages import (
     Goal,
     MoveGoal,
+    NamedGoal,
     PlannedGoal,
     PoseGoal,
     SlidersGoal,
@@ -41,6 +42,10 @@ class NamedFrames:
                 return self._pose(goal)
             case MoveGoal():
                 return self._move(goal, place)
+            case NamedGoal(name=name):  # what there is has a pose in its place when it comes here
+                raise RefusedError(
+                    RefusalCode.UNKNOWN_POSE, f"no pose {name!r}: `trirail poses` lists those that there are"
+                )
             case SlidersGoal() | VelocityGoal() | TrajectoryGoal():
                 return goal
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import select
 import signal
@@ -36,12 +37,12 @@ from trirail.wire.messages import (
     CommandReply,
     ErrorReply,
     Event,
+    Goal,
     GoalReply,
     NoContent,
     Override,
     ReleaseLease,
     RoleReply,
-    SentGoal,
     Stop,
 )
 from trirail.wire.packets import (
@@ -157,7 +158,8 @@ class Gateway:
         except Closed:
             self._tell_of_its_end()
         finally:
-            self._poses.close()
+            with contextlib.suppress(Closed):
+                self._poses.close()
             for incoming in [
                 *(waiting.incoming for waiting in self._waiting.values()),
                 *(goal.incoming for goal in self._backlog),
@@ -202,8 +204,8 @@ class Gateway:
 
     def _goal(self, incoming: Incoming) -> None:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
-        sent: SentGoal = boundary.decode(incoming.payload, SentGoal, "not a goal", incoming.encoding)
-        goal = self._poses.stated(sent)
+        sent: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
+        goal = self._poses.of_name(sent)
         self._backlog.check_room(user, incoming.size)
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]

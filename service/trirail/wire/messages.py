@@ -221,9 +221,7 @@ class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
 
 PlannedGoal = PoseGoal | SlidersGoal | VelocityGoal | TrajectoryGoal
 """What the planner is asked for; its tools are points and its poses those of the base frame."""
-Goal = PlannedGoal | MoveGoal
-SentGoal = Goal | NamedGoal
-"""What clients send. The gateway puts poses in the place of their names: the loop, and recordings, know none."""
+Goal = PlannedGoal | MoveGoal | NamedGoal
 
 
 class Override(Struct, frozen=True, forbid_unknown_fields=True):
