@@ -13,7 +13,7 @@ import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.samples import SampleReader
-from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import least_role
 from trirail.wire.credentials import Credentials
@@ -26,6 +26,8 @@ ROLE_WITHIN = 0.8
 """How long the answer may take which role a user has [s]."""
 REPLY_WITHIN = 20.0
 """How long a command may take to be carried out [s]."""
+POST_WITHIN = 2.0
+"""How long the answer may take to what is posted [s]."""
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -83,6 +85,41 @@ class Connection:
                     raise refused
                 unreadable = refused
         raise unreadable or self.nobody(*parts)
+
+    def post(
+        self, parts: tuple[str, ...], kind: type[T], payload: bytes, take: Callable[[T | TrirailError], None]
+    ) -> None:
+        """Query the key of these parts without waiting: `take` gets a message of `kind`, or why there is none.
+
+        It is called once, by a thread of the connection: it must be quick.
+        """
+        answers: list[T | TrirailError] = []
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            try:
+                if reply.ok is not None:
+                    answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
+                    answers.append(answer)
+                elif reply.err is not None:
+                    answers.append(refusal(reply.err.payload.to_bytes()))
+            except RefusedError as error:
+                answers.append(ServiceError(f"somebody answered at {self._connect}, but {error}"))
+
+        def on_end() -> None:
+            silent = ServiceError(f"no robot {self._robot!r} answers at {self._connect}: is its service running?")
+            take(answers[0] if answers else silent)
+
+        self._session.get(
+            self._key(*parts),
+            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
+            payload=payload,
+            encoding=boundary.JSON,
+            timeout=POST_WITHIN,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+        )
 
     def nobody(self, *parts: str) -> ServiceError | RefusedError:
         """Return what to raise where nobody answers on the key of these parts.

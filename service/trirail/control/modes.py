@@ -20,7 +20,7 @@ class ModeEvent(Enum):
     RESET = auto()
     PAUSE = auto()
     RESUME = auto()
-    RELEASE = auto()  # nobody keeps the jog alive any more
+    RELEASE = auto()  # nobody renews the jog or the track any more
     HOME = auto()
     POWERED = auto()  # all drives reached operation enabled
     HOMED = auto()  # all drives know where they are, and follow setpoints again

@@ -20,6 +20,7 @@ from trirail.wire.messages import (
     PoseGoal,
     SlidersGoal,
     Tool,
+    TrackGoal,
     TrajectoryGoal,
     VelocityGoal,
 )
@@ -41,7 +42,7 @@ class NamedFrames:
                 return self._pose(goal)
             case MoveGoal():
                 return self._move(goal, place)
-            case SlidersGoal() | VelocityGoal() | TrajectoryGoal():
+            case SlidersGoal() | VelocityGoal() | TrackGoal() | TrajectoryGoal():
                 return goal
 
     def _pose(self, goal: PoseGoal) -> PoseGoal:
