@@ -18,9 +18,11 @@ import zenoh
 from trirail.client.async_client import AsyncRobot
 from trirail.client.async_goal import AsyncGoalHandle, AsyncJog
 from trirail.client.async_lease import AsyncLease
+from trirail.client.async_track import AsyncTrack
 from trirail.client.client import Robot
 from trirail.client.goal import GoalHandle, Jog
 from trirail.client.lease import Lease
+from trirail.client.track import Track
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import zenoh_session
 from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply
@@ -44,12 +46,17 @@ def test_every_public_name_of_robot_has_its_twin(name: str) -> None:
         return
     assert list(inspect.signature(ours).parameters.values()) == list(inspect.signature(theirs).parameters.values())
     assert inspect.getdoc(ours)
-    waits = not (inspect.isgeneratorfunction(theirs) or name in ("jog", "lease", "states", "events", "records"))
+    waits = not (
+        inspect.isgeneratorfunction(theirs) or name in ("jog", "lease", "track", "states", "events", "records")
+    )
     assert inspect.iscoroutinefunction(ours) == waits
 
 
-@pytest.mark.parametrize(("ours", "theirs"), [(AsyncGoalHandle, GoalHandle), (AsyncJog, Jog), (AsyncLease, Lease)])
-def test_goals_jogs_and_leases_have_the_same_names_too(ours: type, theirs: type) -> None:
+TWINS = [(AsyncGoalHandle, GoalHandle), (AsyncJog, Jog), (AsyncLease, Lease), (AsyncTrack, Track)]
+
+
+@pytest.mark.parametrize(("ours", "theirs"), TWINS)
+def test_goals_jogs_leases_and_tracks_have_the_same_names_too(ours: type, theirs: type) -> None:
     assert {name for name in dir(ours) if name[0] != "_"} == {name for name in dir(theirs) if name[0] != "_"}
 
 

@@ -2,6 +2,7 @@
 
 import ast
 import csv
+import math
 import os
 import pty
 import subprocess
@@ -117,6 +118,20 @@ def test_a_jog_lasts_while_the_key_is_held(service: Service) -> None:
     assert words == "stands at"
     assert 0.005 < float(x) < 0.1
     assert abs(float(y)) < 1e-4
+    assert abs(float(phi)) < 1e-3
+
+
+@pytest.mark.slow
+def test_a_camera_is_followed(service: Service) -> None:
+    with Robot("demo", service.locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.02, y=0.0, phi=0.0).wait(WITHIN)
+    followed, stands = run("follow_a_camera.py", "demo", service.locator)
+    assert followed.startswith("400 updates, at most ")
+    assert float(followed.split()[4]) < 20.0  # it has followed; how closely, simulated time tells
+    words, x, y, phi = stands.rsplit(maxsplit=3)
+    assert words == "stands at"
+    assert math.hypot(float(x), float(y)) == pytest.approx(0.02, abs=5e-3)
     assert abs(float(phi)) < 1e-3
 
 

@@ -21,9 +21,11 @@ import msgspec
 from trirail.client.async_connection import AsyncConnection
 from trirail.client.async_goal import AsyncGoalHandle, AsyncJog
 from trirail.client.async_lease import AsyncLease
+from trirail.client.async_track import AsyncTrack
 from trirail.client.client import HOME_WITHIN, Robot, identity, message_of, result_of
 from trirail.client.connection import REPLY_WITHIN
 from trirail.client.goal import GoalHandle
+from trirail.client.track import Taker
 from trirail.errors import RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import AcquireLease, CommandReply, Event, Goal, GoalReply, Stop
@@ -135,6 +137,19 @@ class AsyncRobot:
             await the_key_is_released()
         """
         return AsyncJog(self.send, (x, y, phi), timeout)
+
+    def track(self, *, timeout: float = 0.25, id: str | None = None) -> AsyncTrack:  # noqa: A002
+        """Follow a moving target while the context lasts, as Robot.track does.
+
+        async with robot.track() as track:
+            async for pose, velocity, time in camera:
+                await track.update(pose, velocity, time)
+        """
+
+        def post(goal: Goal, take: Taker) -> None:
+            self._connection.post(("goal", self.user), GoalReply, msgspec.json.encode(goal), take)
+
+        return AsyncTrack(self.send, post, id or uuid.uuid4().hex[:12], timeout)
 
     async def send(self, make: Callable[[str], Goal], id: str | None = None) -> AsyncGoalHandle:  # noqa: A002
         """Send the goal that `make` makes for an id, as Robot.send does."""

@@ -12,7 +12,7 @@ import msgspec
 import zenoh
 
 from trirail.client.connection import REPLY_WITHIN, ROLE_WITHIN, Connection, once
-from trirail.errors import RefusedError, ServiceError
+from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import Event, RoleReply
 from trirail.wire.state import State
@@ -71,6 +71,12 @@ class AsyncConnection:
         finally:
             query.cancel()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
         raise unreadable or await self.nobody(*parts)
+
+    def post(
+        self, parts: tuple[str, ...], kind: type[T], payload: bytes, take: Callable[[T | TrirailError], None]
+    ) -> None:
+        """Query the key of these parts, and have what comes of it taken in the event loop, as Connection.post does."""
+        self._connection.post(parts, kind, payload, self._hand_over(take))
 
     def tell(self, parts: tuple[str, ...], payload: bytes | None) -> None:
         """Query the key of these parts, and wait for no answer."""

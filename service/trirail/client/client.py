@@ -22,6 +22,7 @@ import zenoh
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import GoalHandle, Jog, Result
 from trirail.client.lease import Lease
+from trirail.client.track import Taker, Track
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.credentials import Credentials, credentials_for
@@ -46,7 +47,7 @@ from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command
 
-__all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot"]
+__all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot", "Track"]
 
 HOME_WITHIN = 600.0
 """How long homing may take [s]: three drives of the greatest time-out there is."""
@@ -242,6 +243,22 @@ class Robot:
             wait_for_the_key_to_be_released()
         """
         return Jog(self.send, (x, y, phi), timeout)
+
+    def track(self, *, timeout: float = 0.25, id: str | None = None) -> Track:  # noqa: A002 - the field's name on the wire
+        """Follow a moving target while the context lasts, told of 10 to 200 times a second; brake when it ends.
+
+        with robot.track() as track:
+            for pose, velocity, time in camera:
+                track.update(pose, velocity, time)
+
+        The robot goes on with the target's velocity between two updates, within every limit, and brakes on its path
+        when none has come for `timeout` seconds of real time. `id` as of move_to.
+        """
+
+        def post(goal: Goal, take: Taker) -> None:
+            self._connection.post(("goal", self.user), GoalReply, msgspec.json.encode(goal), take)
+
+        return Track(self.send, post, id or uuid.uuid4().hex[:12], timeout)
 
     def send(self, make: Callable[[str], Goal], id: str | None = None) -> GoalHandle:  # noqa: A002
         """Send the goal that `make` makes for an id, a trirail.wire.messages.Goal; return once it is accepted."""

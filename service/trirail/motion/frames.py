@@ -21,6 +21,7 @@ from trirail.wire.messages import (
     PoseGoal,
     SlidersGoal,
     Tool,
+    TrackGoal,
     TrajectoryGoal,
     VelocityGoal,
 )
@@ -46,7 +47,7 @@ class NamedFrames:
                 raise RefusedError(
                     RefusalCode.UNKNOWN_POSE, f"no pose {name!r}: `trirail poses` lists those that there are"
                 )
-            case SlidersGoal() | VelocityGoal() | TrajectoryGoal():
+            case SlidersGoal() | VelocityGoal() | TrackGoal() | TrajectoryGoal():
                 return goal
 
     def _pose(self, goal: PoseGoal) -> PoseGoal:
