@@ -161,7 +161,7 @@ def test_a_recording_is_read_while_it_is_written(service: Service) -> None:
 @pytest.mark.slow
 def test_the_notebook_plots_a_recording(service: Service) -> None:
     """Its cells one after the other, as Jupyter runs them; every axis has something finite drawn in it."""
-    notebook = nbformat.read(EXAMPLES / "plot_recording.ipynb", as_version=4)
+    notebook = nbformat.read(EXAMPLES / "plot_recording.ipynb", as_version=4)  # type: ignore[no-untyped-call]
     nbformat.validate(notebook)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert all(not cell.outputs and cell.execution_count is None for cell in cells), "clear its outputs"
