@@ -10,6 +10,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from motion.test_runs import ROBOT, way
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 from trirail.kinematics.robot import inverse
 from trirail.motion.path_sampling import survey
@@ -107,6 +108,20 @@ def test_the_greatest_rates_are_those_of_a_closer_look(
     assert math.isnan(leaves_at)
     assert worst == pytest.approx(expected, rel=0.05, abs=1e-9)
     assert (worst[:, :2] <= expected[:, :2] * (1.0 + 1e-2) + 1e-9).all()
+
+
+@given(POSES, POSES, st.floats(0.5, 3.0))
+def test_a_jerk_that_is_greatest_just_before_the_end_is_seen(begin: Pose, end: Pose, seconds: float) -> None:
+    """It grows evenly, from none at the beginning; however far apart the moments are, the last cycle is looked at."""
+    assume(math.dist(begin, end) > 1e-3)
+    left = Polynomial([seconds, -1.0])
+    shape = (left**3 - left**4 / (4.0 * seconds)).coef
+    c = np.subtract(begin, end) / (0.75 * seconds**3)
+    pieces = np.zeros((1, 3, 6))
+    pieces[0, :, :5] = np.outer(c, shape)
+    pieces[0, :, 0] += end
+    _, worst = surveyed(Path(np.array([0.0, seconds]), pieces), 1.0)
+    assert worst[1:4, 2] == pytest.approx(6.0 * np.abs(c), rel=0.01, abs=1e-9)
 
 
 @given(POSES, POSES, st.integers(0, 4), st.integers(0, 1), st.floats(0.05, 0.95), RATES)
