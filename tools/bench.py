@@ -47,6 +47,14 @@ def frames(*, cycles: int = 3000, json: bool = False) -> None:
 
 
 @app.command
+def machine(*, period: float = 0.001, cycles: int = 3000, json: bool = False) -> None:
+    """Time the same work hot and cold, once in a period: what of a cycle's cost is the machine's."""
+    import bench_machine
+
+    bench_machine.main(period, cycles, json)
+
+
+@app.command
 def peers(*, seconds: float = 15.0, json: bool = False) -> None:
     """Measure the intervals of SYNC beside python-canopen's, on the same bus."""
     import bench_peers

@@ -13,6 +13,7 @@ Results = dict[str, Any]
 """What each measurement gave, by its name."""
 
 COMMANDS = {
+    "machine": (),
     "frames": (),
     "kinematics": (),
     "planning": (),
@@ -24,6 +25,7 @@ COMMANDS = {
 }
 """The measurements, with what they take: together under ten minutes."""
 BRIEF = {
+    "machine": ("--cycles", "200"),
     "frames": ("--cycles", "50"),
     "latency": ("--goals", "3"),
     "loop": ("--rates", "1000", "--seconds", "2", "--runs", "1"),
@@ -138,6 +140,14 @@ def _show(results: Results) -> None:
     for row in results["aims"]:
         measured, aim = (" / ".join(f"{value:.4g}" for value in row[key]) for key in ("measured", "aim"))
         print(f"{row['name']:68}{row['before']:>26}{measured:>26}{aim:>20}   {'yes' if row['met'] else 'NO'}")
+    if "machine" in results:
+        took = {name: results["machine"][name] for name in ("arithmetic", "send_that_wakes", "send_after_it")}
+        cold = took["arithmetic"]["cold"][0] / took["arithmetic"]["hot"][0]
+        wakes, hot = took["send_that_wakes"]["cold"][0], took["send_after_it"]["hot"][0]
+        print(
+            f"the machine: arithmetic once a millisecond takes {cold:.1f} times what it takes hot, "
+            f"a send that wakes its receiver {wakes:.0f} µs instead of {hot:.1f}"
+        )
     if "settle" in results:
         print("settling, p50 / p99 / max [ms]: " + " / ".join(f"{ms:.0f}" for ms in results["settle"]["settle_ms"]))
     if "peers" in results:

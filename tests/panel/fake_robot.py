@@ -17,7 +17,17 @@ from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse
 from trirail.processes.info import info
 from trirail.wire.messages import CommandReply, Event, Goal, VelocityGoal
-from trirail.wire.state import Commanded, FrameCounts, GoalState, Info, LoopState, Percentiles, Sliders, State
+from trirail.wire.state import (
+    Commanded,
+    FrameCounts,
+    GoalState,
+    Info,
+    LoopState,
+    NamedPose,
+    Percentiles,
+    Sliders,
+    State,
+)
 from trirail.wire.vocabulary import Command
 from trirail_drivers.interface import Triple
 
@@ -40,6 +50,8 @@ class FakeRobot:
         self.goal: GoalState | None = None
         self.faults: tuple[str, ...] = ()
         self.share = 1.0
+        self.named = {"park": (0.0, 0.05, 0.0)}
+        self.gone_to: list[str] = []
         self.sent: list[VelocityGoal] = []
         self.commands: list[str] = []
         self.refusal: RefusedError | None = None
@@ -82,6 +94,15 @@ class FakeRobot:
             self._alive_until = time.monotonic() + goal.timeout
             self.goal = GoalState(goal_id, 0.0, 0.0)
             return self._handles.setdefault(goal_id, GoalHandle(goal_id, self.robot().command))
+
+    def poses(self) -> dict[str, NamedPose]:
+        return {name: NamedPose(name, *pose, taught=name != "park") for name, pose in self.named.items()}
+
+    def move_to_named(self, name: str) -> GoalHandle:
+        if name not in self.named:
+            raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {name!r}")
+        self.gone_to.append(name)
+        return GoalHandle(name, self.robot().command)
 
     def command(self, name: str) -> CommandReply:
         with self._lock:

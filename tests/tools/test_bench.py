@@ -69,6 +69,13 @@ def test_settling_is_measured() -> None:
     assert told["settle_ms"][0] > 0.0
 
 
+def test_what_the_machine_itself_takes_is_measured() -> None:
+    told = measured("machine")
+    for part in ("arithmetic", "send_that_wakes", "send_after_it"):
+        for values in (told[part]["cold"], told[part]["hot"]):
+            assert is_spread(values, told["quantiles"])
+
+
 @pytest.mark.slow
 def test_sync_is_measured_beside_python_canopens() -> None:
     told = measured("peers")

@@ -205,5 +205,6 @@ def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
         said = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
     elif isinstance(error, CoercionError) and error.msg and error.argument and not said.startswith("Invalid value"):
         said = f"Invalid value for {error.argument.name.strip('-')}: {said}"
-    command = " ".join(("trirail", *(error.command_chain or ())))
+    by_command = error.command_chain is None  # who raises it does not know how it was called
+    command = " ".join(("trirail", *(words[:1] if by_command else error.command_chain or ())))
     return f"{said} ({command} --help tells the usage)"

@@ -26,7 +26,15 @@ from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.wire.messages import Outcome
-from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest, PlannerLost, RefusedRequest, Request
+from trirail.wire.packets import (
+    CommandRequest,
+    Disturbance,
+    GoalRequest,
+    PlannerLost,
+    PoseChanged,
+    RefusedRequest,
+    Request,
+)
 from trirail.wire.planning import PlanAnswer
 from trirail.wire.records import Part
 from trirail.wire.vocabulary import Command, Mode
@@ -94,7 +102,7 @@ class Control:
                 match what:
                     case Disturbance():
                         self.happen(ModeEvent[what.event], what.reason)
-                    case GoalRequest() | CommandRequest() | RefusedRequest():
+                    case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged():
                         self.handle(what, now_ns)
                     case PlannerLost():
                         self._planner.lose(what.reason)
@@ -157,6 +165,8 @@ class Control:
                 self.goal_queue.take(request, now_ns, self.cycles)
             elif isinstance(request, CommandRequest):
                 self._take_command(request)
+            elif isinstance(request, PoseChanged):
+                self.ledger.tell("pose", "info", request.message, user=request.user)
             else:
                 self.ledger.tell("refused", "warning", request.message, user=request.user)
         except RefusedError as refusal:

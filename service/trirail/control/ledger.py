@@ -18,6 +18,7 @@ from trirail.wire.packets import (
     CommandRequest,
     Confirmed,
     GoalRequest,
+    PoseChanged,
     Refused,
     RefusedRequest,
     Request,
@@ -174,7 +175,7 @@ class Ledger:
 
     def refuse(self, request: Request, refusal: RefusedError) -> None:
         """Answer that a request is not carried out. A goal that is refused has ended; a used id has its own ending."""
-        if isinstance(request, RefusedRequest):
+        if isinstance(request, RefusedRequest | PoseChanged):
             return
         text = str(refusal)
         self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))

@@ -15,7 +15,7 @@ from trirail.client.client import Robot
 from trirail.client.held_jog import HeldJog
 from trirail.errors import TrirailError
 from trirail.panel.feed import Feed, now
-from trirail.panel.messages import FromPage, Hold, Release, Seen, SetOverride, Tell
+from trirail.panel.messages import FromPage, GoTo, Hold, Release, Seen, SetOverride, Tell
 from trirail.wire.vocabulary import Command
 
 AHEAD = 3
@@ -78,6 +78,8 @@ class Tab:
                 self._tell(name)
             case SetOverride(percent):
                 self._begin(lambda: self._robot.override(percent), Command.OVERRIDE)
+            case GoTo(name):
+                self._begin(lambda: self._robot.move_to_named(name), f"go to {name}", "accepted")
 
     # ------------------------------------------------------------------ doing
 
@@ -97,14 +99,14 @@ class Tab:
 
         self._begin(tell, name)
 
-    def _begin(self, do: Callable[[], object], what: str) -> None:
+    def _begin(self, do: Callable[[], object], what: str, then: str = "done") -> None:
         def run() -> None:
             try:
                 do()
             except TrirailError as error:
                 self._say("refused", to=what, message=str(error))
             else:
-                self._say("done", to=what)
+                self._say(then, to=what)
 
         threading.Thread(target=run, name=what, daemon=True).start()
 
@@ -117,13 +119,15 @@ class Tab:
 
     def _send(self) -> None:
         """Send what there is, each thing once, states only as fast as the page draws them."""
-        robot, event, stamp, silent = b"", 0, 0, False
+        robot, poses, event, stamp, silent = b"", b"", 0, 0, False
         feed = self._feed
         while True:
             due: list[bytes] = []
             with feed.changed:
                 if feed.robot is not robot:
                     due.append(robot := feed.robot)
+                if feed.poses != poses:
+                    due.append(poses := feed.poses)
                 for number, content in feed.events(event):
                     event = number
                     due.append(content)

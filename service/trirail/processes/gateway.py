@@ -21,6 +21,7 @@ from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox, Incoming
 from trirail.processes.info import info
 from trirail.processes.last_words import LastWords
+from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications
 from trirail.processes.replies import Replies
 from trirail.processes.state import StateMaker
@@ -31,11 +32,11 @@ from trirail.wire.messages import (
     CommandReply,
     ErrorReply,
     Event,
-    Goal,
     GoalReply,
     NoContent,
     Override,
     RoleReply,
+    SentGoal,
     Stop,
 )
 from trirail.wire.packets import (
@@ -46,6 +47,7 @@ from trirail.wire.packets import (
     GoalRequest,
     Happened,
     Kind,
+    PoseChanged,
     Refused,
     RefusedRequest,
     Status,
@@ -101,6 +103,7 @@ class Gateway:
         self._state_due = 0.0
         self._replies = Replies(self._robot)
         self._inbox = Inbox(opened, self._robot, self._too_much)
+        self._poses = Poses(config, self._replies.send, self._refuse, self._tell_of_pose, self._inbox.wake)
         self._backlog = Backlog()
         self._ahead: set[int] = set()
         self._commands: set[int] = set()
@@ -127,16 +130,22 @@ class Gateway:
                     self._beat()
                     self._last_words.heard()
                     self._hear(packet, ready)
+                self._poses.settle()
                 self._give_up_late()
         except Closed:
             self._tell_of_its_end()
         finally:
+            self._poses.close()
             for incoming in [
                 *(waiting.incoming for waiting in self._waiting.values()),
                 *(goal.incoming for goal in self._backlog),
             ]:
                 self._replies.send(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
             self._replies.close()
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what people should know of how the service is run, one line each."""
+        return (*self._guard.warnings(), *self._poses.warnings())
 
     def end(self) -> None:
         """End soon; safe from a signal handler."""
@@ -156,6 +165,10 @@ class Gateway:
                 self._replies.send(incoming, RoleReply(user, self._guard.role(user)))
             elif incoming.kind == "goal":
                 self._goal(incoming)
+            elif incoming.kind == "poses":
+                self._replies.send(incoming, self._poses.table())
+            elif incoming.kind in ("teach", "forget"):
+                self._poses.take(incoming)
             else:
                 self._command(incoming)
         except RefusedError as refusal:
@@ -167,7 +180,8 @@ class Gateway:
 
     def _goal(self, incoming: Incoming) -> None:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
-        goal: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
+        sent: SentGoal = boundary.decode(incoming.payload, SentGoal, "not a goal", incoming.encoding)
+        goal = self._poses.stated(sent)
         self._backlog.check_room(incoming.size)
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
@@ -222,6 +236,9 @@ class Gateway:
         user, *_ = [*incoming.key.split("/")[3:], ""]
         self._tell(text, user if is_name(user) else "")
 
+    def _tell_of_pose(self, changed: PoseChanged) -> None:
+        self._link.send(message(changed))
+
     def _tell(self, text: str, user: str = "") -> None:
         """Have the loop tell everyone, but not too often."""
         now = time.monotonic()
@@ -270,11 +287,13 @@ class Gateway:
     def _publish(self, batch: memoryview) -> None:
         """Take in a batch of records and pass it on; publish the newest state when it is time."""
         self._publications.records(bytes(batch))
-        self._states.records(unpack(batch))
+        records = unpack(batch)
+        self._states.records(records)
+        self._poses.measure(records[-1])
         now = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
-            self._publications.state(self._states.newest(self._guard.warnings()))
+            self._publications.state(self._states.newest(self.warnings()))
 
     def _happened(self, event: Event) -> None:
         """Tell everyone of an event, and the service's log."""
@@ -319,5 +338,5 @@ def main(
     with guard.open() as opened:
         gateway = Gateway(config, link, beat, opened, guard, log)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
-        gateway.serve(lambda: ready({"warnings": guard.warnings()}))
+        gateway.serve(lambda: ready({"warnings": gateway.warnings()}))
     return 0

@@ -18,7 +18,7 @@ UNREAD = 8192
 """Messages that may wait to be read; beyond that they are refused, commands at twice as many: a flood of goals must not
 keep a stop out."""
 
-Kind = Literal["goal", "cmd", "info", "role"]
+Kind = Literal["goal", "cmd", "info", "role", "poses", "teach", "forget"]
 
 
 class Incoming(NamedTuple):
@@ -70,6 +70,9 @@ class Inbox:
             declare(key("cmd", "*", "*"), queries("cmd")),
             declare(key("info"), queries("info")),
             declare(key("role", "*"), queries("role")),
+            declare(key("poses"), queries("poses")),
+            declare(key("teach", "*", "*"), queries("teach")),
+            declare(key("forget", "*", "*"), queries("forget")),
             self._session.declare_subscriber(key("goal", "*"), on_sample),
             self._session.liveliness().declare_token(key("alive")),
         ]

@@ -75,5 +75,6 @@ class Replies:
             if isinstance(content, ErrorReply):
                 query.reply_err(payload, encoding=encoding)
             else:
-                key = zenoh_session.key(self._robot, "info") if incoming.kind == "info" else incoming.key
+                of_robot = incoming.kind in ("info", "poses")  # what was asked may have wildcards
+                key = zenoh_session.key(self._robot, incoming.kind) if of_robot else incoming.key
                 query.reply(key, payload, encoding=encoding)

@@ -37,6 +37,7 @@ Validity = Annotated[float, Meta(ge=1e-3, le=86_400.0)]
 Moment = Annotated[float, Meta(ge=-86_400.0, le=86_400.0)]
 OwnTriple = tuple[OwnLimit, OwnLimit, OwnLimit]
 FrameName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
+PoseName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
 Tool = tuple[Coordinate, Coordinate] | FrameName
 """A point of the platform in its own frame, whose origin is the centre [m], or the name of one in [frames.tool]."""
 
@@ -103,6 +104,26 @@ class MoveGoal(
     """From which pose: "commanded" is where the goals before it lead, and where the robot is commanded to be without
     one or in a jog, so that moves add up whenever they come; "measured" is where it is measured to be when they have
     been planned."""
+    id: Identifier | None = None
+    """As of a pose goal."""
+    speed: Speed = 1.0
+    """As of a pose goal."""
+    valid_for: Validity | None = None
+    """As of a pose goal [s]."""
+    limits: OwnLimits | None = None
+    """As of a pose goal."""
+    blend: Annotated[float, Meta(ge=0.0, le=1e3)] | None = None
+    """As of a pose goal [m]."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+class NamedGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="named"):
+    """Move the platform to a pose that has a name: a pose goal, of the pose of that name when it comes in."""
+
+    name: PoseName
+    """One of those that are answered on …/poses."""
     id: Identifier | None = None
     """As of a pose goal."""
     speed: Speed = 1.0
@@ -201,6 +222,8 @@ class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
 PlannedGoal = PoseGoal | SlidersGoal | VelocityGoal | TrajectoryGoal
 """What the planner is asked for; its tools are points and its poses those of the base frame."""
 Goal = PlannedGoal | MoveGoal
+SentGoal = Goal | NamedGoal
+"""What clients send. The gateway puts poses in the place of their names: the loop, and recordings, know none."""
 
 
 class Override(Struct, frozen=True, forbid_unknown_fields=True):
@@ -312,8 +335,9 @@ class Event(Struct, frozen=True, omit_defaults=True):
     """Its cycle, as in records."""
     time: float
     """Wall clock [s since 1970]."""
-    kind: Literal["goal", "mode", "fault", "refused", "service"]
-    """What it is about: the end of a goal, a new mode, a fault, something refused, the service itself."""
+    kind: Literal["goal", "mode", "fault", "refused", "pose", "service"]
+    """What it is about: the end of a goal, a new mode, a fault, something refused, a named pose that was taught or
+    removed, the service itself."""
     level: Level
     """How much it matters to people."""
     message: str
@@ -329,7 +353,7 @@ class Event(Struct, frozen=True, omit_defaults=True):
     goal: str | None = None
     """The id of the goal that set the robot in motion, with kind mode."""
     user: str | None = None
-    """Who sent the goal, or what was refused."""
+    """Who sent the goal, or what was refused, or has taught or removed the pose."""
     settle: float | None = None
     """With outcome done: time from the end of the path until the robot was in position, to the first cycle of the dwell
     [s]. None of a goal that was not to settle: a jog, one that was passed on the way to the next."""

@@ -56,6 +56,13 @@ class RefusedRequest(Struct, frozen=True, tag=True):
     message: str
 
 
+class PoseChanged(Struct, frozen=True, tag=True):
+    """Gateway to loop: a named pose was taught or removed; wants an event."""
+
+    user: str
+    message: str
+
+
 class Accepted(Struct, frozen=True, tag=True):
     """Loop to gateway: the goal is the loop's now."""
 
@@ -148,7 +155,8 @@ class PlannerLost(Struct, frozen=True, tag=True):
     reason: str
 
 
-GivenInput = GoalRequest | CommandRequest | RefusedRequest | Disturbance | DrivesFault | PlanAnswer | PlannerLost
+Request = GoalRequest | CommandRequest | RefusedRequest | PoseChanged
+GivenInput = Request | Disturbance | DrivesFault | PlanAnswer | PlannerLost
 
 
 class ControlInput(Struct, frozen=True, tag="Input"):  # as recordings have it
@@ -172,7 +180,6 @@ class Remark(Struct, frozen=True, tag=True):
     message: str
 
 
-Request = GoalRequest | CommandRequest | RefusedRequest
 Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Status | ControlInput
 
 encode = msgpack.Encoder().encode

@@ -1,7 +1,7 @@
-"""What the service publishes of the robot, and what it answers on …/info. SI units and radians, if not said otherwise.
+"""What the service publishes of the robot, and what it answers on …/info and …/poses.
 
-Sliders are in the order A, B, C; poses are x, y [m] of the platform's centre and its angle phi [rad], counterclockwise,
-in the base frame.
+SI units and radians, if not said otherwise. Sliders are in the order A, B, C; poses are x, y [m] of the platform's
+centre and its angle phi [rad], counterclockwise, in the base frame.
 """
 
 from __future__ import annotations
@@ -167,3 +167,25 @@ class Info(Struct, frozen=True):
     """Of Python and the libraries that matter, by name."""
     missing_protections: tuple[MissingProtection, ...] = ()
     """What the drives do without; none where they have all."""
+
+
+class NamedPose(Struct, frozen=True):
+    """A pose of the platform's centre in the base frame that goals may name: the reply on …/teach and …/forget."""
+
+    name: str
+    """Letters, digits, - and _."""
+    x: float
+    """[m]."""
+    y: float
+    """[m]."""
+    phi: float
+    """Counterclockwise [rad]."""
+    taught: bool
+    """Whether it was taught, and can be taught anew or removed; else it is one of [poses] of the configuration."""
+
+
+class NamedPoses(Struct, frozen=True):
+    """All that there are, answered on …/poses."""
+
+    poses: tuple[NamedPose, ...]
+    """By name."""

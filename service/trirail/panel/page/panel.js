@@ -87,6 +87,14 @@ const takes = {
   done({ to }) {
     readings.answer(`${to}: done`);
   },
+  accepted({ to }) {
+    readings.answer(`${to}: on its way`);
+  },
+  poses({ names }) {
+    byId("poses-part").hidden = names.length === 0;
+    byId("poses").replaceChildren(...names.map(poseButton));
+    allow();
+  },
 };
 
 function take(said) {
@@ -134,9 +142,19 @@ function allow() {
     resume: Boolean(goal) && (mode === "holding" || mode === "stopping"),
   };
   for (const button of document.querySelectorAll("[data-command]")) button.disabled = !may[button.dataset.command];
-  for (const button of document.querySelectorAll(".hold")) button.disabled = !POWERED.includes(mode);
+  for (const button of document.querySelectorAll(".hold, #poses button")) button.disabled = !POWERED.includes(mode);
   byId("override").disabled = !mode;
   if (!POWERED.includes(mode)) hold.end(); // a button that is disabled is not told that the finger leaves it
+}
+
+function poseButton(name) {
+  const button = document.createElement("button");
+  button.textContent = name;
+  button.addEventListener("click", () => {
+    readings.answer(`go to ${name} …`);
+    send({ do: "goto", name });
+  });
+  return button;
 }
 
 function showSpeed() {
