@@ -138,17 +138,17 @@ def test_two_masters_are_noticed(rig: Rig, identifier: int | None, data: bytes, 
         assert said in stopped_within(rig, 1)
 
 
-@pytest.mark.parametrize("apart", [0, 16_000_000])
+@pytest.mark.parametrize("apart", [1, -40, 16_000_000])
 def test_a_second_node_with_the_same_id_is_noticed(rig: Rig, apart: int) -> None:
-    """Its slider may be anywhere: also at the same place [counts], as of a drive that was copied."""
+    """Its slider may be anywhere: also beside this one [counts], as of a drive that was copied and not moved."""
     node, way = rig.nodes[2], rig.drives._axes[2].way
     pdo = next(index for index in node._pdos(0x1800) if node.value(index, 1) & 0x7FF == way.feedback.identifier)
     with stranger(rig) as bus:
-        for n in range(45):
+        for _ in range(200):
             data = bytearray(node._packed(pdo))
             counts = node.value(0x6064)
             at = data.index(counts.to_bytes(4, "little", signed=True))
-            data[at : at + 4] = (counts + n % 2 * apart).to_bytes(4, "little", signed=True)
+            data[at : at + 4] = (counts + apart).to_bytes(4, "little", signed=True)
             bus.send(can.Message(arbitration_id=way.feedback.identifier, data=data, is_extended_id=False))
             feedback = rig.cycle(rig.commanded)
             if feedback.fault is not None:
