@@ -20,6 +20,7 @@ from trirail.cli import (
     panel_command,
     recording_commands,
     robot_commands,
+    sessions_command,
     terminal,
     units,
     workspace_command,
@@ -156,6 +157,7 @@ app.command(workspace_command.workspace)
 app.command(recording_commands.replay)
 app.command(recording_commands.report)
 app.command(recording_commands.export)
+app.command(sessions_command.sessions)
 
 
 @app.command

@@ -72,6 +72,11 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         ),
     },
     "Recordings": {
+        "sessions": (
+            "trirail sessions",
+            "trirail sessions --since 2026-01-31 --fault emcy",
+            "trirail sessions /var/lib/trirail --user ann --outcome faulted --json",
+        ),
         "report": ("trirail report session.rrd", "trirail report session.rrd --plot session.png"),
         "export": ("trirail export session.rrd", "trirail export session.rrd --out session.parquet"),
         "replay": (
