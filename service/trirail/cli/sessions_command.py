@@ -72,7 +72,9 @@ def sessions(
 
     if not folder.is_dir():
         raise ServiceError(f"{folder}: no such folder: name that of [telemetry] directory")
-    wanted = Wanted(robot, since and since.timestamp(), until and until.timestamp(), fault, user, outcome)
+    wanted = Wanted(
+        robot, since.timestamp() if since else None, until.timestamp() if until else None, fault, user, outcome
+    )
     index = SessionIndex(folder)
     try:
         if rebuild:

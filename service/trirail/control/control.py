@@ -26,7 +26,7 @@ from trirail.motion.frames import NamedFrames
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import Fault, Outcome, TrackGoal
+from trirail.wire.messages import FaultDetail, Outcome, TrackGoal
 from trirail.wire.packets import (
     CommandRequest,
     Disturbance,
@@ -147,7 +147,7 @@ class Control:
             drive, cause, code, message = feedback.fault
             if mode is Mode.FAULT and feedback.fault != before.fault:
                 # The first one stays, but this came of it.
-                self.ledger.tell("fault", "error", message, fault=Fault(cause, drive, code))
+                self.ledger.tell("fault", "error", message, fault=FaultDetail(cause, drive, code))
             self.trip(message, cause, drive, code)
         elif mode is Mode.ENABLING:
             self._power_up()
@@ -261,11 +261,11 @@ class Control:
         return (x, y, phi)
 
     def trip(self, reason: str, cause: str, drive: str = "", code: int = 0) -> None:
-        """Stop all three drives in this cycle and latch the reason; cause, drive and code as wire.messages.Fault."""
+        """Stop all three drives in this cycle and latch the reason; cause, drive and code as wire.messages.FaultDetail."""
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason
-        self.ledger.tell("fault", "error", reason, fault=Fault(cause, drive, code))
+        self.ledger.tell("fault", "error", reason, fault=FaultDetail(cause, drive, code))
         self._go(ModeEvent.FAULT, reason)
         self._withdraw(ModeEvent.FAULT, reason)
 

@@ -13,7 +13,7 @@ from trirail.control.in_position import Settled
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.messages import (
-    Fault,
+    FaultDetail,
     Level,
     MoveGoal,
     Outcome,
@@ -66,7 +66,7 @@ class Notice(NamedTuple):
     settle: float | None = None
     residual: Residual | None = None
     overshoot: Triple | None = None
-    fault: Fault | None = None
+    fault: FaultDetail | None = None
 
 
 class ActiveGoal(NamedTuple):
@@ -301,7 +301,7 @@ class Ledger:
         reason: str | None = None,
         goal: str | None = None,
         user: str | None = None,
-        fault: Fault | None = None,
+        fault: FaultDetail | None = None,
     ) -> None:
         """Note something that everyone is to know."""
         self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, goal, user, fault=fault))

@@ -389,7 +389,7 @@ class Residual(Struct, frozen=True):
     """Of x, y [m] and phi [rad]."""
 
 
-class Fault(Struct, frozen=True, omit_defaults=True):
+class FaultDetail(Struct, frozen=True, omit_defaults=True):
     """What a fault is about, for programs."""
 
     cause: str
@@ -440,5 +440,5 @@ class Event(Struct, frozen=True, omit_defaults=True):
     overshoot: Triple | None = None
     """Likewise, how far each of the sliders A, B, C was beyond its target at most since the end of the path, in the
     direction in which it was last commanded to move; of one that was not to move, to either side [m]."""
-    fault: Fault | None = None
+    fault: FaultDetail | None = None
     """What it is about, with kind fault."""
