@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import ipaddress
 import itertools
 import math
 import re
@@ -22,7 +23,7 @@ from trirail_drivers.interface import NAMES
 
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles, travels
-from trirail.wire.endpoints import ReachableBy, reach
+from trirail.wire.endpoints import ReachableBy, endpoint_of, is_local, reach
 from trirail.wire.vocabulary import LeasePolicy, Role
 
 _PACKAGED = Path(__file__).parent / "configs"
@@ -207,6 +208,10 @@ class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     """Loopback port of the live Rerun server; 0 for none."""
     live_mb: Annotated[float, Meta(ge=1.0, le=4096.0)] = 64.0
     """Memory for what viewers that connect late are shown of the past [1e6 bytes]; beyond that the oldest is let go."""
+    metrics_port: Annotated[int, Meta(ge=0, le=65535)] = 0
+    """Port of the metrics for Prometheus, /metrics, and of the processes' health, /healthz; 0 for none."""
+    metrics_address: Name = "127.0.0.1"
+    """The IP address of that port; beyond the loopback it takes [zenoh.tls], and a certificate with a role."""
     capture_can: bool = False
     """Write every CAN frame of the session beside the recording, in candump's log format."""
     rotate_minutes: Annotated[float, Meta(ge=0.01, le=100_000.0)] = 30.0
@@ -297,6 +302,15 @@ def _beside(path: Path, config: Config) -> Config:
         tls = msgspec.structs.replace(zenoh.tls, directory=str(path.parent / zenoh.tls.directory))
         zenoh = msgspec.structs.replace(zenoh, tls=tls)
     return msgspec.structs.replace(config, drives=drives, zenoh=zenoh)
+
+
+def metrics_url(config: Config) -> str:
+    """Return where the metrics are; "" where there are none. Beyond the loopback they are encrypted, if anything is."""
+    telemetry = config.telemetry
+    endpoint = endpoint_of(telemetry.metrics_address, telemetry.metrics_port)
+    encrypted = config.zenoh.tls is not None and not is_local(endpoint)
+    where = f"{'https' if encrypted else 'http'}://{endpoint.removeprefix('tcp/')}/metrics"
+    return where if telemetry.metrics_port else ""
 
 
 def geometry(table: GeometryTable) -> Geometry:
@@ -428,6 +442,7 @@ def _check(config: Config) -> None:
                 f"{angle - math.copysign(margin, angle):.4f}"
             )
     _check_reach(config.zenoh)
+    _check_metrics(config)
     settling = config.limits.in_position
     if settling.timeout <= settling.dwell:
         raise ConfigError(
@@ -487,6 +502,21 @@ def _check_poses(config: Config, robot: Geometry) -> None:
                     f"poses.{name} = [{numbers}]: {what} would be {at:.6g}, outside of "
                     f"limits.{section}.{key} = [{low:g}, {high:g}]"
                 )
+
+
+def _check_metrics(config: Config) -> None:
+    """Refuse an address of the metrics that is none, or that lets a network read them by accident."""
+    address, zenoh = config.telemetry.metrics_address, config.zenoh
+    key = f"telemetry.metrics_address = {address!r}"
+    try:
+        loopback = ipaddress.ip_address(address).is_loopback
+    except ValueError as error:
+        raise ConfigError(f"{key}: it must be an IP address, as 127.0.0.1 or ::1") from error
+    if config.telemetry.metrics_port and not loopback and zenoh.tls is None and not zenoh.insecure:
+        raise ConfigError(
+            f"{key}: whoever reaches it could read them: use an address of the loopback, [zenoh.tls] "
+            "(trirail keys init), or write zenoh.insecure = true if that is what you want"
+        )
 
 
 def _check_reach(zenoh: Zenoh) -> None:

@@ -26,7 +26,7 @@ from trirail.motion.frames import NamedFrames
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import Outcome
+from trirail.wire.messages import Fault, Outcome
 from trirail.wire.packets import (
     CommandRequest,
     Disturbance,
@@ -38,7 +38,7 @@ from trirail.wire.packets import (
 )
 from trirail.wire.planning import PlanAnswer
 from trirail.wire.records import Part
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, FaultCause, Mode
 
 Given = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
 """What the control is given in a cycle, and when, by the monotonic clock [ns]."""
@@ -121,7 +121,7 @@ class Control:
             mark(Part.MOTION)
             self.solve()
         except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
-            self.trip(f"internal error, please report it: {error!r}")
+            self.trip(f"internal error, please report it: {error!r}", FaultCause.INTERNAL)
         mark(Part.KINEMATICS)
         self.write()
         mark(Part.WRITE)
@@ -144,9 +144,11 @@ class Control:
         self._tell_warnings(feedback)
         mode = self.state.mode
         if feedback.fault is not None:
+            drive, cause, code, message = feedback.fault
             if mode is Mode.FAULT and feedback.fault != before.fault:
-                self.ledger.tell("fault", "error", feedback.fault.message)  # the first one stays, but this came of it
-            self.trip(feedback.fault.message)
+                # The first one stays, but this came of it.
+                self.ledger.tell("fault", "error", message, fault=Fault(cause, drive, code))
+            self.trip(message, cause, drive, code)
         elif mode is Mode.ENABLING:
             self._power_up()
         elif mode in (Mode.HOMING, Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
@@ -154,7 +156,9 @@ class Control:
                 error = self.measured.following_error[behind - 1]
                 self.trip(
                     f"slider {NAMES[behind - 1]}: following error {error * 1e3:.3f} mm is beyond its limit "
-                    f"{self._following_error_limit * 1e3:g} mm"
+                    f"{self._following_error_limit * 1e3:g} mm",
+                    FaultCause.FOLLOWING_ERROR,
+                    NAMES[behind - 1],
                 )
             elif not feedback.homing:
                 self._homing_over()
@@ -225,7 +229,7 @@ class Control:
         refused = self.setpoints.refusal(found)
         schedule = self._schedule
         if refused:
-            self.trip(refused)
+            self.trip(refused, FaultCause.LIMIT)
         elif self.state.mode in (Mode.MOVING, Mode.STOPPING) and schedule.runs[0].stands:
             self._stand(schedule.runs[0])
 
@@ -254,12 +258,12 @@ class Control:
         x, y, phi = last.destination(self.commanded.pose)
         return (x, y, phi)
 
-    def trip(self, reason: str) -> None:
-        """Stop all three drives in this cycle and latch the reason."""
+    def trip(self, reason: str, cause: str, drive: str = "", code: int = 0) -> None:
+        """Stop all three drives in this cycle and latch the reason; cause, drive and code as wire.messages.Fault."""
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason
-        self.ledger.tell("fault", "error", reason)
+        self.ledger.tell("fault", "error", reason, fault=Fault(cause, drive, code))
         self._go(ModeEvent.FAULT, reason)
         self._withdraw(ModeEvent.FAULT, reason)
 
@@ -316,7 +320,7 @@ class Control:
             raise RefusedError(RefusalCode.STOPPING, still_powered(self.measured, self.fault))
         reason = f"{request.name} by {request.user}"
         if event is ModeEvent.QUICK_STOP:
-            self.trip(reason)
+            self.trip(reason, FaultCause.QUICK_STOP)
         else:
             self._go(event, reason)
             self._withdraw(event, reason)
@@ -447,7 +451,9 @@ class Control:
                 if state is not PowerState.OPERATION_ENABLED
             ]
             seconds = self._enable_cycles * self._period
-            self.trip(f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected")
+            self.trip(
+                f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected", FaultCause.ENABLE
+            )
 
     def _homing_over(self) -> None:
         """Hold where homing has ended, or was stopped."""
@@ -457,7 +463,7 @@ class Control:
             try:
                 self.setpoints.check_start()
             except RefusedError as refusal:
-                self.trip(f"all drives are homed, but {refusal}")
+                self.trip(f"all drives are homed, but {refusal}", FaultCause.PLACE)
                 return
             if not self._rest_at_setpoints():
                 return
@@ -471,7 +477,7 @@ class Control:
         a, b, c = self.setpoints.rows[0]
         pose = self.measured.pose_of((a, b, c))
         if pose is None:
-            self.trip("the measured sliders belong to no pose")
+            self.trip("the measured sliders belong to no pose", FaultCause.PLACE)
             return False
         self._schedule.commanded = rest(pose)
         return True

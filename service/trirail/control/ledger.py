@@ -11,7 +11,7 @@ from trirail_drivers.interface import Triple
 from trirail.control.in_position import Settled
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.messages import Level, MoveGoal, Outcome, PoseGoal, Residual, TrajectoryGoal, VelocityGoal
+from trirail.wire.messages import Fault, Level, MoveGoal, Outcome, PoseGoal, Residual, TrajectoryGoal, VelocityGoal
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -54,6 +54,7 @@ class Notice(NamedTuple):
     settle: float | None = None
     residual: Residual | None = None
     overshoot: Triple | None = None
+    fault: Fault | None = None
 
 
 class ActiveGoal(NamedTuple):
@@ -257,6 +258,7 @@ class Ledger:
         reason: str | None = None,
         goal: str | None = None,
         user: str | None = None,
+        fault: Fault | None = None,
     ) -> None:
         """Note something that everyone is to know."""
-        self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, goal, user))
+        self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, goal, user, fault=fault))

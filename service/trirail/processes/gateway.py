@@ -23,6 +23,7 @@ from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox, Incoming
 from trirail.processes.info import info
 from trirail.processes.last_words import LastWords
+from trirail.processes.measured import Meter
 from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications
 from trirail.processes.replies import Replies
@@ -101,6 +102,7 @@ class Gateway:
         opened: zenoh.Session,
         guard: Guard,
         log: Callable[[Event], None] = lambda _: None,
+        measured: Callable[[msgspec.Struct], None] = lambda _: None,
     ) -> None:
         self._log = log
         self._robot = config.robot.name
@@ -113,6 +115,7 @@ class Gateway:
         self._last_words = LastWords(config.period)
         self._info = info(config)
         self._states = StateMaker(config)
+        self._meter = Meter(measured) if config.telemetry.metrics_port else None
         self._state_every = 1.0 / config.telemetry.state_hz
         self._state_due = 0.0
         self._replies = Replies(self._robot)
@@ -339,10 +342,13 @@ class Gateway:
 
     def _publish(self, batch: memoryview) -> None:
         """Take in a batch of records and pass it on; publish the newest state when it is time."""
+        rows = unpack(batch)
         self._publications.records(bytes(batch))
-        records = unpack(batch)
-        self._states.records(records)
-        self._poses.measure(records[-1])
+        self._states.records(rows)
+        self._poses.measure(rows[-1])
+        if self._meter is not None:
+            self._meter.records(rows)
+            self._meter.tell(self._states.newest)
         now = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
@@ -354,6 +360,8 @@ class Gateway:
             self._backlog.withdraw_others(event.user, event.message)
         self._publications.event(event)
         self._log(event)
+        if self._meter is not None:
+            self._meter.event(event)
 
     def _tell_of_its_end(self) -> None:
         """The loop has gone: where it has died, tell everyone in its place."""
@@ -386,12 +394,16 @@ def main(
     beat: Callable[[], None],
     ready: Callable[[object], None],
     log: Callable[[Event], None],
+    measured: Callable[[msgspec.Struct], None],
 ) -> int:
-    """Run the gateway's process; `ready` is called once it can be reached, `log` with each event."""
+    """Run the gateway's process.
+
+    `ready` is called once it can be reached, `log` with each event, `measured` each second if there are metrics.
+    """
     sys.setswitchinterval(SWITCH_EVERY)
     guard = Guard(config)
     with guard.open() as opened:
-        gateway = Gateway(config, link, beat, opened, guard, log)
+        gateway = Gateway(config, link, beat, opened, guard, log, measured)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
         gateway.serve(lambda: ready({"warnings": gateway.warnings()}))
     return 0

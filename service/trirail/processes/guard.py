@@ -10,7 +10,7 @@ from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import zenoh_session
 from trirail.wire.access import access_control
-from trirail.wire.credentials import Credentials, revoked
+from trirail.wire.credentials import Credentials, with_role
 from trirail.wire.endpoints import ReachableBy, reach, socket_file
 from trirail.wire.vocabulary import Role
 
@@ -31,9 +31,8 @@ class Guard:
         if config.zenoh.tls is not None:
             folder = Path(config.zenoh.tls.directory)
             self._credentials = Credentials.read(folder)
-            without = revoked(folder)
-            self.users = {user: role for user, role in config.zenoh.users.items() if user not in without}
-            self._gone = [user for user in config.zenoh.users if user in without]
+            self.users = with_role(config.zenoh.users, folder)
+            self._gone = [user for user in config.zenoh.users if user not in self.users]
 
     def open(self) -> zenoh.Session:
         """Open the session. Raises ServiceError where an address cannot be listened on."""

@@ -354,6 +354,17 @@ class Residual(Struct, frozen=True):
     """Of x, y [m] and phi [rad]."""
 
 
+class Fault(Struct, frozen=True, omit_defaults=True):
+    """What a fault is about, for programs."""
+
+    cause: str
+    """A trirail.wire.vocabulary.FaultCause, or a cause of trirail_drivers.interface.DriveFault: emcy, silent, bus, …"""
+    drive: str = ""
+    """A, B or C, where it is about one."""
+    code: int = 0
+    """The drive's own: EMCY or 603Fh error code, or an ODrive's error bits; 0 where there is none."""
+
+
 class Event(Struct, frozen=True, omit_defaults=True):
     """Something that happened, in order, numbered without gaps by the loop."""
 
@@ -394,3 +405,5 @@ class Event(Struct, frozen=True, omit_defaults=True):
     overshoot: Triple | None = None
     """Likewise, how far each of the sliders A, B, C was beyond its target at most since the end of the path, in the
     direction in which it was last commanded to move; of one that was not to move, to either side [m]."""
+    fault: Fault | None = None
+    """What it is about, with kind fault."""

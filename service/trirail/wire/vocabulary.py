@@ -22,6 +22,25 @@ MODES = tuple(Mode)
 """In the order in which records number them."""
 
 
+class FaultCause(StrEnum):
+    """Why the robot is in fault where no drive has told it: drives have causes of their own, see DriveFault."""
+
+    FOLLOWING_ERROR = "following_error"
+    """A slider is farther from its setpoint than [limits.slider] following_error."""
+    LIMIT = "limit"
+    """The last gate has refused a setpoint."""
+    ENABLE = "enable"
+    """The drives took too long to power up."""
+    PLACE = "place"
+    """Where the sliders are belongs to no pose, or is none that may be held."""
+    QUICK_STOP = "quick_stop"
+    """Somebody sent quick_stop."""
+    LOOP = "loop"
+    """The loop has died or was frozen."""
+    INTERNAL = "internal"
+    """An error of the program's own."""
+
+
 class Command(StrEnum):
     """What the robot can be told beside goals: the name on the wire, one line of help, and what follows from it.
 
