@@ -261,7 +261,7 @@ class Control:
         return (x, y, phi)
 
     def trip(self, reason: str, cause: str, drive: str = "", code: int = 0) -> None:
-        """Stop all three drives in this cycle and latch the reason; cause, drive and code as wire.messages.FaultDetail."""
+        """Stop all three drives in this cycle and latch the reason; cause, drive and code as of a FaultDetail."""
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason
