@@ -39,6 +39,14 @@ def settle(*, goals: int = 100, json: bool = False) -> None:
 
 
 @app.command
+def fairness(*, goals: int = 1000, json: bool = False) -> None:
+    """Time until one user's goals and stops are answered, quiet and while another floods, and the ratio of the two."""
+    import bench_fairness
+
+    bench_fairness.main(goals, json)
+
+
+@app.command
 def frames(*, cycles: int = 3000, json: bool = False) -> None:
     """Time one cycle's frames by python-can, and on the bus's own socket."""
     import bench_frames

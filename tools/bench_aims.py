@@ -13,6 +13,7 @@ Results = dict[str, Any]
 """What each measurement gave, by its name."""
 
 COMMANDS = {
+    "fairness": ("--goals", "400"),
     "machine": (),
     "frames": (),
     "kinematics": (),
@@ -25,6 +26,7 @@ COMMANDS = {
 }
 """The measurements, with what they take: together under ten minutes."""
 BRIEF = {
+    "fairness": ("--goals", "20"),
     "machine": ("--cycles", "200"),
     "frames": ("--cycles", "50"),
     "latency": ("--goals", "3"),
@@ -89,6 +91,12 @@ AIMS = (
         "2.3 / 4.1",
         (5.0, 7.0),
         lambda results: tuple(results["latency"]["in_motion_ms"][:2]),
+    ),
+    Aim(
+        "answer under another's flood to quiet, p99 of goals / of stops",
+        "59 / 6.2",
+        (2.0, 2.0),
+        lambda results: (results["fairness"]["goal_p99_ratio"], results["fairness"]["stop_p99_ratio"]),
     ),
     Aim("frames of one cycle, p50 [µs]", "43", (10.0,), lambda results: (results["frames"]["socket_us"]["p50"],)),
     Aim("planning a pose goal, p99 [ms]", "0.35 to 0.9, in the loop", (5.0,), _planner),

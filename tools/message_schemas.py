@@ -34,6 +34,8 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "summary": (state.Summary, "What is published on summary."),
     "event": (messages.Event, "What is published on event."),
     "role": (messages.RoleReply, "The reply to a query on role/<user>."),
+    "pose": (state.NamedPose, "The reply to a query on teach/<user>/<name> or forget/<user>/<name>."),
+    "poses": (state.NamedPoses, "The reply to a query on poses."),
     "info": (state.Info, "The reply to a query on info."),
 }
 """By file: the type, and where the message is met."""

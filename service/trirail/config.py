@@ -22,9 +22,9 @@ from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES
 
 from trirail.errors import ConfigError
-from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles
+from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles, travels
 from trirail.wire.endpoints import ReachableBy, endpoint_of, is_local, reach
-from trirail.wire.vocabulary import Role
+from trirail.wire.vocabulary import LeasePolicy, Role
 
 _PACKAGED = Path(__file__).parent / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[2] / "configs") / "sim.toml"
@@ -39,6 +39,7 @@ BASE, PLATFORM = "base", "platform"
 FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 UserName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 """The <user> of Zenoh keys."""
+PoseName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Point = tuple[Coordinate, Coordinate]
 Range = tuple[Coordinate, Coordinate]
 
@@ -139,6 +140,15 @@ class MotionTable(Struct, frozen=True, forbid_unknown_fields=True):
 
     queue: Annotated[int, Meta(ge=0, le=100)] = 8
     """How many goals may wait for the one under way, where that has a `blend`."""
+
+
+class ControlTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [control]: who may move the robot, beside what his role allows."""
+
+    lease: LeasePolicy = "optional"
+    """Whether the robot moves while nobody holds the lease; while somebody does, it moves for him alone."""
+    takeover: Role = Role.MAINTAINER
+    """The least role that may take the lease over from who holds it."""
 
 
 class FramesTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -242,6 +252,10 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     watchdogs: Watchdogs
     motion: MotionTable = MotionTable()
     frames: FramesTable = FramesTable()
+    control: ControlTable = ControlTable()
+    poses: dict[PoseName, tuple[Coordinate, Coordinate, Angle]] = {}
+    """Poses by name: x, y [m] of the platform's centre and phi [rad], in the base frame. The others that goals may name
+    are taught, and kept by the service."""
 
     @property
     def period(self) -> float:
@@ -442,6 +456,7 @@ def _check(config: Config) -> None:
     for name in config.frames.work:
         if name in (BASE, PLATFORM):
             raise ConfigError(f"frames.work.{name}: every robot has a frame of that name; give this one another")
+    _check_poses(config, robot)
     nodes = [config.drives.master_node, *(drive.node for drive in config.drives.each)]
     if len(set(nodes)) < len(nodes):
         raise ConfigError(
@@ -467,6 +482,31 @@ def _check(config: Config) -> None:
         checks.check(config.drives, required)
     except DriveError as error:
         raise ConfigError(str(error)) from error
+
+
+def _check_poses(config: Config, robot: Geometry) -> None:
+    """Refuse named poses at which the robot cannot be."""
+    platform, slider = config.limits.platform, config.limits.slider
+    for name, pose in config.poses.items():
+        places = [
+            (key, at, key, getattr(platform, key), "platform") for key, at in zip(("x", "y", "phi"), pose, strict=True)
+        ]
+        position, passive = travels(robot, pose).tolist()
+        places += [
+            (f"slider {leg}", at, "position", slider.position, "slider")
+            for leg, at in zip(NAMES, position, strict=True)
+        ]
+        places += [
+            (f"lambda_32 of {leg}", at, "passive", slider.passive, "slider")
+            for leg, at in zip(NAMES, passive, strict=True)
+        ]
+        for what, at, key, (low, high), section in places:
+            if not low <= at <= high:
+                numbers = ", ".join(f"{value:g}" for value in pose)
+                raise ConfigError(
+                    f"poses.{name} = [{numbers}]: {what} would be {at:.6g}, outside of "
+                    f"limits.{section}.{key} = [{low:g}, {high:g}]"
+                )
 
 
 def _check_metrics(config: Config) -> None:

@@ -65,6 +65,12 @@ class RefusalCode(StrEnum):
     UNKNOWN_COMMAND = "unknown_command", "no such command", "send one of those that the message names"
     DUPLICATE_ID = "duplicate_id", "the goal's id has been used", "give every goal an id of its own, or none"
     UNKNOWN_FRAME = "unknown_frame", "no tool or frame of that name in [frames]", "use one of those that info tells"
+    UNKNOWN_POSE = "unknown_pose", "no pose of that name", "use one of those that poses tells, or teach it"
+    CONFIGURED_POSE = (
+        "configured_pose",
+        "a pose of [poses] in the configuration, neither to be taught nor removed",
+        "choose another name, or change the configuration",
+    )
 
     # Who sent it.
     NOT_ALLOWED = (
@@ -72,6 +78,10 @@ class RefusalCode(StrEnum):
         "the user's role does not allow it, or he has none",
         "ask for a role that does: [zenoh.users] of the robot's configuration",
     )
+
+    LEASED = "leased", "another user holds the lease", "wait until it is free, or take it over"
+    NO_LEASE = "no_lease", "nobody holds the lease, and this robot moves for its holder alone", "send acquire"
+    LEASE_OVER = "lease_over", "the lease was released, taken over, or kept by no sign of life", "acquire a new one"
 
     # What the robot's mode allows.
     NOT_ENABLED = "not_enabled", "the drives have no power yet", "send enable, and wait for it"
@@ -117,7 +127,12 @@ class RefusalCode(StrEnum):
     )
     NO_VELOCITY = "no_velocity", "a jog that moves nothing", "give it a velocity"
     AT_LIMIT = "at_limit", "the jog has ended at a limit", "begin a new one, away from it"
-    JOG_OVER = "jog_over", "the jog was not renewed in time", "begin a new one"
+    JOG_OVER = "jog_over", "the jog or track was not renewed in time", "begin a new one"
+    WRONG_TIME = (
+        "wrong_time",
+        "a track's target of too long ago, or of too far ahead",
+        "have both machines' clocks agree, or leave time out",
+    )
 
     # Too late, too much, or not carried out.
     EXPIRED = "expired", "the goal could not begin in time", "send it again, or with a longer valid_for"

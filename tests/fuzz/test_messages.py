@@ -42,15 +42,18 @@ values = st.recursive(
     lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=20), inner, max_size=5),
 )
 goals = st.fixed_dictionaries(
-    {"kind": st.sampled_from(("pose", "sliders", "velocity", "trajectory", "dance"))},
+    {"kind": st.sampled_from(("pose", "named", "sliders", "velocity", "track", "trajectory", "dance"))},
     optional=dict.fromkeys(
         ("x", "y", "phi", "speed", "timeout", "blend", "valid_for", "stretch", "z"), numbers | values
     )
     | {
         "position": st.lists(numbers, max_size=4),
+        "velocity": st.lists(numbers, min_size=2, max_size=4),
+        "time": numbers,
         "limits": st.dictionaries(st.sampled_from(("velocity", "jerk")), st.lists(numbers, max_size=4)),
         "points": st.lists(st.fixed_dictionaries(dict.fromkeys(("t", "x", "y", "phi"), numbers)), max_size=3),
         "id": st.text(max_size=70),
+        "name": st.text(max_size=70) | st.sampled_from(("pick", "nowhere")),
     },
 )
 
@@ -72,7 +75,10 @@ payloads = (
     )
 )
 keys = st.text(max_size=60) | st.lists(
-    st.sampled_from(("trirail", "demo", "goal", "cmd", "eve", "stop", "*", "**", "", "$*", "a b", "x" * 65)), max_size=7
+    st.sampled_from(
+        ("trirail", "demo", "goal", "cmd", "teach", "forget", "eve", "stop", "*", "**", "", "$*", "a b", "x" * 65)
+    ),
+    max_size=7,
 ).map("/".join)
 
 
@@ -111,7 +117,7 @@ def test_a_goal_that_is_taken_has_only_numbers_that_can_be_planned_with(goal: di
             for name, low, high in (("speed", 1e-3, 1.0), ("timeout", 0.01, 10.0), ("valid_for", 1e-3, 86_400.0)):
                 value = getattr(taken, name, None)
                 assert value is None or low <= value <= high
-            for value in msgspec.to_builtins(taken).values():
+            for value in (value for name, value in msgspec.to_builtins(taken).items() if name != "time"):
                 assert not isinstance(value, float) or abs(value) <= 1e5
             request = GoalRequest(1, "ann", "g", taken, 1)
             assert packets.decode_request(packets.message(request)[1:]) == request
@@ -176,7 +182,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gateway,
 
 
 @given(
-    kind=st.sampled_from(("goal", "cmd", "info", "role")),
+    kind=st.sampled_from(("goal", "cmd", "info", "role", "poses", "teach", "forget")),
     key=keys,
     payload=payloads,
     encoding=st.sampled_from(ENCODINGS),

@@ -428,7 +428,8 @@ def test_a_goal_that_preempts_at_an_override_goes_on_as_the_robot_moves(
     answer = rig.goal("g2", 0.03, 0.06, 0.2)
     assert isinstance(answer, Accepted)
     assert not answer.stops_first
-    rig.until(rig.holds)
+    taken = rig.until(rig.holds) * PERIOD - LIMITS.in_position.dwell
+    assert taken == pytest.approx(answer.duration, rel=0.1)
     assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
     assert (rig.used() <= RAMPS + BETWEEN).all()
     assert_within_limits(rig)
@@ -445,6 +446,8 @@ def test_how_far_a_trajectory_may_begin_from_where_the_robot_stands(rig: Rig, co
         assert isinstance(answer, Accepted) is taken
         if not taken:
             assert refusal(answer).code == "wrong_start"
+            name = ("x", "y", "phi")[coordinate]
+            assert f"the trajectory begins at {name} = -0.000101" in refusal(answer).message
         rig.until(rig.holds)
     assert_within_limits(rig)
 

@@ -24,7 +24,7 @@ from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.contents import Contents, FaultEntry, of_file
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.session_index import FILE, Session, SessionIndex, Wanted
-from trirail.wire.messages import Event, Fault, PoseGoal
+from trirail.wire.messages import Event, FaultDetail, PoseGoal
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
 from trirail.wire.vocabulary import Command
 
@@ -87,7 +87,7 @@ def record(folder: Path, began: str = "2026-01-31 12:00:00", name: str = "demo",
     for event in (
         Event(1, 0.3, 300, now, "goal", "info", "done", id="g1", outcome="done", user="ann"),
         Event(2, 0.3, 300, now, "goal", "error", "faulted", id="g2", outcome="faulted", user="ben"),
-        Event(3, 0.3, 300, now, "fault", "error", "drive B: EMCY 8700", fault=Fault("emcy", "B", 0x8700)),
+        Event(3, 0.3, 300, now, "fault", "error", "drive B: EMCY 8700", fault=FaultDetail("emcy", "B", 0x8700)),
     ):
         recording.event(event)
         box.event(event)
@@ -277,7 +277,7 @@ when = st.floats(0.0, 100.0)
 faults = st.builds(
     FaultEntry,
     when,
-    st.builds(Fault, st.sampled_from(["emcy", "bus"]), st.just(""), st.sampled_from([0, 0x8700])),
+    st.builds(FaultDetail, st.sampled_from(["emcy", "bus"]), st.just(""), st.sampled_from([0, 0x8700])),
     st.sampled_from(["drive A", "CAN bus"]),
 )
 

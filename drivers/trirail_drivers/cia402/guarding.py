@@ -45,13 +45,19 @@ def _give_guarding(drive: Differences, period: int, node: int) -> bool:
         return False
     if remote.look(0x1017) and not drive.apply:
         return True  # it may answer no guarding while it sends heartbeats; setting it up will tell
+    found = remote.look(0x100C), remote.look(0x100D)
     if drive.apply and remote.look(0x1017):
         drive.give(0x1017, 0, 0)  # CiA 301: a node has heartbeats or is guarded, not both
-    if not _answers(drive, node):
-        drive.tell("object 100C:00 (Guard time) is there, but the drive answers no guarding")
-        return False
     drive.give(0x100C, 0, period)
     drive.give(0x100D, 0, MISSED)
+    if not _answers(drive, node):
+        if not drive.apply and 0 in found:
+            return True  # some, as lely-core, answer once they are to be guarded; setting it up will tell
+        for index, value in zip((0x100C, 0x100D), found, strict=True):
+            if value is not None:
+                drive.give(index, 0, value)
+        drive.tell("object 100C:00 (Guard time) is there, but the drive answers no guarding")
+        return False
     drive.tell("has no heartbeat consumer (1016): node guarding instead")
     return True
 

@@ -149,8 +149,9 @@ app.command(panel_command.panel)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)
+app.command(robot_commands.acquire, name=Command.ACQUIRE, help=Command.ACQUIRE.help)
 for each in Command:
-    if each is not Command.OVERRIDE:
+    if each not in (Command.OVERRIDE, Command.ACQUIRE):
         app.command(robot_commands.telling(each), name=each.replace("_", "-"), help=each.help)
 app.command(config_commands.app)
 app.command(keys_command.app)
@@ -165,7 +166,7 @@ app.command(sessions_command.sessions)
 
 @app.command
 def completion(shell: Shell | None = None, /, *, install: Annotated[bool, Flag] = False) -> int:
-    """Print a script for tab completion, of the robots that answer too, or install it for this user.
+    """Print a script for tab completion, of robots, poses, tools and frames too, or install it for this user.
 
     Parameters
     ----------
@@ -211,5 +212,6 @@ def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
         said = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
     elif isinstance(error, CoercionError) and error.msg and error.argument and not said.startswith("Invalid value"):
         said = f"Invalid value for {error.argument.name.strip('-')}: {said}"
-    command = " ".join(("trirail", *(error.command_chain or ())))
+    by_command = type(error) is CycloptsError  # raised by the command itself, which is not told how it was called
+    command = " ".join(("trirail", *(words[:1] if by_command else error.command_chain or ())))
     return f"{said} ({command} --help tells the usage)"

@@ -73,6 +73,8 @@ def table(state: State, robot: str, limits: Limits | None = None) -> Table:
         grid.add_row("fault", f"[bold red]{plain(fault)}[/]")
     colour = "yellow" if state.override != 1.0 else "default"
     grid.add_row("override", f"[{colour}]{units.written(state.override * 100.0, '%', 0)}[/]")
+    if state.lease is not None:
+        grid.add_row("lease", f"held by {plain(state.lease)}")
     if state.goal:
         _add_goal(grid, state.goal, state.pose)
     grid.add_row("measured", units.pose(state.pose, 9))
@@ -129,7 +131,10 @@ def _mode(state: State) -> str:
 
 
 def _add_goal(grid: Table, goal: GoalState, pose: Sequence[float]) -> None:
-    grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {left(goal)}")
+    if goal.lag is not None:
+        grid.add_row("goal", f"{plain(goal.id)}  follows its target, {units.written(goal.lag, 'm', 6)} behind")
+    else:
+        grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {left(goal)}")
     if goal.target is not None:
         grid.add_row("  target", units.pose(goal.target, 9))
         grid.add_row("  to go", units.pose([end - at for end, at in zip(goal.target, pose, strict=True)], 9))

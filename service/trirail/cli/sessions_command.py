@@ -72,7 +72,9 @@ def sessions(
 
     if not folder.is_dir():
         raise ServiceError(f"{folder}: no such folder: name that of [telemetry] directory")
-    wanted = Wanted(robot, _seconds(since), _seconds(until), fault, user, outcome)
+    wanted = Wanted(
+        robot, since.timestamp() if since else None, until.timestamp() if until else None, fault, user, outcome
+    )
     index = SessionIndex(folder)
     try:
         if rebuild:
@@ -87,10 +89,6 @@ def sessions(
         return 0
     _print(shown, len(found))
     return 0
-
-
-def _seconds(moment: datetime | None) -> float | None:
-    return None if moment is None else moment.timestamp()
 
 
 SAID_EVERY = 1.0

@@ -16,6 +16,7 @@ from trirail.config import Config, geometry
 from trirail.control.completion import still_powered, verdict
 from trirail.control.feedback import Measured
 from trirail.control.goal_queue import GoalQueue
+from trirail.control.lease import LeaseArbiter, LeaseChange
 from trirail.control.ledger import Ledger
 from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeState, Refusal, step
 from trirail.control.plan_requests import PlannerPort, PlanRequests
@@ -25,8 +26,16 @@ from trirail.motion.frames import NamedFrames
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import Fault, Outcome
-from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest, PlannerLost, RefusedRequest, Request
+from trirail.wire.messages import FaultDetail, Outcome, TrackGoal
+from trirail.wire.packets import (
+    CommandRequest,
+    Disturbance,
+    GoalRequest,
+    PlannerLost,
+    PoseChanged,
+    RefusedRequest,
+    Request,
+)
 from trirail.wire.planning import PlanAnswer
 from trirail.wire.records import Part
 from trirail.wire.vocabulary import Command, FaultCause, Mode
@@ -49,7 +58,11 @@ _GO_ON = (
     ModeEvent.ARRIVED,
     ModeEvent.POWERED,
     # Homing moves the sliders: what was sent before would not begin from where it was meant to.
-    *(ModeEvent[name.name] for name in Command if not name.stops and name not in (Command.OVERRIDE, Command.HOME)),
+    *(
+        ModeEvent[name.name]
+        for name in Command
+        if not name.stops and name.name in ModeEvent.__members__ and name is not Command.HOME
+    ),
 )
 """Events that leave alone what has been sent but not begun."""
 
@@ -65,7 +78,10 @@ class Control:
         self._planner = PlanRequests(config, planner, self._schedule)
         self.ledger = Ledger()
         frames, queue = NamedFrames(config.frames), config.motion.queue
-        self.goal_queue = GoalQueue(self.ledger, self._planner, self._schedule, frames, queue, config.period)
+        self.lease = LeaseArbiter(config.control.lease, config.period)
+        self.goal_queue = GoalQueue(
+            self.ledger, self.lease, self._planner, self._schedule, frames, queue, config.period
+        )
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
         self._following_error_limit = config.limits.slider.following_error
         self.measured = Measured(
@@ -94,7 +110,7 @@ class Control:
                 match what:
                     case Disturbance():
                         self.happen(ModeEvent[what.event], what.reason)
-                    case GoalRequest() | CommandRequest() | RefusedRequest():
+                    case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged():
                         self.handle(what, now_ns)
                     case PlannerLost():
                         self._planner.lose(what.reason)
@@ -131,7 +147,7 @@ class Control:
             drive, cause, code, message = feedback.fault
             if mode is Mode.FAULT and feedback.fault != before.fault:
                 # The first one stays, but this came of it.
-                self.ledger.tell("fault", "error", message, fault=Fault(cause, drive, code))
+                self.ledger.tell("fault", "error", message, fault=FaultDetail(cause, drive, code))
             self.trip(message, cause, drive, code)
         elif mode is Mode.ENABLING:
             self._power_up()
@@ -161,6 +177,8 @@ class Control:
                 self.goal_queue.take(request, now_ns, self.cycles)
             elif isinstance(request, CommandRequest):
                 self._take_command(request)
+            elif isinstance(request, PoseChanged):
+                self.ledger.tell("pose", "info", request.message, user=request.user)
             else:
                 self.ledger.tell("refused", "warning", request.message, user=request.user)
         except RefusedError as refusal:
@@ -175,10 +193,12 @@ class Control:
         self._withdraw(event, reason)
 
     def advance(self) -> None:
-        """End a jog that nobody renews, begin what has been planned, and go on to the motion of this cycle."""
+        """End a lease or a jog that nobody renews, begin what is planned, and go on to the motion of this cycle."""
+        if (over := self.lease.silent(self.cycles)) is not None:
+            self._change_lease(over)
         released = self.ledger.release(self.cycles) if self.state.mode is Mode.MOVING else None
         if released is not None:
-            self._go(ModeEvent.RELEASE, f"goal {released.id} of {released.user} is not renewed")
+            self._go(ModeEvent.NOT_RENEWED, f"goal {released.id} of {released.user} is not renewed")
         beginning = self.goal_queue.think(self.cycles, self._admit, self._place)
         if beginning is not None:
             self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
@@ -231,19 +251,21 @@ class Control:
 
     @property
     def target(self) -> Triple | None:
-        """The pose that the running goal leads to; None without one, and for a jog."""
-        last = self._schedule.last
-        if self.ledger.goal is None or self.ledger.goal.is_jog or last is None:
+        """The pose that the running goal leads to, or that its target was last told to have; None for a jog."""
+        last, goal = self._schedule.last, self.ledger.goal
+        if goal is None or last is None:
             return None
+        if goal.renewed is not None:
+            return goal.target
         x, y, phi = last.destination(self.commanded.pose)
         return (x, y, phi)
 
     def trip(self, reason: str, cause: str, drive: str = "", code: int = 0) -> None:
-        """Stop all three drives in this cycle and latch the reason; cause, drive and code as wire.messages.Fault."""
+        """Stop all three drives in this cycle and latch the reason; cause, drive and code as of a FaultDetail."""
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason
-        self.ledger.tell("fault", "error", reason, fault=Fault(cause, drive, code))
+        self.ledger.tell("fault", "error", reason, fault=FaultDetail(cause, drive, code))
         self._go(ModeEvent.FAULT, reason)
         self._withdraw(ModeEvent.FAULT, reason)
 
@@ -263,7 +285,7 @@ class Control:
         if origin == "measured":
             return self.measured.pose
         last, goal = self._schedule.last, self.ledger.goal
-        if last is None or goal is None or goal.is_jog:
+        if last is None or goal is None or goal.renewed is not None:
             return self.commanded.pose
         return last.end(self.commanded.pose)
 
@@ -273,6 +295,11 @@ class Control:
             self.goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason)
 
     def _take_command(self, request: CommandRequest) -> None:
+        if request.name in (Command.ACQUIRE, Command.RELEASE):
+            self._take_lease(request)
+            return
+        if not request.name.everybodys:
+            self.lease.check(request.user)
         if request.name is Command.OVERRIDE:
             self._take_override(request)
             return
@@ -285,8 +312,8 @@ class Control:
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
-        if event is ModeEvent.PAUSE and self.ledger.goal is not None and self.ledger.goal.is_jog:
-            event = ModeEvent.STOP  # nobody would be at the key when it is resumed
+        if event is ModeEvent.PAUSE and self.ledger.goal is not None and self.ledger.goal.renewed is not None:
+            event = ModeEvent.STOP  # nobody would be at the key, nor where the target was, when it is resumed
         if decided.action is Action.POWER_UP:
             self.setpoints.check_rest()
             if self.measured.homed:
@@ -308,6 +335,24 @@ class Control:
             self._planner.run_at(self.override)
         self.ledger.tell("service", "info", f"override {self.override:.0%} by {request.user}", user=request.user)
         self.ledger.undertake(request, self.cycles)
+
+    def _take_lease(self, request: CommandRequest) -> None:
+        """Let a user have the lease, keep it, or give it back."""
+        if request.name is Command.ACQUIRE:
+            change = self.lease.acquire(request, self.cycles)
+        else:
+            change = self.lease.release(request)
+        if change is not None:
+            self._change_lease(change)
+        self.ledger.undertake(request, self.cycles)
+
+    def _change_lease(self, change: LeaseChange) -> None:
+        """Tell who holds the lease from now on; what others have under way stops, and does not begin any more."""
+        user = self.lease.user
+        self.ledger.tell("lease", change.level, change.message, user=user)
+        if user is None or not self.ledger.is_all_of(user):
+            self._go(ModeEvent.STOP, change.message)
+            self._withdraw(ModeEvent.STOP, change.message)
 
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
@@ -379,6 +424,8 @@ class Control:
         goal, settling = self.ledger.goal, self.measured.settling
         if not run.arrived:
             self._go(ModeEvent.STANDSTILL, "standstill")
+        elif self.state.mode is Mode.MOVING and goal is not None and goal.renewed is TrackGoal:
+            return  # it waits for its target to move on, for as long as it is renewed
         elif goal is None or not goal.settles:
             self._go(ModeEvent.ARRIVED, "standstill")
         elif not settling.under_way:

@@ -7,13 +7,19 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
+from msgspec import structs
+
+from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger, Withdrawal
 from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.frames import NamedFrames, Place
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import Outcome, PoseGoal, VelocityGoal
+from trirail.wire.messages import Outcome, PlannedGoal, PoseGoal, RenewedGoal, TrackGoal, VelocityGoal
 from trirail.wire.packets import GoalRequest
+
+FURTHEST = 0.5
+"""How long ago, or how far ahead, a target may have been where a track says [s]: farther nobody knows where it is."""
 
 
 class _Sent(NamedTuple):
@@ -22,20 +28,34 @@ class _Sent(NamedTuple):
     request: GoalRequest
     cycle: float
 
+    def known_since(self, period: float) -> float:
+        """Return when a target was where a track says, as a cycle."""
+        return self.cycle - self.request.age / period
+
 
 class GoalQueue:
     """Takes goals in their order to the planner, and to the ledger what becomes of them."""
 
     def __init__(
-        self, ledger: Ledger, planner: PlanRequests, schedule: Schedule, frames: NamedFrames, queue: int, period: float
+        self,
+        ledger: Ledger,
+        lease: LeaseArbiter,
+        planner: PlanRequests,
+        schedule: Schedule,
+        frames: NamedFrames,
+        queue: int,
+        period: float,
     ) -> None:
         self._ledger = ledger
+        self._lease = lease
         self._planner = planner
         self._schedule = schedule
         self._frames = frames
         self._queue = queue
         self._period = period
         self._waiting: deque[_Sent] = deque()
+        self._served: dict[str, int] = {}
+        """When each user's last goal had its turn, counted since there was none to plan."""
         self._planned: _Sent | None = None
 
     @property
@@ -44,9 +64,19 @@ class GoalQueue:
         return not self._waiting and not self._planner.busy
 
     def take(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
-        """Take a goal in a cycle, at a time of the monotonic clock; it waits until those before it are planned."""
+        """Take a goal in a cycle, at a time of the monotonic clock; it waits for its user's turn.
+
+        What is told of a target takes the place of what has been told before and still waits.
+        """
         age = (now_ns - request.received_ns) * 1e-9 / self._period
         sent = _Sent(request, cycle - age)
+        if self.idle:
+            self._served.clear()
+        if isinstance(request.goal, TrackGoal) and self._waiting and self._ledger.renewed_by(request):
+            before = self._waiting[-1].request
+            if self._ledger.renewed_by(before):
+                self._waiting.pop()
+                self._ledger.pass_over(before)
         self._waiting.append(sent)
         self._ledger.keep_alive(request, self._alive_until(sent))
 
@@ -57,14 +87,15 @@ class GoalQueue:
         from where a move begins.
         """
         if not self._planner.busy and self._waiting:
-            self._planned = self._waiting.popleft()
+            self._planned = self._next()
             try:
                 self._consider(self._planned, cycle, admit, place)
             except RefusedError as refusal:
                 self._ledger.refuse(self._planned.request, refusal)
         try:
             if self._planner.busy and self._planned is not None:
-                self._ledger.check_id(self._planned.request)  # a jog may end while its renewal is being planned
+                self._ledger.check_id(self._planned.request)  # it may end while its renewal is being planned
+                self._lease.check(self._planned.request.user)  # and the lease may have another holder by now
                 self._check_age(self._planned, cycle)
             at_end = self._planner.busy and self._schedule.ended
             taken = self._planner.think()
@@ -118,6 +149,13 @@ class GoalQueue:
                 self._drop(number, goal.id, "expired", "it has not begun in time")
                 return
 
+    def _next(self) -> _Sent:
+        """Take the oldest goal of the user who has waited longest for his turn."""
+        sent = min(self._waiting, key=lambda sent: self._served.get(sent.request.user, 0))
+        self._waiting.remove(sent)
+        self._served[sent.request.user] = max(self._served.values(), default=0) + 1
+        return sent
+
     def _consider(self, sent: _Sent, cycle: int, admit: Callable[[], bool], place: Place) -> None:
         """Begin to plan a goal, or refuse it."""
         ledger, request, goal = self._ledger, sent.request, sent.request.goal
@@ -125,18 +163,35 @@ class GoalQueue:
         if request.withdrawn is not None:
             ledger.withdraw(request, "stopped", request.withdrawn)
             return
+        self._lease.check(request.user)
         if isinstance(goal, VelocityGoal) and not any((goal.x, goal.y, goal.phi)) and not ledger.renewed_by(request):
             raise RefusedError(
                 RefusalCode.NO_VELOCITY, "a jog of no velocity moves nothing: give it one along x, y or phi"
             )
         moving = admit()
         self._check_age(sent, cycle)
-        planned = self._frames.planned(goal, place)
+        planned = self._timed(self._frames.planned(goal, place), sent, cycle)
         blend = ledger.goals[-1].blend if moving and ledger.goals and isinstance(planned, PoseGoal) else None
         if blend is not None and len(ledger.goals) > self._queue:
             text = f"{self._queue} goals are waiting already (motion.queue): send it when one has ended"
             raise RefusedError(RefusalCode.QUEUE_FULL, text, value=len(ledger.goals), limit=self._queue)
         self._planner.plan(planned, blend)
+
+    def _timed(self, planned: PlannedGoal, sent: _Sent, cycle: int) -> PlannedGoal:
+        """Return a goal with its time as the schedule counts it. Raises RefusedError where that is too far from now.
+
+        The setpoints of the schedule's cycle, which is commanded now, are taken up at this cycle's SYNC: that is now.
+        """
+        if not isinstance(planned, TrackGoal):
+            return planned
+        ago = (cycle - sent.known_since(self._period)) * self._period
+        if not abs(ago) <= FURTHEST:
+            when = f"{ago:.3f} s ago" if ago > 0.0 else f"in {-ago:.3f} s"
+            text = (
+                f"the target is said to be there {when}, by the clock of this machine: {FURTHEST:g} s at most is taken"
+            )
+            raise RefusedError(RefusalCode.WRONG_TIME, text, value=ago, limit=math.copysign(FURTHEST, ago))
+        return structs.replace(planned, time=self._schedule.cycle * self._period - ago)
 
     def _check_age(self, sent: _Sent, cycle: int) -> None:
         """Refuse what can no more begin in time."""
@@ -144,12 +199,12 @@ class GoalQueue:
         if valid is not None and cycle - sent.cycle > valid / self._period:
             raise RefusedError(RefusalCode.EXPIRED, f"the goal came too late: it was valid for {valid:g} s")
         if cycle > self._alive_until(sent):
-            raise RefusedError(RefusalCode.EXPIRED, "the jog came too late: its timeout was over before it could begin")
+            raise RefusedError(RefusalCode.EXPIRED, "it came too late: its timeout was over before it could begin")
 
     def _alive_until(self, sent: _Sent) -> float:
-        """Return the cycle in which a jog ends that nobody renews; infinite for other goals."""
+        """Return the cycle in which a goal ends that nobody renews; infinite for those that need not be."""
         goal = sent.request.goal
-        return sent.cycle + goal.timeout / self._period if isinstance(goal, VelocityGoal) else math.inf
+        return sent.cycle + goal.timeout / self._period if isinstance(goal, RenewedGoal) else math.inf
 
     def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: str) -> None:
         """End a goal that waits, and those behind it."""

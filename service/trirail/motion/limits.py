@@ -23,7 +23,7 @@ EDGE = 1e-6
 EXCESS = 1e-3
 """By that share may a setpoint exceed a limit of velocity, acceleration or jerk that its path was checked against."""
 PLATFORM_EXCESS = (0.01, 0.05, 0.1)
-"""Likewise the platform's velocity, acceleration and jerk: plans make use of all of it (checks.PLATFORM_LAWS)."""
+"""Likewise the platform's velocity, acceleration and jerk: plans make use of all of it (feasibility.PLATFORM_LAWS)."""
 
 BOUNDS = np.dtype(
     [
@@ -221,6 +221,12 @@ class Bounds:
         bounds["slider_jerk"] = slider.jerk
         bounds["platform"] = np.transpose((platform.velocity, platform.acceleration, platform.jerk))
         bounds["period"] = period
+
+    @property
+    def box(self) -> Array:
+        """Low and high of x, y [m] and phi [rad], (2, 3)."""
+        box: Array = self.packed[0]["pose"].T
+        return box
 
     def pose(self, pose: ArrayLike) -> Violation | None:
         """Check a pose x, y [m], phi [rad] alone."""

@@ -63,6 +63,11 @@ class StateMaker:
             self._statistics = self._lateness.percentiles(), self._cycle.percentiles()
 
     @property
+    def lease(self) -> str | None:
+        """Who holds the lease."""
+        return self._status.lease
+
+    @property
     def cycle(self) -> int:
         """Cycle of the newest record; 0 for none."""
         return 0 if self._newest is None else int(self._newest["cycle"])
@@ -96,11 +101,12 @@ class StateMaker:
                 status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
                 traffic=(FrameCounts(*a), FrameCounts(*b), FrameCounts(*c)),
             ),
-            goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._status.target)
+            goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._status.target, self._status.lag)
             if goal
             else None,
             settled=bool(row["settled"]),
             override=self._status.override,
+            lease=self._status.lease,
             faults=(self._status.fault,) if self._status.fault else (),
             warnings=warnings,
             loop=LoopState(

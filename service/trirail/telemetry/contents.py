@@ -14,7 +14,7 @@ from trirail.errors import ConfigError, EmptyRecordingError, ServiceError
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import read
 from trirail.telemetry.retention import BLACK_BOX
-from trirail.wire.messages import Event, Fault
+from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, RefusedRequest
 from trirail.wire.records import DTYPE, unpack
 
@@ -28,7 +28,7 @@ class FaultEntry(NamedTuple):
 
     time: float
     """[s since 1970]."""
-    fault: Fault
+    fault: FaultDetail
     message: str
 
 
@@ -71,7 +71,7 @@ class Contents(msgspec.Struct):
         if event.outcome is not None:
             self.goals[event.user or "", event.outcome] += 1
         if event.kind == "fault":
-            self.faults.append(FaultEntry(event.time, event.fault or Fault(""), event.message))
+            self.faults.append(FaultEntry(event.time, event.fault or FaultDetail(""), event.message))
 
     def given(self, what: ControlInput) -> None:
         """Take what the control was given."""

@@ -35,8 +35,10 @@ Coordinates = tuple[Coordinate, Coordinate, Coordinate]
 Speed = Annotated[float, Meta(ge=1e-3, le=1.0)]
 Validity = Annotated[float, Meta(ge=1e-3, le=86_400.0)]
 Moment = Annotated[float, Meta(ge=-86_400.0, le=86_400.0)]
+Clock = Annotated[float, Meta(ge=-1e11, le=1e11)]
 OwnTriple = tuple[OwnLimit, OwnLimit, OwnLimit]
 FrameName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
+PoseName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
 Tool = tuple[Coordinate, Coordinate] | FrameName
 """A point of the platform in its own frame, whose origin is the centre [m], or the name of one in [frames.tool]."""
 
@@ -118,6 +120,26 @@ class MoveGoal(
         _check(self)
 
 
+class NamedGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="named"):
+    """Move the platform to a pose that has a name: a pose goal, of the pose of that name when it comes in."""
+
+    name: PoseName
+    """One of those that are answered on …/poses."""
+    id: Identifier | None = None
+    """As of a pose goal."""
+    speed: Speed = 1.0
+    """As of a pose goal."""
+    valid_for: Validity | None = None
+    """As of a pose goal [s]."""
+    limits: OwnLimits | None = None
+    """As of a pose goal."""
+    blend: Annotated[float, Meta(ge=0.0, le=1e3)] | None = None
+    """As of a pose goal [m]."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
 class SlidersGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="sliders"):
     """Move the sliders to positions, straight in slider space where the start allows."""
 
@@ -147,6 +169,36 @@ class VelocityGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="k
     """The same for every renewal of one jog."""
     timeout: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.1
     """Real time, at every override, after which a jog that is not renewed brakes [s]."""
+    valid_for: Validity | None = None
+    """As of a pose goal [s]."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+class TrackGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="track"):
+    """Follow a moving target, renewed 10 to 200 times a second, until `timeout` passes without a fresh one of its id.
+
+    Between two messages the target is taken to go on with its velocity. What is too fast is followed as fast as the
+    limits allow; where the target is out of reach the platform waits at the border. Who does not renew it in time has
+    the robot brake on its path.
+    """
+
+    x: Coordinate
+    """Where the target is at `time`: there the platform's centre is to be, in the base frame [m]."""
+    y: Coordinate
+    """Likewise [m]."""
+    phi: Coordinate
+    """The angle that the platform is to have then, counterclockwise [rad]."""
+    velocity: Coordinates = (0.0, 0.0, 0.0)
+    """Of x, y and phi then [m/s, m/s, rad/s]."""
+    time: Clock | None = None
+    """When that is so, by the wall clock of the service's machine [s since 1970]: clocks of two machines must agree to
+    a millisecond or so. At most half a second ago or ahead; without it, when the message comes."""
+    id: Identifier | None = None
+    """The same for every renewal of one track."""
+    timeout: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.25
+    """Real time, at every override, after which a track that is not renewed brakes [s]."""
     valid_for: Validity | None = None
     """As of a pose goal [s]."""
 
@@ -198,9 +250,11 @@ class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
                 )
 
 
-PlannedGoal = PoseGoal | SlidersGoal | VelocityGoal | TrajectoryGoal
-"""What the planner is asked for; its tools are points and its poses those of the base frame."""
-Goal = PlannedGoal | MoveGoal
+RenewedGoal = VelocityGoal | TrackGoal
+"""What lasts only while it is renewed, by goals of its own kind, id and user."""
+PlannedGoal = PoseGoal | SlidersGoal | VelocityGoal | TrackGoal | TrajectoryGoal
+"""What the planner is asked for; its tools are points, its poses those of the base frame, its times the loop's."""
+Goal = PlannedGoal | MoveGoal | NamedGoal
 
 
 class Override(Struct, frozen=True, forbid_unknown_fields=True):
@@ -222,11 +276,41 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
     """Its id; none for the robot as a whole."""
 
 
+LeaseTimeout = Annotated[float, Meta(ge=0.1, le=10.0)]
+
+
+class AcquireLease(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content, if any, of the command acquire. The same one again, within its timeout, is a sign of life."""
+
+    id: Identifier | None = None
+    """A new one for every lease, the same in every sign of life: a lease that has ended does not come back by one.
+    Without it, each one asks anew."""
+    timeout: LeaseTimeout = 1.0
+    """Real time after which a lease without a sign of life ends, with a controlled stop [s]."""
+    force: bool = False
+    """Take it over from who holds it, by a role of [control] `takeover`."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+class ReleaseLease(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content, if any, of the command release: which lease is given back."""
+
+    id: Identifier | None = None
+    """As in its acquire; without it the user's own, whichever that is."""
+
+
 class NoContent(Struct, frozen=True, forbid_unknown_fields=True):
     """The content of the other commands."""
 
 
-CONTENT: dict[Command, Any] = {Command.OVERRIDE: Override, Command.STOP: Stop | None}
+CONTENT: dict[Command, Any] = {
+    Command.OVERRIDE: Override,
+    Command.STOP: Stop | None,
+    Command.ACQUIRE: AcquireLease | None,
+    Command.RELEASE: ReleaseLease | None,
+}
 """What commands carry, with None where they may come without; those that are not here, NoContent | None."""
 
 
@@ -247,7 +331,8 @@ class GoalReply(Struct, frozen=True):
     id: str
     """The goal's own, or the one that was made for it."""
     duration: float | None
-    """Expected time from now to the end of its path [s]; None while the override is zero: then it has no expected end.
+    """Expected time from now to the end of its path [s]; None while the override is zero: then it has no expected end,
+    and for what was told of a target before something newer took its place.
     It is done when the robot has been in position for the dwell of [limits.in_position] after that."""
     slowed: float = 1.0
     """How many times slower it is than was asked for, since a slider or the platform may not move so fast."""
@@ -255,6 +340,9 @@ class GoalReply(Struct, frozen=True):
     """The robot stops on its old path first: from its present motion it could not, or would be later."""
     queued: bool = False
     """It begins when the goals before it are reached."""
+    lag: float | None = None
+    """Of a track: how far a point of the platform was at most from where the target had it, when this was taken up
+    [m]."""
     accepted: Literal[True] = True
 
 
@@ -301,7 +389,7 @@ class Residual(Struct, frozen=True):
     """Of x, y [m] and phi [rad]."""
 
 
-class Fault(Struct, frozen=True, omit_defaults=True):
+class FaultDetail(Struct, frozen=True, omit_defaults=True):
     """What a fault is about, for programs."""
 
     cause: str
@@ -323,8 +411,9 @@ class Event(Struct, frozen=True, omit_defaults=True):
     """Its cycle, as in records."""
     time: float
     """Wall clock [s since 1970]."""
-    kind: Literal["goal", "mode", "fault", "refused", "service"]
-    """What it is about: the end of a goal, a new mode, a fault, something refused, the service itself."""
+    kind: Literal["goal", "mode", "fault", "refused", "pose", "lease", "service"]
+    """What it is about: the end of a goal, a new mode, a fault, something refused, a named pose that was taught or
+    removed, a new holder of the lease, the service itself."""
     level: Level
     """How much it matters to people."""
     message: str
@@ -340,7 +429,8 @@ class Event(Struct, frozen=True, omit_defaults=True):
     goal: str | None = None
     """The id of the goal that set the robot in motion, with kind mode."""
     user: str | None = None
-    """Who sent the goal, or what was refused."""
+    """Who sent the goal, or what was refused, or has taught or removed the pose; with kind lease who holds it from now
+    on, None for nobody."""
     settle: float | None = None
     """With outcome done: time from the end of the path until the robot was in position, to the first cycle of the dwell
     [s]. None of a goal that was not to settle: a jog, one that was passed on the way to the next."""
@@ -350,5 +440,5 @@ class Event(Struct, frozen=True, omit_defaults=True):
     overshoot: Triple | None = None
     """Likewise, how far each of the sliders A, B, C was beyond its target at most since the end of the path, in the
     direction in which it was last commanded to move; of one that was not to move, to either side [m]."""
-    fault: Fault | None = None
+    fault: FaultDetail | None = None
     """What it is about, with kind fault."""
