@@ -16,6 +16,7 @@ from trirail.config import geometry
 from trirail.motion import feasibility
 from trirail.motion.feasibility import Checker, parts
 from trirail.motion.limits import Bounds
+from trirail.motion.path_sampling import survey
 from trirail.motion.paths import FOR_EVER, Path, constant
 from trirail.motion.runs import stretched
 
@@ -80,11 +81,10 @@ def test_where_a_path_leaves_the_workspace_is_said_to_the_moment(share: float) -
 def test_how_often_a_path_is_looked_at(monkeypatch: pytest.MonkeyPatch, seconds: float, moments: int) -> None:
     """Beside its knots: every 20 ms, sixteen times at least and sixty-four times at most."""
     asked: list[int] = []
-    plain = feasibility.survey
 
     def noted(*arguments: Any) -> float:
         asked.append(arguments[9])
-        return plain(*arguments)
+        return survey(*arguments)
 
     monkeypatch.setattr(feasibility, "survey", noted)
     path = stretched(straight(), seconds)
