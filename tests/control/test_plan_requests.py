@@ -498,7 +498,7 @@ def test_warming_up_plans_each_motion_from_the_one_before(monkeypatch: pytest.Mo
     monkeypatch.setattr(MotionPlanner, "plan", noted)
     MotionPlanner(CONFIG).warm_up()
     begins = [answer.first for answer in answers if isinstance(answer, Planned)]
-    assert begins == [None, 2, 2]
+    assert begins == [None, 2, 2, 2]
 
 
 def test_a_planner_with_other_limits_plans_nothing(rig: Rig, meddler: Meddler) -> None:

@@ -246,6 +246,20 @@ def test_a_drive_that_keeps_a_sync_of_another_kind_is_refused(rigs: list[Rig], i
         rig.ready()
 
 
+def test_a_drive_that_answers_no_guarding_is_not_watched_by_it(rigs: list[Rig]) -> None:
+    rig = Rig("technosoft_ipos", Habits(answers_guarding=False))
+    rigs.append(rig)
+    before = [(node.value(0x100C), node.value(0x100D)) for node in rig.nodes]
+    with pytest.raises(DriveError, match="drive A lacks protections: 1016, its watch on this service"):
+        rig.ready()
+    assert [(node.value(0x100C), node.value(0x100D)) for node in rig.nodes] == before
+    rig = Rig("technosoft_ipos", Habits(answers_guarding=False), accept_without=("1016",))
+    rigs.append(rig)
+    rig.ready()
+    rig.enable()
+    rig.move(0.05, 60)
+
+
 OF_EARLIER = (
     b"\x60\x40\x60\x00\x00\x00\x00\x00",  # a controlword was taken
     b"\x80\x40\x60\x00\x21\x00\x00\x08",  # or was not
