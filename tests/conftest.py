@@ -242,7 +242,7 @@ def what_memory_takes(cycle: Callable[[], None], cycles: int) -> tuple[int, int]
 
     Without the garbage collector, as the loop runs. The cycles before are for what is made once, and for the tuples
     that CPython keeps for later: 2000 of each length, then no more. Only what is allocated below this function counts
-    as grown: threads of earlier tests allocate too.
+    as grown, and the least of five rounds as in use: threads of earlier tests allocate too.
     """
     gc.collect()
     gc.disable()
@@ -251,16 +251,21 @@ def what_memory_takes(cycle: Callable[[], None], cycles: int) -> tuple[int, int]
         for _ in range(2500):
             cycle()
         before = _allocated_here()
-        held, _ = tracemalloc.get_traced_memory()
-        tracemalloc.reset_peak()
-        for _ in range(cycles):
-            cycle()
-        _, peak = tracemalloc.get_traced_memory()
+        peaks = [_peak(cycle, cycles // 5) for _ in range(5)]
         grown = _allocated_here().compare_to(before, "lineno")
     finally:
         tracemalloc.stop()
         gc.enable()
-    return sum(line.size_diff for line in grown), peak - held
+    return sum(line.size_diff for line in grown), min(peaks)
+
+
+def _peak(cycle: Callable[[], None], cycles: int) -> int:
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.reset_peak()
+    for _ in range(cycles):
+        cycle()
+    _, peak = tracemalloc.get_traced_memory()
+    return peak - held
 
 
 def _allocated_here() -> tracemalloc.Snapshot:

@@ -23,7 +23,7 @@ from trirail.telemetry import contents
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.contents import Contents, FaultEntry, of_file
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.session_index import FILE, Session, SessionIndex, Wanted
+from trirail.telemetry.session_index import FILE, RecordedSession, SessionIndex, Wanted
 from trirail.wire.messages import Event, FaultDetail, PoseGoal
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
 from trirail.wire.vocabulary import Command
@@ -102,7 +102,7 @@ def rested(folder: Path) -> None:
         os.utime(path, (1e9, 1e9))
 
 
-def sessions(folder: Path, *options: str) -> list[Session]:
+def sessions(folder: Path, *options: str) -> list[RecordedSession]:
     """What the command prints."""
     done: list[str] = []
     capture = pytest.MonkeyPatch()
@@ -113,7 +113,7 @@ def sessions(folder: Path, *options: str) -> list[Session]:
         )
     finally:
         capture.undo()
-    return msgspec.convert(json.loads(done[0])["sessions"], list[Session])
+    return msgspec.convert(json.loads(done[0])["sessions"], list[RecordedSession])
 
 
 def test_what_the_recorder_enters_is_what_its_files_hold(tmp_path: Path) -> None:

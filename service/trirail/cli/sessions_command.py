@@ -21,7 +21,7 @@ from trirail.wire.messages import Outcome
 from trirail.wire.text import wall_clock
 
 if TYPE_CHECKING:
-    from trirail.telemetry.session_index import Session, SessionIndex
+    from trirail.telemetry.session_index import RecordedSession, SessionIndex
 
 FOLDER = Path("recordings")
 """Where a service records that was started in this folder."""
@@ -104,7 +104,7 @@ def _update(index: SessionIndex) -> None:
             print(f"reading {path.name}, recording {number} that the index lacks", file=sys.stderr)  # noqa: T201
 
 
-def _print(found: list[Session], of: int) -> None:
+def _print(found: list[RecordedSession], of: int) -> None:
     table = Table("began", "lasted", "robot", "goals", "users", "faults", "files", box=None, pad_edge=False)
     for session in found:
         table.add_row(
@@ -124,7 +124,7 @@ def _print(found: list[Session], of: int) -> None:
     terminal.say(f"{len(found)} of {of} sessions" if len(found) < of else f"{of} sessions")
 
 
-def _lasted(session: Session) -> str:
+def _lasted(session: RecordedSession) -> str:
     if session.began is None or session.ended is None:
         return ""
     minutes, seconds = divmod(round(session.ended - session.began), 60)
@@ -132,7 +132,7 @@ def _lasted(session: Session) -> str:
     return f"{hours}:{minutes:02}:{seconds:02}"
 
 
-def _faults(session: Session) -> str:
+def _faults(session: RecordedSession) -> str:
     """Why a black box was kept; of a session its first fault, and how many more there were."""
     if session.trouble is not None:
         return f"[yellow]{terminal.plain(session.trouble)}[/]"

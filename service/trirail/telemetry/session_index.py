@@ -55,7 +55,7 @@ class Wanted(NamedTuple):
     outcome: str | None = None
 
 
-class Session(Struct):
+class RecordedSession(Struct):
     """A session, of one file or, where its recording was rotated, several."""
 
     session: str
@@ -118,9 +118,9 @@ class SessionIndex:
                 yield there[name]
                 self.put([read(there[name])])
 
-    def find(self, wanted: Wanted = Wanted()) -> list[Session]:  # noqa: B008 - a value, and never changed
+    def find(self, wanted: Wanted = Wanted()) -> list[RecordedSession]:  # noqa: B008 - a value, and never changed
         """Return the sessions that are wanted, in the order in which they began."""
-        found: dict[str, Session] = {}
+        found: dict[str, RecordedSession] = {}
 
         def look(index: sqlite3.Connection) -> None:
             found.clear()
@@ -171,7 +171,7 @@ def _enter(index: sqlite3.Connection, row: Contents) -> None:
     index.executemany("INSERT INTO fault VALUES (?, ?, ?, ?, ?, ?)", faults)
 
 
-def _sessions(index: sqlite3.Connection, wanted: Wanted) -> dict[str, Session]:
+def _sessions(index: sqlite3.Connection, wanted: Wanted) -> dict[str, RecordedSession]:
     conditions, values = _conditions(wanted)
     index.execute("CREATE TEMP TABLE chosen (session TEXT PRIMARY KEY)")
     index.execute(
@@ -179,14 +179,14 @@ def _sessions(index: sqlite3.Connection, wanted: Wanted) -> dict[str, Session]:
         + (f"HAVING {' AND '.join(conditions)}" if conditions else ""),
         values,
     )
-    found: dict[str, Session] = {}
+    found: dict[str, RecordedSession] = {}
     of_chosen = "FROM recording JOIN chosen USING (session)"
     for name, session, *rest in index.execute(
         f"SELECT name, session, robot, began, ended, cycles, reason, trouble {of_chosen} ORDER BY began, name"
     ):
         robot, began, ended, cycles, reason, trouble = rest
         if session not in found:
-            found[session] = Session(session, robot, began, ended, 0, [], reason, trouble, [], {}, [])
+            found[session] = RecordedSession(session, robot, began, ended, 0, [], reason, trouble, [], {}, [])
         known = found[session]
         known.files.append(name)
         known.cycles += cycles
