@@ -128,12 +128,12 @@ class Net:
 
 @contextlib.contextmanager
 def standing_in(net: Net) -> Iterator[None]:
-    """The robots that stand for whole ones, in processes that give way to all else: as if they were elsewhere."""
+    """The robots that stand for whole ones, in a few processes."""
     program = str(Path(bench_gateways.__file__))
     groups = [net.standing_in[n : n + PER_PROCESS] for n in range(0, len(net.standing_in), PER_PROCESS)]
     processes = [
         subprocess.Popen(
-            ["nice", sys.executable, program, net.locator, str(net.keys), *names], stdout=subprocess.PIPE, text=True
+            [sys.executable, program, net.locator, str(net.keys), *names], stdout=subprocess.PIPE, text=True
         )
         for names in groups
     ]
@@ -201,11 +201,13 @@ def are_heard(fleet: Fleet, number: int, since: float) -> Callable[[], bool]:
     return heard
 
 
-def measure(gateways: int, seconds: float, stops: int, faults: int) -> dict[str, Any]:
-    """Measure with so many robots that stand for whole ones; each rate over so many seconds."""
+def measure(gateways: int, seconds: float, stops: int, faults: int) -> Iterator[dict[str, Any]]:
+    """Measure with so many robots that stand for whole ones, each rate over so many seconds; yield part by part."""
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="trirail-")))
         net = Net(folder, gateways)
+        number = len(net.robots)
+        yield {"robots": number, "whole": len(WHOLE), "quantiles": QUANTILES}
         net.route()
         stack.callback(net.kill_router)
         _say("two whole services")
@@ -218,30 +220,32 @@ def measure(gateways: int, seconds: float, stops: int, faults: int) -> dict[str,
         direct = [stack.enter_context(net.robot(name, own)) for name, (_, own) in zip(WHOLE, made, strict=True)]
         _say(f"{gateways} robots that stand for whole ones")
         stack.enter_context(standing_in(net))
-        told: dict[str, Any] = {"robots": len(net.robots), "whole": len(WHOLE), "quantiles": QUANTILES}
-        told |= _rates(net, net.router.pid, child(services[0].pid, "gateway"), seconds)
+        yield {"rates": _rates(net, net.router.pid, child(services[0].pid, "gateway"), seconds)}
         with net.fleet() as fleet:
-            wait_for(are_heard(fleet, len(net.robots), 0.0), "all robots heard")
-            _say("faults, stops, the router gone and back, a robot killed")
-            told["fault_seen_s"] = _faults(fleet, direct[0], faults)
-            told |= _stops(direct[0], net, stops)
-            quiet = _missed(direct, lambda: time.sleep(2.0 * ROUTER_GONE))
+            wait_for(are_heard(fleet, number, 0.0), "all robots heard")
+            _say("faults")
+            yield {"fault_seen_s": _faults(fleet, direct[0], faults)}
+            _say("stops")
+            yield _stops(direct[0], net, stops)
+            _say("the router gone and back")
+            before = _missed(direct, lambda: time.sleep(2.0 * ROUTER_GONE))
             back: list[float] = []
-
-            def without() -> None:
-                net.kill_router()
-                time.sleep(ROUTER_GONE)
-                began = time.monotonic()
-                net.route()
-                wait_for(are_heard(fleet, len(net.robots), began), "all robots heard after the router came back")
-                back.append(time.monotonic() - began)
-
-            told["missed_ticks"] = {"router gone and back": _missed(direct, without), "before": quiet}
-            told["router_back_s"] = back[0]
+            missed = _missed(direct, lambda: back.append(_without_router(net, fleet)))
+            yield {"router_back_s": back[0], "missed_ticks": {"meanwhile": missed, "before": before}}
+            _say("a robot killed")
             direct[1].close()
             _kill(services[1])
-            told["killed_seen_s"] = wait_for(is_seen(fleet, WHOLE[1], Attention.SILENT), "a killed robot seen silent")
-        return told
+            yield {"killed_seen_s": wait_for(is_seen(fleet, WHOLE[1], Attention.SILENT), "a killed robot seen silent")}
+
+
+def _without_router(net: Net, fleet: Fleet) -> float:
+    """Kill the router and start it again; return how long after it routes all robots are heard [s]."""
+    net.kill_router()
+    time.sleep(ROUTER_GONE)
+    net.route()
+    began = time.monotonic()
+    wait_for(are_heard(fleet, len(net.robots), began), "all robots heard after the router came back")
+    return time.monotonic() - began
 
 
 def _say(what: str) -> None:
@@ -278,7 +282,7 @@ def _rates(net: Net, router: int, gateway: int, seconds: float) -> dict[str, Any
         ):
             with session.declare_subscriber(zenoh_session.key(robot, key), nothing):
                 over(what, watched)
-    return {"rates": found}
+    return found
 
 
 def _faults(fleet: Fleet, robot: Robot, times: int) -> list[float]:
@@ -336,44 +340,56 @@ def _spread(values: list[float]) -> list[float]:
 
 
 def main(gateways: int, seconds: float, stops: int, faults: int, json: bool = False) -> None:
-    """Measure and print."""
-    told = measure(gateways, seconds, stops, faults)
+    """Measure and print, each part when it has been measured."""
+    told: dict[str, Any] = {}
+    for part in measure(gateways, seconds, stops, faults):
+        told |= part
+        if not json:
+            _show(part, told["robots"])
     if json:
         print(json_format.dumps(told))
-    else:
-        _show(told)
 
 
-def _show(told: dict[str, Any]) -> None:
-    robots, whole = told["robots"], told["whole"]
-    print(
-        f"{robots} robots behind a router on this machine: {whole} whole services, and {robots - whole} sessions that "
-        "publish what a gateway\npublishes, as often, of a canned loop; all with certificates."
-    )
+def _show(part: dict[str, Any], robots: int) -> None:
+    match part:
+        case {"whole": whole}:
+            print(
+                f"{robots} robots behind a router on this machine, all with certificates: {whole} whole services, and "
+                f"{robots - whole} sessions\nthat publish what a gateway publishes, as often, of a canned loop"
+            )
+        case {"rates": rates}:
+            _show_rates(rates, robots)
+        case {"fault_seen_s": took}:
+            _against("a fault is seen, at worst, the table drawn [s]", took[-1] + REFRESH, "fault_seen_s")
+        case {"stop_direct_ms": direct, "stop_routed_ms": routed, "stop_more_ms": more}:
+            for name, took in (("direct", direct), ("through the router", routed)):
+                print(f"a stop {name}: " + " / ".join(f"{value:.2f}" for value in took) + " ms (p50 / p99 / max)")
+            _against("a stop through the router, more, p99 [ms]", more, "stop_more_ms")
+        case {"router_back_s": back, "missed_ticks": missed}:
+            _against("the router back: all robots heard [s]", back, "router_back_s")
+            without = f"ticks missed meanwhile ({missed['before']} in {2.0 * ROUTER_GONE:g} s before)"
+            _against(without, missed["meanwhile"], "missed_ticks")
+        case {"killed_seen_s": took}:
+            _against("a robot killed is seen, the table drawn [s]", took + REFRESH, "killed_seen_s")
+    sys.stdout.flush()
+
+
+def _show_rates(rates: dict[str, dict[str, float]], robots: int) -> None:
     print(f"\n{'a second':18}{'to the router':>16}{'from the router':>18}{'router':>14}{'a gateway':>14}")
-    for what, rate in told["rates"].items():
+    for what, rate in rates.items():
         print(
             f"{what:18}{rate['received_per_s']:>14.0f} B{rate['sent_per_s']:>16.0f} B"
             f"{rate['router_processor'] * 1e3:>11.1f} ms{rate['gateway_processor'] * 1e3:>11.1f} ms"
         )
-    idle, fleet = told["rates"]["nobody watches"], told["rates"]["fleet"]
+    idle, fleet = rates["nobody watches"], rates["fleet"]
     print(
         f"a robot, fleet watched: {fleet['received_per_s'] / robots:.0f} B/s to the router "
         f"({idle['received_per_s'] / robots:.0f} of them whoever watches), "
         f"{(fleet['sent_per_s'] - idle['sent_per_s']) / robots:.0f} B/s to who watches, "
         f"{fleet['router_processor'] / robots * 1e6:.0f} µs/s of the router's processor "
-        f"({idle['router_processor'] / robots * 1e6:.0f} whoever watches)"
+        f"({idle['router_processor'] / robots * 1e6:.0f} whoever watches)\n"
     )
-    print(f"\n{'':44}{'measured':>16}{'aim':>8}   met")
-    ticks = told["missed_ticks"]
-    rows = (
-        ("a fault is seen, worst, table drawn [s]", told["fault_seen_s"][-1] + REFRESH, "fault_seen_s"),
-        ("a robot killed is seen, table drawn [s]", told["killed_seen_s"] + REFRESH, "killed_seen_s"),
-        ("router back: all robots heard [s]", told["router_back_s"], "router_back_s"),
-        (f"ticks missed meanwhile ({ticks['before']} before)", ticks["router gone and back"], "missed_ticks"),
-        ("a stop through the router, more, p99 [ms]", told["stop_more_ms"], "stop_more_ms"),
-    )
-    for name, value, aim in rows:
-        print(f"{name:44}{value:>16.3g}{AIMS[aim]:>8.3g}   {'yes' if value <= AIMS[aim] else 'NO'}")
-    for name in ("stop_direct_ms", "stop_routed_ms"):
-        print(f"{name:20}" + " / ".join(f"{value:.2f}" for value in told[name]) + "  (p50 / p99 / max)")
+
+
+def _against(what: str, measured: float, aim: str) -> None:
+    print(f"{what:52}{measured:>10.3g}   aim {AIMS[aim]:g}: {'met' if measured <= AIMS[aim] else 'NOT MET'}")
