@@ -63,6 +63,7 @@ from trirail.wire.packets import (
     message,
 )
 from trirail.wire.records import unpack
+from trirail.wire.state import summary_of
 from trirail.wire.text import is_name, quoted
 from trirail.wire.vocabulary import Command, Mode
 
@@ -82,6 +83,8 @@ UNDER_WAY_OF_ALL = 64
 """Likewise, of all users."""
 REPLY_WITHIN = 15.0
 """A command that the loop has not carried out by then is answered with an error [s]."""
+SUMMARY_EVERY = 1.0
+"""How often the summary is published [s]."""
 TOO_MUCH = "too many messages at once: send fewer"
 REFUSALS_PER_SECOND = 10
 """What is refused of one user that is told to everyone; the rest only gets its error reply."""
@@ -120,7 +123,7 @@ class Gateway:
         self._states = StateMaker(config)
         self._meter = Meter(measured) if config.telemetry.metrics_port else None
         self._state_every = 1.0 / config.telemetry.state_hz
-        self._state_due = 0.0
+        self._state_due = self._summary_due = self._heard = 0.0
         self._replies = Replies(self._robot)
         self._inbox = Inbox(opened, self._robot, self._too_much)
         self._poses = Poses(config, self._replies.send, self._refuse, self._tell_of_pose, self._inbox.wake)
@@ -156,6 +159,7 @@ class Gateway:
                 self._send_goals()  # those for which there was no room
                 self._poses.settle()
                 self._give_up_late()
+                self._summarize()
                 self._tell_of_overruns()
         except Closed:
             self._tell_of_its_end()
@@ -355,10 +359,17 @@ class Gateway:
         if self._meter is not None:
             self._meter.records(rows)
             self._meter.tell(self._states.newest)
-        now = time.monotonic()
+        now = self._heard = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
             self._publications.state(self._states.newest(self.warnings()))
+
+    def _summarize(self) -> None:
+        """Publish the summary when it is time, also while the loop says nothing: then it tells since when."""
+        now = time.monotonic()
+        if now >= self._summary_due and self._states.cycle:
+            self._summary_due = now + SUMMARY_EVERY
+            self._publications.summary(summary_of(self._states.newest(), now - self._heard, self._info.version))
 
     def _happened(self, event: Event) -> None:
         """Tell everyone of an event, and the service's log; what others have sent under a new holder does not begin."""
