@@ -206,7 +206,7 @@ def test_a_command_ends_it(late: Rig, name: str, outcome: str, mode: Mode) -> No
     [(ModeEvent.GATEWAY_LOST, Mode.HOLDING), (ModeEvent.LATE, Mode.HOLDING), (ModeEvent.SHUTDOWN, Mode.DISABLED)],
 )
 def test_a_disturbance_ends_it(late: Rig, event: ModeEvent, mode: Mode) -> None:
-    late.control.happen(event, "it happened")
+    late.control.modes.happen(event, "it happened")
     late.until(lambda: late.mode is mode)
     late.cycles(1000)
     assert late.outcomes() == [("g1", "stopped")]
