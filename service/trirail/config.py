@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import itertools
 import math
@@ -20,6 +21,8 @@ from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Driv
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES
 
+from trirail import as_built
+from trirail.as_built import AsBuilt
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles
 from trirail.wire.endpoints import ReachableBy, reach
@@ -149,6 +152,20 @@ class FramesTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Frames by name: x, y [m] of the origin and the angle [rad], in the base frame."""
 
 
+Play = Annotated[float, Meta(ge=0.0, le=0.001)]
+"""[m]."""
+
+
+class CorrectionTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [correction]: what the robot as built differs from [geometry] by; where it is absent, nothing."""
+
+    map: Name | None = None
+    """File of as-built errors, from `tools/calibrate.py --map`, relative to the configuration file."""
+    backlash: tuple[Play, Play, Play] = (0.0, 0.0, 0.0)
+    """Play between drive and slider, A, B, C [m]: taken up wherever a slider turns back."""
+    as_built: AsBuilt | None = None
+
+
 class LoopTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [loop]."""
 
@@ -232,6 +249,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     watchdogs: Watchdogs
     motion: MotionTable = MotionTable()
     frames: FramesTable = FramesTable()
+    correction: CorrectionTable = CorrectionTable()
 
     @property
     def period(self) -> float:
@@ -246,13 +264,22 @@ def load(path: Path) -> Config:
     except FileError as error:
         raise ConfigError(f"{error}; `trirail config copy sim` gives one to start from") from error
     try:
-        return _beside(path, parse(text))
+        config = _beside(path, _parsed(text))
+        _check(config)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
+    return config
 
 
 def parse(text: str) -> Config:
     """Read a configuration from TOML. Raises ConfigError."""
+    config = _parsed(text)
+    _check(config)
+    return config
+
+
+def _parsed(text: str) -> Config:
+    """Read a configuration whose values are each possible by itself."""
     try:
         raw = tomllib.loads(text)
         leaves = list(_leaves(raw))
@@ -264,15 +291,13 @@ def parse(text: str) -> Config:
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{key} = {value}: it must be a finite number")
     try:
-        config = msgspec.convert(raw, Config)
+        return msgspec.convert(raw, Config)
     except msgspec.ValidationError as error:
         raise ConfigError(_explain(str(error), raw)) from error
-    _check(config)
-    return config
 
 
 def _beside(path: Path, config: Config) -> Config:
-    """The configuration with EDS files and certificates where they lie: relative to the configuration file."""
+    """The configuration with what lies relative to its file: EDS files, certificates, and what is in the map's file."""
     drives = config.drives
     for name, drive in zip(NAMES, drives.each, strict=True):
         if drive.eds is not None:
@@ -282,7 +307,15 @@ def _beside(path: Path, config: Config) -> Config:
     if zenoh.tls is not None:
         tls = msgspec.structs.replace(zenoh.tls, directory=str(path.parent / zenoh.tls.directory))
         zenoh = msgspec.structs.replace(zenoh, tls=tls)
-    return msgspec.structs.replace(config, drives=drives, zenoh=zenoh)
+    correction = config.correction
+    if correction.map is not None and correction.as_built is None:
+        file = path.parent / correction.map
+        try:
+            read = as_built.read(file)
+        except ConfigError as error:
+            raise ConfigError(f"correction.map: {error}") from error
+        correction = msgspec.structs.replace(correction, map=str(file), as_built=read)
+    return msgspec.structs.replace(config, drives=drives, zenoh=zenoh, correction=correction)
 
 
 def geometry(table: GeometryTable) -> Geometry:
@@ -296,6 +329,12 @@ def geometry(table: GeometryTable) -> Geometry:
         return Geometry(legs=(first, second, third))
     except ValueError as error:
         raise ConfigError(f"geometry: {error}") from error
+
+
+def corrected_geometry(config: Config) -> Geometry:
+    """Build the robot's geometry with the correction, where it has one. Raises ConfigError."""
+    robot, found = geometry(config.geometry), config.correction.as_built
+    return dataclasses.replace(robot, correction=as_built.correction(found)) if found is not None else robot
 
 
 def _leaves(value: object, key: str = "") -> Iterator[tuple[str, object]]:
@@ -403,9 +442,13 @@ def _check(config: Config) -> None:
     for key, (low, high) in ranges.items():
         if low >= high:
             raise ConfigError(f"{key} = [{low:g}, {high:g}]: the lower limit must be below the upper one")
-    (low, high), margin = platform.phi, config.limits.singularity_margin
+    _check_correction(config, robot)
+    off = corrected_geometry(config).correction
+    x, y, phi = np.zeros(3) if off is None else off.bound  # the legs are told places that far beyond
+    (low, high), margin = (platform.phi[0] - phi, platform.phi[1] + phi), config.limits.singularity_margin
     # On a robot as built the singular angles move with the centre: linearly in x and y, so the corners bound them.
-    centres = [(0.0, 0.0), *itertools.product(platform.x, platform.y)]
+    beside = [(low - more, high + more) for (low, high), more in ((platform.x, x), (platform.y, y))]
+    centres = [(0.0, 0.0), *itertools.product(*beside)]
     for angle in {angle for centre in centres for angle in singular_angles(robot, centre)}:
         if low - margin < angle < high + margin:
             raise ConfigError(
@@ -447,6 +490,21 @@ def _check(config: Config) -> None:
         checks.check(config.drives, required)
     except DriveError as error:
         raise ConfigError(str(error)) from error
+
+
+def _check_correction(config: Config, robot: Geometry) -> None:
+    """Refuse a map that is not this robot's, or that the limits have no room for."""
+    platform, slider, told = config.limits.platform, config.limits.slider, config.correction
+    if told.as_built is None:
+        if told.map is not None:
+            raise ConfigError(f"correction.map = {told.map!r}: a file, which only a configuration in a file can name")
+        return
+    low, high = np.transpose([platform.x, platform.y, platform.phi]).tolist()
+    allowed = as_built.Platform(low, high, platform.velocity, platform.acceleration, platform.jerk)
+    try:
+        as_built.check(told.as_built, robot, allowed, (slider.velocity, slider.acceleration, slider.jerk))
+    except ConfigError as error:
+        raise ConfigError(f"correction.map: {told.map or 'as_built'}: {error}") from error
 
 
 def _check_reach(zenoh: Zenoh) -> None:

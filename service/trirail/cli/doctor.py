@@ -11,6 +11,7 @@ from trirail_drivers.bus.load import HIGH
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
+from trirail import as_built
 from trirail.config import Config
 from trirail.processes.clock import Tick
 from trirail.processes.guard import Guard
@@ -83,6 +84,7 @@ def examine(config: Config, machine: Machine) -> list[Check]:
         isolation(machine.cpu, machine.isolated, simulated=simulated),
         *can_interface(config, machine),
         *protections(config),
+        *corrected(config),
         load(config),
         *network(config, machine),
         lateness(machine.ticks, config),
@@ -141,6 +143,20 @@ def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
     elsewhere = f"loop.cpu = {isolated[0]} is isolated; name it" if isolated else "none is isolated"
     remedy = f"boot with isolcpus={cpu} nohz_full={cpu} and set loop.cpu = {cpu}"
     return Check("processor", "warning", f"{cpu}, shared; {elsewhere}", "" if isolated else remedy)
+
+
+def corrected(config: Config) -> list[Check]:
+    """What as-built errors are corrected by: nobody should have to guess that it is on."""
+    section = config.correction
+    told = as_built.told(section.map, section.as_built, section.backlash)
+    if told is None:
+        return []
+    x, y, phi = told.greatest
+    found = f"{told.file}, measured {told.made}: " if told.file else ""
+    if any(told.greatest):
+        found += f"up to {x * 1e6:.3g} µm in x, {y * 1e6:.3g} µm in y, {phi * 1e3:.3g} mrad; "
+    width = ", ".join(f"{each * 1e6:.3g}" for each in told.backlash)
+    return [Check("correction", "ok", f"{found}backlash of A, B, C {width} µm")]
 
 
 def can_interface(config: Config, machine: Machine) -> list[Check]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from trirail.errors import KinematicsError
 from trirail.kinematics.algebra import Array
+from trirail.kinematics.correction import Correction
 from trirail.kinematics.recursion import Joint, serial_leg
 
 __all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "gains", "singular_angles"]
@@ -55,14 +56,20 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Three legs A, B, C. KinematicsError if a number is not finite or the pose (0, 0, 0) is singular."""
+    """Three legs A, B, C, and what the robot differs from them by, if that is known.
+
+    KinematicsError if a number is not finite or the pose (0, 0, 0) is singular.
+    """
 
     legs: tuple[Leg, Leg, Leg]
+    correction: Correction | None = None
     _packed: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         _check(self)
         packed = np.stack([leg.packed() for leg in self.legs])
+        if self.correction is not None:
+            packed = np.concatenate([packed, self.correction.packed().reshape(-1, *packed.shape[1:])])
         packed.setflags(write=False)
         object.__setattr__(self, "_packed", packed)
 
@@ -91,6 +98,8 @@ class Geometry:
         """Return the three legs as compiled code takes them: float64, shape (3, 4, 13), read-only.
 
         Axes: leg; its three joints and the platform's centre; the columns described in trirail.kinematics.recursion.
+        Where there is a correction it follows, in as many more rows of the first axis as it takes: one array, since
+        each further one would cost every call a microsecond.
         """
         return self._packed
 

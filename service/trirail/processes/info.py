@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 from trirail_drivers.interface import NAMES
 
+from trirail import as_built
 from trirail.config import Config, geometry
 from trirail.telemetry.provenance import software, versions
 from trirail.wire.state import Info
@@ -31,4 +32,5 @@ def info(config: Config) -> Info:
         live=f"rerun+http://127.0.0.1:{live}/proxy" if live else "",
         homes=tuple(name for name, drive in zip(NAMES, config.drives.each, strict=True) if drive.homing is not None),
         versions=versions(),
+        correction=as_built.told(config.correction.map, config.correction.as_built, config.correction.backlash),
     )

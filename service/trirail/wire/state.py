@@ -140,6 +140,19 @@ class State(Struct, frozen=True):
     certificate expires soon."""
 
 
+class CorrectionTold(Struct, frozen=True):
+    """What the robot's as-built errors are corrected by."""
+
+    file: str
+    """The map's; "" for none."""
+    made: str
+    """When the robot was measured for it; "" for none."""
+    greatest: Triple
+    """The greatest correction in x, y [m] and phi [rad]."""
+    backlash: Triple
+    """Of the sliders A, B, C, as it is taken up [m]."""
+
+
 class Info(Struct, frozen=True):
     """What a client needs to know the robot: answered on …/info."""
 
@@ -167,3 +180,5 @@ class Info(Struct, frozen=True):
     """Of Python and the libraries that matter, by name."""
     missing_protections: tuple[MissingProtection, ...] = ()
     """What the drives do without; none where they have all."""
+    correction: CorrectionTold | None = None
+    """Of as-built errors; None where the robot is taken for its geometry."""
