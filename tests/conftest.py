@@ -7,6 +7,7 @@ import heapq
 import itertools
 import math
 import os
+import tempfile
 import tracemalloc
 from collections.abc import Callable, Iterator
 from typing import cast
@@ -33,6 +34,9 @@ from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedDrive
 
 CONFIG = load(SIM)
+
+_STATE = tempfile.TemporaryDirectory(prefix="trirail-tests-")
+os.environ["STATE_DIRECTORY"] = _STATE.name  # the poses that somebody has taught on this machine are no test's
 
 # How fast this machine is, or how many random robots are thrown away, says nothing of the code. What decides whether
 # a change lands tries the same examples every time; by hand they are new ones at every run.

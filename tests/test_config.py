@@ -13,7 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec import Meta, Struct
 from msgspec.structs import fields
-from trirail.config import SIM, Config, load, parse
+from trirail.config import SIM, Config, load, metrics_url, parse
 from trirail.errors import ConfigError
 from trirail.telemetry import provenance
 from trirail.wire.messages import PoseGoal
@@ -405,6 +405,30 @@ def test_every_number_has_a_floor_and_a_ceiling() -> None:
 def test_an_open_door_is_taken_where_it_is_written_out() -> None:
     config = parse(TEXT.replace(LISTEN, 'listen = ["tcp/0.0.0.0:7447"]\ninsecure = true'))
     assert config.zenoh.insecure
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0", "::", "192.0.2.7"])
+def test_metrics_are_open_to_a_network_only_on_purpose(address: str) -> None:
+    metrics = f'[telemetry]\nmetrics_port = 9464\nmetrics_address = "{address}"'
+    with pytest.raises(ConfigError, match=r"whoever reaches it could read them"):
+        parse(TEXT.replace("[telemetry]", metrics))
+    insecure = TEXT.replace(LISTEN, f"{LISTEN}\ninsecure = true").replace("[telemetry]", metrics)
+    assert metrics_url(parse(insecure)).startswith("http://")
+    certified = TEXT.replace(LISTEN, 'listen = ["tls/0.0.0.0:7447"]\n[zenoh.tls]').replace("[telemetry]", metrics)
+    assert metrics_url(parse(certified)).startswith("https://")
+
+
+@pytest.mark.parametrize("address", ["localhost", "", "1.2.3", "127.0.0.1:80"])
+def test_an_address_of_the_metrics_that_is_none_is_refused(address: str) -> None:
+    with pytest.raises(ConfigError, match=r"telemetry\.metrics_address"):
+        parse(TEXT.replace("[telemetry]", f'[telemetry]\nmetrics_address = "{address}"'))
+
+
+def test_metrics_of_this_machine_alone_need_no_certificate() -> None:
+    for address in ("127.0.0.1", "::1"):
+        given = parse(TEXT.replace("[telemetry]", f'[telemetry]\nmetrics_port = 9464\nmetrics_address = "{address}"'))
+        assert metrics_url(given).startswith("http://")
+    assert metrics_url(parse(TEXT)) == ""
 
 
 def test_certificates_are_looked_for_beside_the_configuration(tmp_path: Path) -> None:

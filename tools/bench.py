@@ -39,11 +39,27 @@ def settle(*, goals: int = 100, json: bool = False) -> None:
 
 
 @app.command
+def fairness(*, goals: int = 1000, json: bool = False) -> None:
+    """Time until one user's goals and stops are answered, quiet and while another floods, and the ratio of the two."""
+    import bench_fairness
+
+    bench_fairness.main(goals, json)
+
+
+@app.command
 def frames(*, cycles: int = 3000, json: bool = False) -> None:
     """Time one cycle's frames by python-can, and on the bus's own socket."""
     import bench_frames
 
     bench_frames.main(cycles, json)
+
+
+@app.command
+def machine(*, period: float = 0.001, cycles: int = 3000, json: bool = False) -> None:
+    """Time the same work hot and cold, once in a period: what of a cycle's cost is the machine's."""
+    import bench_machine
+
+    bench_machine.main(period, cycles, json)
 
 
 @app.command

@@ -13,6 +13,8 @@ Results = dict[str, Any]
 """What each measurement gave, by its name."""
 
 COMMANDS = {
+    "fairness": ("--goals", "400"),
+    "machine": (),
     "frames": (),
     "kinematics": (),
     "planning": (),
@@ -24,6 +26,8 @@ COMMANDS = {
 }
 """The measurements, with what they take: together under ten minutes."""
 BRIEF = {
+    "fairness": ("--goals", "20"),
+    "machine": ("--cycles", "200"),
     "frames": ("--cycles", "50"),
     "latency": ("--goals", "3"),
     "loop": ("--rates", "1000", "--seconds", "2", "--runs", "1"),
@@ -88,6 +92,12 @@ AIMS = (
         (5.0, 7.0),
         lambda results: tuple(results["latency"]["in_motion_ms"][:2]),
     ),
+    Aim(
+        "answer under another's flood to quiet, p99 of goals / of stops",
+        "59 / 6.2",
+        (2.0, 2.0),
+        lambda results: (results["fairness"]["goal_p99_ratio"], results["fairness"]["stop_p99_ratio"]),
+    ),
     Aim("frames of one cycle, p50 [µs]", "43", (10.0,), lambda results: (results["frames"]["socket_us"]["p50"],)),
     Aim("planning a pose goal, p99 [ms]", "0.35 to 0.9, in the loop", (5.0,), _planner),
 )
@@ -138,6 +148,14 @@ def _show(results: Results) -> None:
     for row in results["aims"]:
         measured, aim = (" / ".join(f"{value:.4g}" for value in row[key]) for key in ("measured", "aim"))
         print(f"{row['name']:68}{row['before']:>26}{measured:>26}{aim:>20}   {'yes' if row['met'] else 'NO'}")
+    if "machine" in results:
+        took = {name: results["machine"][name] for name in ("arithmetic", "send_that_wakes", "send_after_it")}
+        cold = took["arithmetic"]["cold"][0] / took["arithmetic"]["hot"][0]
+        wakes, hot = took["send_that_wakes"]["cold"][0], took["send_after_it"]["hot"][0]
+        print(
+            f"the machine: arithmetic once a millisecond takes {cold:.1f} times what it takes hot, "
+            f"a send that wakes its receiver {wakes:.0f} µs instead of {hot:.1f}"
+        )
     if "settle" in results:
         print("settling, p50 / p99 / max [ms]: " + " / ".join(f"{ms:.0f}" for ms in results["settle"]["settle_ms"]))
     if "peers" in results:

@@ -3,8 +3,8 @@
 The service runs as a user runs it, with gateway, recorder and a client that watches every cycle, while goals come
 without pause. cyclictest runs in the same minute on the same processor, one priority above the loop, in as many runs as
 lateness is compared in. The simulated drives are a process of their own, real-time on the other processor, so that a
-cycle is the loop's own: faults for their stalls are counted and reset. Where they cannot keep up they are inside, and
-their own share is timed and taken off.
+cycle is the loop's own; where a virtual machine stalls one of the two, the other waits for it. Faults are counted and
+reset. Where the drives cannot keep up they are inside, and their own share is timed and taken off.
 """
 
 from __future__ import annotations

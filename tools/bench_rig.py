@@ -27,9 +27,10 @@ BITRATE = 8_000_000
 class Rig:
     """A running service and a client of it."""
 
-    def __init__(self, robot: Robot, pid: int, bus: str | None) -> None:
+    def __init__(self, robot: Robot, pid: int, bus: str | None, locator: str) -> None:
         self.robot = robot
         self.pid = pid
+        self.locator = locator
         self.bus = bus
         """Path of the bus between processes; None where the drives are inside the loop."""
 
@@ -46,7 +47,7 @@ def rig(rate_hz: int, inside: bool = False) -> Iterator[Rig]:
         service = stack.enter_context(own_service.service(config, folder / "bench.rrd"))
         robot = stack.enter_context(Robot("demo", locator, user="bench"))
         robot.enable()
-        yield Rig(robot, service.pid, bus)
+        yield Rig(robot, service.pid, bus, locator)
         with contextlib.suppress(TrirailError):  # it may be in fault, which is told elsewhere
             robot.disable()
 

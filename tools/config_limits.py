@@ -52,9 +52,19 @@ BOUNDS = (
           "it is killed; a gateway is started again, with the loop the service ends"),
     Bound("Controlled stop when the service ends", ("trirail.processes.loop:SHUTDOWN s",), "the drives' quick stop"),
     Bound("Goals that wait for the one under way", ("motion.queue",), "refused, `queue_full`"),
+    Bound("Unread messages, of one user and of all", ("trirail.processes.inbox:UNREAD_OF_ONE messages",
+          "trirail.processes.inbox:UNREAD messages"), "refused, `busy`; commands at twice as many"),
+    Bound("Messages of one user that are read at once, and then a second", ("trirail.processes.pace:BURST messages",
+          "trirail.processes.pace:RATE messages/s"), "they wait"),
+    Bound("Goals that the loop has not been given yet, of one user and of all",
+          ("trirail.processes.backlog:MOST_OF_ONE goals", "trirail.processes.backlog:MOST goals"), "refused, `busy`"),
+    Bound("Commands under way, of one user and of all", ("trirail.processes.gateway:UNDER_WAY commands",
+          "trirail.processes.gateway:UNDER_WAY_OF_ALL commands"), "refused, `busy`, but for what stops the robot"),
+    Bound("Zenoh sessions", ("trirail.wire.zenoh_session:SESSIONS sessions",), "not opened"),
     Bound("Wait of a goal for those before it", ("trirail.processes.backlog:PATIENCE s",),
           "refused, `stopped`; a goal may have its own, `valid_for`: `expired`"),
     Bound("Renewal of a jog", (), "the robot brakes, `jog_over`"),
+    Bound("Sign of life of who holds the lease", (), "controlled stop, the lease is free"),
     Bound("A command, as the service waits for it", ("trirail.processes.gateway:REPLY_WITHIN s",),
           "error `timeout`; for `home` later by the time-outs of homing"),
     Bound("A command, as the client waits for it", ("trirail.client.client:REPLY_WITHIN s",
@@ -66,7 +76,8 @@ BOUNDS = (
 
 def table(known: set[str]) -> str:
     """Return the table. `known` are the keys of the configuration; KeyError for a place that is not there."""
-    rows = [f"| {what} | {', '.join(_said(place, known) for place in places) or 'each goal, `timeout`'} | {beyond} |"
+    own = "each one its own, `timeout`"
+    rows = [f"| {what} | {', '.join(_said(place, known) for place in places) or own} | {beyond} |"
             for what, places, beyond in BOUNDS]  # fmt: skip
     return "\n".join([INTRODUCTION, "| what is bounded | where | beyond it |", "|---|---|---|", *rows]) + "\n"
 

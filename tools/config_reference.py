@@ -128,6 +128,14 @@ def reference() -> str:
                 for name, values, default, text in keys(kind)]  # fmt: skip
         table = ["", "| key | value | default | meaning |", "|---|---|---|---|", *rows] if rows else []
         parts.append("\n".join([f"## {title}", *(["", doc[0].upper() + doc[1:]] if doc else []), *table]) + "\n")
+    for name, values, _, text in keys(Config):  # a table whose keys are names
+        rows = [
+            "",
+            "| key | value | default | meaning |",
+            "|---|---|---|---|",
+            f"| any name | {values.removeprefix('table of ')} | | |",
+        ]
+        parts.append("\n".join([f"## `[{name}]`, may be absent", "", text, *rows]) + "\n")
     return "\n".join(parts)
 
 

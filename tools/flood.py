@@ -1,8 +1,9 @@
 """A service among strangers: junk of every kind, for so many seconds, on every port it has; does it hold?
 
 Two hundred client sessions send what cannot be read, twenty subscribe and never read, and TCP connections stay
-half open on the Zenoh port and on Rerun's. Meanwhile a user moves the robot and stops it. Afterwards the same processes
-must live, the robot must move to a goal, and what memory and log have grown by must be bounded.
+half open on the Zenoh port, on Rerun's and on that of the operator's page. Meanwhile a user moves the robot and stops
+it. Afterwards the same processes must live, the robot must move to a goal, the page must be served, and what memory and
+log have grown by must be bounded.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ import multiprocessing
 import os
 import random
 import socket
+import subprocess
 import sys
 import tempfile
 import threading
 import time
+import urllib.parse
+import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
@@ -31,6 +35,7 @@ import zenoh
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import RefusedError, ServiceError, TrirailError
+from trirail.processes.interpreter import python
 from trirail.telemetry.sinks import free_port
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE
@@ -47,7 +52,8 @@ GREATEST_MB = 900.0
 """What no process of the service may be beyond [1e6 bytes]."""
 SAMPLES = 10
 """How often the memory is looked at meanwhile."""
-LOG_BYTES = 100_000
+LOG_BYTES, LOG_BYTES_A_SECOND = 100_000, 300
+"""What may be written: a burst of lines, and then one or two a second."""
 STOP_WITHIN = 5.0
 """How long a stop may take to be answered on a machine that the flood keeps busy [s]."""
 
@@ -216,7 +222,7 @@ def sampled(pids: dict[str, int], every: float) -> Iterator[list[dict[str, float
 
 
 @contextlib.contextmanager
-def private_service(folder: Path) -> Iterator[tuple[own_service.Process, str, tuple[int, int]]]:
+def private_service(folder: Path) -> Iterator[tuple[own_service.Process, str, tuple[int, ...]]]:
     """Run a service on TCP ports of its own; give its process, its locator and the ports."""
     zenoh_port, live_port = free_port(), free_port()
     config, private = own_service.private(folder, live_port)
@@ -224,6 +230,18 @@ def private_service(folder: Path) -> Iterator[tuple[own_service.Process, str, tu
     config.write_text(config.read_text().replace(private, locator))
     with own_service.service(config, folder / "flood.rrd") as process:
         yield process, locator, (zenoh_port, live_port)
+
+
+@contextlib.contextmanager
+def operators_page(locator: str) -> Iterator[str]:
+    """Serve the operator's page by a process of its own; give its address."""
+    command = python("-m", "trirail", "panel", "--port", "0", "--robot", "demo", "--connect", locator, "--json")
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            told = process.stdout.readline() if process.stdout else ""
+            yield json.loads(told)["url"]
+        finally:
+            process.terminate()
 
 
 def use(locator: str, seconds: float) -> tuple[int, list[float]]:
@@ -249,15 +267,20 @@ def use(locator: str, seconds: float) -> tuple[int, list[float]]:
 
 def run(seconds: float, rate: float) -> list[str]:
     """Flood a service for so many seconds; print what happened, and return what did not hold."""
-    with tempfile.TemporaryDirectory() as name, private_service(Path(name)) as (service, locator, ports):
+    with (
+        tempfile.TemporaryDirectory() as name,
+        private_service(Path(name)) as (service, locator, ports),
+        operators_page(locator) as page,
+    ):
         pids = processes(service.pid)
+        flooded = (*ports, urllib.parse.urlsplit(page).port or 0)
         with Robot("demo", locator, user="ann") as robot:
             robot.enable()
             before = memory(pids)
             context = multiprocessing.get_context("spawn")
             heard, said = context.Pipe(duplex=False)
             floods = [
-                context.Process(target=_flood, args=(locator, ports, rate, seconds, deaf, said), daemon=True)
+                context.Process(target=_flood, args=(locator, flooded, rate, seconds, deaf, said), daemon=True)
                 for deaf in (False, True)
             ]
             for one in floods:
@@ -273,11 +296,11 @@ def run(seconds: float, rate: float) -> list[str]:
             for process in pids:
                 meanwhile = " ".join(f"{sample[process]:.0f}" for sample in samples)
                 print(f"{process:12}{before[process]:5.0f} MB before, {meanwhile}, {after[process]:.0f} after")
-            return list(_failures(robot, service.pid, pids, after, stops))
+            return [*_failures(robot, service.pid, pids, after, stops, seconds), *_page_failures(page)]
 
 
 def _failures(
-    robot: Robot, service: int, pids: dict[str, int], after: dict[str, float], stops: list[float]
+    robot: Robot, service: int, pids: dict[str, int], after: dict[str, float], stops: list[float], seconds: float
 ) -> Iterator[str]:
     if processes(service) != pids:
         yield f"processes have ended: {pids} before, {processes(service)} after"
@@ -288,7 +311,7 @@ def _failures(
             yield f"the {name} holds {held:.0f} MB"
     size = os.stat(f"/proc/{service}/fd/1").st_size
     print(f"{size} bytes of log")
-    if size > LOG_BYTES:
+    if size > LOG_BYTES + seconds * LOG_BYTES_A_SECOND:
         yield f"the log has {size} bytes"
     try:
         result = robot.move_to(x=0.03, y=0.01, phi=0.1).wait(20.0)
@@ -296,6 +319,15 @@ def _failures(
             yield f"the robot did not move: {result.message}"
     except (TrirailError, TimeoutError) as error:
         yield f"the robot does not move: {error}"
+
+
+def _page_failures(page: str) -> Iterator[str]:
+    try:
+        with urllib.request.urlopen(page, timeout=20.0) as answer:
+            if b"STOP" not in answer.read():
+                yield "the operator's page is another one"
+    except OSError as error:
+        yield f"the operator's page is not served: {error}"
 
 
 def main() -> int:

@@ -21,7 +21,7 @@ FOLDER = Path(messages.__file__).parent / "schemas"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 MESSAGES: dict[str, tuple[Any, str]] = {
-    "goal": (messages.Goal, "What is sent to goal/<user>: a goal of one of the kinds."),
+    "goal": (messages.SentGoal, "What is sent to goal/<user>: a goal of one of the kinds."),
     "goal-reply": (messages.GoalReply, "The reply to a goal that is accepted."),
     **{
         f"command-{name}": (kind, f"The content{', if any,' * (type(None) in get_args(kind))} of cmd/<user>/{name}.")
@@ -33,6 +33,8 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "state": (state.State, "What is published on state."),
     "event": (messages.Event, "What is published on event."),
     "role": (messages.RoleReply, "The reply to a query on role/<user>."),
+    "pose": (state.NamedPose, "The reply to a query on teach/<user>/<name> or forget/<user>/<name>."),
+    "poses": (state.NamedPoses, "The reply to a query on poses."),
     "info": (state.Info, "The reply to a query on info."),
 }
 """By file: the type, and where the message is met."""

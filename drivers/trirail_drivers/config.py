@@ -124,6 +124,8 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     """The node id of the service itself, for its heartbeat on CANopen."""
     heartbeat: Annotated[float, Meta(ge=0.001, le=21.845)] = 0.1
     """Period of everyone's heartbeat [s]; three missed ones are a loss. An ODrive must have been given it."""
+    missed_positions: Annotated[int, Meta(ge=1, le=1000)] = 3
+    """So many cycles in a row without a drive's position are a loss of that drive."""
     following_error: Distance = 0.005
     """The following error window [m]: the drives' own, object 6065h; for ODrives, which have none, the driver's."""
     quick_stop_deceleration: Acceleration = 10.0

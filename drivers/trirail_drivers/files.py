@@ -1,9 +1,10 @@
-"""Files that people name, read and written without waiting: regular ones, no FIFOs, devices or folders."""
+"""Files: those that people name are read without waiting, if they are regular ones; what must last is written whole."""
 
 from __future__ import annotations
 
 import os
 import stat
+import tempfile
 from pathlib import Path
 from typing import BinaryIO
 
@@ -54,9 +55,46 @@ def text(path: Path) -> str:
         raise FileError(f"{path}: not text in UTF-8: {error.reason} at byte {error.start}") from error
 
 
+def replace(path: Path, content: bytes, mode: int = 0o644) -> None:
+    """Write a file such that a crash or a power cut, whenever it comes, leaves the old one or the new one, whole.
+
+    It is written beside its place, where only its owner can read it, and is on the disk before it takes its name; the
+    name is on the disk when this returns. Raises OSError.
+    """
+    descriptor, beside = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # 0600
+    try:
+        with os.fdopen(descriptor, "wb") as written:
+            written.write(content)
+            written.flush()
+            os.fchmod(descriptor, mode)
+            os.fsync(descriptor)
+        os.replace(beside, path)
+    except BaseException:
+        Path(beside).unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it that are missing, such that a power cut does not take them. Raises OSError."""
+    if not folder.is_dir():
+        make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+        _sync_folder(folder.parent)
+
+
 def check(path: Path) -> None:
     """Raise FileError for what is there but is no regular file, OSError where nothing is there."""
     _check(path, os.stat(path))
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the names in a folder on the disk: fsync of a file keeps its content, not its name."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _check(path: Path, found: os.stat_result) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import ipaddress
 import itertools
 import math
 import re
@@ -24,9 +25,9 @@ from trirail_drivers.interface import NAMES
 from trirail import as_built
 from trirail.as_built import AsBuilt
 from trirail.errors import ConfigError
-from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles
-from trirail.wire.endpoints import ReachableBy, reach
-from trirail.wire.vocabulary import Role
+from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles, travels
+from trirail.wire.endpoints import ReachableBy, endpoint_of, is_local, reach
+from trirail.wire.vocabulary import LeasePolicy, Role
 
 _PACKAGED = Path(__file__).parent / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[2] / "configs") / "sim.toml"
@@ -41,6 +42,7 @@ BASE, PLATFORM = "base", "platform"
 FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 UserName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 """The <user> of Zenoh keys."""
+PoseName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Point = tuple[Coordinate, Coordinate]
 Range = tuple[Coordinate, Coordinate]
 
@@ -143,6 +145,15 @@ class MotionTable(Struct, frozen=True, forbid_unknown_fields=True):
     """How many goals may wait for the one under way, where that has a `blend`."""
 
 
+class ControlTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [control]: who may move the robot, beside what his role allows."""
+
+    lease: LeasePolicy = "optional"
+    """Whether the robot moves while nobody holds the lease; while somebody does, it moves for him alone."""
+    takeover: Role = Role.MAINTAINER
+    """The least role that may take the lease over from who holds it."""
+
+
 class FramesTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [frames]: points and frames that goals may name."""
 
@@ -214,6 +225,10 @@ class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     """Loopback port of the live Rerun server; 0 for none."""
     live_mb: Annotated[float, Meta(ge=1.0, le=4096.0)] = 64.0
     """Memory for what viewers that connect late are shown of the past [1e6 bytes]; beyond that the oldest is let go."""
+    metrics_port: Annotated[int, Meta(ge=0, le=65535)] = 0
+    """Port of the metrics for Prometheus, /metrics, and of the processes' health, /healthz; 0 for none."""
+    metrics_address: Name = "127.0.0.1"
+    """The IP address of that port; beyond the loopback it takes [zenoh.tls], and a certificate with a role."""
     capture_can: bool = False
     """Write every CAN frame of the session beside the recording, in candump's log format."""
     rotate_minutes: Annotated[float, Meta(ge=0.01, le=100_000.0)] = 30.0
@@ -250,6 +265,10 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     motion: MotionTable = MotionTable()
     frames: FramesTable = FramesTable()
     correction: CorrectionTable = CorrectionTable()
+    control: ControlTable = ControlTable()
+    poses: dict[PoseName, tuple[Coordinate, Coordinate, Angle]] = {}
+    """Poses by name: x, y [m] of the platform's centre and phi [rad], in the base frame. The others that goals may name
+    are taught, and kept by the service."""
 
     @property
     def period(self) -> float:
@@ -316,6 +335,15 @@ def _beside(path: Path, config: Config) -> Config:
             raise ConfigError(f"correction.map: {error}") from error
         correction = msgspec.structs.replace(correction, map=str(file), as_built=read)
     return msgspec.structs.replace(config, drives=drives, zenoh=zenoh, correction=correction)
+
+
+def metrics_url(config: Config) -> str:
+    """Return where the metrics are; "" where there are none. Beyond the loopback they are encrypted, if anything is."""
+    telemetry = config.telemetry
+    endpoint = endpoint_of(telemetry.metrics_address, telemetry.metrics_port)
+    encrypted = config.zenoh.tls is not None and not is_local(endpoint)
+    where = f"{'https' if encrypted else 'http'}://{endpoint.removeprefix('tcp/')}/metrics"
+    return where if telemetry.metrics_port else ""
 
 
 def geometry(table: GeometryTable) -> Geometry:
@@ -457,6 +485,7 @@ def _check(config: Config) -> None:
                 f"{angle - math.copysign(margin, angle):.4f}"
             )
     _check_reach(config.zenoh)
+    _check_metrics(config)
     settling = config.limits.in_position
     if settling.timeout <= settling.dwell:
         raise ConfigError(
@@ -465,6 +494,7 @@ def _check(config: Config) -> None:
     for name in config.frames.work:
         if name in (BASE, PLATFORM):
             raise ConfigError(f"frames.work.{name}: every robot has a frame of that name; give this one another")
+    _check_poses(config, robot)
     nodes = [config.drives.master_node, *(drive.node for drive in config.drives.each)]
     if len(set(nodes)) < len(nodes):
         raise ConfigError(
@@ -505,6 +535,46 @@ def _check_correction(config: Config, robot: Geometry) -> None:
         as_built.check(told.as_built, robot, allowed, (slider.velocity, slider.acceleration, slider.jerk))
     except ConfigError as error:
         raise ConfigError(f"correction.map: {told.map or 'as_built'}: {error}") from error
+
+
+def _check_poses(config: Config, robot: Geometry) -> None:
+    """Refuse named poses at which the robot cannot be."""
+    platform, slider = config.limits.platform, config.limits.slider
+    for name, pose in config.poses.items():
+        places = [
+            (key, at, key, getattr(platform, key), "platform") for key, at in zip(("x", "y", "phi"), pose, strict=True)
+        ]
+        position, passive = travels(robot, pose).tolist()
+        places += [
+            (f"slider {leg}", at, "position", slider.position, "slider")
+            for leg, at in zip(NAMES, position, strict=True)
+        ]
+        places += [
+            (f"lambda_32 of {leg}", at, "passive", slider.passive, "slider")
+            for leg, at in zip(NAMES, passive, strict=True)
+        ]
+        for what, at, key, (low, high), section in places:
+            if not low <= at <= high:
+                numbers = ", ".join(f"{value:g}" for value in pose)
+                raise ConfigError(
+                    f"poses.{name} = [{numbers}]: {what} would be {at:.6g}, outside of "
+                    f"limits.{section}.{key} = [{low:g}, {high:g}]"
+                )
+
+
+def _check_metrics(config: Config) -> None:
+    """Refuse an address of the metrics that is none, or that lets a network read them by accident."""
+    address, zenoh = config.telemetry.metrics_address, config.zenoh
+    key = f"telemetry.metrics_address = {address!r}"
+    try:
+        loopback = ipaddress.ip_address(address).is_loopback
+    except ValueError as error:
+        raise ConfigError(f"{key}: it must be an IP address, as 127.0.0.1 or ::1") from error
+    if config.telemetry.metrics_port and not loopback and zenoh.tls is None and not zenoh.insecure:
+        raise ConfigError(
+            f"{key}: whoever reaches it could read them: use an address of the loopback, [zenoh.tls] "
+            "(trirail keys init), or write zenoh.insecure = true if that is what you want"
+        )
 
 
 def _check_reach(zenoh: Zenoh) -> None:

@@ -65,6 +65,12 @@ class RefusalCode(StrEnum):
     UNKNOWN_COMMAND = "unknown_command", "no such command", "send one of those that the message names"
     DUPLICATE_ID = "duplicate_id", "the goal's id has been used", "give every goal an id of its own, or none"
     UNKNOWN_FRAME = "unknown_frame", "no tool or frame of that name in [frames]", "use one of those that info tells"
+    UNKNOWN_POSE = "unknown_pose", "no pose of that name", "use one of those that poses tells, or teach it"
+    CONFIGURED_POSE = (
+        "configured_pose",
+        "a pose of [poses] in the configuration, neither to be taught nor removed",
+        "choose another name, or change the configuration",
+    )
 
     # Who sent it.
     NOT_ALLOWED = (
@@ -72,6 +78,10 @@ class RefusalCode(StrEnum):
         "the user's role does not allow it, or he has none",
         "ask for a role that does: [zenoh.users] of the robot's configuration",
     )
+
+    LEASED = "leased", "another user holds the lease", "wait until it is free, or take it over"
+    NO_LEASE = "no_lease", "nobody holds the lease, and this robot moves for its holder alone", "send acquire"
+    LEASE_OVER = "lease_over", "the lease was released, taken over, or kept by no sign of life", "acquire a new one"
 
     # What the robot's mode allows.
     NOT_ENABLED = "not_enabled", "the drives have no power yet", "send enable, and wait for it"

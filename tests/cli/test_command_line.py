@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
+import shutil
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,11 +18,12 @@ import msgspec
 import pytest
 from cyclopts import App
 from trirail.cli import commands, help_pages, terminal, units, view
-from trirail.client import connection
+from trirail.client import client, connection
 from trirail.client.goal import Result
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire.messages import GoalReply
+from trirail.wire.state import NamedPose
 
 Run = Callable[..., tuple[int, str, str]]
 NOBODY = "tcp/127.0.0.1:1"
@@ -188,6 +192,75 @@ def test_the_names_of_robots_are_asked_for_where_the_line_says(monkeypatch: pyte
     code, out, _ = run("__complete", "status", "--connect", "tcp/1.2.3.4:5", "--robot", "")
     assert code == 0
     assert out.splitlines()[-1] == "at-tcp/1.2.3.4:5"
+
+
+class Known:
+    """A robot that knows poses, tools and frames; stands in for the client."""
+
+    def __init__(self, robot: str, connect: str, tls: object) -> None:
+        assert (robot, connect, tls) == ("left", "tcp/1.2.3.4:5", None)
+
+    def __enter__(self) -> Known:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def poses(self) -> dict[str, NamedPose]:
+        return {name: NamedPose(name, 0.0, 0.0, 0.0, taught=name != "park") for name in ("park", "pick", "place")}
+
+    def info(self) -> SimpleNamespace:
+        return SimpleNamespace(frames={"tool": {"camera": [0.02, 0.0]}, "work": {"part": [0.1, 0.0, 0.0]}})
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        ("goto", ["park", "pick", "place"]),
+        ("forget", ["pick", "place"]),
+        ("goto 0 0 0 --tool", ["camera"]),
+        ("move 0 0 0 --tool", ["camera"]),
+        ("goto 0 0 0 --frame", ["base", "part"]),
+        ("move 0 0 0 --frame", ["base", "platform", "part"]),
+    ],
+)
+def test_the_names_that_a_robot_knows_are_completed(
+    monkeypatch: pytest.MonkeyPatch, run: Run, words: str, names: list[str]
+) -> None:
+    monkeypatch.setattr(client, "Robot", Known)
+    command, *rest = words.split()
+    code, out, _ = run("__complete", command, "--robot", "left", "--connect", "tcp/1.2.3.4:5", *rest, "")
+    assert code == 0
+    assert out.splitlines()[-len(names) :] == names
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize("command", ["goto", "forget"])
+def test_each_shell_asks_for_the_names_of_poses(shell: str, command: str, run: Run, tmp_path: Path) -> None:
+    """In the shell itself where there is one: with a program in the place of trirail, that is asked and answers."""
+    if shutil.which(shell) is None:
+        pytest.skip(f"needs {shell}")
+    _, script, _ = run("completion", shell)
+    (tmp_path / f"completion.{shell}").write_text(script)
+    answer = tmp_path / "trirail"
+    answer.write_text("#!/bin/sh\n[ \"$1\" = __complete ] && printf '\\037begin\\nparked\\npicked\\n'\n")
+    answer.chmod(0o755)
+    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        [shell, *NO_START_FILES[shell]],
+        input=COMPLETES[shell].format(file=tmp_path / f"completion.{shell}", line=f"trirail {command} p"),
+        env=environment, capture_output=True, text=True, timeout=30, check=False,
+    )  # fmt: skip
+    assert {"parked", "picked"} <= set(done.stdout.split()), done.stdout + done.stderr
+
+
+NO_START_FILES = {"bash": ["--norc"], "zsh": ["-f"], "fish": ["--no-config"]}
+COMPLETES = {
+    "bash": "source {file}\nCOMP_WORDS=({line})\nCOMP_CWORD=2\n_trirail\necho ${{COMPREPLY[@]}}\n",
+    "fish": "source {file}\ncomplete --do-complete '{line}'\n",
+    # zsh completes in a terminal alone: it is enough that its script asks for what follows the command.
+    "zsh": "grep -A40 'goto)' {file} | grep -q __complete && echo parked picked # {line}\n",
+}
 
 
 class Interrupted:

@@ -49,7 +49,11 @@ def changed(tmp_path: Path) -> Path:
 
 def test_what_is_shipped_is_listed_with_a_line_each(capsys: pytest.CaptureFixture[str], answer: Any) -> None:
     files = answer("config")["files"]
-    assert {str(path.relative_to(SIM.parent)) for path in SHIPPED} | {"trirail.service"} == set(files)
+    assert {str(path.relative_to(SIM.parent)) for path in SHIPPED} | {
+        "trirail.service",
+        "prometheus.yml",
+        "grafana.json",
+    } == set(files)
     assert "drives/elmo_gold.toml" in files
     assert all(len(purpose) > 20 for purpose in files.values())
     assert call("config") == 0
@@ -69,7 +73,7 @@ def test_each_can_be_copied_to_a_file_or_into_a_folder_but_never_over_one(tmp_pa
 
 
 def test_what_cannot_be_copied_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no configuration 'robot' is shipped: there are sim\.toml, "):
+    with pytest.raises(ConfigError, match=r"no configuration 'robot' is shipped: there are .*sim\.toml, "):
         call(f"config copy robot {tmp_path}")
     with pytest.raises(ConfigError, match="No such file or directory"):
         call(f"config copy sim {tmp_path}/nowhere/my.toml")

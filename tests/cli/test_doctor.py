@@ -15,7 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.cli import doctor, probes
 from trirail.cli.doctor import Check, Machine, Passed
-from trirail.config import SIM, Config, load
+from trirail.config import SIM, Config, Tls, load
 from trirail.errors import ServiceError
 from trirail.processes.clock import Tick
 from trirail_drivers.bus.frames import bits_of, frame_bits
@@ -272,3 +272,18 @@ def test_the_command(json_wanted: bool) -> None:
         assert (done.returncode == 0) == said["ok"] == ("failure" not in verdicts.values())
     else:
         assert "simulated: no hardware is used" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("address", "tls", "verdict", "by"),
+    [
+        ("127.0.0.1", False, "ok", "every user of this machine"),
+        ("0.0.0.0", True, "ok", "who has a role, by his certificate,"),
+        ("0.0.0.0", False, "warning", "everybody in the network"),
+    ],
+)
+def test_who_can_read_the_metrics_is_told(address: str, tls: bool, verdict: str, by: str) -> None:
+    config = changed(SIMULATED, "telemetry", metrics_port=9464, metrics_address=address)
+    (check,) = doctor.metrics(changed(config, "zenoh", tls=Tls() if tls else None))
+    assert (check.verdict, check.found) == (verdict, f"tcp/{address}:9464: {by} can read them")
+    assert doctor.metrics(SIMULATED) == []

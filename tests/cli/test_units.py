@@ -132,7 +132,8 @@ def test_what_ik_and_fk_print_is_what_they_take(run: Run) -> None:
         ("goto -- -0.06 0 0 --speed 0.5", "--speed stands behind --"),
         ("goto -- -0.06 0 0 --speed=0.5", "--speed stands behind --"),
         ("goto 0 0 0 --sped 0.5", "Did you mean --speed?"),
-        ("goto 0 0", "PHI requires an argument"),
+        ("goto 0 0", "goto takes X, Y and PHI, or the NAME of a pose"),
+        ("jog 1mm/s 0", "jog takes VX, VY and W, or none of them"),
     ],
 )
 def test_what_is_wrong_is_one_line_that_says_what_would_be_right(line: str, said: str, run: Run) -> None:
@@ -141,3 +142,48 @@ def test_what_is_wrong_is_one_line_that_says_what_would_be_right(line: str, said
     assert said in err
     assert err.count("\n") == 1
     assert err.endswith(f"(trirail {line.split(maxsplit=1)[0]} --help tells the usage)\n")
+
+
+@pytest.mark.parametrize(
+    ("line", "tool"),
+    [
+        ("goto 50mm 0 0 --tool 20mm 0", (0.02, 0.0)),
+        ("goto --tool 20mm 0 50mm 0 0", (0.02, 0.0)),
+        ("goto --tool -20mm -5mm -50mm 0 0", (-0.02, -0.005)),
+        ("goto 0 0 0 --tool 20mm,-1mm --wait", (0.02, -0.001)),
+        ("goto 0 0 0 --tool camera --wait", "camera"),
+        ("goto --tool camera 0 0 0", "camera"),
+        ("goto --tool=camera 0 0 0", "camera"),
+        ("move 0 0 1deg --tool 2nd", "2nd"),
+        ("move 0 0 1deg", None),
+    ],
+)
+def test_a_tool_is_a_point_or_a_name(line: str, tool: object) -> None:
+    _, bound, _ = commands.app.parse_args(units.numbers(line.split()), exit_on_error=False, print_error=False)
+    assert bound.arguments.get("tool") == tool
+    assert len([word for word in bound.args if word != ""]) == 3
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("goto 0 0 0 --tool 0.02", "'0.02' is half a point: U V, as 20mm 0, or a name of [frames.tool]"),
+        ("goto 0 0 0 --tool 20mm,x", "'x' is not a length"),
+        ("goto 0 0 0 --tool a/b", "'a/b' is neither a point, as 20mm 0, nor a name"),
+        ("goto 0 0", "goto takes X, Y and PHI, or the NAME of a pose"),
+        ("goto 0.5", "goto takes X, Y and PHI, or the NAME of a pose"),
+        (
+            "goto pick --tool camera",
+            "goto takes X, Y and PHI, or the NAME of a pose, that knows no --tool and no --frame",
+        ),
+        ("goto pick 0 0", "Invalid value for X: 'pick' is not a length"),
+    ],
+)
+def test_half_a_tool_or_half_a_pose_is_wrong_usage(
+    line: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["trirail", *line.split()])
+    with pytest.raises(SystemExit) as ended:
+        commands.main()
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err

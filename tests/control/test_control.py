@@ -17,9 +17,9 @@ from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState, rest
-from trirail.wire.messages import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.messages import Fault, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, Confirmed, GoalRequest, Refused
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import FaultCause, Mode
 from trirail_drivers.cia402 import frames
 from trirail_drivers.interface import PowerState
 
@@ -224,6 +224,9 @@ def test_an_id_is_used_once(rig: Rig) -> None:
     assert refusal(rig.goal("g1", 0.01, 0.0, 0.0)).code == "duplicate_id"
     rig.until(lambda: rig.mode is Mode.HOLDING)
     assert refusal(rig.goal("g1", 0.01, 0.0, 0.0)).code == "duplicate_id"
+    for order in ("disable", "quick_stop"):  # no goal is taken then; this one has ended all the same, and once
+        rig.command(order)
+        assert refusal(rig.goal("g1", 0.01, 0.0, 0.0)).code == "duplicate_id"
     assert rig.outcomes() == [("g1", "done")]
 
 
@@ -427,6 +430,7 @@ def test_a_following_error(rig: Rig) -> None:
     rig.drives[0].servo.position += 0.0045 * 1e7  # something pushed the slider; the drive itself allows 5 mm
     rig.until(lambda: rig.mode is Mode.FAULT, 3)
     assert_tripped(rig, "slider A: following error")
+    assert Fault(FaultCause.FOLLOWING_ERROR, "A") in [notice.fault for notice in rig.notices]
 
 
 @pytest.mark.parametrize(
@@ -716,3 +720,21 @@ def test_the_target_is_where_the_goal_leads(rig: Rig) -> None:
     assert target == pytest.approx(rig.control.commanded.pose, abs=1e-9)
     rig.send("jog", VelocityGoal(x=0.01, y=0.0, phi=0.0))
     assert rig.control.target is None
+
+
+def test_a_fault_says_what_it_is_about_for_programs(rig: Rig) -> None:
+    rig.enable()
+    rig.order("quick_stop")
+    (said,) = [notice for notice in rig.notices if notice.kind == "fault"]
+    assert said.fault == Fault(FaultCause.QUICK_STOP)
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_a_drives_fault_has_its_name_and_code(rig: Rig, number: int) -> None:
+    rig.enable()
+    rig.drives[number].fail(0x8611)
+    rig.until(lambda: rig.mode is Mode.FAULT)
+    first, *_ = [notice.fault for notice in rig.notices if notice.kind == "fault"]
+    assert first is not None
+    assert (first.drive, first.code) == ("ABC"[number], 0x8611)
+    assert first.cause in ("emcy", "fault")

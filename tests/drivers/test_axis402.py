@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.axis import REGISTER_TIME, Cia402Axis
+from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
@@ -18,12 +20,14 @@ OPERATIONAL, PRE_OPERATIONAL, BOOT_UP = b"\x05", b"\x7f", b"\0"
 WANTED: frames.Wanted = P.OPERATION_ENABLED
 OFF: frames.Wanted = P.SWITCH_ON_DISABLED
 T = 50.0
+EACH = Drive(1, 1e6)
+UNHURRIED = Drives("cia402", EACH, EACH, EACH, heartbeat=100.0)
 COOL = "let it cool down; look at load and air"
 
 
 def made() -> Cia402Axis:
     """A drive that is heard and follows setpoints."""
-    axis = Cia402Axis("B", 2, Scale(-1e6, 0.1), heartbeat=100.0)
+    axis = Cia402Axis("B", 2, Scale(-1e6, 0.1), UNHURRIED)
     axis.on_heartbeat(OPERATIONAL, T)
     axis.on_status(ENABLED, T)
     axis.on_position(frames.POSITION.pack(1000), T)
@@ -62,7 +66,7 @@ def test_a_fault_reset_has_the_time_of_two_statuswords() -> None:
 
 @pytest.mark.parametrize("wanted", [OFF, WANTED, P.QUICK_STOP_ACTIVE])
 def test_a_fault_from_before_the_start_is_told_and_left_alone_until_it_is_to_be_reset(wanted: frames.Wanted) -> None:
-    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), heartbeat=100.0)
+    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), UNHURRIED)
     axis.on_heartbeat(OPERATIONAL, T)
     axis.on_status(FAULT, T)
     assert axis.fault(T, wanted) == ("B", "fault", 0, "drive B: fault")
@@ -106,7 +110,7 @@ def test_a_drive_that_has_left_its_fault_has_no_code_of_it() -> None:
 
 @pytest.mark.parametrize("told_by", ["heartbeat", "position"])
 def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -> None:
-    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), heartbeat=100.0)
+    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), UNHURRIED)
     axis.on_status(ENABLED, T)
     axis.on_heartbeat(PRE_OPERATIONAL, T)  # from before it was started
     assert axis.fault(T, WANTED) is None
@@ -190,3 +194,17 @@ def test_what_is_no_state_of_cia_402_is_a_fault() -> None:
     assert axis.fault(T, WANTED) == ("B", "state", 0, "drive B: statusword 002A is that of no CiA 402 state")
     assert state_of(axis) is P.OPERATION_ENABLED
     assert axis.heard < math.inf
+
+
+@pytest.mark.parametrize("most", [1, 3, 40])
+def test_as_many_positions_may_be_missed_as_the_configuration_says(most: int) -> None:
+    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), msgspec.structs.replace(UNHURRIED, missed_positions=most))
+    axis.on_heartbeat(OPERATIONAL, T)
+    axis.on_status(ENABLED, T)
+    for cycle in range(most + 1):
+        assert axis.fault(T, WANTED) is None, cycle
+        axis.answers.sync_sent()
+        if cycle == 0:
+            axis.on_position(frames.POSITION.pack(1000), T)
+        axis.answers.read_over()
+    assert axis.fault(T, WANTED) == ("B", "silent", 0, f"drive B: no position for {most} cycles in a row")

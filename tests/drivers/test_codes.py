@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.codes import words
 from trirail_drivers.cia402.frames import EMERGENCY
+from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import LONGEST
 from trirail_drivers.odrive import codes as odrive
@@ -49,7 +50,8 @@ def test_every_class_that_the_canopen_library_knows_is_known(code: int) -> None:
 
 @given(st.integers(0x0100, 0xFFFF), st.integers(0, 0xFF), st.binary(min_size=5, max_size=5))
 def test_a_drives_emergency_is_one_line_whatever_its_code(code: int, register: int, more: bytes) -> None:
-    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), heartbeat=100.0)
+    each = Drive(1, 1e6)
+    axis = Cia402Axis("B", 2, Scale(1e6, 0.0), Drives("cia402", each, each, each))
     axis.on_emergency(EMERGENCY.pack(code, register, more), 0.0)
     assert axis.event is not None
     said = axis.event.message

@@ -22,7 +22,7 @@ from trirail.processes.guard import Guard
 from trirail.processes.inbox import Incoming, Kind
 from trirail.wire import boundary, links, packets, text, zenoh_session
 from trirail.wire.links import Port, TooLarge
-from trirail.wire.messages import CommandReply, Event, Goal, Override, PoseGoal, Stop, TrajectoryGoal
+from trirail.wire.messages import CommandReply, Event, Goal, Override, PoseGoal, SentGoal, Stop, TrajectoryGoal
 from trirail.wire.messages import TrajectoryPoint as Point
 from trirail.wire.packets import Accepted, GoalRequest, Happened, RefusedRequest
 from trirail.wire.records import DTYPE, SIZE
@@ -30,7 +30,7 @@ from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_PACKET, MAX_POINTS
 from trirail.wire.state import Info, State
 from trirail.wire.vocabulary import Mode
 
-KINDS: tuple[Any, ...] = (Goal, Stop | None, Override, State, Event, Info, CommandReply)
+KINDS: tuple[Any, ...] = (SentGoal, Stop | None, Override, State, Event, Info, CommandReply)
 ENCODINGS = ("", "zenoh/bytes", "application/json;v=1", boundary.JSON, boundary.MSGPACK)
 OPENINGS = (b"[", b'{"a":', b'{"kind":', b"\x91", b"\x81\xa1a")
 NUMBERS = ("x", "y", "phi", "speed", "timeout", "blend", "valid_for", "stretch", "z")
@@ -42,7 +42,7 @@ values = st.recursive(
     lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=20), inner, max_size=5),
 )
 goals = st.fixed_dictionaries(
-    {"kind": st.sampled_from(("pose", "sliders", "velocity", "trajectory", "dance"))},
+    {"kind": st.sampled_from(("pose", "named", "sliders", "velocity", "trajectory", "dance"))},
     optional=dict.fromkeys(
         ("x", "y", "phi", "speed", "timeout", "blend", "valid_for", "stretch", "z"), numbers | values
     )
@@ -51,6 +51,7 @@ goals = st.fixed_dictionaries(
         "limits": st.dictionaries(st.sampled_from(("velocity", "jerk")), st.lists(numbers, max_size=4)),
         "points": st.lists(st.fixed_dictionaries(dict.fromkeys(("t", "x", "y", "phi"), numbers)), max_size=3),
         "id": st.text(max_size=70),
+        "name": st.text(max_size=70) | st.sampled_from(("pick", "nowhere")),
     },
 )
 
@@ -72,7 +73,10 @@ payloads = (
     )
 )
 keys = st.text(max_size=60) | st.lists(
-    st.sampled_from(("trirail", "demo", "goal", "cmd", "eve", "stop", "*", "**", "", "$*", "a b", "x" * 65)), max_size=7
+    st.sampled_from(
+        ("trirail", "demo", "goal", "cmd", "teach", "forget", "eve", "stop", "*", "**", "", "$*", "a b", "x" * 65)
+    ),
+    max_size=7,
 ).map("/".join)
 
 
@@ -176,7 +180,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gateway,
 
 
 @given(
-    kind=st.sampled_from(("goal", "cmd", "info", "role")),
+    kind=st.sampled_from(("goal", "cmd", "info", "role", "poses", "teach", "forget")),
     key=keys,
     payload=payloads,
     encoding=st.sampled_from(ENCODINGS),

@@ -11,13 +11,24 @@ from typing import cast
 
 import msgspec
 from trirail.client.client import GoalHandle, Result, Robot
+from trirail.client.lease import Lease
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse
 from trirail.processes.info import info
 from trirail.wire.messages import CommandReply, Event, Goal, VelocityGoal
-from trirail.wire.state import Commanded, FrameCounts, GoalState, Info, LoopState, Percentiles, Sliders, State
+from trirail.wire.state import (
+    Commanded,
+    FrameCounts,
+    GoalState,
+    Info,
+    LoopState,
+    NamedPose,
+    Percentiles,
+    Sliders,
+    State,
+)
 from trirail.wire.vocabulary import Command
 from trirail_drivers.interface import Triple
 
@@ -40,6 +51,9 @@ class FakeRobot:
         self.goal: GoalState | None = None
         self.faults: tuple[str, ...] = ()
         self.share = 1.0
+        self.holder: str | None = None
+        self.named = {"park": (0.0, 0.05, 0.0)}
+        self.gone_to: list[str] = []
         self.sent: list[VelocityGoal] = []
         self.commands: list[str] = []
         self.refusal: RefusedError | None = None
@@ -83,7 +97,19 @@ class FakeRobot:
             self.goal = GoalState(goal_id, 0.0, 0.0)
             return self._handles.setdefault(goal_id, GoalHandle(goal_id, self.robot().command))
 
-    def command(self, name: str) -> CommandReply:
+    def poses(self) -> dict[str, NamedPose]:
+        return {name: NamedPose(name, *pose, taught=name != "park") for name, pose in self.named.items()}
+
+    def move_to_named(self, name: str) -> GoalHandle:
+        if name not in self.named:
+            raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {name!r}")
+        self.gone_to.append(name)
+        return GoalHandle(name, self.robot().command)
+
+    def lease(self) -> Lease:
+        return Lease(self.command, force=False, timeout=0.2)
+
+    def command(self, name: str, _content: bytes = b"") -> CommandReply:
         with self._lock:
             self.commands.append(name)
         if name in self._hanging:
@@ -96,6 +122,7 @@ class FakeRobot:
                 self._stand("stopped", "stop of ann")
             self.mode = {"enable": "holding", "disable": "disabled", "reset": "disabled"}.get(name, self.mode)
             self.faults = () if name == "reset" else self.faults
+            self.holder = {"acquire": self.user, "release": None}.get(name, self.holder)
             return CommandReply(name, self.mode)
 
     def stop(self) -> None:
@@ -172,6 +199,7 @@ class FakeRobot:
             faults=self.faults,
             loop=LOOP,
             settled=True,
+            lease=self.holder,
         )
 
     def _advance(self) -> None:

@@ -7,6 +7,7 @@ import logging
 import re
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -172,6 +173,34 @@ def test_what_is_no_message_is_refused_and_the_tab_goes_on(panel: Panel, message
         while not said or "done" not in said[-1]:
             said.append(str(opened.recv(10.0)))
     assert any("not a message of this page" in text for text in said)
+
+
+@pytest.mark.parametrize("end", ["released", "closed"])
+def test_a_tab_keeps_the_lease_while_it_is_open_and_no_longer(end: str) -> None:
+    robot = FakeRobot()
+    with Panel(robot.robot(), 0) as panel, connect(socket_of(panel), legacy=True) as opened:
+
+        def done(name: str) -> None:
+            opened.send(f'{{"do": "command", "name": "{name}"}}')
+            while f'"done","to":"{name}"' not in (said := str(opened.recv(10.0))):
+                assert "refused" not in said
+
+        done("acquire")
+        deadline = time.monotonic() + 20.0
+        while robot.commands.count("acquire") < 4:  # signs of life, by nobody at the page
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        assert "release" not in robot.commands
+        if end == "released":
+            done("release")
+        else:
+            opened.close()
+        while "release" not in robot.commands:
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        signs = robot.commands.count("acquire")
+        assert robot.holder is None
+    assert robot.commands.count("acquire") == signs
 
 
 @pytest.mark.parametrize("end", ["cut off", "too large", "closed"])

@@ -284,6 +284,27 @@ def test_the_override_is_shown_and_set(enabled: Page, robot: FakeRobot) -> None:
     enabled.until("document.querySelector('#override').value === '80'")
 
 
+def test_named_poses_are_buttons_that_come_and_go_with_them(enabled: Page, robot: FakeRobot) -> None:
+    names = "JSON.stringify([...document.querySelectorAll('#poses button')].map((button) => button.textContent))"
+    enabled.until(f"{names} === '[\"park\"]'")
+    robot.named["pick"] = (0.0, 0.0, 0.0)
+    robot.say("pose pick taught by bob", kind="pose")
+    enabled.until(f'{names} === \'["park","pick"]\'')
+    enabled.click("#poses button:last-child")
+    enabled.until("document.querySelector('#answer').textContent === 'go to pick: on its way'")
+    assert robot.gone_to == ["pick"]
+    robot.named.clear()  # and nobody is told
+    enabled.click("#poses button:first-child")
+    enabled.until("document.querySelector('#answer').textContent === \"go to park: no pose 'park'\"")
+    robot.say("pose park removed by bob", kind="pose")
+    enabled.until("document.querySelector('#poses-part').hidden")
+    robot.named["<b>"] = (0.0, 0.0, 0.0)  # whatever a service says, it is a name and no page
+    robot.say("pose <b> taught by bob", kind="pose")
+    enabled.until(f"{names} === '[\"<b>\"]'")
+    robot.command("disable")
+    enabled.until("document.querySelector('#poses button').disabled")
+
+
 def test_only_a_robot_that_homes_has_the_button(page: Page, browser: Page) -> None:
     assert page.evaluate("document.querySelector('[data-command=home]').hidden")
     homing = FakeRobot(homes=("A", "C"))

@@ -23,12 +23,13 @@ MESSAGES = ("put", "delete", "query", "reply", "declare_subscriber", "declare_qu
 FLOWS = ("ingress", "egress")
 
 PUBLISHED = {"state", "event", "records"}
-OPERATORS = {"enable", "disable", "quick_stop", "pause", "resume", "override"}
+OPERATORS = {"enable", "disable", "quick_stop", "pause", "resume", "override", "acquire", "release"}
 MAINTAINERS = {"reset", "home"}
 
 KEYS = [
     *PUBLISHED, "info", "alive", "role/ME", "role/bob", "goal/ME", "goal/bob", "goal/*",
     *(f"cmd/{who}/{name}" for who in ("ME", "bob", "*") for name in Command), "cmd/ME/dance", "cmd/*/*", "role/*",
+    "poses", *(f"{what}/{who}/pick" for what in ("teach", "forget") for who in ("ME", "bob", "*")), "teach/*/*",
     "event/@adv/pub/1/2/_", "nothing", "../other/state", "../../elsewhere", "../../@/1/peer/config",
 ]  # fmt: skip
 """Below trirail/demo; ME is the user."""
@@ -42,20 +43,22 @@ def allowed(role: Role | None, flow: str, message: str) -> set[str]:
         ({"cmd/ME/stop"} if asking else set())
         | ({f"cmd/ME/{name}" for name in OPERATORS} | {"goal/ME"} if sends else set())
         | ({f"cmd/ME/{name}" for name in MAINTAINERS} if role is Role.MAINTAINER else set())
+        | ({"teach/ME/pick", "forget/ME/pick"} if role is Role.MAINTAINER else set())
     )
     roles = {"role/ME", "role/bob", "role/*"}
-    of_all = {key for key in KEYS if key.split("/")[0] in ("goal", "cmd") and key != "cmd/ME/dance"} | {"cmd/ME/dance"}
+    of_all = {key for key in KEYS if key.split("/")[0] in ("goal", "cmd", "teach", "forget")}
+    told = {"info", "poses"}
     adv = {"event/@adv/pub/1/2/_"}
     table: dict[tuple[str, str], set[str]] = {
-        ("ingress", "query"): roles | (mine | {"info"} | adv if seeing else set()),
+        ("ingress", "query"): roles | (mine | told | adv if seeing else set()),
         ("ingress", "put"): {"goal/ME"} if sends else set(),
         ("ingress", "declare_subscriber"): PUBLISHED | adv if seeing else set(),
         ("ingress", "liveliness_query"): {"alive"} | adv if seeing else set(),
         ("ingress", "declare_liveliness_subscriber"): {"alive"} | adv if seeing else set(),
         ("egress", "put"): PUBLISHED | adv if seeing else set(),
-        ("egress", "reply"): roles | (of_all | {"info", "alive"} | PUBLISHED | adv if seeing else set()),
+        ("egress", "reply"): roles | (of_all | told | {"alive"} | PUBLISHED | adv if seeing else set()),
         ("egress", "declare_subscriber"): {"goal/ME", "goal/bob", "goal/*"} if seeing else set(),
-        ("egress", "declare_queryable"): roles | (of_all | {"info"} | adv if seeing else set()),
+        ("egress", "declare_queryable"): roles | (of_all | told | adv if seeing else set()),
         ("egress", "liveliness_token"): {"alive"} | adv if seeing else set(),
     }
     return table.get((flow, message), set())

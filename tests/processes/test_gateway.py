@@ -12,14 +12,25 @@ from pathlib import Path
 
 import pytest
 from conftest import CONFIG
-from trirail.processes.backlog import PATIENCE
-from trirail.processes.gateway import UNDER_WAY, Gateway
+from trirail.processes.backlog import MOST_OF_ONE, PATIENCE
+from trirail.processes.gateway import AHEAD, AHEAD_OF_ALL, REFUSALS_PER_SECOND, UNDER_WAY, Gateway
 from trirail.processes.guard import Guard
 from trirail.processes.inbox import Incoming
 from trirail.wire import boundary, packets, zenoh_session
-from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, RefusedRequest, Request, Welcome
+from trirail.wire.messages import Event
+from trirail.wire.packets import (
+    Accepted,
+    CommandRequest,
+    Confirmed,
+    GoalRequest,
+    Happened,
+    RefusedRequest,
+    Request,
+    Status,
+    Welcome,
+)
 from trirail.wire.state import Info
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import Command, Role
 from trirail_drivers.interface import MissingProtection
 
 
@@ -44,13 +55,22 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         yield Gateway(CONFIG, link, lambda: None, opened, Guard(CONFIG)), link  # type: ignore[arg-type]
 
 
-def goal(gateway: Gateway, name: str) -> None:
+def goal(gateway: Gateway, name: str, user: str = "ann", number: int = 0) -> None:
     content = json.dumps({"kind": "pose", "x": 0, "y": 0, "phi": 0, "id": name}).encode()
-    gateway._handle(Incoming("goal", "trirail/demo/goal/ann", len(content), content, "", None))
+    gateway._handle(Incoming("goal", f"trirail/demo/goal/{user}", len(content), content, "", None, number))
 
 
-def command(gateway: Gateway, name: str, content: bytes = b"") -> None:
-    gateway._handle(Incoming("cmd", f"trirail/demo/cmd/ann/{name}", len(content), content, "", None))
+def command(gateway: Gateway, name: str, content: bytes = b"", user: str = "ann", number: int = 0) -> None:
+    gateway._handle(Incoming("cmd", f"trirail/demo/cmd/{user}/{name}", len(content), content, "", None, number))
+
+
+def passed(link: FakeLink) -> list[tuple[str, str | None]]:
+    """The goals that the loop was given, and why they are not to begin."""
+    return [(request.id, request.withdrawn) for request in link.sent if isinstance(request, GoalRequest)]
+
+
+def accepted(gateway: Gateway, ticket: int) -> None:
+    gateway._hear(packets.message(Accepted(ticket, "g", 1.0, 1.0, False, False)), lambda: None)
 
 
 @pytest.mark.parametrize("name", Command)
@@ -72,7 +92,7 @@ def test_what_a_command_does_not_take_is_refused_with_what_it_takes(rig: Rig, na
 def test_a_command_that_there_is_not_is_refused_with_those_that_there_are(rig: Rig) -> None:
     gateway, link = rig
     command(gateway, "dance")
-    names = "enable, disable, stop, quick_stop, reset, home, pause, resume, override"
+    names = "enable, disable, stop, quick_stop, reset, home, pause, resume, override, acquire, release"
     assert link.sent == [RefusedRequest("ann", f"dance: no such command; there are {names}")]
 
 
@@ -107,6 +127,97 @@ def test_many_commands_are_refused_but_never_a_stop(rig: Rig) -> None:
     last = link.sent[-1]
     assert isinstance(last, CommandRequest)
     assert last.name == "reset"
+
+
+def test_users_take_turns_at_the_loop(rig: Rig) -> None:
+    gateway, link = rig
+    for number in range(4):
+        goal(gateway, f"e{number}", "eve")
+    goal(gateway, "a", "ann")
+    assert [name for name, _ in passed(link)] == ["e0", "e1", "a"]  # two of each at most
+    accepted(gateway, 1)
+    assert [name for name, _ in passed(link)] == ["e0", "e1", "a", "e2"]
+
+
+def test_what_the_loop_has_at_once_is_bounded_for_all_users_together(rig: Rig) -> None:
+    gateway, link = rig
+    for number in range(40):
+        goal(gateway, f"g{number}", f"u{number % 20}")
+    assert len(passed(link)) == AHEAD_OF_ALL
+    for ticket in range(1, 41):
+        accepted(gateway, ticket)
+    assert sorted(name for name, _ in passed(link)) == sorted(f"g{number}" for number in range(40))
+
+
+def test_goals_of_one_who_floods_are_refused_and_nobody_elses(rig: Rig) -> None:
+    gateway, link = rig
+    for number in range(AHEAD + MOST_OF_ONE + 3):
+        goal(gateway, f"e{number}", "eve")
+    goal(gateway, "a", "ann")
+    refused = [said for said in link.sent if isinstance(said, RefusedRequest)]
+    assert refused == [RefusedRequest("eve", f"{MOST_OF_ONE} goals of eve are waiting already: send fewer")] * 3
+    assert passed(link)[-1] == ("a", None)
+
+
+def test_a_stop_that_overtook_goals_withdraws_them_and_none_that_came_later(rig: Rig) -> None:
+    gateway, link = rig
+    command(gateway, "stop", number=5)
+    for number, user in ((3, "ann"), (4, "bob"), (6, "ann"), (7, "eve")):
+        goal(gateway, f"g{number}", user, number)
+    assert passed(link) == [("g3", "stop by ann"), ("g4", "stop by ann"), ("g6", None), ("g7", None)]
+
+
+def test_what_waits_for_the_loop_does_not_begin_under_anothers_lease(rig: Rig) -> None:
+    gateway, link = rig
+    for number in range(AHEAD + 1):
+        goal(gateway, f"a{number}", "ann")
+        goal(gateway, f"b{number}", "bob")
+    event = Event(1, 0.0, 1, 0.0, "lease", "info", "lease acquired by bob", user="bob")
+    gateway._hear(packets.message(Happened(event)), lambda: None)
+    for ticket in range(1, 2 * AHEAD + 1):
+        accepted(gateway, ticket)
+    assert passed(link)[2 * AHEAD :] == [(f"a{AHEAD}", "lease acquired by bob"), (f"b{AHEAD}", None)]
+
+
+@pytest.mark.parametrize(("holder", "withdrawn"), [(None, True), ("ann", True), ("bob", False)])
+def test_goals_that_wait_are_withdrawn_by_a_pause_of_who_may(rig: Rig, holder: str | None, withdrawn: bool) -> None:
+    gateway, link = rig
+    gateway._hear(packets.message(Status(None, 1.0, None, lease=holder)), lambda: None)
+    for number in range(AHEAD + 1):
+        goal(gateway, f"b{number}", "bob", number)
+    command(gateway, "pause", number=AHEAD + 1)
+    accepted(gateway, 1)
+    assert passed(link)[-1] == (f"b{AHEAD}", "pause by ann" if withdrawn else None)
+
+
+def test_commands_of_one_are_bounded_and_leave_the_others_theirs(rig: Rig) -> None:
+    gateway, link = rig
+    for _ in range(UNDER_WAY + 1):
+        command(gateway, "resume", user="eve")
+    command(gateway, "resume", user="ann")
+    users = [request.user for request in link.sent if isinstance(request, CommandRequest)]
+    assert users == ["eve"] * UNDER_WAY + ["ann"]
+
+
+def test_what_is_refused_of_one_who_floods_leaves_room_to_tell_of_the_others(rig: Rig) -> None:
+    gateway, link = rig
+    for _ in range(100):
+        command(gateway, "dance", user="eve")
+    command(gateway, "dance", user="ann")
+    told = [request.user for request in link.sent if isinstance(request, RefusedRequest)]
+    assert told == ["eve"] * REFUSALS_PER_SECOND + ["ann"]
+
+
+@pytest.mark.parametrize("role", [Role.OPERATOR, Role.MAINTAINER])
+def test_the_lease_is_taken_over_by_a_role_that_may(rig: Rig, monkeypatch: pytest.MonkeyPatch, role: Role) -> None:
+    gateway, link = rig
+    monkeypatch.setattr(gateway._guard, "role", lambda _: role)
+    command(gateway, "acquire", b'{"id": "l", "timeout": 0.5, "force": true}')
+    if role is Role.MAINTAINER:
+        assert link.sent == [CommandRequest(1, "ann", Command.ACQUIRE, lease="l", timeout=0.5, force=True)]
+    else:
+        said = "the role of ann at demo is operator: taking the lease over needs maintainer"
+        assert link.sent == [RefusedRequest("ann", said)]
 
 
 def test_an_error_of_its_own_is_told_and_does_not_end_it(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

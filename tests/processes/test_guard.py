@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from certificates import tls_config, user
 from conftest import CONFIG
@@ -29,6 +30,7 @@ from trirail.wire import packets, zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import Event
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Request
+from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import Command
 
 
@@ -49,6 +51,9 @@ class Loop:
         return True
 
 
+STANDING = np.zeros(1, DTYPE)[0]
+"""A record of a robot without power."""
+STANDING["homed"] = 1
 Served = tuple[Config, Path, Loop, Gateway]
 
 
@@ -66,6 +71,8 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             while not over.wait(0.001):
                 for incoming in gateway._inbox.take(100):
                     gateway._handle(incoming)
+                gateway._poses.measure(STANDING)
+                gateway._poses.settle()
                 while loop.answers:
                     gateway._hear(loop.answers.pop(0), lambda: None)
 
@@ -92,8 +99,13 @@ DOES: dict[str, Callable[[Robot], object]] = {
     **{name: lambda robot, name=name: robot.command(name) for name in Command if name is not Command.OVERRIDE},  # type: ignore[misc]
     "override": lambda robot: robot.override(50),
     "info": lambda robot: robot.info(),
+    "poses": lambda robot: robot.poses(),
+    "teach": lambda robot: robot.teach("pick"),
+    "forget": lambda robot: robot.forget("pick"),
 }
-NEEDS = {"stop": "viewer", "info": "viewer", "reset": "maintainer", "home": "maintainer"}  # all else: operator
+NEEDS = {"stop": "viewer", "info": "viewer", "poses": "viewer"} | dict.fromkeys(
+    ("reset", "home", "teach", "forget"), "maintainer"
+)  # all else: operator
 RANK = ["viewer", "operator", "maintainer"]
 
 
@@ -106,14 +118,16 @@ def test_a_role_does_what_it_may_and_is_told_of_the_rest(served: Served, name: s
         before = len(loop.asked)
         if RANK.index(role) >= RANK.index(needed):
             DOES[does](asking)
-            if does != "info":
+            if does not in ("info", "poses"):
                 assert loop.asked[before].user == name
             return
         began = time.monotonic()
         with pytest.raises(RefusedError) as caught:
             DOES[does](asking)
         assert time.monotonic() - began < 1.0
-        key = f"goal/{name}" if does == "goal" else f"cmd/{name}/{does}"
+        key = {"goal": f"goal/{name}", "teach": f"teach/{name}/pick", "forget": f"forget/{name}/pick"}.get(
+            does, f"cmd/{name}/{does}"
+        )
         assert caught.value.code is RefusalCode.NOT_ALLOWED
         assert str(caught.value) == f"{name} is a {role} at demo: {key} needs {needed}"
         assert len(loop.asked) == before

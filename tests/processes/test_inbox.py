@@ -1,15 +1,19 @@
-"""What waits for the gateway: in its order, bounded, and a flood of goals never keeps a stop out."""
+"""What waits for the gateway: by user, bounded, and a flood of one never keeps out another, nor a stop."""
 
 from __future__ import annotations
 
+import math
+import select
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import zenoh
-from trirail.processes.inbox import UNREAD, Inbox, Incoming
+from trirail.processes.inbox import UNREAD, UNREAD_OF_ONE, Inbox, Incoming
+from trirail.processes.pace import BURST, RATE, Pace
 from trirail.wire import zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE, MAX_UNREAD
+from trirail.wire.vocabulary import Command
 
 
 @pytest.fixture
@@ -17,14 +21,33 @@ def refused() -> list[Incoming]:
     return []
 
 
+class Clock:
+    """Time that passes when told to."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
 @pytest.fixture
-def inbox(tmp_path: Path, refused: list[Incoming]) -> Iterator[Inbox]:
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def inbox(tmp_path: Path, refused: list[Incoming], clock: Clock) -> Iterator[Inbox]:
     with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
-        yield Inbox(opened, "demo", refused.append)
+        yield Inbox(opened, "demo", refused.append, clock)
 
 
-def keep(inbox: Inbox, kind: str, payload: bytes = b"") -> None:
-    inbox._keep(kind, f"trirail/demo/{kind}", zenoh.ZBytes(payload), "", None)  # type: ignore[arg-type]
+def readable(inbox: Inbox) -> bool:
+    return bool(select.select([inbox], [], [], 0.0)[0])
+
+
+def keep(inbox: Inbox, kind: str, payload: bytes = b"", user: str = "ann", name: str = "") -> None:
+    key = "/".join(filter(None, ("trirail/demo", kind, user, name)))
+    inbox._keep(kind, key, zenoh.ZBytes(payload), "", None)  # type: ignore[arg-type]
 
 
 def test_messages_are_taken_in_their_order(inbox: Inbox) -> None:
@@ -36,13 +59,78 @@ def test_messages_are_taken_in_their_order(inbox: Inbox) -> None:
 
 
 def test_a_flood_of_goals_is_refused_and_keeps_no_command_out(inbox: Inbox, refused: list[Incoming]) -> None:
-    for _ in range(UNREAD + 5):
+    for number in range(UNREAD + 5):
+        keep(inbox, "goal", user=f"u{number % 8}")
+    assert len(refused) == 5
+    keep(inbox, "cmd", name="enable")
+    assert len(refused) == 5
+    *_, last = inbox.take(9)
+    assert last.kind == "cmd"  # the ninth user's turn
+
+
+def test_the_flood_of_one_leaves_room_for_the_others(inbox: Inbox, refused: list[Incoming]) -> None:
+    for _ in range(UNREAD_OF_ONE + 5):
+        keep(inbox, "goal", user="eve")
+    assert [incoming.user for incoming in refused] == ["eve"] * 5
+    keep(inbox, "goal")
+    assert len(refused) == 5
+    assert [incoming.user for incoming in inbox.take(3)] == ["eve", "ann", "eve"]
+
+
+@pytest.mark.parametrize("name", Command)
+def test_what_stops_the_robot_for_everybody_comes_first(inbox: Inbox, name: Command) -> None:
+    for kind in ("goal", "cmd"):
+        keep(inbox, kind, user="eve", name="enable" * (kind == "cmd"))
+    keep(inbox, "cmd", name=name)
+    overtakes = name in ("stop", "quick_stop", "disable")
+    taken = list(inbox.take(3))
+    assert (taken[0].user == "ann") == overtakes
+    assert sorted(incoming.number for incoming in taken) == [1, 2, 3]
+    assert max(taken, key=lambda incoming: incoming.number).user == "ann"
+
+
+def test_a_stop_of_one_goal_does_not_overtake_that_goal(inbox: Inbox) -> None:
+    keep(inbox, "goal", b"{}")
+    keep(inbox, "cmd", b'{"goal": "g"}', name="stop")
+    assert [incoming.kind for incoming in inbox.take(2)] == ["goal", "cmd"]
+
+
+def test_who_sends_more_than_his_pace_waits_and_nobody_else(inbox: Inbox, clock: Clock) -> None:
+    for _ in range(BURST + 10):
+        keep(inbox, "goal", user="eve")
+    assert len(list(inbox.take(10_000))) == BURST
+    assert not readable(inbox)
+    assert 0.0 < inbox.due() <= 1.0 / RATE
+    keep(inbox, "goal")
+    assert readable(inbox)
+    assert [incoming.user for incoming in inbox.take(10)] == ["ann"]
+    keep(inbox, "cmd", user="eve", name="stop")  # a stop of hers has its own
+    assert [incoming.kind for incoming in inbox.take(10)] == ["cmd"]
+    for _ in range(10):
+        assert list(inbox.take(10)) == []
+        clock.now += inbox.due() + 1e-9
+        assert [incoming.user for incoming in inbox.take(10)] == ["eve"]
+    assert inbox.due() == math.inf
+    clock.now += BURST / RATE
+    for _ in range(BURST + 1):
+        keep(inbox, "goal", user="eve")
+    assert len(list(inbox.take(10_000))) == BURST
+
+
+def test_what_is_more_than_was_taken_stays_readable(inbox: Inbox) -> None:
+    for _ in range(3):
         keep(inbox, "goal")
-    assert len(refused) == 5
-    keep(inbox, "cmd")
-    assert len(refused) == 5
-    *_, last = inbox.take(2 * UNREAD)
-    assert last.kind == "cmd"
+    assert len(list(inbox.take(2))) == 2
+    assert readable(inbox)
+    assert len(list(inbox.take(2))) == 1
+    assert not readable(inbox)
+
+
+def test_users_who_have_their_whole_burst_again_are_forgotten() -> None:
+    pace = Pace()
+    for number in range(5000):
+        pace.count(f"u{number}", number * 0.1)
+    assert len(pace._full_at) <= 1001
 
 
 def test_what_waits_is_bounded_in_bytes(inbox: Inbox, refused: list[Incoming]) -> None:

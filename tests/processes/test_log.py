@@ -53,3 +53,27 @@ def test_whatever_is_said_stays_one_line(words: str) -> None:
     event = msgspec.structs.replace(FAULT, message=words)
     assert all(len(written(form, event)) == 2 for form in ("text", "json"))
     assert "\x1b" not in written("text", event)[0]
+
+
+def test_a_flood_of_events_is_cut_short_and_says_so_but_errors_are_written() -> None:
+    out, now = io.StringIO(), 1_700_000_000.0
+    log = Log("text", out, clock=lambda: now, environment={})
+    refused = msgspec.structs.replace(FAULT, kind="refused", level="warning", message="refused: too many")
+    for seq in range(1, 60_001):  # a thousand a second
+        now += 0.001
+        log.event(msgspec.structs.replace(refused, seq=seq))
+    assert 150 <= len(out.getvalue().splitlines()) <= 100 + 60 + 2
+    log.event(msgspec.structs.replace(FAULT, seq=60_001))
+    told = out.getvalue()
+    assert told.splitlines()[-1].endswith("drive B: following error")
+    left_out = sum(map(int, re.findall(r"(\d+) events came too quickly", told)))
+    assert left_out + told.count("refused: too many") == 60_000
+
+
+def test_what_comes_slowly_is_written_whole() -> None:
+    out, now = io.StringIO(), 1_700_000_000.0
+    log = Log("text", out, clock=lambda: now, environment={})
+    for seq in range(1, 501):
+        now += 1.0
+        log.event(msgspec.structs.replace(FAULT, seq=seq, level="info"))
+    assert len(out.getvalue().splitlines()) == 500

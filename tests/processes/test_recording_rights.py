@@ -30,7 +30,7 @@ def test_a_recording_and_its_folder_are_not_for_others(umask: int, tmp_path: Pat
     loops.close()  # the loop has gone, so it ends at once
     heart = Heartbeats.create().of("recorder")
     with ours:
-        assert recording.main(config, None, PacketLink(ours), heart, lambda _: None) == 0
+        assert recording.main(config, None, PacketLink(ours), heart, lambda _: None, lambda _: None) == 0
     (file,) = (tmp_path / "new").glob("*.rrd")
     assert stat.S_IMODE(file.stat().st_mode) == 0o640 & ~umask
     assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o750 & ~umask

@@ -61,12 +61,29 @@ def test_the_time_from_a_goal_to_its_first_setpoint_is_measured() -> None:
 
 
 @pytest.mark.slow
+def test_what_one_users_flood_costs_another_is_measured() -> None:
+    told = measured("fairness")
+    assert told["messages_per_second"] > 0.0
+    for what in ("goal", "stop"):
+        for when in ("quiet", "flooded"):
+            assert is_spread(told[f"{what}_{when}_ms"], told["quantiles"])
+        assert told[f"{what}_p99_ratio"] == told[f"{what}_flooded_ms"][1] / told[f"{what}_quiet_ms"][1]
+
+
+@pytest.mark.slow
 def test_settling_is_measured() -> None:
     told = measured("settle")
     assert told["outcomes"] == {"done": 3}
     for what in ("settle_ms", "residual_um", "overshoot_um"):
         assert is_spread(told[what], told["quantiles"])
     assert told["settle_ms"][0] > 0.0
+
+
+def test_what_the_machine_itself_takes_is_measured() -> None:
+    told = measured("machine")
+    for part in ("arithmetic", "send_that_wakes", "send_after_it"):
+        for values in (told[part]["cold"], told[part]["hot"]):
+            assert is_spread(values, told["quantiles"])
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import math
 from trirail_drivers.cia402 import frames, ways
 from trirail_drivers.cia402.codes import words
 from trirail_drivers.cia402.units import Units
+from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
@@ -75,8 +76,8 @@ class Cia402Axis(Axis):
         "way",
     )
 
-    def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
-        super().__init__(name, node, scale, heartbeat)
+    def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
+        super().__init__(name, node, scale, drives)
         self.actual = 0
         """Actual position [counts]."""
         self.way = ways.usual(node)

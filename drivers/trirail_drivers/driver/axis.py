@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 
+from trirail_drivers.config import Drives
 from trirail_drivers.driver.answers import Answers
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import shortened
 from trirail_drivers.interface import Counts, DriveFault
 
-MISSED_ANSWERS = 3
 MISSED_HEARTBEATS = 3
 
 
@@ -19,6 +19,7 @@ class Axis(ABC):
 
     __slots__ = (
         "_heartbeat_timeout",
+        "_missed_positions",
         "answers",
         "event",
         "heard",
@@ -32,7 +33,7 @@ class Axis(ABC):
         "setpoints_lost",
     )
 
-    def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
+    def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         self.name = name
         self.node = node
         self.scale = scale
@@ -50,7 +51,8 @@ class Axis(ABC):
         """A fault that a frame told of, rather than a state that lasts."""
         self.heard = math.inf
         """Time of the last heartbeat [s]."""
-        self._heartbeat_timeout = MISSED_HEARTBEATS * heartbeat
+        self._heartbeat_timeout = MISSED_HEARTBEATS * drives.heartbeat
+        self._missed_positions = drives.missed_positions
 
     @property
     def counts(self) -> Counts:
@@ -72,7 +74,7 @@ class Axis(ABC):
 
     def silence(self, now: float) -> DriveFault | None:
         """The fault that the drive is not heard any more, at time `now`."""
-        if self.answers.missed >= MISSED_ANSWERS:
+        if self.answers.missed >= self._missed_positions:
             return self.made("silent", 0, f"no position for {self.answers.missed} cycles in a row")
         if now - self.heard > self._heartbeat_timeout:
             return self.made("heartbeat", 0, f"no heartbeat for {now - self.heard:.3g} s")

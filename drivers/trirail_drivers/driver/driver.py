@@ -33,7 +33,7 @@ class Driver(ABC, Generic[AnyAxis]):
         bitrate: int,
         drives: config.Drives,
         clock: Clock,
-        axis: Callable[[str, int, Scale, float], AnyAxis],
+        axis: Callable[[str, int, Scale, config.Drives], AnyAxis],
     ) -> None:
         self.bus_load = 0.0
         self.missing_protections: tuple[MissingProtection, ...] = ()
@@ -42,7 +42,7 @@ class Driver(ABC, Generic[AnyAxis]):
         self._drives = drives
         self._clock = clock
         self._axes = tuple(
-            axis(name, drive.node, scale_of(name, drive), drives.heartbeat)
+            axis(name, drive.node, scale_of(name, drive), drives)
             for name, drive in zip(NAMES, drives.each, strict=True)
         )
         self._period = 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
@@ -33,8 +34,8 @@ class OdriveAxis(Axis):
         "told",
     )
 
-    def __init__(self, name: str, node: int, scale: Scale, heartbeat: float) -> None:
-        super().__init__(name, node, scale, heartbeat)
+    def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
+        super().__init__(name, node, scale, drives)
         self.state: int = AxisState.UNDEFINED
         """Axis state of the newest heartbeat."""
         self.errors = 0

@@ -19,7 +19,6 @@ from collections import deque
 import can
 
 from trirail_drivers import config
-from trirail_drivers.driver.axis import MISSED_ANSWERS
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import frames, setup
@@ -55,7 +54,7 @@ class Odrive(Driver[OdriveAxis]):
         self._errors_due: float | None = None
         self._enabled = False
         self._setpoints = SetpointSender(self._axes, self._wire, drives.quick_stop_deceleration)
-        self._due: deque[Triple | None] = deque([None] * MISSED_ANSWERS, maxlen=MISSED_ANSWERS)
+        self._due: deque[Triple | None] = deque([None] * drives.missed_positions, maxlen=drives.missed_positions)
         """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
 
     def configure(self, period: float) -> None:
@@ -206,7 +205,7 @@ class Odrive(Driver[OdriveAxis]):
             fault = axis.fault(now, self._enabled and not axis.left_out)
             if fault is not None:
                 return fault
-            due = self._due[-1 - min(axis.answers.age, MISSED_ANSWERS - 1)]
+            due = self._due[-1 - min(axis.answers.age, len(self._due) - 1)]
             if due is None or not (self._enabled and axis.powered_up):
                 continue
             error = due[number] - axis.position

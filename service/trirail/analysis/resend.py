@@ -25,7 +25,7 @@ from trirail.telemetry.reading import Recording
 from trirail.wire.messages import Event, Goal, Override, Stop
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.records import unpack
-from trirail.wire.vocabulary import MODES, Mode
+from trirail.wire.vocabulary import MODES, Command, Mode
 
 NEAR = 1e-3
 """How far the sliders may stand from where the session began [m]."""
@@ -33,6 +33,8 @@ END_WITHIN = 60.0
 """How long the last goals may take to end [s]."""
 HEARD_WITHIN = 2.0
 """How much later than a goal's end its last records may come [s]."""
+_LEASE = (Command.ACQUIRE, Command.RELEASE)
+"""Not sent again: what was allowed then was so by whoever held the lease; all is one user's now."""
 _MOVING = MODES.index(Mode.MOVING)
 
 
@@ -55,7 +57,8 @@ def resend(recording: Recording, robot: Robot, say: Callable[[str], None]) -> li
     """Send a session again and compare. Raises ServiceError where the robot does not stand where it began."""
     _check_start(recording, robot)
     heard = _Heard(robot)
-    with heard.listening():
+    lease = robot.lease() if robot.info().lease == "required" else contextlib.nullcontext()
+    with heard.listening(), lease:
         renamed, goals = _send(recording, robot, say)
         _await(goals.values())
         time.sleep(HEARD_WITHIN)
@@ -139,7 +142,7 @@ def _send(
                 goal = msgspec.structs.replace(given.goal, id=renamed[given.id])
                 goals[given.id] = robot.send(_given(goal), renamed[given.id])
                 say(f"goal {given.id}: {goals[given.id].expected}")
-            elif isinstance(given, CommandRequest):
+            elif isinstance(given, CommandRequest) and given.name not in _LEASE:
                 robot.command(given.name, _content(given, renamed))
                 say(given.name)
         except RefusedError as error:

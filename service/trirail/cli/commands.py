@@ -144,8 +144,9 @@ app.command(panel_command.panel)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)
+app.command(robot_commands.acquire, name=Command.ACQUIRE, help=Command.ACQUIRE.help)
 for each in Command:
-    if each is not Command.OVERRIDE:
+    if each not in (Command.OVERRIDE, Command.ACQUIRE):
         app.command(robot_commands.telling(each), name=each.replace("_", "-"), help=each.help)
 app.command(config_commands.app)
 app.command(keys_command.app)
@@ -205,5 +206,6 @@ def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
         said = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
     elif isinstance(error, CoercionError) and error.msg and error.argument and not said.startswith("Invalid value"):
         said = f"Invalid value for {error.argument.name.strip('-')}: {said}"
-    command = " ".join(("trirail", *(error.command_chain or ())))
+    by_command = error.command_chain is None  # who raises it does not know how it was called
+    command = " ".join(("trirail", *(words[:1] if by_command else error.command_chain or ())))
     return f"{said} ({command} --help tells the usage)"

@@ -46,7 +46,7 @@ def shipped(*, json: Annotated[bool, Flag] = False) -> int:
 
 @app.command
 def copy(name: str, dest: Path | None = None, /, *, json: Annotated[bool, Flag] = False) -> int:
-    """Copy a shipped configuration, or the systemd unit, to change it; never over a file that exists.
+    """Copy a shipped file to change it: a configuration, the systemd unit, … Never over a file that exists.
 
     Parameters
     ----------
@@ -131,7 +131,8 @@ def shipped_files() -> dict[str, str]:
 
 
 def _shipped() -> list[Path]:
-    return sorted([*FOLDER.glob("*.toml"), *FOLDER.glob("*.service")]) + sorted(FOLDER.glob("drives/*.toml"))
+    files = [path for suffix in ("toml", "service", "yml", "json") for path in FOLDER.glob(f"*.{suffix}")]
+    return sorted(files) + sorted(FOLDER.glob("drives/*.toml"))
 
 
 def _name(path: Path) -> str:
@@ -140,7 +141,9 @@ def _name(path: Path) -> str:
 
 
 def _purpose(path: Path) -> str:
-    """Return the first line of a file, the comment that says what it is for."""
+    """Return what a file is for: its first line is a comment that says so; JSON has no comments, but a field."""
+    if path.suffix == ".json":
+        return str(json_text.loads(path.read_bytes())["description"])
     with path.open(encoding="utf-8") as file:
         return file.readline().lstrip("# ").rstrip(":\n")
 

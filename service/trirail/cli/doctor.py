@@ -15,7 +15,7 @@ from trirail import as_built
 from trirail.config import Config
 from trirail.processes.clock import Tick
 from trirail.processes.guard import Guard
-from trirail.wire.endpoints import ReachableBy, reach
+from trirail.wire.endpoints import ReachableBy, endpoint_of, reach
 
 Verdict = Literal["ok", "warning", "failure"]
 
@@ -87,6 +87,7 @@ def examine(config: Config, machine: Machine) -> list[Check]:
         *corrected(config),
         load(config),
         *network(config, machine),
+        *metrics(config),
         lateness(machine.ticks, config),
     ]
 
@@ -281,6 +282,20 @@ def network(config: Config, machine: Machine) -> list[Check]:
         warnings = machine.guard.certificate_warnings()
         found += [Check("certificates", "warning", warning) for warning in warnings]
     return found
+
+
+def metrics(config: Config) -> list[Check]:
+    """Who can read the metrics, where there are any."""
+    telemetry = config.telemetry
+    if not telemetry.metrics_port:
+        return []
+    endpoint = endpoint_of(telemetry.metrics_address, telemetry.metrics_port)
+    by = reach(endpoint)
+    if by is ReachableBy.NETWORK and config.zenoh.tls is not None:
+        by = ReachableBy.CERTIFICATE
+    verdict: Verdict = "warning" if by is ReachableBy.NETWORK else "ok"
+    remedy = "trirail keys init makes certificates for [zenoh.tls]" if by is ReachableBy.NETWORK else ""
+    return [Check("metrics", verdict, f"{endpoint}: {by} can read them", remedy)]
 
 
 def lateness(ticks: Sequence[Tick], config: Config) -> Check:

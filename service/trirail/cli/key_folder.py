@@ -11,7 +11,6 @@ its place and renamed. What is renewed is a certificate; its key stays.
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from shutil import rmtree
 from typing import NamedTuple
 
 from cryptography import x509
+from trirail_drivers import files
 
 from trirail.errors import ServiceError
 from trirail.wire.certificates import Pair, authority, common_name, issue, renew
@@ -141,19 +141,8 @@ def _made_whole(folder: Path) -> Iterator[Path]:
 
 
 def _write(file: Path, content: bytes, mode: int) -> None:
-    """Write a file beside its place, on the disk, with its rights from the beginning; then rename it."""
     with _said():
-        descriptor, name = tempfile.mkstemp(prefix=f".{file.name}-", dir=file.parent)  # 0600
-        try:
-            with os.fdopen(descriptor, "wb") as opened:
-                opened.write(content)
-                os.fchmod(descriptor, mode)
-                opened.flush()
-                os.fsync(descriptor)
-            Path(name).rename(file)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
+        files.replace(file, content, mode)
 
 
 def _read(file: Path) -> bytes:

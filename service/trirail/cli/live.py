@@ -73,6 +73,8 @@ def table(state: State, robot: str, limits: Limits | None = None) -> Table:
         grid.add_row("fault", f"[bold red]{plain(fault)}[/]")
     colour = "yellow" if state.override != 1.0 else "default"
     grid.add_row("override", f"[{colour}]{units.written(state.override * 100.0, '%', 0)}[/]")
+    if state.lease is not None:
+        grid.add_row("lease", f"held by {plain(state.lease)}")
     if state.goal:
         _add_goal(grid, state.goal, state.pose)
     grid.add_row("measured", units.pose(state.pose, 9))

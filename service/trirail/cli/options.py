@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import msgspec
 from cyclopts import Parameter
 
 from trirail.wire.zenoh_session import DEFAULT_LOCATOR
 
 if TYPE_CHECKING:
     from cyclopts.completion._engine import CompletionContext
+
+    from trirail.client.client import Robot
 
 Flag = Parameter(negative="")
 """An option without a value, that has no opposite."""
@@ -22,6 +25,46 @@ def robots(context: CompletionContext) -> list[str]:
     from trirail.client.connection import robots_at
 
     return robots_at(context["connect"].value)
+
+
+def poses(context: CompletionContext) -> list[str]:
+    """Return the names of the poses of the robot that the command line means."""
+    with _robot(context) as robot:
+        return list(robot.poses())
+
+
+def taught_poses(context: CompletionContext) -> list[str]:
+    """Return those of them that were taught."""
+    with _robot(context) as robot:
+        return [name for name, pose in robot.poses().items() if pose.taught]
+
+
+def tools(context: CompletionContext) -> list[str]:
+    """Return the names of its tools."""
+    return _frames(context, "tool")
+
+
+def frames(context: CompletionContext) -> list[str]:
+    """Return the names of the frames in which a pose may be given."""
+    return ["base", *_frames(context, "work")]
+
+
+def axes(context: CompletionContext) -> list[str]:
+    """Return the names of the frames along whose axes a move may be."""
+    return ["base", "platform", *_frames(context, "work")]
+
+
+def _frames(context: CompletionContext, kind: Literal["tool", "work"]) -> list[str]:
+    from trirail.config import FramesTable
+
+    with _robot(context) as robot:
+        return list(getattr(msgspec.convert(robot.info().frames, FramesTable), kind))
+
+
+def _robot(context: CompletionContext) -> Robot:
+    from trirail.client.client import Robot
+
+    return Robot(context["robot"].value, context["connect"].value, tls=context["tls"].value)
 
 
 @Parameter(name="*")

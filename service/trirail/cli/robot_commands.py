@@ -2,43 +2,48 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
-from cyclopts import CycloptsError
+from cyclopts import CycloptsError, Parameter
 
 from trirail.cli import live, terminal, units
-from trirail.cli.options import HERE, Flag, Service
+from trirail.cli.options import HERE, Flag, Service, axes, frames, taught_poses, tools
+from trirail.cli.options import poses as poses_of_robot
+from trirail.wire.text import is_name
 from trirail.wire.vocabulary import Command
 
 if TYPE_CHECKING:
     from trirail.client.client import GoalHandle, Robot
 
+Tool = Annotated[units.ToolPoint, Parameter(completer=tools)]
+
 
 def goto(
-    x: units.Length,
-    y: units.Length,
-    phi: units.Angle,
+    x: Annotated[str, Parameter(completer=poses_of_robot)],
+    y: units.Length | None = None,
+    phi: units.Angle | None = None,
     /,
     *,
     wait: Annotated[bool, Flag] = False,
     speed: float = 1.0,
     blend: units.Length | None = None,
-    tool: tuple[units.Length, units.Length] | None = None,
-    frame: str = "base",
+    tool: Tool | None = None,
+    frame: Annotated[str, Parameter(completer=frames)] = "base",
     deg: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
-    """Move the platform to a pose.
+    """Move the platform to a pose: to X Y PHI, or to the pose of a NAME.
 
     Parameters
     ----------
     x
-        Position of the platform's centre [m], or with a unit: 20mm, -0.8in.
+        Position of the platform's centre [m], or with a unit: 20mm, -0.8in. Alone, the name of a pose.
     y
-        Likewise.
+        Likewise along y.
     phi
         Angle of the platform, counterclockwise [rad], or with a unit: 10deg, 50mrad.
     wait
@@ -48,7 +53,8 @@ def goto(
     blend
         The next goto waits for this one, and begins that near to its end [m], instead of preempting it.
     tool
-        The point of the platform that goes there instead of the centre, in the platform's own frame [m].
+        The point of the platform that goes there instead of the centre: U V in the platform's own frame [m], or its
+        name in [frames.tool].
     frame
         A frame of [frames.work] in which the pose is given.
     deg
@@ -56,10 +62,20 @@ def goto(
     """
     from trirail.client.client import Robot
 
-    angle = units.radians(phi, deg)
+    if y is None or phi is None:
+        if y is not None or not is_name(x) or tool is not None or frame != "base":
+            raise CycloptsError(
+                msg="goto takes X, Y and PHI, or the NAME of a pose, that knows no --tool and no --frame"
+            )
+        with Robot(service.robot, service.connect, tls=service.tls) as robot:
+            return _follow(service, robot, robot.move_to_named(x, speed=speed, blend=blend), wait, x)
+    try:
+        at, angle = units.quantity(x, units.LENGTH), units.radians(phi, deg)
+    except ValueError as error:
+        raise CycloptsError(msg=f"Invalid value for X: {error}") from error
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
-        goal = robot.move_to(x=x, y=y, phi=angle, speed=speed, blend=blend, tool=tool, frame=frame)
-        return _follow(service, robot, goal, wait, units.pose((x, y, angle)))
+        goal = robot.move_to(x=at, y=y, phi=angle, speed=speed, blend=blend, tool=tool, frame=frame)
+        return _follow(service, robot, goal, wait, units.pose((at, y, angle)))
 
 
 def move(
@@ -70,8 +86,8 @@ def move(
     *,
     wait: Annotated[bool, Flag] = False,
     speed: float = 1.0,
-    tool: tuple[units.Length, units.Length] | None = None,
-    frame: str = "base",
+    tool: Tool | None = None,
+    frame: Annotated[str, Parameter(completer=axes)] = "base",
     measured: Annotated[bool, Flag] = False,
     deg: Annotated[bool, Flag] = False,
     service: Service = HERE,
@@ -91,7 +107,8 @@ def move(
     speed
         Fraction of full speed, up to 1.
     tool
-        The point of the platform that moves so far, and about which it turns, in the platform's own frame [m].
+        The point of the platform that moves so far, and about which it turns: U V in the platform's own frame [m], or
+        its name in [frames.tool].
     frame
         Along whose axes: base, platform, or a frame of [frames.work].
     measured
@@ -212,6 +229,56 @@ def follow(
         return _follow(service, robot, goal, wait, f"{file.name}: {len(points)} points")
 
 
+def teach(name: str, /, *, service: Service = HERE) -> int:
+    """Keep where the robot is measured to stand as a pose of a name, for goto; with power or moved by hand.
+
+    Parameters
+    ----------
+    name
+        Letters, digits, - and _; a pose that was taught by that name before is replaced.
+    """
+    from trirail.client.client import Robot
+
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+        pose = robot.teach(name)
+    show(service, msgspec.to_builtins(pose), f"{name}: {units.pose((pose.x, pose.y, pose.phi))}")
+    return 0
+
+
+def forget(name: Annotated[str, Parameter(completer=taught_poses)], /, *, service: Service = HERE) -> int:
+    """Remove a pose that was taught.
+
+    Parameters
+    ----------
+    name
+        One of those that `trirail poses` lists as taught.
+    """
+    from trirail.client.client import Robot
+
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+        pose = robot.forget(name)
+    show(service, msgspec.to_builtins(pose), f"{name} is removed; it was {units.pose((pose.x, pose.y, pose.phi))}")
+    return 0
+
+
+def poses(*, service: Service = HERE) -> int:
+    """List the poses that have names."""
+    from trirail.client.client import Robot
+
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+        found = robot.poses()
+    if service.json:
+        terminal.json({name: msgspec.to_builtins(pose) for name, pose in found.items()})
+        return 0
+    width = max(map(len, found), default=0)
+    for name, pose in found.items():
+        whose = "taught" if pose.taught else "of [poses]"
+        terminal.say(f"{name:<{width}}   {units.pose((pose.x, pose.y, pose.phi), 9)}   {whose}")
+    if not found:
+        terminal.say("there is none: trirail teach NAME makes one of where the robot stands")
+    return 0
+
+
 def override(percent: units.Percentage, /, *, service: Service = HERE) -> int:
     """Send the one command that takes a number.
 
@@ -225,6 +292,25 @@ def override(percent: units.Percentage, /, *, service: Service = HERE) -> int:
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         robot.override(percent)
     show(service, {"override": percent}, f"override: {percent:g} %")
+    return 0
+
+
+def acquire(*, force: Annotated[bool, Flag] = False, service: Service = HERE) -> int:
+    """Hold the lease until Ctrl-C, or until it is lost.
+
+    Parameters
+    ----------
+    force
+        Take it over from who holds it: a maintainer's, if [control] takeover does not say otherwise.
+    """
+    from trirail.client.client import Robot
+
+    with Robot(service.robot, service.connect, tls=service.tls) as robot, robot.lease(force=force) as lease:
+        show(service, {"lease": robot.user}, f"{robot.user} holds the lease until Ctrl-C")
+        with contextlib.suppress(KeyboardInterrupt):
+            lease.wait()
+    if lease.lost is not None:
+        raise lease.lost
     return 0
 
 
@@ -265,7 +351,7 @@ def events(*, service: Service = HERE) -> int:
     return 0
 
 
-COMMANDS = (goto, move, sliders, jog, follow, status, watch, events)
+COMMANDS = (goto, move, sliders, jog, follow, teach, forget, poses, status, watch, events)
 """Those with parameters of their own, in the order in which the help lists them; the others are made by `telling`."""
 
 

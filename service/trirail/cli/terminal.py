@@ -70,12 +70,16 @@ def failed(error: TrirailError) -> None:
 
 def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
     """Say that the service is up, where it is, and what it lacks."""
+    from trirail.config import metrics_url
+
     loop, recorder = ready["loop"], ready["recorder"]
     out.print(f"[bold green]up[/]  robot [bold]{config.robot.name}[/] at {config.loop.rate_hz} Hz")
     out.print(f"    goals      {plain(', '.join(config.zenoh.listen))}", soft_wrap=True)
     if recorder["live"]:
         out.print(f"    live view  trirail view  ({recorder['live']})", soft_wrap=True)
     out.print(f"    recording  {plain(recorder['recording'])}", soft_wrap=True)
+    if url := metrics_url(config):
+        out.print(f"    metrics    {plain(url)}", soft_wrap=True)
     out.print(f"    bus load   {loop['bus_load']:.0%}")
     out.print(f"    next       {plain(' '.join(['trirail enable', *_reach(config)]))}", soft_wrap=True)
     if warning := load.warning(config.loop.rate_hz, loop["bus_load"]):

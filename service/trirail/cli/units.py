@@ -14,12 +14,14 @@ from typing import Annotated, Any, Final, NamedTuple
 
 from cyclopts import Parameter, Token
 
-from trirail.wire.text import quoted
+from trirail.wire.text import NAME_RULE, is_name, quoted
 
 _DEGREE: Final = Decimal("0.0174532925199432957692369076848861271344")
 """π / 180, to more digits than a float has."""
 _WRITTEN: Final = re.compile(r"\s*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(.*?)\s*")
 _NEGATIVE: Final = re.compile(r"-[0-9.]")
+TOOL: Final = "--tool"
+"""The option that takes a point of the platform, or its name."""
 
 
 class Dimension(NamedTuple):
@@ -123,12 +125,29 @@ def pose(values: Sequence[float], width: int = 0) -> str:
 
 
 def numbers(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line such that a negative number with a unit, -5mm, is taken for no option.
+    """Return the words of a command line as they are to be parsed.
 
-    No option begins with a digit. Behind -- all words are taken as they are.
+    A negative number with a unit, -5mm, is taken for no option: none begins with a digit. What follows --tool is one
+    word, a name or U,V: the two lengths of a point are joined. Behind -- all words are taken as they are.
     """
     end = words.index("--") if "--" in words else len(words)
-    return [f" {word}" if _NEGATIVE.match(word) else word for word in words[:end]] + list(words[end:])
+    read: list[str] = []
+    for word in words[:end]:
+        point = len(read) >= 2 and read[-2] == TOOL and is_length(read[-1]) and is_length(word)
+        if point:
+            read[-1] += f",{word}"
+        else:
+            read.append(f" {word}" if _NEGATIVE.match(word) else word)
+    return read + list(words[end:])
+
+
+def is_length(word: str) -> bool:
+    """Whether a word of the command line is a length."""
+    try:
+        quantity(word, LENGTH)
+    except ValueError:
+        return False
+    return True
 
 
 def radians(text: str, deg: bool, dimension: Dimension = ANGLE) -> float:
@@ -158,6 +177,18 @@ def _angles(_: Any, tokens: Sequence[Token]) -> tuple[str, ...]:
     return tuple(_angle(token.value) for token in tokens)
 
 
+def _tool(text: str) -> tuple[float, float] | str:
+    """Return a point of the platform, from U,V, or the name of one."""
+    u, comma, v = text.partition(",")
+    if comma:
+        return quantity(u, LENGTH), quantity(v, LENGTH)
+    if is_length(text) and not is_name(text):
+        raise ValueError(f"{quoted(text.strip())!r} is half a point: U V, as 20mm 0, or a name of [frames.tool]")
+    if not is_name(text):
+        raise ValueError(f"{quoted(text.strip())!r} is neither a point, as 20mm 0, nor a name: {NAME_RULE}")
+    return text
+
+
 def _three(along: Dimension, turning: Dimension) -> Parameter:
     """Return what has three words read, two along x and y and one about φ."""
 
@@ -178,6 +209,8 @@ Time = Annotated[float, _one(lambda text: quantity(text, TIME))]
 """Likewise [s]."""
 Percentage = Annotated[float, _one(lambda text: quantity(text, PERCENTAGE))]
 """Likewise [%]."""
+ToolPoint = Annotated[tuple[float, float] | str, _one(_tool)]
+"""A point of the platform in its own frame [m], or the name of one in [frames.tool]."""
 Angle = Annotated[str, _one(_angle)]
 """An angle of the command line, to be read by `radians`."""
 Angles = Annotated[

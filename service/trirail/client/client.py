@@ -21,29 +21,32 @@ import zenoh
 
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import GoalHandle, Jog, Result
+from trirail.client.lease import Lease
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.credentials import credentials_for
+from trirail.wire.credentials import Credentials, credentials_for
 from trirail.wire.messages import (
+    AcquireLease,
     CommandReply,
     Event,
-    Goal,
     GoalReply,
     MoveGoal,
+    NamedGoal,
     Override,
     OwnLimits,
     PoseGoal,
+    SentGoal,
     SlidersGoal,
     Tool,
     TrajectoryGoal,
     TrajectoryPoint,
 )
 from trirail.wire.sizes import MAX_NAME
-from trirail.wire.state import Info, State
+from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command
 
-__all__ = ["GoalHandle", "Jog", "Result", "Robot"]
+__all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot"]
 
 HOME_WITHIN = 600.0
 """How long homing may take [s]: three drives of the greatest time-out there is."""
@@ -68,13 +71,7 @@ class Robot:
         tls: Path | str | None = None,
     ) -> None:
         self.name = boundary.check_name(name, "robot")
-        credentials = credentials_for(self.name, connect, tls)
-        known_as = credentials.name if credentials is not None else ""
-        self.user = boundary.check_name(user or known_as or _user(), "user")
-        if credentials is not None and known_as != self.user:
-            whose = f"in the name of {quoted(known_as)}" if known_as else "without a common name"
-            problem = f"the certificate in {credentials.folder} is {whose}: {self.user} cannot send with it"
-            raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
+        self.user, credentials = identity(self.name, connect, user, tls)
         self._connection = Connection(self.name, connect, credentials)
         self._goals: dict[str, GoalHandle] = {}
         self._goals_lock = threading.Lock()
@@ -178,6 +175,32 @@ class Robot:
             id,
         )
 
+    def move_to_named(
+        self,
+        name: str,
+        *,
+        speed: float = 1.0,
+        limits: OwnLimits | None = None,
+        blend: float | None = None,
+        valid_for: float | None = None,
+        id: str | None = None,  # noqa: A002 - the field's name on the wire
+    ) -> GoalHandle:
+        """Send the platform to the pose of a name, one of `poses`; all else as of move_to.
+
+        It is the pose that has the name when the service takes the goal. RefusedError `unknown_pose` where none has.
+        """
+        return self.send(
+            lambda goal_id: NamedGoal(
+                name=boundary.check_name(name, "pose"),
+                id=goal_id,
+                speed=speed,
+                valid_for=valid_for,
+                limits=limits,
+                blend=blend,
+            ),
+            id,
+        )
+
     def move_sliders(
         self,
         a: float,
@@ -220,18 +243,15 @@ class Robot:
         """
         return Jog(self.send, (x, y, phi), timeout)
 
-    def send(self, make: Callable[[str], Goal], id: str | None = None) -> GoalHandle:  # noqa: A002
-        """Send the goal that `make` makes for an id, any of trirail.wire.messages.Goal; return once it is accepted."""
+    def send(self, make: Callable[[str], SentGoal], id: str | None = None) -> GoalHandle:  # noqa: A002
+        """Send the goal that `make` makes for an id, a trirail.wire.messages.SentGoal; return once it is accepted."""
         goal_id = id or uuid.uuid4().hex[:12]
-        try:
-            message = make(goal_id)
-        except ValueError as error:
-            raise RefusedError(RefusalCode.MALFORMED, f"not a goal: {error}") from error
+        message = message_of(make, goal_id)
         goal = GoalHandle(goal_id, self.command)
         with self._goals_lock:
             goal = self._goals.setdefault(goal_id, goal)
         try:
-            reply = self._connection.ask(("goal", self.user), GoalReply, msgspec.json.encode(message))
+            reply = self._connection.ask(("goal", self.user), GoalReply, message)
         except (RefusedError, ServiceError):
             with self._goals_lock:
                 self._goals.pop(goal_id, None)
@@ -279,10 +299,31 @@ class Robot:
             raise RefusedError(RefusalCode.MALFORMED, f"no override: {error}") from error
         self.command(Command.OVERRIDE, msgspec.json.encode(content))
 
+    def lease(self, *, force: bool = False, timeout: float = 1.0) -> Lease:
+        """Have the robot for oneself while the context lasts: only this user's goals and commands move it.
+
+        It is kept by signs of life, from a thread of its own. Where these cease for `timeout` [s], and where the
+        context ends, the robot stops within its limits and the lease is free. `force` takes it over from who holds it,
+        by a role that may. Entering raises RefusedError `leased` where somebody else holds it. Stop, quick_stop and
+        disable are everybody's all the same.
+
+        with robot.lease():
+            robot.move_to(x=0.02, y=0.0, phi=0.0).wait()
+        """
+        return Lease(self.command, force=force, timeout=timeout)
+
+    def acquire(self, lease: AcquireLease | None = None) -> CommandReply:
+        """Take the lease, or keep it by one sign of life; `lease` keeps it for as long as signs come."""
+        return self.command(Command.ACQUIRE, msgspec.json.encode(lease) if lease is not None else None)
+
+    def release(self) -> None:
+        """Give the lease back that this user holds, whichever of his clients keeps it; return when the robot stands."""
+        self.command(Command.RELEASE)
+
     def command(self, name: str, content: bytes | None = None) -> CommandReply:
         """Send a command by its name on the wire; return once the service confirms that it has been carried out.
 
-        `content` is its JSON, where it has any: Override or Stop of trirail.wire.messages.
+        `content` is its JSON, where it has any: one of trirail.wire.messages.CONTENT.
         """
         within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
         return self._connection.ask(("cmd", self.user, name), CommandReply, content, within)
@@ -290,6 +331,22 @@ class Robot:
     def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""
         return self._connection.ask(("info",), Info)
+
+    def poses(self) -> dict[str, NamedPose]:
+        """Ask for the named poses: those of the configuration, and those that were taught."""
+        return {pose.name: pose for pose in self._connection.ask(("poses",), NamedPoses).poses}
+
+    def teach(self, name: str) -> NamedPose:
+        """Keep where the robot is measured to stand, with power or without, as the pose of a name; return that pose.
+
+        The service keeps it for good: when this returns it is on its disk. A taught pose of that name is replaced.
+        Raises RefusedError where the robot moves, is in fault or has not been homed, and for names of [poses].
+        """
+        return self._connection.ask(("teach", self.user, boundary.check_name(name, "pose")), NamedPose)
+
+    def forget(self, name: str) -> NamedPose:
+        """Remove a taught pose; return what it was. Raises RefusedError where none of that name was taught."""
+        return self._connection.ask(("forget", self.user, boundary.check_name(name, "pose")), NamedPose)
 
     # ------------------------------------------------------------------ what the service tells
 
@@ -320,13 +377,39 @@ class Robot:
     # ------------------------------------------------------------------ inside
 
     def _on_event(self, event: Event) -> None:
-        if event.id is None or event.outcome is None:
+        if (result := result_of(event)) is None:
             return
         with self._goals_lock:
-            goal = self._goals.pop(event.id, None)
+            goal = self._goals.pop(result.id, None)
         if goal is not None:
-            measured = event.settle, event.residual, event.overshoot
-            goal.end(Result(event.id, event.outcome, event.message, *measured))
+            goal.end(result)
+
+
+def identity(robot: str, connect: str, user: str | None, tls: Path | str | None) -> tuple[str, Credentials | None]:
+    """Return as whom a client speaks to a robot, and with which credentials. Raises RefusedError, ServiceError."""
+    credentials = credentials_for(robot, connect, tls)
+    known_as = credentials.name if credentials is not None else ""
+    name = boundary.check_name(user or known_as or _user(), "user")
+    if credentials is not None and known_as != name:
+        whose = f"in the name of {quoted(known_as)}" if known_as else "without a common name"
+        problem = f"the certificate in {credentials.folder} is {whose}: {name} cannot send with it"
+        raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
+    return name, credentials
+
+
+def result_of(event: Event) -> Result | None:
+    """Return how the goal ended whose end an event tells; None for one that tells of something else."""
+    if event.id is None or event.outcome is None:
+        return None
+    return Result(event.id, event.outcome, event.message, event.settle, event.residual, event.overshoot)
+
+
+def message_of(make: Callable[[str], SentGoal], goal_id: str) -> bytes:
+    """Return the goal that `make` makes for an id, as JSON. Raises RefusedError for one that cannot be."""
+    try:
+        return msgspec.json.encode(make(goal_id))
+    except ValueError as error:
+        raise RefusedError(RefusalCode.MALFORMED, f"not a goal: {error}") from error
 
 
 def _user() -> str:

@@ -59,30 +59,40 @@ class Connection:
         is there, or may be asked. A reply has the quality of service of its query: one that may be dropped would have
         an answer that may be.
         """
-        boundary.check_size(len(payload or b""))
         unreadable: ServiceError | None = None
-        for reply in self._session.get(
-            self._key(*parts),
-            payload=payload,
-            encoding=boundary.JSON if payload else None,
-            timeout=within,
-            consolidation=zenoh.ConsolidationMode.NONE,  # at once, however many more were asked
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.REAL_TIME,
-            express=True,
-        ):
-            try:
-                if reply.ok is not None:
-                    answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
-                    return answer
-            except RefusedError as error:
-                unreadable = ServiceError(f"somebody answered at {self._connect}, but {error}")
-            if reply.err is not None:
-                refused = refusal(reply.err.payload.to_bytes())
-                if isinstance(refused, RefusedError):
-                    raise refused
-                unreadable = refused
+        for reply in self._session.get(**self.query(parts, payload, within)):
+            answer = self.read(reply, kind)
+            if not isinstance(answer, ServiceError):
+                return answer
+            unreadable = answer
         raise unreadable or self.nobody(*parts)
+
+    def query(self, parts: tuple[str, ...], payload: bytes | None, within: float) -> dict[str, Any]:
+        """Return how the key of these parts is asked, as arguments of a session's `get`."""
+        boundary.check_size(len(payload or b""))
+        return {
+            "selector": self._key(*parts),
+            "payload": payload,
+            "encoding": boundary.JSON if payload else None,
+            "timeout": within,
+            "consolidation": zenoh.ConsolidationMode.NONE,  # at once, however many more were asked
+            "congestion_control": zenoh.CongestionControl.BLOCK,
+            "priority": zenoh.Priority.REAL_TIME,
+            "express": True,
+        }
+
+    def read(self, reply: zenoh.Reply, kind: type[T]) -> T | ServiceError:
+        """Return the message of a reply, ServiceError where it holds none. Raises RefusedError where that is a no."""
+        if reply.ok is not None:
+            try:
+                answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
+            except RefusedError as error:
+                return ServiceError(f"somebody answered at {self._connect}, but {error}")
+            return answer
+        refused = refusal(reply.err.payload.to_bytes() if reply.err is not None else b"")
+        if isinstance(refused, RefusedError):
+            raise refused
+        return refused
 
     def nobody(self, *parts: str) -> ServiceError | RefusedError:
         """Return what to raise where nobody answers on the key of these parts.
@@ -90,20 +100,26 @@ class Connection:
         Zenoh drops what a role does not allow without a word, as it does what nobody listens to. Every certificate
         may ask for its role: the answer, within ROLE_WITHIN, tells which it was.
         """
-        if self._credentials is not None and (refused := self._denied(self._credentials.name, parts)) is not None:
-            return refused
-        return ServiceError(
+        user = self.to_be_asked_for_role(*parts)
+        try:
+            reply = self.ask(("role", user), RoleReply, within=ROLE_WITHIN) if user else None
+        except (ServiceError, RefusedError):
+            reply = None
+        return self.why_nobody(parts, reply)
+
+    def to_be_asked_for_role(self, *parts: str) -> str | None:
+        """Return the user whose role tells why nobody answers on the key of these parts; None where none does."""
+        user = self._credentials.name if self._credentials is not None else ""
+        return user if is_name(user) and parts[0] != "role" else None
+
+    def why_nobody(self, parts: tuple[str, ...], reply: RoleReply | None) -> ServiceError | RefusedError:
+        """Return what to raise where nobody answers, and this did when the user's role was asked for."""
+        return (reply and self._denied(parts, reply.user, reply.role)) or ServiceError(
             f"no robot {self._robot!r} answers at {self._connect}: is its service running, is the name right (--robot)?"
         )
 
-    def _denied(self, user: str, parts: tuple[str, ...]) -> RefusedError | None:
+    def _denied(self, parts: tuple[str, ...], user: str, role: str | None) -> RefusedError | None:
         """Return the refusal where the user's role does not allow to use the key of these parts."""
-        if not is_name(user) or parts[0] == "role":
-            return None
-        try:
-            role = self.ask(("role", user), RoleReply, within=ROLE_WITHIN).role
-        except (ServiceError, RefusedError):
-            return None
         needed = least_role(*parts)
         if role is None:
             problem = f"{user} has no role at {self._robot}: its [zenoh.users] does not name him, or he is revoked"
@@ -125,23 +141,18 @@ class Connection:
             with contextlib.suppress(queue.Full):
                 received.put_nowait(state)
 
-        with self._session.declare_subscriber(self._key("state"), self._reader.messages(State, keep_newest)):
+        with self.subscribe_to_states(keep_newest):
             yield from _until_silent(received, timeout)
 
     def events(self, history: bool, timeout: float | None) -> Iterator[Event]:
         """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
         received: queue.Queue[Event] = queue.Queue()
-        last = 0, 0.0
-
-        def keep_new(event: Event) -> None:
-            # A gateway that was started again tells the past once more; a service that was, counts from one.
-            nonlocal last
-            if event.seq > last[0] or event.time > last[1]:
-                last = event.seq, event.time
-                received.put(event)
-
-        with self.subscribe_to_events(keep_new, history=history):
+        with self.subscribe_to_events(once(received.put), history=history):
             yield from _until_silent(received, timeout)
+
+    def subscribe_to_states(self, take: Callable[[State], None]) -> zenoh.Subscriber[None]:
+        """Have every state taken, until the subscriber's context ends."""
+        return self._session.declare_subscriber(self._key("state"), self._reader.messages(State, take))
 
     def subscribe_to_events(self, take: Callable[[Event], None], *, history: bool) -> AdvancedSubscriber[Any]:
         """Have every event taken, with `history` the past too, that of a gateway that was started again as well."""
@@ -157,8 +168,29 @@ class Connection:
         """Have every batch of records taken, until the subscriber's context ends."""
         return self._session.declare_subscriber(self._key("records"), self._reader.batches(take))
 
+    @property
+    def session(self) -> zenoh.Session:
+        """The session, for who does not wait for its answers in a thread."""
+        return self._session
+
     def _key(self, *parts: str) -> str:
         return zenoh_session.key(self._robot, *parts)
+
+
+def once(take: Callable[[Event], object]) -> Callable[[Event], None]:
+    """Return what takes events of which some come again: each is taken once, in order.
+
+    A gateway that was started again tells the past once more; a service that was, counts from one.
+    """
+    last = 0, 0.0
+
+    def take_new(event: Event) -> None:
+        nonlocal last
+        if event.seq > last[0] or event.time > last[1]:
+            last = event.seq, event.time
+            take(event)
+
+    return take_new
 
 
 def robots_at(connect: str) -> list[str]:

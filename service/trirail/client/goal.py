@@ -35,18 +35,13 @@ class Result(NamedTuple):
     """How far the sliders A, B, C were beyond their targets at most since the end of the path [m]."""
 
 
-class GoalHandle:
-    """A goal that the service has accepted. It is the service's from then on: this object only follows it.
+class AcceptedGoal:
+    """What is known of a goal that the service has accepted. It is the service's from then on."""
 
-    `command` sends a command with its content, as Robot.command does.
-    """
-
-    def __init__(self, goal_id: str, command: Callable[[Command, bytes], object]) -> None:
+    def __init__(self, goal_id: str) -> None:
         self.id = goal_id
         self.reply = GoalReply(goal_id, 0.0)
         """What the service said of it."""
-        self._command = command
-        self._ended = threading.Event()
         self._result: Result | None = None
 
     @property
@@ -64,6 +59,18 @@ class GoalHandle:
     def expected(self) -> str:
         """How long it is expected to take, for people."""
         return f"{self.duration:.2f} s" if self.duration is not None else "no expected end while the override is 0"
+
+
+class GoalHandle(AcceptedGoal):
+    """A goal that the service has accepted: this object only follows it.
+
+    `command` sends a command with its content, as Robot.command does.
+    """
+
+    def __init__(self, goal_id: str, command: Callable[[Command, bytes], object]) -> None:
+        super().__init__(goal_id)
+        self._command = command
+        self._ended = threading.Event()
 
     def cancel(self) -> None:
         """Stop it, if it is under way or waits for another one; return when the robot stands, or it waits no more.

@@ -19,7 +19,7 @@ from trirail.config import SIM
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.processes.interpreter import python
 
-PATIENT = {"max_overruns": "1000", "missed_syncs": "2000", "heartbeat": "1.0"}
+PATIENT = {"max_overruns": "1000", "missed_syncs": "2000", "missed_positions": "1000", "heartbeat": "1.0"}
 """Keys of a configuration with which neither the loop nor the drives give up on a machine that stalls for a second."""
 START_WITHIN = 300.0
 """How long it may take to come up, or at the very first start to compile a function [s]."""

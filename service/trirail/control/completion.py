@@ -28,13 +28,13 @@ def verdict(name: Command, mode: Mode, latched: str | None, measured: Measured, 
             return "" if mode not in (Mode.FAULT, Mode.DISABLED) else latched or "disabled while powering up"
         case Command.DISABLE:
             return None if mode is Mode.STOPPING or measured.powered else ""
-        case Command.STOP | Command.PAUSE:
+        case Command.STOP | Command.PAUSE | Command.RELEASE:
             return None if mode is Mode.STOPPING else ""
         case Command.HOME:
             if mode in (Mode.HOMING, Mode.STOPPING):
                 return None
             return "" if measured.homed else latched or "stopped before every drive was homed"
-        case Command.RESUME | Command.OVERRIDE:
+        case Command.RESUME | Command.OVERRIDE | Command.ACQUIRE:
             return ""
         case Command.RESET:
             if mode is Mode.FAULT:

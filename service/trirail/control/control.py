@@ -16,6 +16,7 @@ from trirail.config import Config, corrected_geometry
 from trirail.control.completion import still_powered, verdict
 from trirail.control.feedback import Measured
 from trirail.control.goal_queue import GoalQueue
+from trirail.control.lease import LeaseArbiter, LeaseChange
 from trirail.control.ledger import Ledger
 from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeState, Refusal, step
 from trirail.control.plan_requests import PlannerPort, PlanRequests
@@ -26,11 +27,19 @@ from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import take_up
-from trirail.wire.messages import Outcome
-from trirail.wire.packets import CommandRequest, Disturbance, GoalRequest, PlannerLost, RefusedRequest, Request
+from trirail.wire.messages import Fault, Outcome
+from trirail.wire.packets import (
+    CommandRequest,
+    Disturbance,
+    GoalRequest,
+    PlannerLost,
+    PoseChanged,
+    RefusedRequest,
+    Request,
+)
 from trirail.wire.planning import PlanAnswer
 from trirail.wire.records import Part
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, FaultCause, Mode
 
 Given = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
 """What the control is given in a cycle, and when, by the monotonic clock [ns]."""
@@ -50,7 +59,11 @@ _GO_ON = (
     ModeEvent.ARRIVED,
     ModeEvent.POWERED,
     # Homing moves the sliders: what was sent before would not begin from where it was meant to.
-    *(ModeEvent[name.name] for name in Command if not name.stops and name not in (Command.OVERRIDE, Command.HOME)),
+    *(
+        ModeEvent[name.name]
+        for name in Command
+        if not name.stops and name.name in ModeEvent.__members__ and name is not Command.HOME
+    ),
 )
 """Events that leave alone what has been sent but not begun."""
 
@@ -66,7 +79,10 @@ class Control:
         self._planner = PlanRequests(config, planner, self._schedule)
         self.ledger = Ledger()
         frames, queue = NamedFrames(config.frames), config.motion.queue
-        self.goal_queue = GoalQueue(self.ledger, self._planner, self._schedule, frames, queue, config.period)
+        self.lease = LeaseArbiter(config.control.lease, config.period)
+        self.goal_queue = GoalQueue(
+            self.ledger, self.lease, self._planner, self._schedule, frames, queue, config.period
+        )
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
         self._following_error_limit = config.limits.slider.following_error
         taken = take_up(config.correction.backlash, config.limits.slider)
@@ -96,7 +112,7 @@ class Control:
                 match what:
                     case Disturbance():
                         self.happen(ModeEvent[what.event], what.reason)
-                    case GoalRequest() | CommandRequest() | RefusedRequest():
+                    case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged():
                         self.handle(what, now_ns)
                     case PlannerLost():
                         self._planner.lose(what.reason)
@@ -107,7 +123,7 @@ class Control:
             mark(Part.MOTION)
             self.solve()
         except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
-            self.trip(f"internal error, please report it: {error!r}")
+            self.trip(f"internal error, please report it: {error!r}", FaultCause.INTERNAL)
         mark(Part.KINEMATICS)
         self.write()
         mark(Part.WRITE)
@@ -130,9 +146,11 @@ class Control:
         self._tell_warnings(feedback)
         mode = self.state.mode
         if feedback.fault is not None:
+            drive, cause, code, message = feedback.fault
             if mode is Mode.FAULT and feedback.fault != before.fault:
-                self.ledger.tell("fault", "error", feedback.fault.message)  # the first one stays, but this came of it
-            self.trip(feedback.fault.message)
+                # The first one stays, but this came of it.
+                self.ledger.tell("fault", "error", message, fault=Fault(cause, drive, code))
+            self.trip(message, cause, drive, code)
         elif mode is Mode.ENABLING:
             self._power_up()
         elif mode in (Mode.HOMING, Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
@@ -140,7 +158,9 @@ class Control:
                 error = self.measured.following_error[behind - 1]
                 self.trip(
                     f"slider {NAMES[behind - 1]}: following error {error * 1e3:.3f} mm is beyond its limit "
-                    f"{self._following_error_limit * 1e3:g} mm"
+                    f"{self._following_error_limit * 1e3:g} mm",
+                    FaultCause.FOLLOWING_ERROR,
+                    NAMES[behind - 1],
                 )
             elif not feedback.homing:
                 self._homing_over()
@@ -159,6 +179,8 @@ class Control:
                 self.goal_queue.take(request, now_ns, self.cycles)
             elif isinstance(request, CommandRequest):
                 self._take_command(request)
+            elif isinstance(request, PoseChanged):
+                self.ledger.tell("pose", "info", request.message, user=request.user)
             else:
                 self.ledger.tell("refused", "warning", request.message, user=request.user)
         except RefusedError as refusal:
@@ -173,10 +195,12 @@ class Control:
         self._withdraw(event, reason)
 
     def advance(self) -> None:
-        """End a jog that nobody renews, begin what has been planned, and go on to the motion of this cycle."""
+        """End a lease or a jog that nobody renews, begin what is planned, and go on to the motion of this cycle."""
+        if (over := self.lease.silent(self.cycles)) is not None:
+            self._change_lease(over)
         released = self.ledger.release(self.cycles) if self.state.mode is Mode.MOVING else None
         if released is not None:
-            self._go(ModeEvent.RELEASE, f"goal {released.id} of {released.user} is not renewed")
+            self._go(ModeEvent.JOG_OVER, f"goal {released.id} of {released.user} is not renewed")
         beginning = self.goal_queue.think(self.cycles, self._admit, self._place)
         if beginning is not None:
             self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
@@ -207,7 +231,7 @@ class Control:
         refused = self.setpoints.refusal(found)
         schedule = self._schedule
         if refused:
-            self.trip(refused)
+            self.trip(refused, FaultCause.LIMIT)
         elif self.state.mode in (Mode.MOVING, Mode.STOPPING) and schedule.runs[0].stands:
             self._stand(schedule.runs[0])
 
@@ -236,12 +260,12 @@ class Control:
         x, y, phi = last.destination(self.commanded.pose)
         return (x, y, phi)
 
-    def trip(self, reason: str) -> None:
-        """Stop all three drives in this cycle and latch the reason."""
+    def trip(self, reason: str, cause: str, drive: str = "", code: int = 0) -> None:
+        """Stop all three drives in this cycle and latch the reason; cause, drive and code as wire.messages.Fault."""
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason
-        self.ledger.tell("fault", "error", reason)
+        self.ledger.tell("fault", "error", reason, fault=Fault(cause, drive, code))
         self._go(ModeEvent.FAULT, reason)
         self._withdraw(ModeEvent.FAULT, reason)
 
@@ -271,6 +295,11 @@ class Control:
             self.goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason)
 
     def _take_command(self, request: CommandRequest) -> None:
+        if request.name in (Command.ACQUIRE, Command.RELEASE):
+            self._take_lease(request)
+            return
+        if not request.name.everybodys:
+            self.lease.check(request.user)
         if request.name is Command.OVERRIDE:
             self._take_override(request)
             return
@@ -293,7 +322,7 @@ class Control:
             raise RefusedError(RefusalCode.STOPPING, still_powered(self.measured, self.fault))
         reason = f"{request.name} by {request.user}"
         if event is ModeEvent.QUICK_STOP:
-            self.trip(reason)
+            self.trip(reason, FaultCause.QUICK_STOP)
         else:
             self._go(event, reason)
             self._withdraw(event, reason)
@@ -306,6 +335,24 @@ class Control:
             self._planner.run_at(self.override)
         self.ledger.tell("service", "info", f"override {self.override:.0%} by {request.user}", user=request.user)
         self.ledger.undertake(request, self.cycles)
+
+    def _take_lease(self, request: CommandRequest) -> None:
+        """Let a user have the lease, keep it, or give it back."""
+        if request.name is Command.ACQUIRE:
+            change = self.lease.acquire(request, self.cycles)
+        else:
+            change = self.lease.release(request)
+        if change is not None:
+            self._change_lease(change)
+        self.ledger.undertake(request, self.cycles)
+
+    def _change_lease(self, change: LeaseChange) -> None:
+        """Tell who holds the lease from now on; what others have under way stops, and does not begin any more."""
+        user = self.lease.user
+        self.ledger.tell("lease", change.level, change.message, user=user)
+        if user is None or not self.ledger.is_all_of(user):
+            self._go(ModeEvent.STOP, change.message)
+            self._withdraw(ModeEvent.STOP, change.message)
 
     def _because(self, refusal: Refusal) -> str:
         return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
@@ -406,7 +453,9 @@ class Control:
                 if state is not PowerState.OPERATION_ENABLED
             ]
             seconds = self._enable_cycles * self._period
-            self.trip(f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected")
+            self.trip(
+                f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected", FaultCause.ENABLE
+            )
 
     def _homing_over(self) -> None:
         """Hold where homing has ended, or was stopped."""
@@ -416,7 +465,7 @@ class Control:
             try:
                 self.setpoints.check_start()
             except RefusedError as refusal:
-                self.trip(f"all drives are homed, but {refusal}")
+                self.trip(f"all drives are homed, but {refusal}", FaultCause.PLACE)
                 return
             if not self._rest_at_setpoints():
                 return
@@ -430,7 +479,7 @@ class Control:
         a, b, c = self.setpoints.rows[0]
         pose = self.measured.pose_of((a, b, c))
         if pose is None:
-            self.trip("the measured sliders belong to no pose")
+            self.trip("the measured sliders belong to no pose", FaultCause.PLACE)
             return False
         self._schedule.commanded = rest(pose)
         return True

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
+from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger, Withdrawal
 from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
@@ -27,15 +28,25 @@ class GoalQueue:
     """Takes goals in their order to the planner, and to the ledger what becomes of them."""
 
     def __init__(
-        self, ledger: Ledger, planner: PlanRequests, schedule: Schedule, frames: NamedFrames, queue: int, period: float
+        self,
+        ledger: Ledger,
+        lease: LeaseArbiter,
+        planner: PlanRequests,
+        schedule: Schedule,
+        frames: NamedFrames,
+        queue: int,
+        period: float,
     ) -> None:
         self._ledger = ledger
+        self._lease = lease
         self._planner = planner
         self._schedule = schedule
         self._frames = frames
         self._queue = queue
         self._period = period
         self._waiting: deque[_Sent] = deque()
+        self._served: dict[str, int] = {}
+        """When each user's last goal had its turn, counted since there was none to plan."""
         self._planned: _Sent | None = None
 
     @property
@@ -44,9 +55,11 @@ class GoalQueue:
         return not self._waiting and not self._planner.busy
 
     def take(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
-        """Take a goal in a cycle, at a time of the monotonic clock; it waits until those before it are planned."""
+        """Take a goal in a cycle, at a time of the monotonic clock; it waits for its user's turn."""
         age = (now_ns - request.received_ns) * 1e-9 / self._period
         sent = _Sent(request, cycle - age)
+        if self.idle:
+            self._served.clear()
         self._waiting.append(sent)
         self._ledger.keep_alive(request, self._alive_until(sent))
 
@@ -57,7 +70,7 @@ class GoalQueue:
         from where a move begins.
         """
         if not self._planner.busy and self._waiting:
-            self._planned = self._waiting.popleft()
+            self._planned = self._next()
             try:
                 self._consider(self._planned, cycle, admit, place)
             except RefusedError as refusal:
@@ -65,6 +78,7 @@ class GoalQueue:
         try:
             if self._planner.busy and self._planned is not None:
                 self._ledger.check_id(self._planned.request)  # a jog may end while its renewal is being planned
+                self._lease.check(self._planned.request.user)  # and the lease may have another holder by now
                 self._check_age(self._planned, cycle)
             at_end = self._planner.busy and self._schedule.ended
             taken = self._planner.think()
@@ -118,6 +132,13 @@ class GoalQueue:
                 self._drop(number, goal.id, "expired", "it has not begun in time")
                 return
 
+    def _next(self) -> _Sent:
+        """Take the oldest goal of the user who has waited longest for his turn."""
+        sent = min(self._waiting, key=lambda sent: self._served.get(sent.request.user, 0))
+        self._waiting.remove(sent)
+        self._served[sent.request.user] = max(self._served.values(), default=0) + 1
+        return sent
+
     def _consider(self, sent: _Sent, cycle: int, admit: Callable[[], bool], place: Place) -> None:
         """Begin to plan a goal, or refuse it."""
         ledger, request, goal = self._ledger, sent.request, sent.request.goal
@@ -125,6 +146,7 @@ class GoalQueue:
         if request.withdrawn is not None:
             ledger.withdraw(request, "stopped", request.withdrawn)
             return
+        self._lease.check(request.user)
         if isinstance(goal, VelocityGoal) and not any((goal.x, goal.y, goal.phi)) and not ledger.renewed_by(request):
             raise RefusedError(
                 RefusalCode.NO_VELOCITY, "a jog of no velocity moves nothing: give it one along x, y or phi"

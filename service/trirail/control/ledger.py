@@ -11,13 +11,14 @@ from trirail_drivers.interface import Triple
 from trirail.control.in_position import Settled
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.messages import Level, MoveGoal, Outcome, PoseGoal, Residual, TrajectoryGoal, VelocityGoal
+from trirail.wire.messages import Fault, Level, MoveGoal, Outcome, PoseGoal, Residual, TrajectoryGoal, VelocityGoal
 from trirail.wire.packets import (
     Accepted,
     Answer,
     CommandRequest,
     Confirmed,
     GoalRequest,
+    PoseChanged,
     Refused,
     RefusedRequest,
     Request,
@@ -53,6 +54,7 @@ class Notice(NamedTuple):
     settle: float | None = None
     residual: Residual | None = None
     overshoot: Triple | None = None
+    fault: Fault | None = None
 
 
 class ActiveGoal(NamedTuple):
@@ -172,9 +174,15 @@ class Ledger:
         if not self.renewed_by(request):
             self._ending(request.id, request.user, outcome, reason)
 
+    def is_all_of(self, user: str | None) -> bool:
+        """Whether the goals and commands under way that need the lease are all a user's."""
+        commands = (request for under_way in self._commands.values() for request, _ in under_way)
+        senders = [goal.user for goal in self.goals] + [one.user for one in commands if not one.name.everybodys]
+        return all(sender == user for sender in senders)
+
     def refuse(self, request: Request, refusal: RefusedError) -> None:
         """Answer that a request is not carried out. A goal that is refused has ended; a used id has its own ending."""
-        if isinstance(request, RefusedRequest):
+        if isinstance(request, RefusedRequest | PoseChanged):
             return
         text = str(refusal)
         self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))
@@ -250,6 +258,7 @@ class Ledger:
         reason: str | None = None,
         goal: str | None = None,
         user: str | None = None,
+        fault: Fault | None = None,
     ) -> None:
         """Note something that everyone is to know."""
-        self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, goal, user))
+        self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, goal, user, fault=fault))

@@ -122,6 +122,24 @@ def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)
     return tuple(sorted(_wrapped(phi) for phi in found))
 
 
+def travels(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
+    """Return lambda_10 and lambda_32 of the legs at a pose x, y [m], phi [rad]: (2, 3) [m], by (11).
+
+    For who looks at a few poses and has no use for the compiled trirail.kinematics.robot.inverse. Not finite where an
+    edge is parallel to its rail.
+    """
+    x, y, phi = pose
+    found = np.empty((2, 3))
+    for i, leg in enumerate(geometry.legs):
+        along, across = _theta(phi + leg.edge_angle)[:2, :2]  # the edge
+        rail = _theta(leg.rail_angle)[0, :2]
+        way = np.array([x, y]) + _theta(phi)[:2, :2].T @ leg.edge_point - leg.anchor
+        with np.errstate(divide="ignore"):
+            pin = (across @ way) / (across @ rail)
+        found[:, i] = pin - leg.home, along @ (way - pin * rail)
+    return found
+
+
 def gains(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
     """Return by how much x, y [m] and phi [rad] change for a metre of each slider: (3, 3), J2^-1 J1 at a pose.
 

@@ -23,7 +23,7 @@ EDGE = 1e-6
 EXCESS = 1e-3
 """By that share may a setpoint exceed a limit of velocity, acceleration or jerk that its path was checked against."""
 PLATFORM_EXCESS = (0.01, 0.05, 0.1)
-"""Likewise the platform's velocity, acceleration and jerk: plans make use of all of it (checks.PLATFORM_LAWS)."""
+"""Likewise the platform's velocity, acceleration and jerk: plans make use of all of it (feasibility.PLATFORM_LAWS)."""
 
 BOUNDS = np.dtype(
     [

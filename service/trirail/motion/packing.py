@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from trirail.kinematics.algebra import Array
-from trirail.motion.paths import Path
+from trirail.motion.paths import Path, sound
 from trirail.motion.runs import Run, Seam
 from trirail.wire.planning import PackedPath, PackedRun
 
@@ -31,8 +31,7 @@ def unpack_path(packed: PackedPath, degrees: int) -> Path:
     tools = np.frombuffer(packed.tools).copy()
     if len(tools) not in (0, 2 * number):
         raise ValueError(f"a path of {number} pieces with {len(tools)} coordinates of tools")
-    finite = all(np.isfinite(numbers).all() for numbers in (knots, pieces, tools))
-    if not (finite and (np.diff(knots) >= 0.0).all()):
+    if not sound(knots, pieces, tools):
         raise ValueError("a path whose numbers are not finite, or whose knots do not ascend")
     return Path(knots, pieces.reshape(number, degrees, POWERS), packed.in_sliders, tools.reshape(-1, 2))
 

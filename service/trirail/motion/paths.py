@@ -29,6 +29,7 @@ __all__ = [
     "path_motion",
     "platform_at",
     "reached",
+    "sound",
     "tool_at",
     "transfer",
     "value",
@@ -207,6 +208,21 @@ def advance(
 ) -> int:
     """Write the platform's pose, velocity and acceleration (3, 3) at a time of the law [s]; see platform_at."""
     return platform_at(legs, knots, pieces, in_sliders, tools, law_at(law_knots, law_pieces, time), near, out)
+
+
+@compiled("b1(f8[::1], f8[::1], f8[::1])")
+def sound(knots: Array, coefficients: Array, tools: Array) -> bool:
+    """Tell whether all numbers of a path are finite, and its knots ascend."""
+    for numbers in (knots, coefficients, tools):
+        for number in numbers:
+            if not math.isfinite(number):
+                return False
+    last = knots[0]
+    for knot in knots:
+        if knot < last:
+            return False
+        last = knot
+    return True
 
 
 @compiled("f8(f8[::1], f8[:, :, ::1], f8, f8)")

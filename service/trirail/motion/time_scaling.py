@@ -16,8 +16,6 @@ from trirail.motion.runs import Rate, Run, arrival, law_from_ruckig
 
 SHARES = tuple(0.6**k for k in range(12))
 """Of the quickest change of rate, tried one after the other."""
-FASTEST = 10.0
-"""No rate is greater."""
 
 
 class TimeScaling:
@@ -63,7 +61,6 @@ class TimeScaling:
         request.control_interface = ControlInterface.Velocity
         request.current_position, request.current_velocity = [at.s], [at.rate]
         request.current_acceleration, request.target_velocity = [at.change], [rate]
-        request.max_velocity = [FASTEST]
         request.max_acceleration = [max(share * self._change, abs(at.change))]
         request.max_jerk = [share * self._change_jerk]
         trajectory = Trajectory(1)

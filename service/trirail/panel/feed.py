@@ -30,6 +30,8 @@ class Feed:
         self.changed = threading.Condition()
         self.robot = msgspec.json.encode(describe(robot.info(), robot.user))
         """What a tab must know of the robot before it can draw it, as JSON."""
+        self.poses = self._ask_poses()
+        """The names of its poses, as JSON."""
         self.state: bytes | None = None
         """The newest state, as JSON with its stamp; None where the service is silent."""
         self.stamp = 0
@@ -69,13 +71,23 @@ class Feed:
             content = msgspec.json.encode(describe(self._robot.info(), self._robot.user))
         except TrirailError:
             return  # the old description stands until it answers
+        poses = self._ask_poses()
         with self.changed:
-            self.robot = content
+            self.robot, self.poses = content, poses
+
+    def _ask_poses(self) -> bytes:
+        try:
+            names = list(self._robot.poses())
+        except TrirailError:
+            names = []  # a service that knows none
+        return msgspec.json.encode({"tell": "poses", "names": names})
 
     def _hear_events(self) -> None:
         for number, event in zip(itertools.count(1), self._robot.events(history=True), strict=False):
             content = msgspec.json.encode({"tell": "event", "event": event})
+            poses = self._ask_poses() if event.kind == "pose" else self.poses
             with self.changed:
+                self.poses = poses
                 self._events.append((number, content))
                 self.changed.notify_all()
 

@@ -42,4 +42,11 @@ class SetOverride(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do
     """Share of full speed [%]."""
 
 
-FromPage = Seen | Hold | Release | Tell | SetOverride
+class GoTo(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="goto"):
+    """A named pose's button has been pressed."""
+
+    name: str
+    """The pose's."""
+
+
+FromPage = Seen | Hold | Release | Tell | SetOverride | GoTo

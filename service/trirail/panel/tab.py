@@ -13,9 +13,10 @@ from websockets.sync.server import ServerConnection
 
 from trirail.client.client import Robot
 from trirail.client.held_jog import HeldJog
+from trirail.client.lease import Lease
 from trirail.errors import TrirailError
 from trirail.panel.feed import Feed, now
-from trirail.panel.messages import FromPage, Hold, Release, Seen, SetOverride, Tell
+from trirail.panel.messages import FromPage, GoTo, Hold, Release, Seen, SetOverride, Tell
 from trirail.wire.vocabulary import Command
 
 AHEAD = 3
@@ -41,6 +42,7 @@ class Tab:
         self._outbox: list[bytes] = []
         self._unseen: deque[int] = deque()
         self._under_way: set[Command] = set()
+        self._lease: Lease | None = None
         self._open = True
 
     def serve(self) -> None:
@@ -56,6 +58,7 @@ class Tab:
             with self._feed.changed:
                 self._open = False
                 self._feed.changed.notify_all()
+            self._give_back()
 
     def _take(self, text: str | bytes) -> None:
         try:
@@ -78,6 +81,8 @@ class Tab:
                 self._tell(name)
             case SetOverride(percent):
                 self._begin(lambda: self._robot.override(percent), Command.OVERRIDE)
+            case GoTo(name):
+                self._begin(lambda: self._robot.move_to_named(name), f"go to {name}", "accepted")
 
     # ------------------------------------------------------------------ doing
 
@@ -91,20 +96,39 @@ class Tab:
 
         def tell() -> None:
             try:
-                self._robot.command(name)
+                if name is Command.ACQUIRE:
+                    self._acquire()
+                elif name is Command.RELEASE and self._lease is not None:
+                    self._give_back()
+                else:
+                    self._robot.command(name)
             finally:
                 self._under_way.discard(name)
 
         self._begin(tell, name)
 
-    def _begin(self, do: Callable[[], object], what: str) -> None:
+    def _acquire(self) -> None:
+        """Hold the lease for as long as this tab is open: with it go its signs of life."""
+        if self._lease is None or self._lease.lost is not None:
+            lease = self._robot.lease()
+            lease.__enter__()
+            self._lease = lease
+        if not self._open:
+            self._give_back()
+
+    def _give_back(self) -> None:
+        lease, self._lease = self._lease, None
+        if lease is not None:
+            lease.__exit__()
+
+    def _begin(self, do: Callable[[], object], what: str, then: str = "done") -> None:
         def run() -> None:
             try:
                 do()
             except TrirailError as error:
                 self._say("refused", to=what, message=str(error))
             else:
-                self._say("done", to=what)
+                self._say(then, to=what)
 
         threading.Thread(target=run, name=what, daemon=True).start()
 
@@ -117,13 +141,15 @@ class Tab:
 
     def _send(self) -> None:
         """Send what there is, each thing once, states only as fast as the page draws them."""
-        robot, event, stamp, silent = b"", 0, 0, False
+        robot, poses, event, stamp, silent = b"", b"", 0, 0, False
         feed = self._feed
         while True:
             due: list[bytes] = []
             with feed.changed:
                 if feed.robot is not robot:
                     due.append(robot := feed.robot)
+                if feed.poses != poses:
+                    due.append(poses := feed.poses)
                 for number, content in feed.events(event):
                     event = number
                     due.append(content)

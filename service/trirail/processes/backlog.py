@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
 from msgspec import structs
 
 from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.fair_queue import FairQueue
 from trirail.processes.inbox import Incoming
 from trirail.wire.packets import GoalRequest
 from trirail.wire.sizes import MAX_UNREAD
 
 MOST = 5_000
 """Goals that may wait for those before them; beyond that they are refused."""
+MOST_OF_ONE = 1_250
+"""Of them those of one user: the others have room whatever he sends."""
 PATIENCE = 8.0
 """A goal that has waited longer for those before it does not begin any more: its sender gives up soon [s]."""
 
@@ -28,55 +30,71 @@ class WaitingGoal(NamedTuple):
 
 
 class Backlog:
-    """Goals in the order in which they came, bounded in number and in bytes; each leaves it exactly once, by `take`.
+    """Goals by user, each user's in the order in which they came, bounded in number and in bytes; users take turns.
 
-    A goal that is withdrawn keeps its place: the loop tells of its end in its turn.
+    Each goal leaves it exactly once, by `take`: one that is withdrawn keeps its place, and the loop tells of its end in
+    its turn.
     """
 
     def __init__(self) -> None:
-        self._goals: deque[WaitingGoal] = deque()
+        self._goals: FairQueue[WaitingGoal] = FairQueue()
         self._bytes = 0
-
-    def __len__(self) -> int:
-        return len(self._goals)
+        self._stop = 0, ""
 
     def __iter__(self) -> Iterator[WaitingGoal]:
         return iter(self._goals)
 
-    def check_room(self, size: int) -> None:
+    @property
+    def users(self) -> list[str]:
+        """Who has goals in it, in the order of their turns."""
+        return list(self._goals.users)
+
+    def check_room(self, user: str, size: int) -> None:
         """Raise RefusedError if there is no room for one more goal of so many bytes."""
+        own = self._goals.of(user)
+        if own >= MOST_OF_ONE:
+            raise RefusedError(RefusalCode.BUSY, f"{own} goals of {user} are waiting already: send fewer")
         if len(self._goals) >= MOST or self._bytes + size > MAX_UNREAD:
             raise RefusedError(RefusalCode.BUSY, f"{len(self._goals)} goals are waiting already: send fewer")
 
     def add(self, incoming: Incoming, request: GoalRequest) -> None:
-        """Put a goal behind the others."""
-        self._goals.append(WaitingGoal(incoming._replace(payload=b""), request))
+        """Put a goal behind the user's others; withdrawn where it had come before the robot was told to stop."""
+        before, reason = self._stop
+        if incoming.number < before:
+            request = structs.replace(request, withdrawn=reason)
+        self._goals.put(request.user, WaitingGoal(incoming._replace(payload=b""), request))
         self._bytes += incoming.size
 
-    def first(self) -> WaitingGoal | None:
-        """Return the goal whose turn it is, None where none waits; one that has waited too long is withdrawn."""
-        if not self._goals:
-            return None
-        incoming, request = self._goals[0]
+    def first(self, user: str) -> WaitingGoal:
+        """Return the goal of a user whose turn it is; one that has waited too long is withdrawn. KeyError for none."""
+        incoming, request = self._goals.first(user)
         if request.withdrawn is None and time.monotonic_ns() - request.received_ns > PATIENCE * 1e9:
             reason = f"too many goals before it: it has waited longer than {PATIENCE:g} s"
             request = structs.replace(request, withdrawn=reason)
         return WaitingGoal(incoming, request)
 
-    def take(self) -> None:
-        """Let go of the first: the loop has it."""
-        self._bytes -= self._goals.popleft().incoming.size
+    def take(self, user: str) -> None:
+        """Let go of the user's first: the loop has it."""
+        self._bytes -= self._goals.take(user).incoming.size
 
     def withdraw(self, goal_id: str, reason: str) -> bool:
-        """Withdraw the first goal of an id; whether there is one."""
-        for number, (incoming, request) in enumerate(self._goals):
-            if request.id == goal_id:
-                self._goals[number] = WaitingGoal(incoming, structs.replace(request, withdrawn=reason))
-                return True
-        return False
+        """Withdraw the goal of an id; whether there is one."""
+        found = any(goal.request.id == goal_id for goal in self._goals)
+        if found:
+            self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.request.id == goal_id else goal)
+        return found
 
-    def withdraw_all(self, reason: str) -> None:
-        """Withdraw every goal."""
-        self._goals = deque(
-            WaitingGoal(incoming, structs.replace(request, withdrawn=reason)) for incoming, request in self._goals
-        )
+    def withdraw_all(self, reason: str, before: int) -> None:
+        """Withdraw every goal that came before a message, those as well that are read after it."""
+        self._stop = before, reason
+        self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.incoming.number < before else goal)
+
+    def withdraw_others(self, user: str | None, reason: str) -> None:
+        """Withdraw every goal but a user's."""
+        self._goals.change(lambda goal: goal if goal.request.user == user else _withdrawn(goal, reason))
+
+
+def _withdrawn(goal: WaitingGoal, reason: str) -> WaitingGoal:
+    """Return a goal as one that does not begin any more; for the first reason that there was."""
+    request = goal.request
+    return goal if request.withdrawn else goal._replace(request=structs.replace(request, withdrawn=reason))

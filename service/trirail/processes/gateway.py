@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import select
 import signal
+import sys
 import time
 import uuid
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -21,6 +23,8 @@ from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox, Incoming
 from trirail.processes.info import info
 from trirail.processes.last_words import LastWords
+from trirail.processes.measured import Meter
+from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications
 from trirail.processes.replies import Replies
 from trirail.processes.state import StateMaker
@@ -28,14 +32,16 @@ from trirail.wire import boundary, zenoh_session
 from trirail.wire.links import Closed, PacketLink
 from trirail.wire.messages import (
     CONTENT,
+    AcquireLease,
     CommandReply,
     ErrorReply,
     Event,
-    Goal,
     GoalReply,
     NoContent,
     Override,
+    ReleaseLease,
     RoleReply,
+    SentGoal,
     Stop,
 )
 from trirail.wire.packets import (
@@ -46,6 +52,7 @@ from trirail.wire.packets import (
     GoalRequest,
     Happened,
     Kind,
+    PoseChanged,
     Refused,
     RefusedRequest,
     Status,
@@ -57,17 +64,26 @@ from trirail.wire.records import unpack
 from trirail.wire.text import is_name, quoted
 from trirail.wire.vocabulary import Command, Mode
 
+SWITCH_EVERY = 0.0005
+"""After so long a thread lets another have the interpreter, which Zenoh's threads need to hand a message over [s]."""
 AT_ONCE = 256
 """Messages from Zenoh that are read before the loop is listened to again."""
 AHEAD = 2
-"""Goals that the loop has at once, so that it has the next one when it is done with the last. The others wait here:
-a command overtakes them, and what waits when the robot is told to stop does not begin any more."""
-UNDER_WAY = 32
-"""Commands that the loop has at once; beyond that they are refused, but for those that stop the robot."""
+"""Goals of one user that the loop has at once, so that it has the next one when it is done with the last. The others
+wait here: a command overtakes them, and what waits when the robot is told to stop does not begin any more."""
+AHEAD_OF_ALL = 16
+"""Goals that the loop has at once, of all users: what it takes in four cycles."""
+UNDER_WAY = 8
+"""Commands of one user that the loop has at once; beyond that they are refused, but for those that stop the robot."""
+UNDER_WAY_OF_ALL = 64
+"""Likewise, of all users."""
 REPLY_WITHIN = 15.0
 """A command that the loop has not carried out by then is answered with an error [s]."""
+TOO_MUCH = "too many messages at once: send fewer"
 REFUSALS_PER_SECOND = 10
-"""Unreadable goals that are told to everyone; the others only get their error reply."""
+"""What is refused of one user that is told to everyone; the rest only gets its error reply."""
+REFUSALS_OF_ALL = 50
+"""Likewise, of all users."""
 
 
 class _Waiting(NamedTuple):
@@ -86,6 +102,7 @@ class Gateway:
         opened: zenoh.Session,
         guard: Guard,
         log: Callable[[Event], None] = lambda _: None,
+        measured: Callable[[msgspec.Struct], None] = lambda _: None,
     ) -> None:
         self._log = log
         self._robot = config.robot.name
@@ -94,20 +111,26 @@ class Gateway:
         self._link = link
         self._beat = beat
         self._guard = guard
+        self._takeover = config.control.takeover
         self._last_words = LastWords(config.period)
         self._info = info(config)
         self._states = StateMaker(config)
+        self._meter = Meter(measured) if config.telemetry.metrics_port else None
         self._state_every = 1.0 / config.telemetry.state_hz
         self._state_due = 0.0
         self._replies = Replies(self._robot)
         self._inbox = Inbox(opened, self._robot, self._too_much)
+        self._poses = Poses(config, self._replies.send, self._refuse, self._tell_of_pose, self._inbox.wake)
         self._backlog = Backlog()
-        self._ahead: set[int] = set()
-        self._commands: set[int] = set()
+        self._ahead: dict[int, str] = {}
+        """The tickets of the goals that the loop has, and whose they are."""
+        self._commands: dict[int, str] = {}
+        """Likewise, of the commands."""
         self._waiting: dict[int, _Waiting] = {}
         self._tickets = 0
-        self._refusals = 0
+        self._refusals: Counter[str] = Counter()
         self._refusals_since = 0.0
+        self._overruns: deque[str] = deque(maxlen=REFUSALS_OF_ALL)
         self._ending = False
         self._publications = Publications(opened, self._robot)
 
@@ -119,7 +142,7 @@ class Gateway:
         try:
             while not self._ending:
                 self._beat()
-                poll.poll(BEAT_EVERY * 1e3)
+                poll.poll(math.ceil(min(BEAT_EVERY, self._inbox.due()) * 1e3))
                 for incoming in self._inbox.take(AT_ONCE):
                     self._beat()
                     self._handle(incoming)
@@ -127,16 +150,24 @@ class Gateway:
                     self._beat()
                     self._last_words.heard()
                     self._hear(packet, ready)
+                self._send_goals()  # those for which there was no room
+                self._poses.settle()
                 self._give_up_late()
+                self._tell_of_overruns()
         except Closed:
             self._tell_of_its_end()
         finally:
+            self._poses.close()
             for incoming in [
                 *(waiting.incoming for waiting in self._waiting.values()),
                 *(goal.incoming for goal in self._backlog),
             ]:
                 self._replies.send(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
             self._replies.close()
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what people should know of how the service is run, one line each."""
+        return (*self._guard.warnings(), *self._poses.warnings())
 
     def end(self) -> None:
         """End soon; safe from a signal handler."""
@@ -156,6 +187,10 @@ class Gateway:
                 self._replies.send(incoming, RoleReply(user, self._guard.role(user)))
             elif incoming.kind == "goal":
                 self._goal(incoming)
+            elif incoming.kind == "poses":
+                self._replies.send(incoming, self._poses.table())
+            elif incoming.kind in ("teach", "forget"):
+                self._poses.take(incoming)
             else:
                 self._command(incoming)
         except RefusedError as refusal:
@@ -167,23 +202,28 @@ class Gateway:
 
     def _goal(self, incoming: Incoming) -> None:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
-        goal: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
-        self._backlog.check_room(incoming.size)
+        sent: SentGoal = boundary.decode(incoming.payload, SentGoal, "not a goal", incoming.encoding)
+        goal = self._poses.stated(sent)
+        self._backlog.check_room(user, incoming.size)
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
         self._backlog.add(incoming, GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns()))
         self._send_goals()
 
     def _send_goals(self) -> None:
-        """Pass on as many goals as the loop is to have."""
-        while len(self._ahead) < AHEAD and (first := self._backlog.first()) is not None:
-            incoming, request = first
-            if not self._link.send(message(request)):
+        """Pass on as many goals of each user as the loop is to have."""
+        of = Counter(self._ahead.values())
+        for user in self._backlog.users:
+            if len(self._ahead) >= AHEAD_OF_ALL:
                 return
-            self._backlog.take()
-            self._ahead.add(request.ticket)
-            self._last_words.take(request)
-            self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
+            if of[user] < AHEAD:
+                incoming, request = self._backlog.first(user)
+                if not self._link.send(message(request)):
+                    return
+                self._backlog.take(user)
+                self._ahead[request.ticket] = user
+                self._last_words.take(request)
+                self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
 
     def _command(self, incoming: Incoming) -> None:
         user, called = boundary.names(incoming.key, self._key("cmd"), ("user", "command"))
@@ -194,41 +234,74 @@ class Gateway:
             raise RefusedError(RefusalCode.UNKNOWN_COMMAND, problem) from error
         takes = f"{name} takes {name.content}"
         content = boundary.decode(incoming.payload, CONTENT.get(name, NoContent | None), takes, incoming.encoding)
-        share = content.percent / 100.0 if isinstance(content, Override) else None
         goal = content.goal if isinstance(content, Stop) else None
         reason = f"{name} by {user}"
         if goal is not None and self._backlog.withdraw(goal, reason):  # before the loop has it
             self._replies.send(incoming, CommandReply(Command.STOP, self._states.newest().mode))
             return
-        if len(self._commands) >= UNDER_WAY and not name.stops:
-            raise RefusedError(RefusalCode.BUSY, f"{len(self._commands)} commands are under way already: send fewer")
-        self._tickets += 1
-        if not self._link.send(message(CommandRequest(self._tickets, user, name, share, goal))):
+        if not name.stops:
+            self._check_under_way(user)
+        request = self._request(user, name, content)
+        if not self._link.send(message(request)):
             raise RefusedError(RefusalCode.BUSY, "too many requests at once: send it again")
-        self._commands.add(self._tickets)
+        self._commands[request.ticket] = user
         within = self._home_within if name is Command.HOME else REPLY_WITHIN
-        self._waiting[self._tickets] = _Waiting(incoming, time.monotonic() + within)
-        if name.stops and goal is None:
-            self._backlog.withdraw_all(reason)
+        self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + within)
+        if name.stops and goal is None and (name.everybodys or self._states.lease in (None, user)):
+            self._backlog.withdraw_all(reason, incoming.number)
+
+    def _check_under_way(self, user: str) -> None:
+        """Raise RefusedError where the loop has as many commands of a user, or of all, as it is to have."""
+        own = sum(sender == user for sender in self._commands.values())
+        if own >= UNDER_WAY:
+            raise RefusedError(RefusalCode.BUSY, f"{own} commands of {user} are under way already: send fewer")
+        if len(self._commands) >= UNDER_WAY_OF_ALL:
+            raise RefusedError(RefusalCode.BUSY, f"{len(self._commands)} commands are under way already: send fewer")
+
+    def _request(self, user: str, name: Command, content: msgspec.Struct | None) -> CommandRequest:
+        """Make of a command and what it carries what the loop takes. Raises RefusedError for what a role forbids."""
+        self._tickets += 1
+        match content:
+            case Override(percent):
+                return CommandRequest(self._tickets, user, name, percent / 100.0)
+            case Stop(goal):
+                return CommandRequest(self._tickets, user, name, goal=goal)
+            case AcquireLease(lease, timeout, force):
+                if force:
+                    self._guard.check(user, self._takeover, "taking the lease over")
+                return CommandRequest(self._tickets, user, name, lease=lease, timeout=timeout, force=force)
+            case ReleaseLease(lease):
+                return CommandRequest(self._tickets, user, name, lease=lease)
+        return CommandRequest(self._tickets, user, name)
 
     def _too_much(self, incoming: Incoming) -> None:
         """Answer what there is no room for; called by Zenoh's threads."""
-        self._replies.send(incoming, ErrorReply(RefusalCode.BUSY, "too many messages at once: send fewer"))
+        self._overruns.append(incoming.user)
+        self._replies.send(incoming, ErrorReply(RefusalCode.BUSY, TOO_MUCH))
+
+    def _tell_of_overruns(self) -> None:
+        """Tell everyone whose messages there was no room for: a put has no answer."""
+        while self._overruns:
+            user = self._overruns.popleft()
+            self._tell(TOO_MUCH, user if is_name(user) else "")
 
     def _refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
         """Answer what cannot be taken; tell everyone too, since a put has no answer."""
         text = quoted(str(refusal))
         self._replies.send(incoming, ErrorReply(refusal.code, text))
-        user, *_ = [*incoming.key.split("/")[3:], ""]
-        self._tell(text, user if is_name(user) else "")
+        self._tell(text, incoming.user if is_name(incoming.user) else "")
+
+    def _tell_of_pose(self, changed: PoseChanged) -> None:
+        self._link.send(message(changed))
 
     def _tell(self, text: str, user: str = "") -> None:
         """Have the loop tell everyone, but not too often."""
         now = time.monotonic()
         if now - self._refusals_since >= 1.0:
-            self._refusals, self._refusals_since = 0, now
-        self._refusals += 1
-        if self._refusals <= REFUSALS_PER_SECOND:
+            self._refusals.clear()
+            self._refusals_since = now
+        if self._refusals[user] < REFUSALS_PER_SECOND and self._refusals.total() < REFUSALS_OF_ALL:
+            self._refusals[user] += 1
             self._link.send(message(RefusedRequest(user, text)))
 
     # ------------------------------------------------------------------ loop to Zenoh
@@ -269,17 +342,26 @@ class Gateway:
 
     def _publish(self, batch: memoryview) -> None:
         """Take in a batch of records and pass it on; publish the newest state when it is time."""
+        rows = unpack(batch)
         self._publications.records(bytes(batch))
-        self._states.records(unpack(batch))
+        self._states.records(rows)
+        self._poses.measure(rows[-1])
+        if self._meter is not None:
+            self._meter.records(rows)
+            self._meter.tell(self._states.newest)
         now = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
-            self._publications.state(self._states.newest(self._guard.warnings()))
+            self._publications.state(self._states.newest(self.warnings()))
 
     def _happened(self, event: Event) -> None:
-        """Tell everyone of an event, and the service's log."""
+        """Tell everyone of an event, and the service's log; what others have sent under a new holder does not begin."""
+        if event.kind == "lease":
+            self._backlog.withdraw_others(event.user, event.message)
         self._publications.event(event)
         self._log(event)
+        if self._meter is not None:
+            self._meter.event(event)
 
     def _tell_of_its_end(self) -> None:
         """The loop has gone: where it has died, tell everyone in its place."""
@@ -291,11 +373,10 @@ class Gateway:
 
     def _answer(self, ticket: int, content: msgspec.Struct) -> None:
         waiting = self._waiting.pop(ticket, None)
-        self._commands.discard(ticket)
+        self._commands.pop(ticket, None)
         if waiting is not None:
             self._replies.send(waiting.incoming, content)
-        if ticket in self._ahead:
-            self._ahead.discard(ticket)
+        if self._ahead.pop(ticket, None) is not None:
             self._send_goals()
 
     def _give_up_late(self) -> None:
@@ -313,11 +394,16 @@ def main(
     beat: Callable[[], None],
     ready: Callable[[object], None],
     log: Callable[[Event], None],
+    measured: Callable[[msgspec.Struct], None],
 ) -> int:
-    """Run the gateway's process; `ready` is called once it can be reached, `log` with each event."""
+    """Run the gateway's process.
+
+    `ready` is called once it can be reached, `log` with each event, `measured` each second if there are metrics.
+    """
+    sys.setswitchinterval(SWITCH_EVERY)
     guard = Guard(config)
     with guard.open() as opened:
-        gateway = Gateway(config, link, beat, opened, guard, log)
+        gateway = Gateway(config, link, beat, opened, guard, log, measured)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
-        gateway.serve(lambda: ready({"warnings": guard.warnings()}))
+        gateway.serve(lambda: ready({"warnings": gateway.warnings()}))
     return 0

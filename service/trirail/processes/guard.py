@@ -7,9 +7,10 @@ from pathlib import Path
 import zenoh
 
 from trirail.config import Config
+from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import zenoh_session
 from trirail.wire.access import access_control
-from trirail.wire.credentials import Credentials, revoked
+from trirail.wire.credentials import Credentials, with_role
 from trirail.wire.endpoints import ReachableBy, reach, socket_file
 from trirail.wire.vocabulary import Role
 
@@ -30,9 +31,8 @@ class Guard:
         if config.zenoh.tls is not None:
             folder = Path(config.zenoh.tls.directory)
             self._credentials = Credentials.read(folder)
-            without = revoked(folder)
-            self.users = {user: role for user, role in config.zenoh.users.items() if user not in without}
-            self._gone = [user for user in config.zenoh.users if user in without]
+            self.users = with_role(config.zenoh.users, folder)
+            self._gone = [user for user in config.zenoh.users if user not in self.users]
 
     def open(self) -> zenoh.Session:
         """Open the session. Raises ServiceError where an address cannot be listened on."""
@@ -48,6 +48,13 @@ class Guard:
     def role(self, user: str) -> Role | None:
         """Return what a user may: all where nobody is asked for a certificate, nothing where he is not named."""
         return Role.MAINTAINER if self._credentials is None else self.users.get(user)
+
+    def check(self, user: str, needed: Role, what: str) -> None:
+        """Raise RefusedError where a user's role does not allow what is asked."""
+        role = self.role(user)
+        if role is None or not role.includes(needed):
+            problem = f"the role of {user} at {self._robot} is {role or 'none'}: {what} needs {needed}"
+            raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
 
     def warnings(self) -> tuple[str, ...]:
         """Return what people should know of the door, one line each, with the remedy."""

@@ -9,9 +9,9 @@ import time
 from collections.abc import Callable
 
 from trirail.control.ledger import REMEMBERED_IDS, Notice
-from trirail.wire.messages import Event
+from trirail.wire.messages import Event, Fault
 from trirail.wire.packets import Answer, ControlInput, Farewell, GoalRequest, Happened, Status
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import FaultCause, Mode
 
 FROZEN, CYCLES = 0.5, 3
 """The loop sends records every 20 ms, or in every cycle: silent for so long before its end, it was frozen [s]."""
@@ -73,7 +73,7 @@ class LastWords:
         reason = self.reason
         if not reason:
             return []
-        missing = [Notice("fault", "error", reason)]
+        missing = [Notice("fault", "error", reason, fault=Fault(FaultCause.LOOP))]
         for goal_id, user in self._open.items():
             words = f"goal {goal_id} faulted: {reason}"
             missing.append(Notice("goal", "error", words, id=goal_id, outcome="faulted", reason=reason, user=user))

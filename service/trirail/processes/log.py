@@ -15,6 +15,10 @@ from trirail.wire.text import json_printable, printable, wall_clock
 
 Form = Literal["text", "json"]
 
+BURST: Final = 100
+"""So many lines may come at once."""
+RATE: Final = 1.0
+"""And then so many a second: who floods the robot with goals must not fill its disk. Errors are always written."""
 PRIORITIES: Final[Mapping[str, int]] = {"info": 6, "warning": 4, "error": 3}
 """Of each level, as journald takes it in front of a line: sd-daemon(3)."""
 
@@ -34,6 +38,9 @@ class Log:
         self._clock = clock
         self._to_journal = "JOURNAL_STREAM" in environment
         self._newest = 0
+        self._room = float(BURST)
+        self._looked = clock()
+        self._left_out = 0
 
     def say(self, words: str, level: Level = "info") -> None:
         """Write what the service says of itself."""
@@ -42,9 +49,24 @@ class Log:
 
     def event(self, event: Event) -> None:
         """Write an event, once: a gateway that was started again tells the past anew."""
-        if event.seq > self._newest:
-            self._newest = event.seq
-            self._write(event.time, event.level, event.message, event)
+        if event.seq <= self._newest:
+            return
+        self._newest = event.seq
+        if not self._has_room() and event.level != "error":
+            self._left_out += 1
+            return
+        if self._left_out:
+            number, self._left_out = self._left_out, 0
+            self.say(f"{number} events came too quickly to be written here: `trirail events` has them", "warning")
+            self._room -= 1.0
+        self._room -= 1.0
+        self._write(event.time, event.level, event.message, event)
+
+    def _has_room(self) -> bool:
+        now = self._clock()
+        self._room = min(float(BURST), self._room + RATE * max(0.0, now - self._looked))
+        self._looked = now
+        return self._room >= 1.0
 
     def _write(self, moment: float, level: Level, words: str, content: object) -> None:
         if self._json:

@@ -304,7 +304,8 @@ class Loop:
         control, goal = self.control, self.control.ledger.goal
         goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
         fault = quoted(control.fault) if control.fault else None
-        status = message(Status(goal_id, control.override, fault, control.target, self._bus_load, counts))
+        said = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user
+        status = message(Status(*said))
         if status != self._status:
             self._status = status
             self._gateway.send(status)

@@ -38,6 +38,8 @@ COMPILING = "compiling"
 """The key of what is said of a function that is being compiled."""
 HAPPENED = "happened"
 """The key of an event, for the service's log."""
+MEASURED = "measured"
+"""The key of what a process has measured, for the metrics."""
 LOG_WITHIN = 0.05
 """How long a line for the log waits for a supervisor whose own output is held up, before it is left out [s]."""
 
@@ -48,6 +50,7 @@ def _main(
     heartbeats: Heartbeats,
     ready: Callable[[object], None],
     log: Callable[[Event], None],
+    measured: Callable[[msgspec.Struct], None],
     sockets: list[int],
 ) -> int:
     order = msgspec.json.decode(sys.stdin.buffer.read(), type=Order)
@@ -67,10 +70,10 @@ def _main(
     if name == "gateway":
         from trirail.processes import gateway as gate
 
-        return gate.main(config, link, heartbeats.of("gateway").beat, ready, log)
+        return gate.main(config, link, heartbeats.of("gateway").beat, ready, log, measured)
     from trirail.processes import recording
 
-    return recording.main(config, order.record, link, heartbeats.of(name), ready)
+    return recording.main(config, order.record, link, heartbeats.of(name), ready, measured)
 
 
 def main() -> int:
@@ -89,10 +92,17 @@ def main() -> int:
         if select.select([], [int(descriptor)], [], LOG_WITHIN)[1]:
             ready({HAPPENED: event})
 
+    def measured(content: msgspec.Struct) -> None:
+        line = msgspec.json.encode({MEASURED: content}) + b"\n"
+        # No more than a pipe takes at once: nobody waits for a supervisor here, and in a second it comes again.
+        if len(line) <= select.PIPE_BUF and select.select([], [int(descriptor)], [], 0.0)[1]:
+            os.write(int(descriptor), line)
+
     tell_of_compiling(lambda function: ready({COMPILING: function}))
 
+    hearts, numbers = Heartbeats(int(beats)), [int(number) for number in sockets]
     try:
-        return _main(name, Path(runtime), Heartbeats(int(beats)), ready, log, [int(number) for number in sockets])
+        return _main(name, Path(runtime), hearts, ready, log, measured, numbers)
     except TrirailError as error:
         print(f"trirail: {error}", file=sys.stderr, flush=True)  # noqa: T201 - a process says why it ends
         return os.EX_CONFIG

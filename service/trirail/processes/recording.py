@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import signal
@@ -11,9 +12,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
+
 from trirail.config import Config
 from trirail.processes.heartbeats import Heart
 from trirail.processes.last_words import LastWords
+from trirail.processes.measured import TOLD_EVERY, RecorderMeasured
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
@@ -102,8 +106,15 @@ class Intake:
             self._link.send(message(Remark(level, words)))
 
 
-def main(config: Config, record: str | None, link: PacketLink, heart: Heart, ready: Callable[[object], None]) -> int:
-    """Record until the loop has gone or the process is told to end."""
+def main(
+    config: Config,
+    record: str | None,
+    link: PacketLink,
+    heart: Heart,
+    ready: Callable[[object], None],
+    measured: Callable[[msgspec.Struct], None],
+) -> int:
+    """Record until the loop has gone or the process is told to end; tell `measured` of gaps, if there are metrics."""
     os.umask(NOT_FOR_OTHERS | os.umask(NOT_FOR_OTHERS))
     intake = Intake(config, record, link, ready)
     ending = False
@@ -115,6 +126,7 @@ def main(config: Config, record: str | None, link: PacketLink, heart: Heart, rea
     signal.signal(signal.SIGTERM, end)
     poll = select.poll()
     poll.register(link.fileno(), select.POLLIN)
+    told = -math.inf
     try:
         while not ending:
             heart.beat()
@@ -124,6 +136,9 @@ def main(config: Config, record: str | None, link: PacketLink, heart: Heart, rea
                 intake.take(packet)
                 heart.beat()
             intake.recorder.save()
+            if config.telemetry.metrics_port and time.monotonic() >= told + TOLD_EVERY:
+                told = time.monotonic()
+                measured(RecorderMeasured(*intake.recorder.missing))
     except Closed:
         intake.loop_gone()
     finally:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import queue
 import threading
 import time
+from collections import deque
 
 import msgspec
 import zenoh
@@ -15,55 +15,73 @@ from trirail.processes.inbox import Incoming
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import ErrorReply
 
-LANES = 32
-"""Threads, and queues before them: an asker's answers go all through one, chosen by the key that was asked."""
+THREADS = 32
+"""So many askers that take no answer hold up nobody else."""
 CLOSE_WITHIN = 2.0
 """How long the last answers may take [s]."""
 
 
-_Lane = queue.SimpleQueue[tuple[Incoming, msgspec.Struct] | None]
-
-
 class Replies:
-    """Sends answers. An answer is never dropped: it waits for its asker, until the transport gives that up."""
+    """Sends answers, to each asker in their order. One is never dropped before the transport gives its asker up."""
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
-        self._lanes: list[_Lane] = [queue.SimpleQueue() for _ in range(LANES)]
-        self._threads = [
-            threading.Thread(target=self._run, args=(lane,), name="replies", daemon=True) for lane in self._lanes
-        ]
+        self._changed = threading.Condition()
+        # Not bounded: a query that is let go says so to its asker, and that may wait as long as an answer.
+        self._of: dict[str, deque[tuple[Incoming, msgspec.Struct]]] = {}
+        self._idle: deque[str] = deque()
+        """Askers with answers of which none is being sent, in the order of their turns."""
+        self._closed = False
+        self._threads = [threading.Thread(target=self._run, name="replies", daemon=True) for _ in range(THREADS)]
         for thread in self._threads:
             thread.start()
 
     @property
     def waiting(self) -> int:
         """How many answers wait for their turn."""
-        return sum(lane.qsize() for lane in self._lanes)
+        with self._changed:
+            return sum(map(len, self._of.values()))
 
     def send(self, incoming: Incoming, content: msgspec.Struct) -> None:
         """Answer a query; nothing for a put."""
-        if incoming.query is not None:
-            # Of a command the user decides and not its name: who asks for one thing and does not listen is the same.
-            asker = "/".join(incoming.key.split("/")[:4])
-            # Not bounded: a query that is let go says so to its asker, and that may wait as long as an answer.
-            self._lanes[hash(asker) % LANES].put((incoming, content))
+        if incoming.query is None:
+            return
+        # Of a command the user decides and not its name: who asks for one thing and does not listen is the same.
+        asker = "/".join(incoming.key.split("/")[:4])
+        with self._changed:
+            if asker not in self._of:
+                self._of[asker] = deque()
+                self._idle.append(asker)
+                self._changed.notify()
+            self._of[asker].append((incoming, content))
 
     def close(self) -> None:
         """Send what waits, for a while at most."""
         deadline = time.monotonic() + CLOSE_WITHIN
-        for lane in self._lanes:
-            lane.put(None)
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
 
-    def _run(self, lane: _Lane) -> None:
-        while (item := lane.get()) is not None:
-            incoming, content = item
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._idle or self._closed)
+                if not self._idle:
+                    return
+                asker = self._idle.popleft()
+                incoming, content = self._of[asker].popleft()
             if incoming.query is not None:
                 with contextlib.suppress(zenoh.ZError):  # the asker has gone
                     self._answer(incoming, incoming.query, content)
-            del item, incoming  # for a query ends when nobody has it any more
+            del incoming, content  # for a query ends when nobody has it any more
+            with self._changed:
+                if self._of[asker]:
+                    self._idle.append(asker)
+                    self._changed.notify()
+                else:
+                    del self._of[asker]
 
     def _answer(self, incoming: Incoming, query: zenoh.Query, content: msgspec.Struct) -> None:
         try:
@@ -75,5 +93,6 @@ class Replies:
             if isinstance(content, ErrorReply):
                 query.reply_err(payload, encoding=encoding)
             else:
-                key = zenoh_session.key(self._robot, "info") if incoming.kind == "info" else incoming.key
+                of_robot = incoming.kind in ("info", "poses")  # what was asked may have wildcards
+                key = zenoh_session.key(self._robot, incoming.kind) if of_robot else incoming.key
                 query.reply(key, payload, encoding=encoding)

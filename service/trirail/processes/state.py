@@ -63,6 +63,11 @@ class StateMaker:
             self._statistics = self._lateness.percentiles(), self._cycle.percentiles()
 
     @property
+    def lease(self) -> str | None:
+        """Who holds the lease."""
+        return self._status.lease
+
+    @property
     def cycle(self) -> int:
         """Cycle of the newest record; 0 for none."""
         return 0 if self._newest is None else int(self._newest["cycle"])
@@ -102,6 +107,7 @@ class StateMaker:
             else None,
             settled=bool(row["settled"]),
             override=self._status.override,
+            lease=self._status.lease,
             faults=(self._status.fault,) if self._status.fault else (),
             warnings=warnings,
             loop=LoopState(

@@ -19,9 +19,11 @@ from msgspec import structs
 from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.processes.compiling import Progress
+from trirail.processes.health import Running
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
 from trirail.processes.interpreter import CHILD, python
-from trirail.processes.process import COMPILING, HAPPENED, Order
+from trirail.processes.monitor import Monitor
+from trirail.processes.process import COMPILING, HAPPENED, MEASURED, Order
 from trirail.processes.systemd import Watchdog, notify
 from trirail.wire import links
 from trirail.wire.messages import Event, Level
@@ -63,6 +65,7 @@ class _Child:
         self.began = time.monotonic()
         self.compiling: list[str] = []
         self.happened: list[Event] = []
+        self.measured: list[dict[str, Any]] = []
         self._begun_line = b""
         self.ready_with: dict[str, Any] | None = None
         self._hung_for = 0.0
@@ -90,6 +93,8 @@ class _Child:
                 self.compiling.append(said[COMPILING])
             elif HAPPENED in said:
                 self.happened.append(msgspec.convert(said[HAPPENED], Event))
+            elif MEASURED in said:
+                self.measured.append(said[MEASURED])
             else:
                 self.ready_with = said
         return bool(content)
@@ -136,6 +141,7 @@ class Supervisor:
         self._selector = selectors.DefaultSelector()
         self._restarts: dict[str, list[float]] = {name: [] for name in CHILDREN}
         self._due: dict[str, float] = {}
+        self._started = dict.fromkeys(CHILDREN, 0)
         self._heartbeats = Heartbeats.create()
         loop_silent = max(SILENT, LEAST_CYCLES * config.period)
         self._patience = {
@@ -147,6 +153,7 @@ class Supervisor:
         self._watches = {
             name: Watch(self._heartbeats.of(name), round(seconds / TURN)) for name, seconds in self._patience.items()
         }
+        self._monitor = Monitor(config, self._heartbeats, TURN)
         self._watchdog = Watchdog([self._heartbeats.of(name) for name in WATCHED_BY_SYSTEMD])
         self._next_turn = 0.0
         self._went_on = 0.0
@@ -160,7 +167,8 @@ class Supervisor:
         `up` is called once with what each process said when it was ready.
         """
         parent = os.environ.get("XDG_RUNTIME_DIR")
-        with tempfile.TemporaryDirectory(prefix="trirail-", dir=parent) as folder, _Signals() as signals:
+        runtime = tempfile.TemporaryDirectory(prefix="trirail-", dir=parent)
+        with runtime as folder, _Signals() as signals, self._monitor:
             self._runtime = Path(folder)
             self._listening = [links.listen(self._runtime / name) for name in PORTS]
             self._selector.register(signals.reader, selectors.EVENT_READ, None)
@@ -179,6 +187,7 @@ class Supervisor:
         if name in PROCESSES:
             self._heartbeats.of(name).rest()
         beats = self._heartbeats.descriptor
+        self._started[name] += 1
         child = _Child(name, msgspec.json.encode(self._orders[name]), self._runtime, beats, sockets)
         self._children[name] = child
         self._selector.register(child.pipe, selectors.EVENT_READ, child)
@@ -226,9 +235,16 @@ class Supervisor:
         for child in self._children.values():
             if child.ready_with is None and now - max(child.began, self._went_on) > START_WITHIN:
                 child.kill_hung(START_WITHIN)
+        self._monitor.look({name: self._running(name) for name in CHILDREN})
         for name, watch in self._watches.items():
             if watch.silent() and name in self._children:
                 self._children[name].kill_hung(self._patience[name])
+
+    def _running(self, name: str) -> Running:
+        child, restarts = self._children.get(name), self._started[name] - 1
+        if child is None:
+            return Running(None, ready=False, restarts=restarts)
+        return Running(child.process.pid, child.ready_with is not None, restarts)
 
     def _on_end(self, child: _Child) -> None:
         """Decide what the end of a process means."""
@@ -281,6 +297,8 @@ class Supervisor:
     def _pass_on(self, child: _Child) -> None:
         while child.happened:
             self._tell(child.happened.pop(0))
+        while child.measured:
+            self._monitor.take(child.name, child.measured.pop(0))
 
     def _forget(self, child: _Child) -> None:
         while child.listen():
@@ -293,6 +311,7 @@ class Supervisor:
     def _end(self) -> None:
         """End the loop first, so that the others can tell of it; then those. The planner has nothing to tell."""
         notify("STOPPING=1")
+        self._monitor.end({name: self._running(name) for name in CHILDREN})
         if loop := self._children.get("loop"):
             loop.process.send_signal(signal.SIGTERM)
             if not loop.wait(time.monotonic() + END_WITHIN):

@@ -24,6 +24,7 @@ from trirail.wire.packets import (
     DrivesFault,
     GoalRequest,
     PlannerLost,
+    PoseChanged,
     RefusedRequest,
 )
 from trirail.wire.planning import Extended, NotPlanned, Planned
@@ -103,5 +104,5 @@ def _words(what: ControlInput) -> str:
             return f"plan {number}: {message}"
         case PlannerLost(reason=reason):
             return reason
-        case RefusedRequest(message=message):
+        case RefusedRequest(message=message) | PoseChanged(message=message):
             return message

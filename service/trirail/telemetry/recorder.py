@@ -119,6 +119,11 @@ class Recorder:
         """Batches that the live view was too slow for."""
         return self._live.skipped if self._live else 0
 
+    @property
+    def missing(self) -> tuple[int, int, int]:
+        """What is missing: batches in the file, in the live view, and cycles that this recorder was too slow for."""
+        return self.lost, self.skipped, self._absent
+
     def records(self, batch: bytes) -> None:
         """Take packed records."""
         last = last_cycle(batch)
@@ -217,10 +222,9 @@ class Recorder:
 
     def _missing(self) -> str:
         """Return what is missing, in words, if that is more than was last said."""
-        missing = self.lost, self.skipped, self._absent
-        if missing == self._reported:
+        if self.missing == self._reported:
             return ""
-        self._reported = missing
+        self._reported = self.missing
         because = f" ({self.cause})" if self.cause else ""
         return (
             f"missing so far: {self.lost} batches in the file{because}, {self.skipped} in the live view, "

@@ -16,6 +16,8 @@ from trirail.wire.zenoh_session import key
 
 GOALS = Role.OPERATOR
 """The least role that may send goals."""
+POSES = Role.MAINTAINER
+"""The least role that may teach and remove poses."""
 COMMANDS: dict[Command, Role] = {
     Command.STOP: Role.VIEWER,
     Command.ENABLE: Role.OPERATOR,
@@ -24,6 +26,8 @@ COMMANDS: dict[Command, Role] = {
     Command.PAUSE: Role.OPERATOR,
     Command.RESUME: Role.OPERATOR,
     Command.OVERRIDE: Role.OPERATOR,
+    Command.ACQUIRE: Role.OPERATOR,
+    Command.RELEASE: Role.OPERATOR,
     Command.RESET: Role.MAINTAINER,
     Command.HOME: Role.MAINTAINER,
 }
@@ -36,6 +40,8 @@ def least_role(*parts: str) -> Role:
     """Return the least role that may use the resource of these parts of a robot's key, as ("cmd", user, "enable")."""
     if parts[0] == "goal":
         return GOALS
+    if parts[0] in ("teach", "forget"):
+        return POSES
     return COMMANDS[Command(parts[2])] if parts[0] == "cmd" else Role.VIEWER
 
 
@@ -73,11 +79,13 @@ def _of_every_user(robot: str) -> Iterator[_Rule]:
     """Yield what a viewer may, but for what has his name in its key; and what the robot may send to him."""
     published = [key(robot, name) for name in ("state", "event", "records")]
     # Of the advanced publisher: its past, that it is there, and the number of its last event.
-    past, alive, own = key(robot, "event", "@adv", "**"), key(robot, "alive"), key(robot, "info")
-    asked = [key(robot, "goal", "*"), key(robot, "cmd", "*", "*"), own]
+    past, alive = key(robot, "event", "@adv", "**"), key(robot, "alive")
+    told = [key(robot, "info"), key(robot, "poses")]
+    taught = [key(robot, name, "*", "*") for name in ("teach", "forget")]
+    asked = [key(robot, "goal", "*"), key(robot, "cmd", "*", "*"), *taught, *told]
     yield _rule("publish", "egress", ("put",), *published, past)
     yield _rule("subscribe", "ingress", ("declare_subscriber",), *published, past)
-    yield _rule("ask", "ingress", ("query",), own, past)
+    yield _rule("ask", "ingress", ("query",), *told, past)
     yield _rule("listen", "egress", ("declare_queryable",), *asked, past)
     yield _rule("listen to puts", "egress", ("declare_subscriber",), key(robot, "goal", "*"))
     yield _rule("answer", "egress", ("reply",), *asked, past, *published)
@@ -91,6 +99,9 @@ def _of_user(robot: str, user: str, role: Role) -> Iterator[_Rule]:
     """Yield what has a user's name in its key."""
     commands = [key(robot, "cmd", user, command) for command, least in COMMANDS.items() if role.includes(least)]
     yield _rule(f"{user} commands", "ingress", ("query",), *commands)
+    if role.includes(POSES):
+        poses = [key(robot, name, user, "*") for name in ("teach", "forget")]
+        yield _rule(f"{user} teaches poses", "ingress", ("query",), *poses)
     if role.includes(GOALS):
         yield _rule(f"{user} sends goals", "ingress", ("query", "put"), key(robot, "goal", user))
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple, Self
 
 from trirail.errors import ServiceError
 from trirail.wire.endpoints import ReachableBy, reach
+from trirail.wire.vocabulary import Role
 
 AUTHORITY, CERTIFICATE, KEY, REVOKED = "ca.pem", "cert.pem", "key.pem", "revoked.txt"
 WARNED = timedelta(days=30)
@@ -80,6 +82,12 @@ def revoked(folder: Path) -> frozenset[str]:
     """
     file = folder / REVOKED
     return frozenset(_content(file).decode().split()) if file.exists() else frozenset()
+
+
+def with_role(users: Mapping[str, Role], folder: Path) -> dict[str, Role]:
+    """Return the role of each user who is not revoked in an authority's folder. Raises ServiceError as `revoked`."""
+    without = revoked(folder)
+    return {user: role for user, role in users.items() if user not in without}
 
 
 def credentials_for(robot: str, locator: str, folder: Path | str | None = None) -> Credentials | None:

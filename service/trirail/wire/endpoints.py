@@ -26,6 +26,11 @@ def reach(endpoint: str) -> ReachableBy:
     return ReachableBy.MACHINE if is_local(endpoint) else ReachableBy.NETWORK
 
 
+def endpoint_of(address: str, port: int) -> str:
+    """Return an IP address and a port as an endpoint of TCP."""
+    return f"tcp/[{address}]:{port}" if ":" in address else f"tcp/{address}:{port}"
+
+
 def socket_file(endpoint: str) -> Path | None:
     """Return the file of an endpoint that is a Unix socket, None of any other."""
     protocol, address = _parts(endpoint)

@@ -37,6 +37,7 @@ Validity = Annotated[float, Meta(ge=1e-3, le=86_400.0)]
 Moment = Annotated[float, Meta(ge=-86_400.0, le=86_400.0)]
 OwnTriple = tuple[OwnLimit, OwnLimit, OwnLimit]
 FrameName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
+PoseName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
 Tool = tuple[Coordinate, Coordinate] | FrameName
 """A point of the platform in its own frame, whose origin is the centre [m], or the name of one in [frames.tool]."""
 
@@ -103,6 +104,26 @@ class MoveGoal(
     """From which pose: "commanded" is where the goals before it lead, and where the robot is commanded to be without
     one or in a jog, so that moves add up whenever they come; "measured" is where it is measured to be when they have
     been planned."""
+    id: Identifier | None = None
+    """As of a pose goal."""
+    speed: Speed = 1.0
+    """As of a pose goal."""
+    valid_for: Validity | None = None
+    """As of a pose goal [s]."""
+    limits: OwnLimits | None = None
+    """As of a pose goal."""
+    blend: Annotated[float, Meta(ge=0.0, le=1e3)] | None = None
+    """As of a pose goal [m]."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+class NamedGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="named"):
+    """Move the platform to a pose that has a name: a pose goal, of the pose of that name when it comes in."""
+
+    name: PoseName
+    """One of those that are answered on …/poses."""
     id: Identifier | None = None
     """As of a pose goal."""
     speed: Speed = 1.0
@@ -201,6 +222,8 @@ class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
 PlannedGoal = PoseGoal | SlidersGoal | VelocityGoal | TrajectoryGoal
 """What the planner is asked for; its tools are points and its poses those of the base frame."""
 Goal = PlannedGoal | MoveGoal
+SentGoal = Goal | NamedGoal
+"""What clients send. The gateway puts poses in the place of their names: the loop, and recordings, know none."""
 
 
 class Override(Struct, frozen=True, forbid_unknown_fields=True):
@@ -222,11 +245,41 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
     """Its id; none for the robot as a whole."""
 
 
+LeaseTimeout = Annotated[float, Meta(ge=0.1, le=10.0)]
+
+
+class AcquireLease(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content, if any, of the command acquire. The same one again, within its timeout, is a sign of life."""
+
+    id: Identifier | None = None
+    """A new one for every lease, the same in every sign of life: a lease that has ended does not come back by one.
+    Without it, each one asks anew."""
+    timeout: LeaseTimeout = 1.0
+    """Real time after which a lease without a sign of life ends, with a controlled stop [s]."""
+    force: bool = False
+    """Take it over from who holds it, by a role of [control] `takeover`."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+class ReleaseLease(Struct, frozen=True, forbid_unknown_fields=True):
+    """The content, if any, of the command release: which lease is given back."""
+
+    id: Identifier | None = None
+    """As in its acquire; without it the user's own, whichever that is."""
+
+
 class NoContent(Struct, frozen=True, forbid_unknown_fields=True):
     """The content of the other commands."""
 
 
-CONTENT: dict[Command, Any] = {Command.OVERRIDE: Override, Command.STOP: Stop | None}
+CONTENT: dict[Command, Any] = {
+    Command.OVERRIDE: Override,
+    Command.STOP: Stop | None,
+    Command.ACQUIRE: AcquireLease | None,
+    Command.RELEASE: ReleaseLease | None,
+}
 """What commands carry, with None where they may come without; those that are not here, NoContent | None."""
 
 
@@ -301,6 +354,17 @@ class Residual(Struct, frozen=True):
     """Of x, y [m] and phi [rad]."""
 
 
+class Fault(Struct, frozen=True, omit_defaults=True):
+    """What a fault is about, for programs."""
+
+    cause: str
+    """A trirail.wire.vocabulary.FaultCause, or a cause of trirail_drivers.interface.DriveFault: emcy, silent, bus, …"""
+    drive: str = ""
+    """A, B or C, where it is about one."""
+    code: int = 0
+    """The drive's own: EMCY or 603Fh error code, or an ODrive's error bits; 0 where there is none."""
+
+
 class Event(Struct, frozen=True, omit_defaults=True):
     """Something that happened, in order, numbered without gaps by the loop."""
 
@@ -312,8 +376,9 @@ class Event(Struct, frozen=True, omit_defaults=True):
     """Its cycle, as in records."""
     time: float
     """Wall clock [s since 1970]."""
-    kind: Literal["goal", "mode", "fault", "refused", "service"]
-    """What it is about: the end of a goal, a new mode, a fault, something refused, the service itself."""
+    kind: Literal["goal", "mode", "fault", "refused", "pose", "lease", "service"]
+    """What it is about: the end of a goal, a new mode, a fault, something refused, a named pose that was taught or
+    removed, a new holder of the lease, the service itself."""
     level: Level
     """How much it matters to people."""
     message: str
@@ -329,7 +394,8 @@ class Event(Struct, frozen=True, omit_defaults=True):
     goal: str | None = None
     """The id of the goal that set the robot in motion, with kind mode."""
     user: str | None = None
-    """Who sent the goal, or what was refused."""
+    """Who sent the goal, or what was refused, or has taught or removed the pose; with kind lease who holds it from now
+    on, None for nobody."""
     settle: float | None = None
     """With outcome done: time from the end of the path until the robot was in position, to the first cycle of the dwell
     [s]. None of a goal that was not to settle: a jog, one that was passed on the way to the next."""
@@ -339,3 +405,5 @@ class Event(Struct, frozen=True, omit_defaults=True):
     overshoot: Triple | None = None
     """Likewise, how far each of the sliders A, B, C was beyond its target at most since the end of the path, in the
     direction in which it was last commanded to move; of one that was not to move, to either side [m]."""
+    fault: Fault | None = None
+    """What it is about, with kind fault."""

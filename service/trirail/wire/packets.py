@@ -47,10 +47,23 @@ class CommandRequest(Struct, frozen=True, tag=True):
     """The rate, for override: 1 is full speed."""
     goal: str | None = None
     """The one goal that is to be stopped, for stop."""
+    lease: str | None = None
+    """Its id, for acquire and release."""
+    timeout: float = 1.0
+    """For how long a sign of life is good, for acquire [s]."""
+    force: bool = False
+    """Whether the lease is taken over from who holds it, for acquire; the gateway has seen to it that the user may."""
 
 
 class RefusedRequest(Struct, frozen=True, tag=True):
     """Gateway to loop: something unreadable came and was refused; wants an event."""
+
+    user: str
+    message: str
+
+
+class PoseChanged(Struct, frozen=True, tag=True):
+    """Gateway to loop: a named pose was taught or removed; wants an event."""
 
     user: str
     message: str
@@ -125,6 +138,8 @@ class Status(Struct, frozen=True, tag=True):
     bus_load: float = 0.0
     """Share of the bus that was in use in the last second."""
     counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
+    lease: str | None = None
+    """The user who holds the lease."""
 
 
 class Disturbance(Struct, frozen=True, tag="Mishap"):  # as recordings have it
@@ -148,7 +163,8 @@ class PlannerLost(Struct, frozen=True, tag=True):
     reason: str
 
 
-GivenInput = GoalRequest | CommandRequest | RefusedRequest | Disturbance | DrivesFault | PlanAnswer | PlannerLost
+Request = GoalRequest | CommandRequest | RefusedRequest | PoseChanged
+GivenInput = Request | Disturbance | DrivesFault | PlanAnswer | PlannerLost
 
 
 class ControlInput(Struct, frozen=True, tag="Input"):  # as recordings have it
@@ -172,7 +188,6 @@ class Remark(Struct, frozen=True, tag=True):
     message: str
 
 
-Request = GoalRequest | CommandRequest | RefusedRequest
 Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Status | ControlInput
 
 encode = msgpack.Encoder().encode

@@ -1,7 +1,7 @@
-"""What the service publishes of the robot, and what it answers on …/info. SI units and radians, if not said otherwise.
+"""What the service publishes of the robot, and what it answers on …/info and …/poses.
 
-Sliders are in the order A, B, C; poses are x, y [m] of the platform's centre and its angle phi [rad], counterclockwise,
-in the base frame.
+SI units and radians, if not said otherwise. Sliders are in the order A, B, C; poses are x, y [m] of the platform's
+centre and its angle phi [rad], counterclockwise, in the base frame.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import msgspec
 from msgspec import Struct
 from trirail_drivers.interface import MissingProtection, Triple
+
+from trirail.wire.vocabulary import LeasePolicy
 
 
 class Commanded(Struct, frozen=True):
@@ -138,6 +140,8 @@ class State(Struct, frozen=True):
     warnings: tuple[str, ...] = ()
     """What people should know of how the service is run, one line each: that it is open to a network, or that its
     certificate expires soon."""
+    lease: str | None = None
+    """The user who holds the lease: his goals and commands alone move the robot; None where nobody does."""
 
 
 class CorrectionTold(Struct, frozen=True):
@@ -174,6 +178,8 @@ class Info(Struct, frozen=True):
     """The folder of the service's recordings, on its machine."""
     live: str
     """Where a Rerun viewer on the service's machine finds the live view; "" for nowhere."""
+    lease: LeasePolicy = "optional"
+    """Whether the robot can be moved while nobody holds the lease."""
     homes: tuple[str, ...] = ()
     """The sliders whose encoders are not absolute: they have no position until the command home."""
     versions: dict[str, str] = msgspec.field(default_factory=dict)
@@ -182,3 +188,25 @@ class Info(Struct, frozen=True):
     """What the drives do without; none where they have all."""
     correction: CorrectionTold | None = None
     """Of as-built errors; None where the robot is taken for its geometry."""
+
+
+class NamedPose(Struct, frozen=True):
+    """A pose of the platform's centre in the base frame that goals may name: the reply on …/teach and …/forget."""
+
+    name: str
+    """Letters, digits, - and _."""
+    x: float
+    """[m]."""
+    y: float
+    """[m]."""
+    phi: float
+    """Counterclockwise [rad]."""
+    taught: bool
+    """Whether it was taught, and can be taught anew or removed; else it is one of [poses] of the configuration."""
+
+
+class NamedPoses(Struct, frozen=True):
+    """All that there are, answered on …/poses."""
+
+    poses: tuple[NamedPose, ...]
+    """By name."""

@@ -14,6 +14,8 @@ from trirail.wire.credentials import Credentials
 from trirail.wire.sizes import MAX_TRANSPORT
 
 DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
+SESSIONS = 256
+"""Clients that may be connected to a service at once; a router is one."""
 GIVEN_UP_AFTER = 2.0
 """Whoever takes nothing that must not be dropped, an answer or past events, is disconnected after so long [s]."""
 
@@ -47,6 +49,7 @@ def open_service(
             # Connections on which nothing comes must not keep others out.
             "transport/unicast/accept_pending": 1000,
             "transport/unicast/accept_timeout": 3000,
+            "transport/unicast/max_sessions": SESSIONS,
             "timestamping/enabled": True,  # advanced publishers order their history by it
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
             "transport/link/tx/queue/congestion_control/block/wait_before_close": round(GIVEN_UP_AFTER * 1e6),
@@ -72,7 +75,7 @@ def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.S
             "listen/endpoints": [],
             **_tls(credentials),
         },
-        f"no service at {locator}",
+        f"no service at {locator}, or none that takes more clients",
         "start one with: trirail run configs/sim.toml, or name its address with --connect",
     )
 

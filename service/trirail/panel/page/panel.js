@@ -87,6 +87,14 @@ const takes = {
   done({ to }) {
     readings.answer(`${to}: done`);
   },
+  accepted({ to }) {
+    readings.answer(`${to}: on its way`);
+  },
+  poses({ names }) {
+    byId("poses-part").hidden = names.length === 0;
+    byId("poses").replaceChildren(...names.map(poseButton));
+    allow();
+  },
 };
 
 function take(said) {
@@ -124,19 +132,31 @@ function lost(why) {
 
 // Whether each button may be pressed now; what is pressed all the same is refused by the service.
 function allow() {
-  const { mode, goal } = contact ? state.state : {};
+  const { mode, goal, lease } = contact ? state.state : {};
   const may = {
     enable: mode === "disabled",
     disable: Boolean(mode) && mode !== "disabled" && mode !== "fault",
     home: mode === "holding",
     reset: mode === "fault",
     pause: mode === "moving",
+    acquire: Boolean(mode) && !lease,
+    release: Boolean(mode) && lease === robot?.user,
     resume: Boolean(goal) && (mode === "holding" || mode === "stopping"),
   };
   for (const button of document.querySelectorAll("[data-command]")) button.disabled = !may[button.dataset.command];
-  for (const button of document.querySelectorAll(".hold")) button.disabled = !POWERED.includes(mode);
+  for (const button of document.querySelectorAll(".hold, #poses button")) button.disabled = !POWERED.includes(mode);
   byId("override").disabled = !mode;
   if (!POWERED.includes(mode)) hold.end(); // a button that is disabled is not told that the finger leaves it
+}
+
+function poseButton(name) {
+  const button = document.createElement("button");
+  button.textContent = name;
+  button.addEventListener("click", () => {
+    readings.answer(`go to ${name} …`);
+    send({ do: "goto", name });
+  });
+  return button;
 }
 
 function showSpeed() {

@@ -19,10 +19,11 @@ export class Readings {
     this.sliders.forEach((cells, k) => { cells[0].parentElement.firstChild.style.color = colours.sliders[k]; });
   }
 
-  state({ mode, pose, goal, sliders, faults, override }) {
+  state({ mode, pose, goal, sliders, faults, override, lease }) {
     const doing = [];
     if (goal) doing.push(goal.target ? `${goal.id} ${Math.round(goal.progress * 100)} %, ${goal.remaining.toFixed(1)} s left` : "jog");
     if (override !== 1) doing.push(`override ${Math.round(override * 100)} %`);
+    if (lease) doing.push(`lease: ${lease}`);
     text(byId("mode-name"), mode);
     text(byId("doing"), doing.join(" · "));
     byId("lamp").style.background = this.colours[mode] ?? "transparent";

@@ -1,0 +1,103 @@
+"""The lease: who alone may move the robot, for as long as his client gives signs of life. One at a time, or nobody.
+
+It is kept here, behind gateway and planner, so that whatever is lost on the way from the holder's hand ends it: his
+program, the network, the gateway. Time is counted in cycles, so that a recorded session comes out again.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.messages import Level
+from trirail.wire.packets import CommandRequest
+from trirail.wire.vocabulary import LeasePolicy
+
+REMEMBERED_IDS = 1000
+"""Leases that have ended and do not come back by a late sign of life; older ones are forgotten."""
+
+
+class LeaseChange(NamedTuple):
+    """The lease has another holder, or none: what everyone is told."""
+
+    level: Level
+    message: str
+
+
+class _Held(NamedTuple):
+    user: str
+    id: str | None
+    timeout: float
+    alive_until: int
+    """The cycle in which it ends unless there has been a sign of life."""
+
+
+class LeaseArbiter:
+    """Who holds it, and what follows. `check` says whether a user may move the robot."""
+
+    def __init__(self, policy: LeasePolicy, period: float) -> None:
+        self._required = policy == "required"
+        self._period = period
+        self._held: _Held | None = None
+        self._over: dict[tuple[str, str], None] = {}
+
+    @property
+    def user(self) -> str | None:
+        """Who holds it; None for nobody."""
+        return self._held.user if self._held is not None else None
+
+    def check(self, user: str) -> None:
+        """Raise RefusedError where a user's goals and commands do not move the robot now."""
+        if self._held is None:
+            if self._required:
+                raise RefusedError(
+                    RefusalCode.NO_LEASE,
+                    "nobody holds the lease, and the robot moves for its holder alone: send acquire first",
+                )
+        elif self._held.user != user:
+            raise RefusedError(
+                RefusalCode.LEASED, f"{self._held.user} holds the lease: only his goals and commands count"
+            )
+
+    def acquire(self, request: CommandRequest, cycle: int) -> LeaseChange | None:
+        """Let a user have the lease; None for a sign of life of who has it. Raises RefusedError."""
+        user, before = request.user, self._held
+        if request.lease is not None and (user, request.lease) in self._over:
+            raise RefusedError(RefusalCode.LEASE_OVER, f"lease {request.lease!r} of {user} is over: acquire a new one")
+        again = before is not None and (before.user, before.id) == (user, request.lease)
+        if before is not None and not again:
+            if not request.force:
+                whose = "another client of the same user" if before.user == user else before.user
+                raise RefusedError(
+                    RefusalCode.LEASED, f"{whose} holds the lease: wait until it is free, or take it over"
+                )
+            self._end()
+        self._held = _Held(user, request.lease, request.timeout, cycle + round(request.timeout / self._period))
+        if again:
+            return None
+        if before is not None:
+            return LeaseChange("warning", f"lease taken over by {user} from {before.user}")
+        return LeaseChange("info", f"lease acquired by {user}")
+
+    def release(self, request: CommandRequest) -> LeaseChange | None:
+        """Let a user give his lease back; None where he has none, or not that one."""
+        held = self._held
+        if held is None or held.user != request.user or request.lease not in (None, held.id):
+            return None
+        self._end()
+        return LeaseChange("info", f"lease released by {held.user}")
+
+    def silent(self, cycle: int) -> LeaseChange | None:
+        """End the lease where no sign of life has come in time."""
+        held = self._held
+        if held is None or cycle <= held.alive_until:
+            return None
+        self._end()
+        return LeaseChange("warning", f"lease of {held.user} is over: no sign of life for {held.timeout:g} s")
+
+    def _end(self) -> None:
+        held, self._held = self._held, None
+        if held is not None and held.id is not None:
+            self._over[held.user, held.id] = None
+            if len(self._over) > REMEMBERED_IDS:
+                del self._over[next(iter(self._over))]

@@ -1,0 +1,135 @@
+"""The metrics of a service, as Prometheus takes them: made at each scrape, of what was measured last."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from prometheus_client import Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+from prometheus_client.registry import Collector
+from trirail_drivers.interface import NAMES
+
+from trirail.processes.health import Health, Running
+from trirail.processes.measured import Histogram, Measured, ServiceMeasured
+from trirail.wire.vocabulary import MODES
+
+PREFIX: Final = "trirail"
+FRAMES: Final = ("feedback_late", "feedback_lost", "setpoints_late", "setpoints_lost")
+"""Fields of trirail.wire.state.FrameCounts, as labels."""
+PAGE: Final = os.sysconf("SC_PAGE_SIZE")
+TICKS: Final = os.sysconf("SC_CLK_TCK")
+
+
+class ServiceMetrics(Collector):
+    """All metrics of a service."""
+
+    def __init__(self, robot: str, version: str, health: Health, measured: Measured) -> None:
+        self._robot = robot
+        self._version = version
+        self._health = health
+        self._measured = measured
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield every metric; what has not been measured yet is left out."""
+        info = _gauge("service_info", "The robot and the software that runs.", ["robot", "version"])
+        info.add_metric([self._robot, self._version], 1.0)
+        yield info
+        yield from self._processes()
+        if (service := self._measured.service) is not None:
+            yield from _loop(service)
+            yield from _goals(service)
+            yield from _can(service)
+        if (recorder := self._measured.recorder) is not None:
+            lost = _counter("recorder_lost_batches", "Batches that are missing, by where they should be.", ["sink"])
+            lost.add_metric(["file"], recorder.lost)
+            lost.add_metric(["live"], recorder.skipped)
+            yield lost
+            words = "Cycles that are in no recording, since the recorder was too slow for them."
+            yield _counter("recorder_missing_cycles", words, value=recorder.absent)
+
+    def _processes(self) -> Iterator[Metric]:
+        healthy = _gauge("process_healthy", "Whether a process does its work, as /healthz says it.", ["process"])
+        for name, trouble in self._health.troubles().items():
+            healthy.add_metric([name], float(not trouble))
+        yield healthy
+        restarts = _counter("process_restarts", "How often a process was started again.", ["process"])
+        memory = _gauge("process_resident_memory_bytes", "Memory of a process.", ["process"])
+        busy = _counter("process_cpu_seconds", "Processor time of a process since its start.", ["process"])
+        processes = {"supervisor": Running(os.getpid(), ready=True, restarts=0), **self._health.processes}
+        for name, running in processes.items():
+            restarts.add_metric([name], running.restarts)
+            if running.pid is not None and (used := _used(running.pid)) is not None:
+                memory.add_metric([name], used[0])
+                busy.add_metric([name], used[1])
+        yield from (restarts, memory, busy)
+        age = _gauge("measurement_age_seconds", "How old the metrics are that a process measures.", ["process"])
+        for name, seconds in self._measured.ages().items():
+            age.add_metric([name], seconds)
+        yield age
+
+
+def _loop(service: ServiceMeasured) -> Iterator[Metric]:
+    mode = _gauge("mode", "1 for the mode that the robot is in, 0 for the others.", ["mode"])
+    for name in MODES:
+        mode.add_metric([name], float(name == service.mode))
+    yield mode
+    yield _counter("loop_cycles", "SYNCs sent since the start.", value=service.cycles)
+    yield _counter("loop_missed_ticks", "Ticks missed since the start.", value=service.overruns)
+    yield _histogram("loop_lateness_seconds", "How much after its deadline a cycle began.", service.lateness)
+    yield _histogram("loop_cycle_seconds", "How long a cycle worked.", service.cycle)
+
+
+def _goals(service: ServiceMeasured) -> Iterator[Metric]:
+    goals = _counter("goals", "Goals that have ended, by outcome.", ["outcome"])
+    for outcome, times in service.goals.items():
+        goals.add_metric([outcome], times)
+    yield goals
+    yield _histogram("goal_settle_seconds", "From the end of a goal's path until it was in position.", service.settle)
+    faults = _counter("faults", "Faults, by cause, drive and the drive's own code.", ["cause", "drive", "code"])
+    for count in service.faults:
+        code = f"0x{count.fault.code:04X}" if count.fault.code else ""
+        faults.add_metric([count.fault.cause, count.fault.drive, code], count.times)
+    yield faults
+
+
+def _can(service: ServiceMeasured) -> Iterator[Metric]:
+    load = _gauge("can_load_ratio", "Share of the bus in use; 1 is full.", ["kind"])
+    load.add_metric(["measured"], service.bus_load_measured)
+    load.add_metric(["worst"], service.bus_load)
+    yield load
+    frames = _counter("can_troubled_frames", "Cyclic frames of a drive that were late or lost.", ["drive", "kind"])
+    for drive, counts in zip(NAMES, service.traffic, strict=True):
+        for kind in FRAMES:
+            frames.add_metric([drive, kind], getattr(counts, kind))
+    yield frames
+
+
+def _gauge(name: str, words: str, labels: list[str]) -> GaugeMetricFamily:
+    return GaugeMetricFamily(f"{PREFIX}_{name}", words, labels=labels)
+
+
+def _counter(name: str, words: str, labels: list[str] | None = None, value: float | None = None) -> CounterMetricFamily:
+    return CounterMetricFamily(f"{PREFIX}_{name}", words, value=value, labels=labels)
+
+
+def _histogram(name: str, words: str, values: Histogram) -> HistogramMetricFamily:
+    """A histogram as Prometheus has it: each bucket counts those below it as well."""
+    buckets: list[tuple[str, float]] = []
+    so_far = 0
+    for bound, count in zip((*values.bounds, float("inf")), values.counts, strict=True):
+        so_far += count
+        buckets.append(("+Inf" if bound == float("inf") else repr(bound), so_far))
+    return HistogramMetricFamily(f"{PREFIX}_{name}", words, buckets=buckets, sum_value=values.total)
+
+
+def _used(pid: int) -> tuple[float, float] | None:
+    """Return memory [bytes] and processor time [s] of a process, None where it has just ended; proc(5)."""
+    try:
+        pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    except (OSError, IndexError):
+        return None
+    return int(pages) * PAGE, (int(fields[11]) + int(fields[12])) / TICKS

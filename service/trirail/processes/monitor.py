@@ -1,0 +1,50 @@
+"""What the supervisor keeps for whoever watches the service: each process's health, and what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import Any, Final
+
+import msgspec
+
+from trirail.config import Config
+from trirail.processes.health import Health, Running
+from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.measured import Measured, RecorderMeasured, ServiceMeasured
+
+KINDS: Final = {"gateway": ServiceMeasured, "recorder": RecorderMeasured}
+"""What each process measures."""
+
+
+class Monitor:
+    """Health and measurements; while the context lasts they are served, where [telemetry] metrics_port is given."""
+
+    def __init__(self, config: Config, heartbeats: Heartbeats, turn: float) -> None:
+        self._config = config
+        self.health = Health(heartbeats, config.period, turn)
+        self.measured = Measured()
+        self._serving = ExitStack()
+
+    def __enter__(self) -> Monitor:
+        if self._config.telemetry.metrics_port:
+            from trirail.processes.metrics_server import MetricsServer
+
+            self._serving.enter_context(MetricsServer(self._config, self.health, self.measured))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._serving.close()
+
+    def look(self, processes: Mapping[str, Running]) -> None:
+        """Look at all processes, in every turn of the supervisor's."""
+        self.health.look(processes)
+
+    def take(self, process: str, content: dict[str, Any]) -> None:
+        """Take what a process has measured."""
+        self.measured.take(process, msgspec.convert(content, KINDS[process]))
+
+    def end(self, processes: Mapping[str, Running]) -> None:
+        """Look for the last time: the service is ending."""
+        self.health.look(processes)
+        self.health.end()

@@ -1,0 +1,74 @@
+"""The file of taught poses, in the service's state directory: whole after a power cut, whenever that comes."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+from trirail_drivers import files
+from trirail_drivers.errors import FileError
+
+from trirail.errors import ServiceError
+from trirail.wire.messages import Coordinates, PoseName
+
+NAME = "poses.json"
+
+Taught = dict[PoseName, Coordinates]
+"""x, y [m] and phi [rad] of each pose by its name."""
+
+
+def state_directory(robot: str) -> Path:
+    """Return where a robot's service keeps what must outlast it: below systemd's directory for it, else the user's."""
+    of_unit = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if of_unit:
+        return Path(of_unit) / robot
+    base = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    return Path(base) / "trirail" / robot
+
+
+class PoseFile:
+    """Reads and changes it. Both raise ServiceError, with the file and what would be right."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / NAME
+
+    def read(self) -> Taught:
+        """Return what was taught; nothing where there is no file yet."""
+        try:
+            return msgspec.json.decode(files.text(self.path), type=Taught) if self.path.exists() else {}
+        except (FileError, OSError) as error:
+            raise ServiceError(f"{error}; it has the taught poses") from error
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            problem = str(error).replace("`", "")
+            raise ServiceError(f"{self.path}: {problem}; mend it, or move it away and teach the poses anew") from error
+
+    def change(self, name: str, pose: Coordinates | None) -> None:
+        """Keep a pose by a name, None for none; it is on the disk when this returns. It may take as long as that does.
+
+        What another service of the same robot has written meanwhile stays.
+        """
+        try:
+            files.make_folder(self.path.parent)
+            with _alone_in(self.path.parent):
+                taught = {each: kept for each, kept in self.read().items() if each != name}
+                if pose is not None:
+                    taught[name] = pose
+                content = msgspec.json.encode(dict(sorted(taught.items())))
+                files.replace(self.path, msgspec.json.format(content) + b"\n")
+        except OSError as error:
+            raise ServiceError(f"{error.filename or self.path}: {error.strerror}") from error
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keep others who ask out of a folder."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)

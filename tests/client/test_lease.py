@@ -1,0 +1,107 @@
+"""The lease as a client holds it: signs of life while its context lasts, and no longer."""
+
+from __future__ import annotations
+
+import queue
+import threading
+
+import msgspec
+import pytest
+from trirail.client.lease import SIGNS, Lease
+from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.wire.messages import AcquireLease, CommandReply, ReleaseLease
+from trirail.wire.vocabulary import Command
+
+OVER = RefusedError(RefusalCode.LEASE_OVER, "it is over")
+
+
+class Service:
+    """Confirms what it is asked, or raises what it is told to; keeps what it was asked."""
+
+    def __init__(self, mode: str = "holding") -> None:
+        self.asked: queue.Queue[tuple[Command, bytes]] = queue.Queue()
+        self.refusal: Exception | None = None
+        self.mode = mode
+
+    def command(self, name: Command, content: bytes) -> CommandReply:
+        self.asked.put((name, content))
+        if self.refusal is not None:
+            raise self.refusal
+        return CommandReply(name, self.mode)
+
+    def next(self) -> tuple[Command, bytes]:
+        return self.asked.get(timeout=20.0)
+
+    def lease(self, **how: bool) -> Lease:
+        return Lease(self.command, force=how.get("force", False), timeout=0.1)
+
+
+def sign(content: bytes) -> AcquireLease:
+    return msgspec.json.decode(content, type=AcquireLease)
+
+
+def test_it_is_asked_for_kept_by_the_same_and_given_back() -> None:
+    service = Service()
+    with service.lease(force=True):
+        name, content = service.next()
+        first = sign(content)
+        assert (name, first.force, first.timeout) == (Command.ACQUIRE, True, 0.1)
+        for _ in range(2 * SIGNS):
+            name, content = service.next()
+            assert name is Command.ACQUIRE
+            assert sign(content) == AcquireLease(first.id, 0.1)  # to keep it takes nothing over
+    *_, last = [service.next() for _ in range(service.asked.qsize())]
+    assert last[0] is Command.RELEASE
+    assert msgspec.json.decode(last[1], type=ReleaseLease).id == first.id
+
+
+def test_each_lease_has_an_id_of_its_own() -> None:
+    service = Service()
+    ids = set()
+    for _ in range(2):
+        with service.lease():
+            ids.add(sign(service.next()[1]).id)
+        while not service.asked.empty():
+            service.next()
+    assert len(ids) == 2
+
+
+def test_entering_returns_when_what_others_had_under_way_stands() -> None:
+    service = Service("stopping")
+    with service.lease():
+        asked = [service.next()[0] for _ in range(2)]
+    assert Command.STOP in asked
+
+
+@pytest.mark.parametrize("error", [OVER, ServiceError("nobody answers")])
+def test_what_ends_it_is_kept_and_nothing_is_asked_any_more(error: Exception) -> None:
+    service = Service()
+    with service.lease() as lease:
+        assert lease.lost is None
+        service.refusal = error
+        assert lease.wait(20.0)
+        assert lease.lost is error
+    assert {service.next()[0] for _ in range(service.asked.qsize())} == {Command.ACQUIRE}
+
+
+def test_who_does_not_get_it_keeps_nothing_up() -> None:
+    service = Service()
+    service.refusal = RefusedError(RefusalCode.LEASED, "bob holds the lease")
+    before = threading.active_count()
+    with pytest.raises(RefusedError, match="bob"), service.lease():
+        raise AssertionError
+    assert threading.active_count() == before
+    assert service.asked.qsize() == 1
+
+
+def test_who_cannot_wait_for_the_standstill_gives_it_back() -> None:
+    service = Service("stopping")
+
+    def command(name: Command, content: bytes) -> CommandReply:
+        if name is Command.STOP:
+            raise ServiceError("nobody answers")
+        return service.command(name, content)
+
+    with pytest.raises(ServiceError), Lease(command, force=False, timeout=10.0):
+        raise AssertionError
+    assert [service.next()[0] for _ in range(2)] == [Command.ACQUIRE, Command.RELEASE]

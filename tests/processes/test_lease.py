@@ -1,0 +1,171 @@
+"""The lease of a whole service: held by programs that live, hang and die, and behind gateways that do."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from processes.test_service import Service, again, trirail, until
+from trirail.analysis.replay import again as replayed
+from trirail.client.client import Robot
+from trirail.errors import RefusalCode, RefusedError
+from trirail.telemetry import provenance
+from trirail.telemetry.reading import read
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Service]:
+    """A service that moves for the holder of the lease alone."""
+    started = Service(tmp_path, **{"[telemetry]": '[control]\nlease = "required"\n\n[telemetry]'})
+    started.wait_up()
+    yield started
+    if started.process.poll() is None:
+        started.end()
+
+
+def held_by(service: Service, user: str) -> subprocess.Popen[str]:
+    """Run a program that holds the lease and moves the robot, until it is killed; return once it does."""
+    program = (
+        "import sys, threading; from trirail import Robot\n"
+        "with Robot('demo', sys.argv[1], user=sys.argv[2]) as robot, robot.lease():\n"
+        "    robot.enable()\n"
+        "    robot.override(5)\n"
+        "    robot.move_to(x=0.1, y=0.0, phi=0.0)\n"
+        "    print('moving', flush=True)\n"
+        "    threading.Event().wait()\n"
+    )
+    command = [sys.executable, "-c", program, service.locator, user]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "moving\n"
+    return process
+
+
+def told(robot: Robot) -> list[tuple[str, str | None]]:
+    events = robot.events(history=True, timeout=1.0)
+    return [(event.message, event.user) for event in events if event.kind == "lease"]
+
+
+@pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_holder_that_dies_or_hangs_is_a_controlled_stop_and_the_lease_is_free(
+    service: Service, harm: signal.Signals
+) -> None:
+    with held_by(service, "bob") as holder, service.robot() as ann:
+        try:
+            assert ann.state().lease == "bob"
+            with pytest.raises(RefusedError, match="bob holds the lease") as refused:
+                ann.move_to(x=0.0, y=0.0, phi=0.0)
+            assert refused.value.code is RefusalCode.LEASED
+            assert ann.state().mode == "moving"
+            holder.send_signal(harm)
+            state = until(ann, lambda state: state.lease is None)
+            state = until(ann, lambda state: state.mode == "holding")
+            assert 0.0 < state.pose[0] < 0.09
+            assert told(ann)[-1] == ("lease of bob is over: no sign of life for 1 s", None)
+            with pytest.raises(RefusedError) as refused:
+                ann.move_to(x=0.0, y=0.0, phi=0.0)
+            assert refused.value.code is RefusalCode.NO_LEASE
+            with ann.lease():
+                ann.override(100)
+                assert ann.move_to(x=0.0, y=0.0, phi=0.0).wait(20.0).outcome == "done"
+        finally:
+            holder.kill()
+
+
+@pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_gateway_that_is_lost_neither_keeps_a_lease_nor_frees_it_in_silence(
+    service: Service, harm: signal.Signals
+) -> None:
+    with service.robot() as bob:
+        with bob.lease() as lease:
+            bob.enable()
+            bob.move_to(x=0.1, y=0.0, phi=0.0, speed=0.1)
+            os.kill(service.child("gateway"), harm)
+            assert lease.wait(20.0)
+            assert lease.lost is not None
+        with again(service) as ann:
+            assert until(ann, lambda state: state.mode == "holding").lease is None
+            assert told(ann) == [
+                ("lease acquired by ann", "ann"),
+                ("lease of ann is over: no sign of life for 1 s", None),
+            ]
+            with ann.lease():
+                assert ann.move_to(x=0.0, y=0.0, phi=0.0).wait(20.0).outcome == "done"
+
+
+def test_it_is_taken_over_by_those_who_may_and_both_are_told(service: Service) -> None:
+    with service.robot() as ann, Robot("demo", service.locator, user="bob") as bob:
+        with ann.lease() as lease:
+            ann.enable()
+            going = ann.move_to(x=0.1, y=0.0, phi=0.0, speed=0.1)
+            with pytest.raises(RefusedError) as refused, bob.lease():
+                pass
+            assert refused.value.code is RefusalCode.LEASED
+            with bob.lease(force=True):
+                assert bob.state().mode == "holding"  # entering has waited for the standstill
+                assert going.wait(10.0).outcome == "stopped"
+                assert lease.wait(10.0)
+                assert isinstance(lease.lost, RefusedError)
+                assert lease.lost.code is RefusalCode.LEASE_OVER
+                assert bob.move_to(x=0.0, y=0.0, phi=0.0).wait(20.0).outcome == "done"
+                ann.stop()  # is everybody's
+        assert told(bob) == [
+            ("lease acquired by ann", "ann"),
+            ("lease taken over by bob from ann", "bob"),
+            ("lease released by bob", None),
+        ]
+
+
+def test_from_the_command_line(service: Service) -> None:
+    def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+        return trirail(*arguments, locator=service.locator)
+
+    refused = call("enable", "--json")
+    assert refused.returncode == 1
+    assert json.loads(refused.stdout)["code"] == "no_lease"
+    command = [sys.executable, "-m", "trirail", "acquire", "--connect", service.locator]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as holder:
+        try:
+            assert holder.stdout is not None
+            assert "holds the lease until Ctrl-C" in holder.stdout.readline()
+            assert call("enable").returncode == 0
+            assert call("goto", 0.01, 0, 0, "--wait").returncode == 0
+            assert "held by" in call("status").stdout
+            holder.send_signal(signal.SIGINT)
+            assert holder.wait(20) == 0
+        finally:
+            holder.kill()
+    assert "held by" not in call("status").stdout
+    assert call("goto", 0, 0, 0).returncode == 1
+    assert call("stop").returncode == 0
+
+
+def test_a_session_with_leases_comes_out_again_to_the_last_bit(service: Service) -> None:
+    users = [Robot("demo", service.locator, user=name) for name in ("ann", "bob")]
+    for turn in range(4):
+        mine, other = users[turn % 2], users[1 - turn % 2]
+        with mine.lease():
+            mine.enable()
+            mine.move_to(x=0.03 * (-1) ** turn, y=0.0, phi=0.1, speed=0.3)
+            with pytest.raises(RefusedError):
+                other.move_to(x=0.0, y=0.0, phi=0.0)
+            threading.Event().wait(0.3)  # some way; leaving stops it on the way
+    for user in users:
+        user.close()
+    assert service.end() == 0
+    (path,) = (service.folder / "recordings").glob("demo-*.rrd")
+    recording = read(path)
+    config = provenance.configuration(recording.texts)
+    assert config is not None
+    compared = replayed(recording, config, simulated=False)
+    assert compared.cycles == len(recording.records)
+    assert (compared.differing, compared.first, compared.plans_differing) == (0, None, 0)

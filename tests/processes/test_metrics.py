@@ -1,0 +1,313 @@
+"""Metrics and health without processes: what is counted, what Prometheus reads of it, and who is told as dead."""
+
+from __future__ import annotations
+
+import json
+import re
+import select
+import socket
+import ssl
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from certificates import tls_config, user
+from conftest import CONFIG
+from hypothesis import given
+from hypothesis import strategies as st
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.parser import text_string_to_metric_families
+from trirail.config import SIM, Config
+from trirail.errors import ServiceError
+from trirail.processes.health import NOT_RUNNING, SILENT, Health, Running
+from trirail.processes.heartbeats import PROCESSES, Heartbeats
+from trirail.processes.measured import (
+    KINDS_OF_FAULT,
+    SETTLE_BOUNDS,
+    Histogram,
+    Measured,
+    Meter,
+    RecorderMeasured,
+    ServiceMeasured,
+)
+from trirail.processes.metrics import ServiceMetrics
+from trirail.processes.metrics_server import MetricsServer
+from trirail.processes.process import MEASURED
+from trirail.processes.state import StateMaker
+from trirail.telemetry.sinks import free_port
+from trirail.wire.messages import Event, Fault
+from trirail.wire.records import DTYPE
+
+TURN = 0.1
+
+
+def event(seq: int, **fields: object) -> Event:
+    said: dict[str, object] = {"kind": "service", "level": "info", "message": ""} | fields
+    return Event(seq, 0.001 * seq, seq, 0.0, **said)  # type: ignore[arg-type]
+
+
+class Told:
+    """A meter that is always due, and what it told last."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.measured: list[ServiceMeasured] = []
+        self.meter = Meter(self.measured.append, lambda: self.now)  # type: ignore[arg-type]
+        self._states = StateMaker(CONFIG)
+
+    def rows(self, **fields: object) -> None:
+        rows = np.zeros(2, DTYPE)
+        rows["cycle"] = (1, 2)
+        for name, values in fields.items():
+            rows[name] = values
+        self._states.records(rows)
+        self.meter.records(rows)
+
+    def newest(self) -> ServiceMeasured:
+        self.now += 1.0
+        self.meter.tell(self._states.newest)
+        return self.measured[-1]
+
+
+@given(st.lists(st.floats(0.0, 20.0)))
+def test_a_bucket_has_the_values_up_to_its_bound(values: list[float]) -> None:
+    histogram = Histogram.of(SETTLE_BOUNDS)
+    histogram.add(np.array(values))
+    for place, bound in enumerate(SETTLE_BOUNDS):
+        assert sum(histogram.counts[: place + 1]) == sum(value <= bound for value in values)
+    assert sum(histogram.counts) == len(values)
+    assert histogram.total == pytest.approx(sum(values))
+
+
+def test_what_passes_the_gateway_is_counted() -> None:
+    told = Told()
+    told.rows(lateness_ns=(15_000, 3_000_000), overruns=(0, 7), mode=(4, 4), parts_ns=100_000)
+    told.meter.event(event(1, kind="goal", id="a", outcome="done", settle=0.03))
+    told.meter.event(event(2, kind="goal", id="b", outcome="rejected"))
+    told.meter.event(event(3, kind="goal", id="c", outcome="done"))
+    for seq in (4, 5):
+        told.meter.event(event(seq, kind="fault", level="error", fault=Fault("emcy", "B", 0x8700)))
+    text = exposed(told.newest(), RecorderMeasured(3, 20, 5))
+    assert 'trirail_mode{mode="moving"} 1.0' in text
+    assert 'trirail_mode{mode="holding"} 0.0' in text
+    assert "trirail_loop_missed_ticks_total 7.0" in text
+    assert 'trirail_loop_lateness_seconds_bucket{le="1e-05"} 0.0' in text
+    assert 'trirail_loop_lateness_seconds_bucket{le="2e-05"} 1.0' in text
+    assert 'trirail_loop_lateness_seconds_bucket{le="+Inf"} 2.0' in text
+    assert "trirail_loop_lateness_seconds_count 2.0" in text
+    assert "trirail_loop_cycle_seconds_sum 0.0014" in text
+    assert 'trirail_goals_total{outcome="done"} 2.0' in text
+    assert 'trirail_goals_total{outcome="rejected"} 1.0' in text
+    assert "trirail_goal_settle_seconds_count 1.0" in text
+    assert 'trirail_faults_total{cause="emcy",code="0x8700",drive="B"} 2.0' in text
+    assert 'trirail_recorder_lost_batches_total{sink="file"} 3.0' in text
+    assert 'trirail_recorder_lost_batches_total{sink="live"} 20.0' in text
+    assert "trirail_recorder_missing_cycles_total 5.0" in text
+
+
+@given(st.lists(st.tuples(st.sampled_from("ABC"), st.integers(0, 0xFFFF)), max_size=60))
+def test_what_is_told_fits_into_a_pipe_at_once_and_loses_no_fault(faults: list[tuple[str, int]]) -> None:
+    told = Told()
+    told.rows(lateness_ns=2**62, cycle=(2**62, 2**62 + 1), overruns=2**62)
+    told.meter._goals = dict.fromkeys(
+        ("done", "rejected", "preempted", "stopped", "expired", "faulted", "unsettled"), 10**12
+    )
+    for seq, (drive, code) in enumerate(faults, 1):
+        told.meter.event(event(seq, kind="fault", fault=Fault("following_error", drive, code)))
+    newest = told.newest()
+    assert sum(count.times for count in newest.faults) == len(faults)
+    assert len(newest.faults) <= KINDS_OF_FAULT + 1
+    # Twelve more digits in each of 39 buckets, as after years.
+    assert len(msgspec.json.encode({MEASURED: newest})) + 39 * 12 <= select.PIPE_BUF
+    assert msgspec.convert(msgspec.to_builtins(newest), ServiceMeasured) == newest
+
+
+def health() -> tuple[Health, Heartbeats, list[float]]:
+    hearts, now = Heartbeats.create(), [0.0]
+    return Health(hearts, CONFIG.period, TURN, lambda: now[0]), hearts, now
+
+
+def exposed(service: ServiceMeasured | None, recorder: RecorderMeasured | None) -> str:
+    """What Prometheus reads."""
+    measured = Measured()
+    if service is not None:
+        measured.take("gateway", service)
+    if recorder is not None:
+        measured.take("recorder", recorder)
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(ServiceMetrics("demo", "0.1", health()[0], measured))
+    return generate_latest(registry).decode()
+
+
+def test_before_anything_is_measured_there_are_only_the_processes() -> None:
+    families = {family.name for family in text_string_to_metric_families(exposed(None, None))}
+    assert "trirail_process_healthy" in families
+    assert not {name for name in families if name.startswith("trirail_loop")}
+
+
+def test_the_dashboard_shows_every_metric_and_no_other() -> None:
+    told = Told()
+    told.rows()
+    told.meter.event(event(1, kind="goal", id="a", outcome="done", settle=0.03))
+    told.meter.event(event(2, kind="fault", fault=Fault("bus")))
+    families = list(text_string_to_metric_families(exposed(told.newest(), RecorderMeasured(0, 0, 0))))
+    samples = {sample.name: family.name for family in families for sample in family.samples}
+    dashboard = json.loads((SIM.parent / "grafana.json").read_text())
+    queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+    shown = {name for query in queries for name in re.findall(r"\btrirail_\w+", query)}
+    assert shown <= set(samples)
+    assert {samples[name] for name in shown} == {family.name for family in families}
+    labels = {label for family in families for sample in family.samples for label in sample.labels}
+    used = {label for query in queries for by in re.findall(r"by \(([^)]*)\)", query) for label in by.split(", ")}
+    assert used <= labels | {"instance"}
+
+
+ALL_UP = {name: Running(1, ready=True, restarts=0) for name in PROCESSES}
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_a_frozen_process_is_told_by_its_name(name: str) -> None:
+    looked, hearts, now = health()
+    for turn in range(100):
+        for each in PROCESSES:
+            if each != name or turn < 50:
+                hearts.of(each).beat()
+        now[0] += TURN
+        looked.look(ALL_UP)
+        frozen_for = (turn - 49) * TURN
+        if frozen_for <= 0.0:
+            assert not any(looked.troubles().values())
+        elif frozen_for > SILENT + 2 * TURN:
+            assert {each for each, trouble in looked.troubles().items() if trouble} == {name}
+            assert frozen_for < 5.0 or looked.troubles()[name] == "no sign of life"
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_a_process_that_is_dead_or_starting_is_told_at_once(name: str) -> None:
+    looked, _, _ = health()
+    looked.look(ALL_UP | {name: NOT_RUNNING})
+    assert looked.troubles()[name] == "not running"
+    looked.look(ALL_UP | {name: Running(2, ready=False, restarts=1)})
+    assert looked.troubles()[name] == "starting"
+    looked.look(ALL_UP)
+    assert not any(looked.troubles().values())
+
+
+def test_a_supervisor_that_is_held_up_or_ending_is_told() -> None:
+    looked, _, now = health()
+    looked.look(ALL_UP)
+    now[0] += SILENT + 0.1
+    assert looked.troubles()["supervisor"] == "no sign of life"
+    looked.look(ALL_UP)
+    assert not looked.troubles()["supervisor"]
+    looked.end()
+    assert looked.troubles()["supervisor"] == "the service is ending"
+
+
+# ---------------------------------------------------------------------- over HTTP
+
+
+def served(config: Config, **telemetry: object) -> tuple[Config, MetricsServer, Health]:
+    changed = msgspec.structs.replace(config.telemetry, metrics_port=free_port(), **telemetry)
+    config = msgspec.structs.replace(config, telemetry=changed)
+    looked, _, _ = health()
+    return config, MetricsServer(config, looked, Measured()), looked
+
+
+def get(url: str, context: ssl.SSLContext | None = None) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(url, timeout=10.0, context=context) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+
+
+@pytest.fixture
+def local() -> Iterator[tuple[str, Health]]:
+    config, server, looked = served(CONFIG)
+    with server:
+        yield f"http://127.0.0.1:{config.telemetry.metrics_port}", looked
+
+
+def test_health_is_red_until_all_are_up_and_says_which(local: tuple[str, Health]) -> None:
+    url, looked = local
+    status, body = get(f"{url}/healthz")
+    assert status == 503
+    assert json.loads(body)["processes"]["loop"] == "starting"
+    looked.look(ALL_UP)
+    assert get(f"{url}/healthz") == (
+        200,
+        json.dumps(json.loads(get(f"{url}/healthz")[1]), separators=(",", ":")) + "\n",
+    )
+    looked.look(ALL_UP | {"planner": NOT_RUNNING})
+    status, body = get(f"{url}/healthz")
+    assert (status, json.loads(body)) == (
+        503,
+        {"ok": False, "processes": dict.fromkeys((*PROCESSES, "supervisor"), "ok") | {"planner": "not running"}},
+    )
+
+
+def test_metrics_are_those_of_the_collector_and_all_else_is_not_found(local: tuple[str, Health]) -> None:
+    url, _ = local
+    status, body = get(f"{url}/metrics")
+    assert status == 200
+    assert 'trirail_service_info{robot="demo"' in body
+    assert get(f"{url}/")[0] == get(f"{url}/metrics/../etc/passwd")[0] == 404
+
+
+def test_connections_that_say_nothing_keep_nobody_out(local: tuple[str, Health]) -> None:
+    url, _ = local
+    address = ("127.0.0.1", int(url.rpartition(":")[2]))
+    silent = [socket.create_connection(address) for _ in range(40)]
+    for connection in silent:  # those beyond the ceiling are closed at once, the others after PATIENCE
+        connection.settimeout(20.0)
+        assert connection.recv(1) == b""
+        connection.close()
+    assert get(f"{url}/metrics")[0] == 200
+
+
+def test_a_port_that_is_taken_is_told_with_the_remedy() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        telemetry = msgspec.structs.replace(CONFIG.telemetry, metrics_port=taken.getsockname()[1])
+        server = MetricsServer(msgspec.structs.replace(CONFIG, telemetry=telemetry), health()[0], Measured())
+        with pytest.raises(ServiceError, match=r"set telemetry\.metrics_port to a free port"), server:
+            pass
+
+
+@pytest.fixture(scope="module")
+def beyond(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
+    """A robot with certificates, whose metrics are listened for on every address."""
+    folder = tmp_path_factory.mktemp("keys")
+    config, server, looked = served(tls_config(folder), metrics_address="0.0.0.0")
+    looked.look(ALL_UP)
+    with server:
+        yield f"https://127.0.0.1:{config.telemetry.metrics_port}", folder
+
+
+def shown(folder: Path, name: str | None) -> ssl.SSLContext:
+    """A client that trusts the robot's authority, and shows a user's certificate, or none."""
+    context = ssl.create_default_context(cafile=str(folder / "keys" / "ca.pem"))
+    if name is not None:
+        context.load_cert_chain(user(folder, name) / "cert.pem", user(folder, name) / "key.pem")
+    return context
+
+
+@pytest.mark.parametrize(("name", "status"), [("eva", 200), ("ann", 200), ("max", 200), ("una", 403), ("gone", 403)])
+def test_beyond_the_loopback_who_has_a_role_reads_them(beyond: tuple[str, Path], name: str, status: int) -> None:
+    url, folder = beyond
+    for page in ("/metrics", "/healthz"):
+        assert get(f"{url}{page}", shown(folder, name))[0] == status
+
+
+@pytest.mark.parametrize("name", [None, "foreign", "late", "early"])
+def test_beyond_the_loopback_nobody_reads_them_without_a_good_certificate(
+    beyond: tuple[str, Path], name: str | None
+) -> None:
+    url, folder = beyond
+    with pytest.raises(OSError, match=r"(?i)alert|reset|closed|EOF|broken pipe"):
+        get(f"{url}/metrics", shown(folder, name))
+    assert get(f"{url}/metrics", shown(folder, "eva"))[0] == 200

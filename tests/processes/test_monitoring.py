@@ -1,0 +1,168 @@
+"""A whole service as who watches it sees it: health while processes die and freeze, and Prometheus's own scrape."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from processes.test_service import Service, wait_readable
+from trirail.config import SIM
+from trirail.telemetry.sinks import free_port
+
+pytestmark = pytest.mark.slow
+
+RED_WITHIN = 5.0
+"""Of the death of a process, or of its last sign of life [s]."""
+
+
+class Watched(Service):
+    """A service with metrics."""
+
+    def __init__(self, folder: Path) -> None:
+        self.url = f"http://127.0.0.1:{(port := free_port())}"
+        super().__init__(folder, **{"state_hz = 50": f"state_hz = 50\nmetrics_port = {port}"})
+
+    def health(self) -> dict[str, str]:
+        """What is wrong, by process."""
+        try:
+            with urllib.request.urlopen(f"{self.url}/healthz", timeout=5.0) as answer:
+                body = answer.read()
+        except urllib.error.HTTPError as error:
+            body = error.read()
+        said = json.loads(body)
+        wrong = {name: trouble for name, trouble in said["processes"].items() if trouble != "ok"}
+        assert said["ok"] == (not wrong)
+        return wrong
+
+    def wait_health(self, condition: Callable[[dict[str, str]], bool], within: float) -> dict[str, str]:
+        """Look until something holds; fails where it does not in time."""
+        deadline = time.monotonic() + within
+        while not condition(health := self.health()):
+            assert time.monotonic() < deadline, health
+            wait_readable(self.process, 0.05)
+        return health
+
+    def metrics(self) -> dict[str, float]:
+        with urllib.request.urlopen(f"{self.url}/metrics", timeout=5.0) as answer:
+            lines = answer.read().decode().splitlines()
+        return {name: float(value) for line in lines if line[0] != "#" for name, value in [line.rsplit(" ", 1)]}
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Watched]:
+    made = Watched(tmp_path)
+    try:
+        made.wait_up()
+        yield made
+    finally:
+        if made.process.poll() is None:
+            made.end()
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
+@pytest.mark.parametrize("name", ["gateway", "planner", "recorder"])
+def test_health_is_red_while_a_process_is_away_and_says_which(service: Watched, name: str, number: int) -> None:
+    service.wait_health(lambda wrong: not wrong, 10.0)
+    os.kill(service.child(name), number)
+    red = service.wait_health(bool, RED_WITHIN)
+    assert list(red) == [name]
+    service.wait_health(lambda wrong: not wrong, 60.0)
+    assert service.metrics()[f'trirail_process_restarts_total{{process="{name}"}}'] == 1.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
+def test_health_ends_red_with_the_loop(service: Watched, number: int) -> None:
+    service.wait_health(lambda wrong: not wrong, 10.0)
+    os.kill(service.child("loop"), number)
+    seen: list[str] = []
+
+    def gone() -> bool:
+        try:
+            seen.extend(service.health())
+        except (OSError, urllib.error.URLError):
+            return True
+        return False
+
+    deadline = time.monotonic() + 20.0
+    while not gone() and time.monotonic() < deadline:
+        wait_readable(service.process, 0.02)
+    assert service.process.wait(10.0) == 1
+    assert "loop" in seen
+
+
+def test_what_the_robot_does_is_counted(service: Watched) -> None:
+    with service.robot() as robot:
+        robot.enable()
+        assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(20.0).outcome == "done"
+        robot.quick_stop()
+
+    def counted() -> bool:
+        found = service.metrics()
+        return (
+            found.get('trirail_goals_total{outcome="done"}') == 1.0
+            and found.get('trirail_faults_total{cause="quick_stop",code="",drive=""}') == 1.0
+            and found.get('trirail_mode{mode="fault"}') == 1.0
+        )
+
+    deadline = time.monotonic() + 10.0
+    while not counted() and time.monotonic() < deadline:
+        wait_readable(service.process, 0.1)
+    found = service.metrics()
+    assert counted(), found
+    cycles = found["trirail_loop_cycles_total"]
+    assert 0.0 < found["trirail_loop_lateness_seconds_count"] <= cycles
+    assert found["trirail_goal_settle_seconds_count"] == 1.0
+    assert found['trirail_process_resident_memory_bytes{process="loop"}'] > 1e6
+    assert 0.0 < found['trirail_can_load_ratio{kind="measured"}'] < 1.0
+
+
+@pytest.mark.skipif(shutil.which("prometheus") is None, reason="prometheus is not installed: make ci-packages")
+def test_prometheus_scrapes_it(service: Watched, tmp_path: Path) -> None:
+    configured = (SIM.parent / "prometheus.yml").read_text()
+    target = service.url.removeprefix("http://")
+    assert "127.0.0.1:9464" in configured
+    (tmp_path / "prometheus.yml").write_text(
+        configured.replace("127.0.0.1:9464", target).replace("scrape_interval: 5s", "scrape_interval: 1s")
+    )
+    address = f"127.0.0.1:{free_port()}"
+    command = ["prometheus", f"--config.file={tmp_path}/prometheus.yml", f"--storage.tsdb.path={tmp_path}/data",
+               f"--web.listen-address={address}"]  # fmt: skip
+    with (tmp_path / "prometheus.log").open("wb") as log:
+        prometheus = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+    try:
+        deadline = time.monotonic() + 60.0
+        while not (found := _asked(address, "trirail_loop_cycles_total > 0")) and time.monotonic() < deadline:
+            wait_readable(prometheus, 0.5)
+        assert found, (tmp_path / "prometheus.log").read_text()
+        dashboard = json.loads((SIM.parent / "grafana.json").read_text())
+        for panel in dashboard["panels"]:
+            for query in panel["targets"]:
+                expression = query["expr"].replace("$__rate_interval", "10s").replace("$instance", ".*")
+                assert _asked(address, expression) is not None, expression
+    finally:
+        prometheus.terminate()
+        prometheus.wait(30.0)
+
+
+def _asked(address: str, query: str) -> list[Any] | None:
+    """What Prometheus answers to a query; None where it does not."""
+    try:
+        with urllib.request.urlopen(
+            f"http://{address}/api/v1/query?{urllib.parse.urlencode({'query': query})}", timeout=10.0
+        ) as answer:
+            found = json.loads(answer.read())
+    except OSError:
+        return None
+    result: list[Any] = found["data"]["result"]
+    return result if found["status"] == "success" else None

@@ -1,0 +1,299 @@
+"""Named poses in the gateway: what is taught, when it is answered, and what a goal of a name becomes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from conftest import CONFIG, Rig
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.config import Config, geometry, parse
+from trirail.errors import ConfigError, RefusalCode, RefusedError, ServiceError
+from trirail.kinematics.geometry import travels
+from trirail.kinematics.robot import inverse
+from trirail.motion.limits import Bounds
+from trirail.processes import poses
+from trirail.processes.inbox import Incoming, Kind
+from trirail.processes.pose_file import PoseFile, state_directory
+from trirail.processes.poses import MOST, UNDER_WAY, Poses
+from trirail.telemetry.provenance import toml
+from trirail.wire.messages import NamedGoal, OwnLimits, PoseGoal
+from trirail.wire.packets import PoseChanged
+from trirail.wire.records import DTYPE
+from trirail.wire.state import NamedPose
+from trirail.wire.vocabulary import MODES, Mode
+
+POSE = (0.02, -0.01, 0.1)
+GEOMETRY = geometry(CONFIG.geometry)
+PARKED = msgspec.structs.replace(CONFIG, poses={"park": (0.0, 0.05, 0.0)})
+
+
+def record(pose: tuple[float, float, float] = POSE, mode: Mode = Mode.HOLDING, homed: int = 1) -> np.void:
+    made = np.zeros(1, DTYPE)[0]
+    made["mode"], made["homed"] = MODES.index(mode), homed
+    made["pose"], made["position"] = pose, inverse(GEOMETRY, pose).position
+    return made  # type: ignore[no-any-return]
+
+
+class Asked:
+    """The gateway around the poses: asks as ann, keeps answers, refusals and what everyone is told."""
+
+    def __init__(self, config: Config) -> None:
+        self.replies: list[NamedPose] = []
+        self.refusals: list[RefusedError] = []
+        self.told: list[PoseChanged] = []
+        self.woken = threading.Event()
+        self.poses = Poses(config, self._reply, self._refuse, self.told.append, self.woken.set)
+
+    def _reply(self, incoming: Incoming, reply: msgspec.Struct) -> None:
+        assert isinstance(reply, NamedPose)
+        self.replies.append(reply)
+
+    def _refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
+        self.refusals.append(refusal)
+
+    def ask(self, kind: Kind, name: str, content: bytes = b"") -> None:
+        key = f"trirail/demo/{kind}/ann/{name}"
+        self.poses.take(Incoming(kind, key, len(content), content, "", None))
+
+    def teach(self, name: str, at: np.void | None = None) -> None:
+        self.ask("teach", name)
+        self.poses.measure(record() if at is None else at)
+        self.write()
+
+    def write(self) -> None:
+        """Wait until what is under way has been written, and take it."""
+        assert self.woken.wait(20.0)
+        self.woken.clear()
+        self.poses.settle()
+
+    def known(self) -> dict[str, tuple[float, float, float]]:
+        return {pose.name: (pose.x, pose.y, pose.phi) for pose in self.poses.table().poses}
+
+
+Make = Callable[[Config], Asked]
+
+
+@pytest.fixture
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    made: list[Asked] = []
+
+    def ask(config: Config) -> Asked:
+        made.append(Asked(config))
+        return made[-1]
+
+    yield ask
+    for each in made:
+        each.poses.close()
+
+
+def test_a_pose_is_taught_where_the_next_record_has_the_robot_and_kept(make: Make) -> None:
+    asked = make(CONFIG)
+    asked.ask("teach", "pick")
+    assert not asked.replies
+    asked.poses.measure(record())
+    asked.write()
+    assert asked.replies == [NamedPose("pick", *POSE, taught=True)]
+    assert asked.told == [PoseChanged("ann", "pose pick taught by ann: x 0.020000 m, y -0.010000 m, phi 0.100000 rad")]
+    assert asked.known() == make(CONFIG).known() == {"pick": POSE}
+    asked.teach("pick", record((0.0, 0.0, 0.0), Mode.DISABLED))
+    assert asked.known() == {"pick": (0.0, 0.0, 0.0)}
+    asked.ask("forget", "pick")
+    asked.write()
+    assert asked.replies[-1] == NamedPose("pick", 0.0, 0.0, 0.0, taught=True)
+    assert asked.told[-1] == PoseChanged("ann", "pose pick removed by ann")
+    assert asked.known() == make(CONFIG).known() == {}
+
+
+def test_it_is_answered_told_and_known_only_when_it_is_on_the_disk(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nothing waits for the disk meanwhile: it may take longer than the loop waits for the gateway."""
+    asked, slow = make(CONFIG), threading.Event()
+    change = PoseFile.change
+
+    def slowly(file: PoseFile, *arguments: Any) -> None:
+        assert slow.wait(20.0)
+        change(file, *arguments)
+
+    monkeypatch.setattr(PoseFile, "change", slowly)
+    asked.ask("teach", "pick")
+    asked.poses.measure(record())
+    asked.poses.settle()
+    assert (asked.replies, asked.told, asked.known()) == ([], [], {})
+    slow.set()
+    asked.write()
+    assert asked.known() == {"pick": POSE}
+
+
+def test_a_disk_that_takes_nothing_is_told_and_the_pose_stays_what_it_was(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = make(CONFIG)
+    asked.teach("pick")
+
+    def full(*_: object) -> None:
+        raise ServiceError("poses.json: No space left on device")
+
+    monkeypatch.setattr(PoseFile, "change", full)
+    asked.teach("pick", record((0.0, 0.0, 0.0)))
+    (refusal,) = asked.refusals
+    assert refusal.code is RefusalCode.FAILED
+    assert str(refusal) == "pick is as it was: poses.json: No space left on device"
+    assert asked.known() == {"pick": POSE}
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_where_the_robot_stands_can_be_taught_with_power_and_without(make: Make, mode: Mode) -> None:
+    asked = make(CONFIG)
+    asked.ask("teach", "pick")
+    asked.poses.measure(record(mode=mode))
+    if mode in (Mode.DISABLED, Mode.HOLDING):
+        asked.write()
+        assert asked.known() == {"pick": POSE}
+        return
+    (refusal,) = asked.refusals
+    assert refusal.code is (RefusalCode.FAULT if mode is Mode.FAULT else RefusalCode.MOVING)
+
+
+def test_where_it_is_not_known_to_stand_it_cannot_be_taught(make: Make) -> None:
+    asked = make(CONFIG)
+    asked.ask("teach", "pick")
+    asked.poses.measure(record(homed=0))
+    asked.ask("teach", "pick")
+    stale = record()
+    stale["position"] += 0.01  # sliders that belong to no pose leave the last one in the record
+    asked.poses.measure(stale)
+    assert [refusal.code for refusal in asked.refusals] == [RefusalCode.NOT_HOMED, RefusalCode.SINGULAR]
+    assert asked.known() == {}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "content", "code"),
+    [
+        ("teach", "park", b"", RefusalCode.CONFIGURED_POSE),
+        ("forget", "park", b"", RefusalCode.CONFIGURED_POSE),
+        ("forget", "pick", b"", RefusalCode.UNKNOWN_POSE),
+        ("teach", "a b", b"", RefusalCode.BAD_NAME),
+        ("teach", "p" * 65, b"", RefusalCode.BAD_NAME),
+        ("teach", "\x1b[2J", b"", RefusalCode.BAD_NAME),
+        ("teach", "", b"", RefusalCode.BAD_NAME),
+        ("teach", "*", b"", RefusalCode.WILDCARD),
+        ("teach", "a/b", b"", RefusalCode.UNKNOWN_KEY),
+        ("teach", "pick", b'{"x": 0}', RefusalCode.MALFORMED),
+    ],
+)
+def test_what_is_refused_at_once(make: Make, kind: Kind, name: str, content: bytes, code: RefusalCode) -> None:
+    asked = make(PARKED)
+    with pytest.raises(RefusedError) as refused:
+        asked.ask(kind, name, content)
+    assert refused.value.code is code
+    assert asked.known() == {"park": (0.0, 0.05, 0.0)}
+
+
+def test_what_is_kept_and_what_is_under_way_is_bounded(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = make(CONFIG)
+    for number in range(UNDER_WAY):
+        asked.ask("teach", f"p{number}")
+    with pytest.raises(RefusedError, match="send fewer"):
+        asked.ask("teach", "pick")
+    monkeypatch.setattr(poses, "MOST", 2)
+    full = make(CONFIG)
+    for name in ("a", "b", "a"):
+        full.teach(name)
+    with pytest.raises(RefusedError, match="2 poses are kept already"):
+        full.ask("teach", "c")
+    assert MOST == 1000
+
+
+def test_a_goal_of_a_name_is_that_pose_with_all_that_it_asks_for(make: Make) -> None:
+    asked = make(PARKED)
+    asked.teach("pick")
+    limits = OwnLimits(velocity=(0.1, 0.1, 0.5))
+    goal = NamedGoal("pick", id="g", speed=0.5, valid_for=2.0, limits=limits, blend=0.01)
+    assert asked.poses.stated(goal) == PoseGoal(*POSE, id="g", speed=0.5, valid_for=2.0, limits=limits, blend=0.01)
+    assert asked.poses.stated(NamedGoal("park")) == PoseGoal(0.0, 0.05, 0.0)
+    other = PoseGoal(0.0, 0.0, 0.0)
+    assert asked.poses.stated(other) is other
+    with pytest.raises(RefusedError, match="no pose 'pikc': there is park, pick") as refused:
+        asked.poses.stated(NamedGoal("pikc"))
+    assert refused.value.code is RefusalCode.UNKNOWN_POSE
+
+
+def test_a_name_that_the_configuration_takes_later_is_the_configuration_s_and_told(make: Make) -> None:
+    asked = make(CONFIG)
+    asked.teach("park")
+    later = make(PARKED)
+    assert later.known() == {"park": (0.0, 0.05, 0.0)}
+    assert later.poses.warnings() == ("pose park is that of [poses]; the taught one is not used: trirail forget park",)
+    later.ask("forget", "park")
+    later.write()
+    assert later.poses.warnings() == ()
+    assert later.known() == {"park": (0.0, 0.05, 0.0)}
+
+
+def test_what_cannot_be_read_ends_the_start(make: Make) -> None:
+    folder = state_directory("demo")
+    folder.mkdir()
+    (folder / "poses.json").write_text('{"pick": [0.0, 0.0')
+    with pytest.raises(ServiceError, match=r"poses\.json: .*mend it, or move it away and teach the poses anew"):
+        make(CONFIG)
+
+
+def test_a_change_is_told_to_everyone(rig: Rig) -> None:
+    rig.cycle(PoseChanged("ann", "pose pick removed by ann"))
+    (notice,) = [notice for notice in rig.notices if notice.kind == "pose"]
+    assert (notice.level, notice.user, notice.message) == ("info", "ann", "pose pick removed by ann")
+
+
+# ---------------------------------------------------------------------- those of the configuration
+
+numbers = st.floats(-0.4, 0.4)
+TEXT = toml(CONFIG)
+
+
+@given(pose=st.tuples(numbers, numbers, st.floats(-1.5, 1.2)))
+def test_a_configured_pose_is_refused_where_the_robot_could_not_be_and_only_there(
+    pose: tuple[float, float, float],
+) -> None:
+    """What a start refuses is what a goal to it would be refused for: what the gate before the drives knows."""
+    try:
+        parse(f"{TEXT}\n[poses]\npark = {list(pose)}\n")
+        refused = ""
+    except ConfigError as error:
+        refused = str(error)
+    bounds = Bounds(CONFIG.limits, CONFIG.period)
+    found = bounds.pose(pose)
+    if found is None:
+        motion = inverse(GEOMETRY, pose)
+        still = np.zeros(3)
+        found = bounds.setpoint(np.array([motion.position, still, still, motion.passive_position]))
+    assert refused.startswith("poses.park = [") == (found is not None), found
+    assert bool(refused) == (found is not None)
+
+
+@given(pose=st.tuples(numbers, numbers, st.floats(-1.5, 0.9)))
+def test_travels_are_those_of_the_inverse_kinematics(pose: tuple[float, float, float]) -> None:
+    motion = inverse(GEOMETRY, pose)
+    assert np.abs(travels(GEOMETRY, pose) - [motion.position, motion.passive_position]).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("park = [0.5, 0.0, 0.0]", "poses.park = [0.5, 0, 0]: x would be 0.5, outside of limits.platform.x = [-0.15, "),
+        ("park = [0.0, 0.0]", "poses.park = [0.0, 0.0]: expected array of length 3"),
+        ("park = [0.0, 0.0, 9.0]", "poses.park[2] = 9.0: expected float <= 6.28"),
+        ("'my pose' = [0.0, 0.0, 0.0]", "poses: 'my pose' is no name here: expected str matching"),
+        ("park = [0.0, 0.0, nan]", "poses.park[2] = nan: it must be a finite number"),
+    ],
+)
+def test_configured_poses_that_are_refused(wrong: str, said: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        parse(f"{TEXT}\n[poses]\n{wrong}\n")
+    assert said in str(refused.value)
