@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
+from scipy.interpolate import NdBSpline  # type: ignore[import-untyped]
 from trirail.errors import KinematicsError
 from trirail.kinematics.correction import Correction
 from trirail.kinematics.geometry import Geometry
@@ -46,12 +47,8 @@ def test_forward_undoes_inverse(cells: tuple[int, int, int], seed: int) -> None:
 @given(cells=SIZES, seed=SEEDS)
 def test_the_legs_are_told_the_pose_and_the_map_there(cells: tuple[int, int, int], seed: int) -> None:
     """Against scipy's splines, and the plain robot."""
-    from scipy.interpolate import NdBSpline
-
-    made = random_map(cells, seed)
-    knots = tuple(low + (high - low) / n * np.arange(-3, n + 4) for low, high, n in zip(LOW, HIGH, cells, strict=True))
-    poses = places(seed)
-    told = poses + NdBSpline(knots, made.nodes, 3)(poses)
+    made, poses = random_map(cells, seed), places(seed)
+    told = poses + told_more(made, poses)
     assert_allclose(inverse(Geometry(PLAIN.legs, made), poses).position, inverse(PLAIN, told).position, atol=1e-15)
 
 
@@ -96,8 +93,6 @@ def test_what_it_adds_is_bounded_in_every_cell(
 
 
 def told_more(made: Correction, poses: Array) -> Array:
-    from scipy.interpolate import NdBSpline
-
     knots = tuple(
         low + (high - low) / n * np.arange(-3, n + 4)
         for low, high, n in zip(made.low, made.high, made.cells, strict=True)
