@@ -78,6 +78,10 @@ def delay_answers(bus: can.BusABC, delay: Delay, clock: Callable[[], float]) -> 
     bus.recv = recv  # type: ignore[method-assign]
 
 
+FRAMES = 25
+"""How deep a stack is looked into for who has allocated."""
+
+
 class Rig:
     """Runs cycles of control, driver and drives, and keeps what was said and every frame that was sent."""
 
@@ -237,29 +241,39 @@ def what_memory_takes(cycle: Callable[[], None], cycles: int) -> tuple[int, int]
     """Return by how many bytes memory grows in so many cycles, and how many are in use for a moment at most.
 
     Without the garbage collector, as the loop runs. The cycles before are for what is made once, and for the tuples
-    that CPython keeps for later: 2000 of each length, then no more. The least of five rounds: what the cycle takes
-    is in all of them, what a thread of an earlier test takes beside it is not.
+    that CPython keeps for later: 2000 of each length, then no more. Only what is allocated below this function counts
+    as grown, and the least of five rounds as in use: threads of earlier tests allocate too.
     """
     gc.collect()
     gc.disable()
-    tracemalloc.start()
+    tracemalloc.start(FRAMES)
     try:
         for _ in range(2500):
             cycle()
-        rounds = [_round(cycle, cycles) for _ in range(5)]
+        before = _allocated_here()
+        peaks = [_peak(cycle, cycles // 5) for _ in range(5)]
+        grown = _allocated_here().compare_to(before, "lineno")
     finally:
         tracemalloc.stop()
         gc.enable()
-    return min(grown for grown, _ in rounds), min(in_use for _, in_use in rounds)
+    return sum(line.size_diff for line in grown), min(peaks)
 
 
-def _round(cycle: Callable[[], None], cycles: int) -> tuple[int, int]:
-    before, _ = tracemalloc.get_traced_memory()
+def _peak(cycle: Callable[[], None], cycles: int) -> int:
+    held, _ = tracemalloc.get_traced_memory()
     tracemalloc.reset_peak()
     for _ in range(cycles):
         cycle()
-    after, peak = tracemalloc.get_traced_memory()
-    return after - before, peak - before
+    _, peak = tracemalloc.get_traced_memory()
+    return peak - held
+
+
+def _allocated_here() -> tracemalloc.Snapshot:
+    """Return what is held that code of the package has allocated, called from here."""
+    found = tracemalloc.take_snapshot()
+    for one in ("*/trirail/*", __file__):
+        found = found.filter_traces([tracemalloc.Filter(True, one, all_frames=True)])
+    return found
 
 
 @pytest.fixture

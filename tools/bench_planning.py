@@ -16,7 +16,7 @@ from trirail.errors import RefusedError
 from trirail.motion.goals import Goals
 from trirail.motion.runs import rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import PlannedGoal, PoseGoal, SlidersGoal, VelocityGoal
+from trirail.wire.messages import PlannedGoal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
 
 GOALS = 1500
 AIM = 5000.0
@@ -36,6 +36,7 @@ def main(json: bool) -> None:
         "velocity": lambda rnd: VelocityGoal(
             rnd.uniform(-0.25, 0.25), rnd.uniform(-0.25, 0.25), rnd.uniform(-1.5, 1.5)
         ),
+        "track": lambda rnd: TrackGoal(*_pose(rnd), velocity=(rnd.uniform(-0.2, 0.2), rnd.uniform(-0.2, 0.2), 0.0)),
     }
     results = {}
     for kind, make in kinds.items():

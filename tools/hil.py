@@ -24,7 +24,7 @@ from typing import Any
 import bus_log
 import hil_dissector
 import hil_second
-from hil_machine import ROOT, heard, machine, pack, prepare
+from hil_machine import ROOT, compiling, heard, machine, pack
 from hil_needs import Failed, install, last, requirements
 from trirail.config import Config, load
 
@@ -110,13 +110,13 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
 def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict[str, Any]) -> None:
     """Boot, run both robots and the tests, check the frames. Raises Failed."""
     config = configure(folder)
-    say("compiling the kinematics for the emulated processor")
-    prepare(folder)
-    packed = pack(folder)
-    say(f"booting {kernel.name} in QEMU; logs are in {folder}")
-    with machine(folder, kernel, packed) as lines:
-        for line in heard(lines, deadline):
-            say(line)
+    say("compiling the kinematics for the emulated processor, beside what follows")
+    with compiling(folder):
+        packed = pack(folder)
+        say(f"booting {kernel.name} in QEMU; logs are in {folder}")
+        with machine(folder, kernel, packed) as lines:
+            for line in heard(lines, deadline):
+                say(line)
     result = _result(folder)
     report["checks"] |= result["checks"]
     if result["failure"]:

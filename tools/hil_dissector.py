@@ -25,10 +25,14 @@ FIELDS = (
     "canopen.sdo.abort_code",
     "canopen.em.err_code",
     "canopen.nmt_guard.state",
+    "canopen.nmt_ctrl.cd",
+    "canopen.nmt_ctrl.node_id",
 )
 SDO_ANSWER, SDO_REQUEST, EMERGENCY, ERROR_CONTROL = 0xB, 0xC, 0x1, 0xE
 """Function codes, bits 7 to 10 of an identifier (CiA 301, 7.3.3)."""
 BOOT_UP, OPERATIONAL = 0x0, 0x5
+START, ALL_NODES = 0x01, 0
+"""Of an NMT command (CiA 301, 7.2.8.3.1)."""
 
 
 class Dissected(NamedTuple):
@@ -46,6 +50,9 @@ class Dissected(NamedTuple):
     """The error code of an EMCY, unless it says "no error"."""
     state: int | None
     """The NMT state in a heartbeat or boot-up."""
+    command: int | None
+    commanded: int | None
+    """An NMT command, and the node that it is for."""
 
 
 def dissect(log: Path) -> list[Dissected]:
@@ -99,9 +106,11 @@ def _unanswered(frames: Sequence[Dissected]) -> Iterator[str]:
 
 
 def _fallen(frames: Sequence[Dissected]) -> Iterator[str]:
-    """A node that has become operational stays so, and sends no EMCY."""
+    """A node that has become operational stays so until it is told otherwise, and sends no EMCY."""
     operational: set[int] = set()
     for frame in frames:
+        if frame.command not in (None, START):
+            operational -= set(operational) if frame.commanded == ALL_NODES else {frame.commanded or 0}
         if frame.emergency:
             yield f"node {frame.node} sends EMCY {frame.emergency:04X}, at {frame.t:.6f}"
         if frame.state is None or frame.node is None:
@@ -118,7 +127,7 @@ def _entry(frame: Dissected) -> str:
 
 
 def _frame(fields: Sequence[str]) -> Dissected:
-    t, function, node, malformed, *entry, abort, emergency, state = fields
+    t, function, node, malformed, *entry, abort, emergency, state, command, commanded = fields
     index, sub = map(_number, entry)
     return Dissected(
         t=float(t),
@@ -129,6 +138,8 @@ def _frame(fields: Sequence[str]) -> Dissected:
         abort=_number(abort),
         emergency=_number(emergency),
         state=_number(state),
+        command=_number(command),
+        commanded=_number(commanded),
     )
 
 

@@ -25,26 +25,44 @@ PORTABLE = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 TESTS = ("tests/drivers/test_real_bus.py", "tests/drivers/test_frame_io.py")
 """What has tests marked vcan."""
 
-COMPILE = "from trirail.processes import gateway, loop, planner, recording; from trirail.client import client"
+COMPILED = "compiled"
+"""The file that says how compiling went: the machine waits for it."""
+CACHE = Path(sys.prefix) / "hil-numba"
+"""What was compiled, for the next run too: numba takes what fits its source's time and size, and compiles the rest."""
+COMPILE = """
+import sys
+from pathlib import Path
+outcome = "failed"
+try:
+    from trirail.processes import gateway, loop, planner, recording
+    from trirail.client import client
+    outcome = "well"
+finally:
+    Path(sys.argv[1]).write_text(outcome)
+"""
 
 
-def prepare(folder: Path) -> None:
-    """Compile the kinematics here, for the machine to load."""
-    done = subprocess.run(
-        (
-            sys.executable,
-            "-P",
-            "-c",
-            COMPILE,
-        ),
-        cwd=ROOT,
-        env=os.environ | PORTABLE | {"NUMBA_CACHE_DIR": str(folder / "numba")},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode != 0:
-        raise Failed(f"cannot compile the kinematics:\n{last(done.stderr)}")
+@contextlib.contextmanager
+def compiling(folder: Path) -> Iterator[None]:
+    """Compile the kinematics here, beside what is done meanwhile, for the machine to load. Raises Failed at the end."""
+    (folder / COMPILED).unlink(missing_ok=True)  # of a run before, in a folder that was kept
+    with (folder / "compile.log").open("wb") as log:
+        process = subprocess.Popen(
+            (sys.executable, "-P", "-c", COMPILE, folder / COMPILED),
+            cwd=ROOT,
+            env=os.environ | PORTABLE | {"NUMBA_CACHE_DIR": str(CACHE)},
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+        )
+    try:
+        yield
+    finally:
+        outcome = process.poll()
+        process.kill()  # where the machine has come to an end without waiting for it
+        process.wait()
+    if outcome:
+        raise Failed(f"cannot compile the kinematics:\n{last((folder / 'compile.log').read_text())}")
 
 
 def pack(folder: Path) -> tuple[Path, ...]:
@@ -90,13 +108,15 @@ cd {ROOT}
 export PATH={BIN}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 export PYTHONDONTWRITEBYTECODE=1 TMPDIR=/dev/shm NUMBA_CACHE_DIR=/dev/shm/numba
 export {" ".join(f"{name}='{value}'" for name, value in PORTABLE.items())}
-cp -r {folder}/numba /dev/shm/numba
 for interface in can0 can1; do
     ip link set $interface txqueuelen 100
     ip link set $interface up type can bitrate 1000000
 done
 ip link add vcan0 type vcan
 ip link set vcan0 up
+until [ -s {folder}/{COMPILED} ]; do sleep 0.2; done
+grep -q well {folder}/{COMPILED}
+cp -r {CACHE} /dev/shm/numba
 set +e
 {sys.executable} tools/hil_guest.py {folder}
 {sys.executable} -m pytest --noconftest -m vcan -rA --tb=short {" ".join(TESTS)} 2>&1 | tee {folder}/vcan.log

@@ -129,19 +129,18 @@ def _faulted(robot: Robot, result: Result, whose: str) -> str:
 
 
 def recover(robot: Robot) -> None:
-    """Reset as soon as the cause is gone, where there is a fault, and enable."""
+    """Reset as soon as the cause is gone, where there is a fault, and enable as soon as the sliders stand."""
 
-    def cleared() -> bool:
-        if robot.state().mode != "fault":
-            return True
+    def enabled() -> bool:
         try:
-            robot.reset()
+            if robot.state().mode == "fault":
+                robot.reset()
+            robot.enable()
         except RefusedError:
             return False
         return True
 
-    until(cleared, "reset")
-    robot.enable()
+    until(enabled, "reset and enabled")
 
 
 def _until_moving(robot: Robot, goal: str) -> None:

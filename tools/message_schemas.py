@@ -21,7 +21,7 @@ FOLDER = Path(messages.__file__).parent / "schemas"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 MESSAGES: dict[str, tuple[Any, str]] = {
-    "goal": (messages.SentGoal, "What is sent to goal/<user>: a goal of one of the kinds."),
+    "goal": (messages.Goal, "What is sent to goal/<user>: a goal of one of the kinds."),
     "goal-reply": (messages.GoalReply, "The reply to a goal that is accepted."),
     **{
         f"command-{name}": (kind, f"The content{', if any,' * (type(None) in get_args(kind))} of cmd/<user>/{name}.")

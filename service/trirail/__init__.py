@@ -3,7 +3,7 @@
 What most programs need is here; each name is loaded when it is first asked for, so that `import trirail` costs
 nothing, `Robot` neither compiles nor draws, and the kinematics needs no network.
 
-from trirail import Robot                        # a connection to a running service
+from trirail import Robot, AsyncRobot            # a connection to a running service
 from trirail import read                         # a recording, into numpy
 from trirail import Geometry, Leg, inverse, forward, jacobians   # the robot's mathematics
 """
@@ -15,6 +15,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from trirail.client.async_client import AsyncRobot
     from trirail.client.client import Robot
     from trirail.errors import ConfigError, KinematicsError, RefusalCode, RefusedError, ServiceError, TrirailError
     from trirail.kinematics.geometry import Geometry, Leg
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from trirail.telemetry.reading import read
 
 __all__ = [
+    "AsyncRobot",
     "ConfigError",
     "Geometry",
     "KinematicsError",
@@ -41,6 +43,7 @@ __all__ = [
 __version__ = version("trirail")
 
 _HOMES = {
+    "trirail.client.async_client": ("AsyncRobot",),
     "trirail.client.client": ("Robot",),
     "trirail.errors": ("ConfigError", "KinematicsError", "RefusalCode", "RefusedError", "ServiceError", "TrirailError"),
     "trirail.kinematics.geometry": ("Geometry", "Leg"),

@@ -127,7 +127,12 @@ class RefusalCode(StrEnum):
     )
     NO_VELOCITY = "no_velocity", "a jog that moves nothing", "give it a velocity"
     AT_LIMIT = "at_limit", "the jog has ended at a limit", "begin a new one, away from it"
-    JOG_OVER = "jog_over", "the jog was not renewed in time", "begin a new one"
+    JOG_OVER = "jog_over", "the jog or track was not renewed in time", "begin a new one"
+    WRONG_TIME = (
+        "wrong_time",
+        "a track's target of too long ago, or of too far ahead",
+        "have both machines' clocks agree, or leave time out",
+    )
 
     # Too late, too much, or not carried out.
     EXPIRED = "expired", "the goal could not begin in time", "send it again, or with a longer valid_for"

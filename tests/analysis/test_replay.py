@@ -7,6 +7,7 @@ import json
 import random
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import made
@@ -34,7 +35,7 @@ STEPS = 14
 def act(robot: Robot, choice: random.Random) -> None:
     """Do one of the things that clients do, whether or not the service agrees."""
     x, y, phi = (choice.uniform(-span, span) for span in (0.07, 0.07, 0.5))
-    match choice.randrange(8):
+    match choice.randrange(9):
         case 0 | 1:
             robot.move_to(x=x, y=y, phi=phi, valid_for=5.0)
         case 2:
@@ -47,8 +48,13 @@ def act(robot: Robot, choice: random.Random) -> None:
             for _ in range(3):
                 robot.send(lambda name: VelocityGoal(0.1 * x, y, phi, timeout=0.2, id=name), "jog")
         case 5:
-            robot.override(choice.choice([30.0, 100.0, 150.0]))
+            with robot.track() as track:
+                for n in range(10):
+                    track.update((x * n / 10.0, y, phi), (x, 0.0, 0.0))
+                    time.sleep(0.01)
         case 6:
+            robot.override(choice.choice([30.0, 100.0, 150.0]))
+        case 7:
             robot.pause()
             robot.resume()
         case _:

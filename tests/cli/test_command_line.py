@@ -163,6 +163,12 @@ def test_the_banner_names_the_next_command_where_it_reaches_the_service(capsys: 
     assert "next       trirail enable --robot left --connect tcp/127.0.0.1:7999\n" in said
 
 
+def test_who_asks_for_a_command_that_there_is_not_is_led_to_the_list_of_them(run: Run) -> None:
+    code, _, err = run("dance")
+    assert code == 2
+    assert err.endswith("(trirail --help tells the usage)\n")
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_the_completion_script_knows_commands_and_options(shell: str, run: Run) -> None:
     code, out, err = run("completion", shell)

@@ -17,7 +17,7 @@ from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState, rest
-from trirail.wire.messages import Fault, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.messages import FaultDetail, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, Confirmed, GoalRequest, Refused
 from trirail.wire.vocabulary import FaultCause, Mode
 from trirail_drivers.cia402 import frames
@@ -430,7 +430,7 @@ def test_a_following_error(rig: Rig) -> None:
     rig.drives[0].servo.position += 0.0045 * 1e7  # something pushed the slider; the drive itself allows 5 mm
     rig.until(lambda: rig.mode is Mode.FAULT, 3)
     assert_tripped(rig, "slider A: following error")
-    assert Fault(FaultCause.FOLLOWING_ERROR, "A") in [notice.fault for notice in rig.notices]
+    assert FaultDetail(FaultCause.FOLLOWING_ERROR, "A") in [notice.fault for notice in rig.notices]
 
 
 @pytest.mark.parametrize(
@@ -726,7 +726,7 @@ def test_a_fault_says_what_it_is_about_for_programs(rig: Rig) -> None:
     rig.enable()
     rig.order("quick_stop")
     (said,) = [notice for notice in rig.notices if notice.kind == "fault"]
-    assert said.fault == Fault(FaultCause.QUICK_STOP)
+    assert said.fault == FaultDetail(FaultCause.QUICK_STOP)
 
 
 @pytest.mark.parametrize("number", range(3))

@@ -139,7 +139,10 @@ def test_whatever_ends_it_stops_what_its_holder_has_under_way_and_what_waits(use
         assert isinstance(users.tell("bob", "acquire", "m", force=True), Confirmed)
         assert leases(rig)[-1] == ("lease taken over by bob from ann", "bob")
         assert code(users.send("ann", "g2")) in (RefusalCode.LEASED, RefusalCode.STOPPED)
-        assert code(users.tell("ann", "acquire", "l")) is RefusalCode.LEASE_OVER
+        late = users.tell("ann", "acquire", "l")
+        assert code(late) is RefusalCode.LEASE_OVER
+        assert isinstance(late, Refused)
+        assert late.message == "lease taken over by bob from ann: acquire a new one"
     else:
         rig.until(lambda: rig.control.lease.user is None)
     rig.until(rig.holds)
@@ -193,7 +196,7 @@ def test_ids_of_leases_that_are_over_are_remembered_each_users_own_and_not_for_e
     for number in range(REMEMBERED_IDS + 1):
         lease.acquire(CommandRequest(1, "ann", Command.ACQUIRE, lease=f"l{number}"), 0)
         lease.release(CommandRequest(1, "ann", Command.RELEASE))
-    with pytest.raises(RefusedError, match="is over"):
+    with pytest.raises(RefusedError, match="lease released by ann: acquire a new one"):
         lease.acquire(CommandRequest(1, "ann", Command.ACQUIRE, lease="l1"), 0)
     lease.acquire(CommandRequest(1, "bob", Command.ACQUIRE, lease="l1"), 0)
     lease.release(CommandRequest(1, "bob", Command.RELEASE))

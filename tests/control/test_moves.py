@@ -65,6 +65,14 @@ def test_a_pose_in_a_work_frame_is_where_the_frame_is(pose: Pose, tool: str | tu
     assert goal.phi == pytest.approx(math.pi / 2.0 + pose[2])
 
 
+@pytest.mark.parametrize("angle", [-2.0, 0.0, 1e-9, 1.0, math.pi])
+def test_a_frame_may_be_turned_by_any_angle(angle: float) -> None:
+    table = FramesTable(work={"part": (0.02, 0.01, angle)})
+    goal = NamedFrames(table).planned(PoseGoal(0.03, -0.01, 0.1, frame="part"), lambda _: (0.0, 0.0, 0.0))
+    assert isinstance(goal, PoseGoal)
+    assert complex(goal.x, goal.y) == pytest.approx(complex(0.02, 0.01) + turned(0.03, -0.01, angle))
+
+
 @pytest.mark.parametrize(
     ("goal", "said"),
     [

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.config import Config
 from trirail.control.modes import ModeEvent
-from trirail.wire.messages import PoseGoal, SlidersGoal, VelocityGoal
+from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
 from trirail.wire.vocabulary import Command, Mode
 
@@ -305,6 +305,21 @@ def test_a_pause_ends_a_jog(rig: Rig) -> None:
     assert stands_from(rig) == stood
 
 
+@pytest.mark.parametrize(
+    "goal", [VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), TrackGoal(0.05, 0.0, 0.0)], ids=["jog", "track"]
+)
+@pytest.mark.parametrize("name", ["stop", "quick_stop", "pause", "disable"])
+def test_what_is_stopped_while_its_renewal_is_planned_ends_once(slow: Rig, name: str, goal: Goal) -> None:
+    slow.send("j1", goal)
+    slow.post("j1", goal)
+    slow.cycles(5)
+    assert not slow.control.goal_queue.idle
+    slow.order(name)
+    slow.cycles(600)
+    assert [goal_id for goal_id, _ in slow.outcomes()] == ["j1"]
+    assert len(slow.answers) == len({answer.ticket for answer in slow.answers if hasattr(answer, "ticket")})
+
+
 def test_nobody_else_renews_a_jog(rig: Rig) -> None:
     rig.enable()
     jog = VelocityGoal(0.05, 0.0, 0.0, timeout=0.2)
@@ -341,6 +356,7 @@ GOAL = st.one_of(
     st.builds(lambda pose: PoseGoal(pose[0], pose[1], pose[2], speed=0.1), POSE),
     st.tuples(*[st.floats(-0.03, 0.03)] * 3).map(SlidersGoal),
     st.builds(fast, POSE, st.sampled_from([0.05, 2.0])),
+    st.builds(lambda pose, going: TrackGoal(pose[0], pose[1], pose[2], going, timeout=0.3), POSE, POSE),
 )
 OVERRIDE = st.sampled_from([0.0, 0.0, 0.02, 0.3, 1.0, 2.0])
 STEP = st.tuples(

@@ -60,11 +60,15 @@ class Habits:
     """What objects hold at power-on."""
     access: dict[Key, str] = field(default_factory=dict)
     """Access that differs from the dictionary's."""
+    more: tuple[tuple[int, int, int, str, int | None, bool], ...] = ()
+    """Objects that its dictionary lacks: rows as `rows` has them."""
     refuses: dict[Key, Callable[[int], bool]] = field(default_factory=dict)
     """Values that it does not take."""
     fixed_pdos: bool = False
     """Mappings and COB-IDs cannot be written."""
     answers_guarding: bool = True
+    answers_unset_guarding: bool = True
+    """It answers guarding also while 100Ch or 100Dh is zero; lely-core does not."""
     has_bit_12: bool = True
     tells_error_reset: bool = True
     """It sends EMCY 0000 when errors are over."""
@@ -82,7 +86,7 @@ def rows(name: str) -> list[tuple[int, int, int, str, int | None, bool]]:
 def dictionary(name: str, node: int, habits: Habits, *, rebased: bool = True) -> canopen.ObjectDictionary:
     """An object dictionary of canopen with one drive's objects."""
     objects = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
-    facts = [row for row in rows(name) if row[0] not in habits.without]
+    facts = [*(row for row in rows(name) if row[0] not in habits.without), *habits.more]
     records = {row[0] for row in facts if row[1] > 0}
     for index, subindex, kind, access, default, mappable in facts:
         variable = ODVariable(f"{index:04X}:{subindex:02X}", index, subindex)
@@ -187,7 +191,8 @@ class ForeignDrive:
         self._last = -math.inf
         self._told: dict[int, bytes] = {}
         self._told_at: dict[int, float] = {}
-        self._pending: set[int] = set()
+        self._heard_at: dict[int, float] = {}
+        self._synced_at = -math.inf
         self._heartbeat_at = self._guarded_at = self._moved_at = clock()
         self._consumer_heard: float | None = None
         self._toggle = 0
@@ -237,6 +242,8 @@ class ForeignDrive:
             self._mapped(index, subindex, value)
         if index & 0xFA00 == 0x1800 and subindex == 3 and not self.value(index, 1) & 1 << 31:
             raise SdoAbortedError(0x0609_0030)  # CiA 301: the inhibit time only while it is invalid
+        if index == 0x1019 and self.value(0x1006):
+            raise SdoAbortedError(0x0800_0022)  # CiA 301: the counter changes only while the period is 0
         self.written.append((index, subindex, bytes(data)))
         if 0x1400 <= index < 0x1C00:
             self._valid.clear()
@@ -276,7 +283,8 @@ class ForeignDrive:
     def _take(self, message: can.Message) -> None:
         identifier = message.arbitration_id
         if message.is_remote_frame:
-            if identifier == 0x700 + self.node and self.habits.answers_guarding:
+            asked = self.habits.answers_unset_guarding or (self.value(0x100C) and self.value(0x100D))
+            if identifier == 0x700 + self.node and self.habits.answers_guarding and asked:
                 self._guarded_at = self.clock()
                 self._send(0x700 + self.node, bytes([self.nmt | self._toggle]))
                 self._toggle ^= 0x80
@@ -291,6 +299,8 @@ class ForeignDrive:
         elif identifier == 0x700 + (self.value(0x1016, 1) >> 16 & 0x7F or 0xFF):
             self._consumer_heard = self.clock()
         elif identifier == 0x80:
+            if bool(data) != bool(self.value(0x1019)):
+                self.emergency(0x8240)
             self._sync()
         elif self.nmt == OPERATIONAL:
             self._rpdo(identifier, data)
@@ -350,8 +360,11 @@ class ForeignDrive:
     def _rpdo(self, identifier: int, data: bytes) -> None:
         for index in self._pdos(0x1400):
             if self.value(index, 1) & 0x7FF == identifier:
+                self._heard_at[index] = self.clock()
+                window = self.value(0x1007) * 1e-6
                 if self.value(index, 2) <= 240:
-                    self._latched[index] = data
+                    if not window or self.clock() <= self._synced_at + window:
+                        self._latched[index] = data
                 else:
                     self._unpack(index, data)
 
@@ -383,6 +396,7 @@ class ForeignDrive:
         if self.nmt != OPERATIONAL:
             return
         self._syncs += 1
+        self._synced_at = self.clock()
         for index in self._pdos(0x1800):
             kind = self.value(index, 2)
             if 1 <= kind <= 240 and self._syncs % kind == 0:
@@ -415,6 +429,11 @@ class ForeignDrive:
             self._guarded_at = math.inf
             self._master_lost()
         if self.nmt == OPERATIONAL:
+            for index, heard in list(self._heard_at.items()):
+                deadline = self.value(index, 5) * 1e-3
+                if deadline and now - heard > deadline:
+                    del self._heard_at[index]
+                    self.emergency(0x8250)
             for index in self._pdos(0x1800):
                 if self.value(index, 2) >= 254:
                     self._event(index, now)

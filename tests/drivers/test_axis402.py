@@ -64,6 +64,24 @@ def test_a_fault_reset_has_the_time_of_two_statuswords() -> None:
     assert axis.fault(T + 0.26, OFF) == ("B", "fault", 0, "drive B: fault")
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_quick_stop_ends_without_power_once_the_slider_has_stood_for_a_tenth_of_a_second(sign: int) -> None:
+    """It stands where it stays within 20 µm; while it moves by more the drive keeps its power, and brakes."""
+    axis = made()
+    axis.on_status(b"\x07\0", T)
+    stopping = axis.word(T, P.QUICK_STOP_ACTIVE)
+    moved = T + 0.05
+    for time, counts in ((T, 1000), (moved, 1000 + sign * 21), (moved + 0.05, 1000 + sign * 2)):
+        axis.on_position(frames.POSITION.pack(counts), time)
+        assert axis.word(time, P.QUICK_STOP_ACTIVE) == stopping
+    axis.on_position(frames.POSITION.pack(1000 + sign * 45), moved + 0.06)
+    stands = moved + 0.06
+    for after, word in ((0.0999, stopping), (0.1001, frames.DISABLE_VOLTAGE)):
+        axis.on_position(frames.POSITION.pack(1000 + sign * 64), stands + after)
+        assert axis.word(stands + after, P.QUICK_STOP_ACTIVE) == word
+    assert stopping != frames.DISABLE_VOLTAGE
+
+
 @pytest.mark.parametrize("wanted", [OFF, WANTED, P.QUICK_STOP_ACTIVE])
 def test_a_fault_from_before_the_start_is_told_and_left_alone_until_it_is_to_be_reset(wanted: frames.Wanted) -> None:
     axis = Cia402Axis("B", 2, Scale(1e6, 0.0), UNHURRIED)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import can
 import msgspec
 import pytest
 from drivers.foreign import ForeignDrive, Habits, Truth, three
@@ -18,7 +19,7 @@ from trirail.errors import ConfigError
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.objects import FOLLOWING_BIT, PROTECTIONS, USES
 from trirail_drivers.config import Drive, Drives
-from trirail_drivers.errors import DriveError
+from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState, Triple
 from trirail_drivers.protocols import PROTOCOLS
 
@@ -133,6 +134,25 @@ def test_a_drive_moves_as_fast_as_it_is_told(rigs: list[Rig], name: str) -> None
     assert rig.feedback.position == pytest.approx([node.servo.position for node in rig.nodes], abs=2e-3)
 
 
+ACTIONS = {0x6040, 0x60C4}
+"""What is written in any case: a controlword that takes power off, and what empties the buffer of mode 7."""
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_a_drive_that_is_set_up_is_only_read_and_nothing_is_ever_stored_in_it(rigs: list[Rig], name: str) -> None:
+    rig = Rig(name)
+    rigs.append(rig)
+    rig.ready()
+    for node in rig.nodes:
+        assert {index for index, *_ in node.written} - ACTIONS
+        assert 0x1010 not in {index for index, *_ in node.written}
+        node.written.clear()
+    rig.drives.configure(PERIOD)
+    for node in rig.nodes:
+        again = {index for index, *_ in node.written} - ACTIONS
+        assert again == ({0x1401, 0x1601} if name == "ros2_cia402_slave" else set()), "a mapping that it refuses"
+
+
 def test_the_table_of_objects_is_that_of_the_guide() -> None:
     guide = (Path(__file__).parents[2] / "drivers" / "README.md").read_text()
     rows = re.findall(r"^\| ([0-9A-F]{4}(?::\d\d)?) \| (\w+) \| (.+?): (.+) \| (.+) \| (.+) \|$", guide, re.MULTILINE)
@@ -177,6 +197,120 @@ def test_a_drive_with_neither_mode_is_refused_by_6502(rigs: list[Rig]) -> None:
     rigs.append(rig)
     with pytest.raises(DriveError, match=r"6502:00 \(supported drive modes\) is 0000002D: neither"):
         rig.ready()
+
+
+@pytest.mark.parametrize(
+    ("left", "values"),
+    [
+        ((0x1007, 0, 7, "rw", 500, False), {}),
+        ((0x1019, 0, 5, "rw", 10, False), {}),
+        ((0x1019, 0, 5, "rw", 10, False), {(0x1006, 0): 2000}),
+        ((0x1400, 5, 6, "rw", 50, False), {}),
+        ((0x1401, 5, 6, "rw", 1, False), {}),
+    ],
+    ids=[
+        "a window for PDOs",
+        "a counter in SYNC",
+        "a counter, while SYNC is watched",
+        "a deadline",
+        "a short deadline",
+    ],
+)
+def test_what_another_master_has_left_in_a_drive_does_not_disturb_the_cycle(
+    rigs: list[Rig], left: tuple[int, int, int, str, int, bool], values: dict[tuple[int, int], int]
+) -> None:
+    """Seen with lely-core's slave: objects that the dictionaries of real drives have, as a master with a SYNC of
+    another kind would leave them."""
+    rig = Rig("elmo_gold", Habits(more=(left,), values=values))
+    rigs.append(rig)
+    rig.ready()
+    rig.enable()
+    for _ in range(100):
+        a, b, c = rig.commanded
+        rig.commanded = a + 1e-4, b + 1e-4, c + 1e-4
+        rig.drives.sync()
+        rig.clock.now += PERIOD / 2  # as long as it takes until the positions are in
+        rig.feedback = rig.drives.read()
+        rig.drives.write(rig.commanded, (0.05, 0.05, 0.05))
+        rig.clock.now += PERIOD / 2
+        assert rig.feedback.fault is None, rig.feedback.fault
+    assert rig.feedback.position == pytest.approx(rig.commanded, abs=1e-3)
+
+
+@pytest.mark.parametrize("index", [0x1005, 0x1007, 0x1019])
+def test_a_drive_that_keeps_a_sync_of_another_kind_is_refused(rigs: list[Rig], index: int) -> None:
+    kind = 5 if index == 0x1019 else 7
+    rig = Rig("elmo_gold", Habits(without=frozenset({index}), more=((index, 0, kind, "ro", 0x81, False),)))
+    rigs.append(rig)
+    with pytest.raises(DriveError, match=f"drive A: object {index:04X}:00 .* and stays; wanted 0"):
+        rig.ready()
+
+
+def test_a_drive_that_answers_no_guarding_is_not_watched_by_it(rigs: list[Rig]) -> None:
+    rig = Rig("technosoft_ipos", Habits(answers_guarding=False))
+    rigs.append(rig)
+    before = [(node.value(0x100C), node.value(0x100D)) for node in rig.nodes]
+    with pytest.raises(DriveError, match="drive A lacks protections: 1016, its watch on this service"):
+        rig.ready()
+    assert [(node.value(0x100C), node.value(0x100D)) for node in rig.nodes] == before
+    rig = Rig("technosoft_ipos", Habits(answers_guarding=False), accept_without=("1016",))
+    rigs.append(rig)
+    rig.ready()
+    rig.enable()
+    rig.move(0.05, 60)
+
+
+OF_EARLIER = (
+    b"\x60\x40\x60\x00\x00\x00\x00\x00",  # a controlword was taken
+    b"\x80\x40\x60\x00\x21\x00\x00\x08",  # or was not
+    b"\x4b\x77\x60\x00\x00\x00\x00\x00",  # an object was read that the set-up does not ask for
+    b"\x80\x77\x60\x00\x00\x00\x04\x05",  # the drive has given up waiting for a segment
+    b"\x01\x00\x00\x00\x00\x00\x00\x00",  # a segment
+    b"\x20\x00\x00\x00\x00\x00\x00\x00",  # a segment was taken
+    b"\x60\x40\x60",  # no frame of an SDO server's
+)
+"""What a drive may send in answer to those who asked before; of 6040h only what is no answer to reading it."""
+
+
+@settings(max_examples=20)
+@given(late=st.lists(st.sampled_from(OF_EARLIER), min_size=1, max_size=20))
+def test_late_answers_to_earlier_requests_are_not_taken_for_others(late: list[bytes]) -> None:
+    rig = Rig("elmo_gold")
+    recv, held = rig.wires.recv, list[can.Message]()
+
+    def late_ones_first(timeout: float | None = None) -> can.Message | None:
+        if held:
+            return held.pop()
+        message = recv(timeout)
+        if message is None or message.arbitration_id != 0x581 or not late or message.data[1:3] == b"\x40\x60":
+            return message
+        held.append(message)
+        return can.Message(arbitration_id=0x581, data=late.pop(), is_extended_id=False)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rig.wires, "recv", late_ones_first)
+        try:
+            rig.ready()
+        finally:
+            rig.drives.close()
+    assert not late
+    assert rig.feedback.fault is None
+
+
+def test_an_answer_against_the_rules_is_not_told_as_silence(rigs: list[Rig], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A segment whose toggle bit is wrong (CiA 301, 7.2.4.3.6)."""
+    rig = Rig("elmo_gold")
+    rigs.append(rig)
+    served = rig.nodes[0].local.sdo
+    answer: Callable[[bytes], None] = served.send_response
+
+    def in_segments(data: bytes) -> None:
+        answer(b"\x41\x00\x10\x00\x04\0\0\0" if data[0] == 0x43 else b"\x10" + bytes(7))
+
+    monkeypatch.setattr(served, "send_response", in_segments)
+    with pytest.raises(DriveError, match=r"drive A: cannot read object 1000:00 .*: Toggle bit") as told:
+        rig.ready()
+    assert not isinstance(told.value, DriveTimeout)
 
 
 LACKABLE = [name for name in PROTECTIONS if name not in ("1016", FOLLOWING_BIT)]

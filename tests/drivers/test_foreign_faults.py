@@ -10,6 +10,7 @@ import pytest
 from drivers.foreign import DISABLED, ENABLED, OPERATIONAL, PRE_OPERATIONAL, QUICK_STOP, STOPPED, ForeignDrive, Habits
 from drivers.test_foreign import MAKES, PERIOD, Rig
 from trirail_drivers.cia402.codes import words
+from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
 
 
@@ -27,6 +28,9 @@ WAYS = {
     "csp without offset": Named("ros2_cia402_slave", Habits, {}),
     "interpolated position, two RPDOs, heartbeat": Named("pilz_prbt", Habits, {}),
     "interpolated position, node guarding": Named("technosoft_ipos", Habits, {}),
+    "interpolated position, node guarding once it is set": Named(
+        "technosoft_ipos", lambda: Habits(answers_unset_guarding=False), {}
+    ),
     "statusword polled": Named(
         "elmo_gold",
         lambda: Habits(
@@ -134,17 +138,34 @@ def test_two_masters_are_noticed(rig: Rig, identifier: int | None, data: bytes, 
         assert said in stopped_within(rig, 1)
 
 
-def test_a_second_node_with_the_same_id_is_noticed(rig: Rig) -> None:
+@pytest.mark.parametrize("apart", [1, -40, 16_000_000])
+def test_a_second_node_with_the_same_id_is_noticed(rig: Rig, apart: int) -> None:
+    """Its slider may be anywhere: also beside this one [counts], as of a drive that was copied and not moved."""
+    node, way = rig.nodes[2], rig.drives._axes[2].way
+    pdo = next(index for index in node._pdos(0x1800) if node.value(index, 1) & 0x7FF == way.feedback.identifier)
     with stranger(rig) as bus:
-        way = rig.drives._axes[2].way
-        for n in range(8):
-            data = bytes(way.feedback.size - 1) + bytes([n])
+        for _ in range(200):
+            data = bytearray(node._packed(pdo))
+            counts = node.value(0x6064)
+            at = data.index(counts.to_bytes(4, "little", signed=True))
+            data[at : at + 4] = (counts + apart).to_bytes(4, "little", signed=True)
             bus.send(can.Message(arbitration_id=way.feedback.identifier, data=data, is_extended_id=False))
             feedback = rig.cycle(rig.commanded)
             if feedback.fault is not None:
                 break
     assert feedback.fault is not None
-    assert feedback.fault.drive == "C"
+    assert feedback.fault.message == "drive C: two nodes answer as node 3: each SYNC has two positions"
+
+
+def test_a_second_node_with_the_same_id_is_refused_by_the_set_up() -> None:
+    """What one is told by SDO both are told, and both answer."""
+    rig = Rig("elmo_gold")
+    first = rig.nodes[2]
+    channel = can.Bus(first.bus.channel_info.removeprefix("Virtual bus channel "), interface="virtual")
+    rig.wires.nodes.append(ForeignDrive("elmo_gold", first.node, channel, rig.clock, first.truth))
+    with pytest.raises(DriveError, match="drive C: two nodes answer as node 3"):
+        rig.ready()
+    rig.drives.close()
 
 
 def test_a_restart_is_noticed(rig: Rig) -> None:
@@ -271,6 +292,7 @@ def test_each_way_is_what_its_name_says() -> None:
         "cyclic synchronous position with velocity offset, statusword with the position, heartbeat",
         "cyclic synchronous position, statusword event-driven, heartbeat",
         "interpolated position, statusword event-driven, heartbeat",
+        "interpolated position, statusword event-driven, node guarding",
         "interpolated position, statusword event-driven, node guarding",
         "cyclic synchronous position with velocity offset, statusword polled, heartbeat",
         "cyclic synchronous position, statusword with the position, heartbeat",

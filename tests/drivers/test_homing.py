@@ -20,8 +20,12 @@ from trirail.kinematics.robot import inverse
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers import config
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.eds import SERVO
+from trirail_drivers.cia402.homing import HomingSequence
+from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from trirail_drivers.simulated.faults import Faults
@@ -372,9 +376,9 @@ def test_the_held_setpoint_is_taken_up_before_setpoints_are_followed(rig: Rig) -
         if any(m.arbitration_id == frames.SDO_REQUEST + 1 and m.data[:5] == b"\x2f\x60\x60\0\x08" for m in rig.sent):
             asked.append(len(held))  # the setpoint of this cycle goes out after the request
     (since,) = asked
-    # Of the setpoints written before the request the last one waits for the next SYNC; the one before is taken up.
-    assert len(set(held[since - 3 :])) == 1
-    assert len(set(held[since - 6 : since - 3])) > 1
+    # Those of this cycle, of the two SYNCs before it, and of the one at which the drive's place was read.
+    assert len(set(held[since - 4 :])) == 1
+    assert held[since - 5] != held[since - 4]
 
 
 def test_a_stop_when_the_last_drive_is_home_comes_too_late(rig: Rig) -> None:
@@ -444,6 +448,27 @@ def test_a_homing_error_is_named(rig: Rig) -> None:
     rig.drives[0].homing.interrupt()
     rig.until(lambda: rig.mode is Mode.FAULT, 50)
     assert "drive A: homing: the drive reports a homing error (statusword" in (rig.control.fault or "")
+
+
+def test_an_object_that_is_not_answered_about_is_waited_for_until_its_time_is_over() -> None:
+    """Then what is asked for beside it, as the state of a drive that sends no PDO, has its turn again."""
+    drives = incremental().drives
+    sent: list[Frame] = []
+    a, b, c = (
+        Cia402Axis(name, drive.node, scale_of(name, drive), drives)
+        for name, drive in zip("ABC", drives.each, strict=True)
+    )
+    homing = HomingSequence((a, b, c), drives, sent.append)
+    homing.start()
+    for now in (10.0, 10.0 + drives.sdo_timeout - 1e-6):
+        assert homing.step(now) is None
+        assert a.sdo_asked == (0x6060).to_bytes(2, "little")
+    fault = homing.step(10.0 + drives.sdo_timeout)
+    assert fault is not None
+    assert "drive A: homing: no answer about object 6060:00" in fault.message
+    assert a.sdo_asked is None
+    assert len(sent) == 1
+    assert not homing.under_way
 
 
 def test_a_slider_that_is_pushed_stops_it(rig: Rig) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -11,9 +13,12 @@ from conftest import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import geometry
+from trirail.motion import feasibility
 from trirail.motion.feasibility import Checker, parts
 from trirail.motion.limits import Bounds
+from trirail.motion.path_sampling import survey
 from trirail.motion.paths import FOR_EVER, Path, constant
+from trirail.motion.runs import stretched
 
 PERIOD = CONFIG.period
 PLATFORM = msgspec.structs.replace(CONFIG.limits.platform, jerk=(1e3, 1e3, 1e3))
@@ -68,6 +73,24 @@ def test_where_a_path_leaves_the_workspace_is_said_to_the_moment(share: float) -
     pieces[0, 0, :2] = LIMITS.platform.x[1] - share * SPEED, SPEED
     found = CHECKER.look(Path(np.array([0.0, 1.0]), pieces), constant(1.0), 0.0, 1.0, (0.0, 0.0, 0.0))
     assert found.leaves_at == pytest.approx(share, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "moments"), [(0.01, 16), (0.32, 16), (0.5, 25), (1.0, 50), (1.28, 64), (1.5, 64), (500.0, 64)]
+)
+def test_how_often_a_path_is_looked_at(monkeypatch: pytest.MonkeyPatch, seconds: float, moments: int) -> None:
+    """Beside its knots: every 20 ms, sixteen times at least and sixty-four times at most."""
+    asked: list[int] = []
+
+    def noted(*arguments: Any) -> float:
+        asked.append(arguments[9])
+        return survey(*arguments)
+
+    monkeypatch.setattr(feasibility, "survey", noted)
+    path = stretched(straight(), seconds)
+    found = CHECKER.look(path, constant(1.0), 0.0, seconds, (-SPEED / 2.0, 0.0, 0.0))
+    assert math.isnan(found.leaves_at)
+    assert asked == [moments]
 
 
 # ---------------------------------------------------------------------- shares of the limits

@@ -28,6 +28,7 @@ from trirail.wire.messages import (
     PlannedGoal,
     PoseGoal,
     SlidersGoal,
+    TrackGoal,
     TrajectoryGoal,
     TrajectoryPoint,
     VelocityGoal,
@@ -367,7 +368,7 @@ def test_a_waiting_goal_expires(rig: Rig) -> None:
 
 # ---------------------------------------------------------------------- thousands
 
-KINDS = ("pose", "pose", "pose", "sliders", "velocity", "trajectory")
+KINDS = ("pose", "pose", "pose", "sliders", "velocity", "track", "trajectory")
 ORDERS = ("stop", "pause", "resume", "override", "disable", "quick_stop", "enable", "reset", "break")
 
 
@@ -385,6 +386,8 @@ def random_goal(rnd: random.Random, rig: Rig) -> Goal:
             return SlidersGoal(tuple(inverse(ROBOT, np.array(pose)).position.tolist()), valid_for=valid)
         case "velocity":
             return VelocityGoal(pose[0], pose[1], 2.0 * pose[2], timeout=0.05)
+        case "track":
+            return TrackGoal(*pose, velocity=(pose[1], pose[0], pose[2]), timeout=0.05)
         case _:
             start = rig.control.commanded.pose
             end = [value + rnd.uniform(-0.01, 0.01) for value in start]

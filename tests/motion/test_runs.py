@@ -154,6 +154,8 @@ def test_what_a_run_tells_of_its_end_is_what_happens(
     assert run.progress == 1.0
     assert run.remaining == pytest.approx(0.0, abs=1e-9)
     assert run.state(0.0, HERE).velocity == pytest.approx(STILL, abs=1e-6)
+    run.time += 7.5 * PERIOD
+    assert (run.progress, run.remaining) == (1.0, 0.0)
 
 
 @given(FAR, st.floats(0.05, 0.9), st.sampled_from([0.0, 0.3, 2.0]))

@@ -146,7 +146,9 @@ def assert_better(pair: Pair, start: Sequence[float], end: Sequence[float]) -> N
         assert np.array_equal(plan.path.pieces, uniform.path.pieces)
         return
     assert plan.path.duration < uniform.path.duration
-    assert plan.slowed < uniform.slowed
+    asked = uniform.path.duration / uniform.slowed
+    assert plan.path.duration >= asked * (1.0 - 1e-9)
+    assert plan.slowed == pytest.approx(plan.path.duration / asked)
     assert_straight(plan.path)
     assert_joined(plan.path, start, end)
 

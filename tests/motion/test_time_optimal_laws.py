@@ -37,6 +37,12 @@ def parabola(bend: float) -> Array:
     return np.stack([1.0 + bend * (1.0 - 2.0 * SIGMA), np.full_like(SIGMA, -2.0 * bend)], axis=1)
 
 
+def hump(height: float) -> Array:
+    """Derivatives of what height sigma² (1 - sigma)² adds to a coordinate."""
+    first = 2.0 * SIGMA - 6.0 * SIGMA**2 + 4.0 * SIGMA**3
+    return height * np.stack([first, 2.0 - 12.0 * SIGMA + 12.0 * SIGMA**2], axis=1)
+
+
 def wave(bend: float) -> Array:
     """Derivatives of a coordinate that goes from 0 to 1 as sigma + bend sin(2 pi sigma) / (2 pi)."""
     turn = 2.0 * np.pi
@@ -124,17 +130,24 @@ def test_the_states_of_a_law_are_those_of_a_cubic_b_spline(c: Array, h: float) -
     assert (sigma[0], v[0], acceleration[0]) == (0.0, 0.0, 0.0)
 
 
-@given(COEFFICIENTS, st.floats(0.01, 1.0), st.floats(-0.9, 0.9), st.tuples(*[st.floats(0.1, 10.0)] * 3))
-def test_how_many_times_too_fast_a_law_is_by_polynomials(c: Array, h: float, bend: float, limits: Limits) -> None:
-    """Along a parabola the coordinate is a polynomial of time: at both ends of each interval and in its middle."""
-    samples = np.zeros((CELLS + 1, 1, 2))
-    samples[:, 0] = parabola(bend)
+@given(
+    COEFFICIENTS,
+    st.floats(0.01, 1.0),
+    st.floats(-0.9, 0.9),
+    st.floats(-3.0, 3.0),
+    st.tuples(*[st.floats(0.1, 10.0)] * 3),
+)
+def test_how_many_times_too_fast_a_law_is_by_polynomials(
+    c: Array, h: float, bend: float, height: float, limits: Limits
+) -> None:
+    """Along a quartic the coordinate is a polynomial of time: at both ends of each interval and in its middle."""
+    samples = (parabola(bend) + hump(height))[:, None, :].copy()
     states = np.empty((len(c) - 3, 4))
     spline_states(c, h, states)
     most = 0.0
     for state in states:
         sigma = Polynomial(state / (1.0, 1.0, 2.0, 6.0))
-        x = sigma + bend * sigma * (1.0 - sigma)
+        x = sigma + bend * sigma * (1.0 - sigma) + height * sigma**2 * (1.0 - sigma) ** 2
         for order, limit in enumerate(limits, start=1):
             values = x.deriv(order)(np.array([0.0, h / 2.0, h]))
             most = max(most, float(np.abs(values).max() / limit) ** (1.0 / order))

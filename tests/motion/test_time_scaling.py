@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from conftest import CONFIG
@@ -40,6 +41,33 @@ def test_a_rate_changes_as_quickly_as_a_motion_at_full_speed_may(rate: float, ta
     assert np.abs(changes).max() <= share * CHANGE * (1.0 + 1e-9)
     assert np.abs(6.0 * law.pieces[:, 0, 3]).max() <= share * JERK * (1.0 + 1e-9)
     assert at(law, ends + 1e-6)[1:, 0] == pytest.approx((target, 0.0), abs=1e-9)
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), SHARE)
+def test_to_raise_a_rate_takes_as_long_as_to_lower_it(by: float, changing: float, share: float) -> None:
+    """Also where it is changing already, faster than this share would have it."""
+    change = changing * CHANGE
+    up = SCALING.ramp(Rate(0.0, 1.0 - by / 2.0, change), 1.0 + by / 2.0, share)
+    down = SCALING.ramp(Rate(0.0, 1.0 + by / 2.0, -change), 1.0 - by / 2.0, share)
+    assert up is not None
+    assert down is not None
+    assert up.knots[-2] == pytest.approx(down.knots[-2], abs=1e-6)
+
+
+@pytest.mark.parametrize("coordinate", range(3))
+@pytest.mark.parametrize("quantity", ["acceleration", "jerk"])
+def test_the_coordinate_that_can_brake_least_decides(coordinate: int, quantity: str) -> None:
+    weaker = list(getattr(LIMITS.platform, quantity))
+    weaker[coordinate] /= 4.0
+    platform = msgspec.structs.replace(LIMITS.platform, **{quantity: tuple(weaker)})
+    limits = msgspec.structs.replace(LIMITS, platform=platform)
+    scaling = TimeScaling(ROBOT, platform, Checker(ROBOT, limits, Bounds(limits, PERIOD), PERIOD), PERIOD)
+    law = scaling.ramp(Rate(0.0, 1.0, 0.0), 0.0, 1.0)
+    assert law is not None
+    most = min(a / v for a, v in zip(platform.acceleration, platform.velocity, strict=True))
+    jerk = min(j / v for j, v in zip(platform.jerk, platform.velocity, strict=True))
+    assert (most < CHANGE) or (jerk < JERK)
+    assert float(law.knots[-2]) == pytest.approx(braking(1.0, most, jerk), abs=1e-6)
 
 
 @given(FAR, st.floats(0.0, 0.95), RATE, SHARE)

@@ -100,16 +100,16 @@ def test_a_goal_that_has_waited_too_long_does_not_begin(rig: Rig, monkeypatch: p
     gateway, link = rig
     now = time.monotonic_ns()
     monkeypatch.setattr(time, "monotonic_ns", lambda: now)
-    for name in ("a", "b", "c", "d"):
+    for name in ("a", "b", "c", "d", "e"):
         goal(gateway, name)
     now += round(0.9 * PATIENCE * 1e9)
     gateway._hear(packets.message(Accepted(1, "a", 1.0, 1.0, False, False)), lambda: None)
     now += round(0.2 * PATIENCE * 1e9)
     gateway._hear(packets.message(Accepted(2, "b", 1.0, 1.0, False, False)), lambda: None)
     passed = [(request.id, request.withdrawn) for request in link.sent if isinstance(request, GoalRequest)]
-    assert [name for name, _ in passed] == ["a", "b", "c", "d"]
-    assert [withdrawn for _, withdrawn in passed[:3]] == [None] * 3
-    assert passed[3][1] == "too many goals before it: it has waited longer than 8 s"
+    assert [name for name, _ in passed] == ["a", "b", "c", "d", "e"]
+    assert [withdrawn for _, withdrawn in passed[:4]] == [None] * 4
+    assert passed[4][1] == "too many goals before it: it has waited longer than 8 s"
 
 
 def test_many_commands_are_refused_but_never_a_stop(rig: Rig) -> None:
@@ -134,9 +134,9 @@ def test_users_take_turns_at_the_loop(rig: Rig) -> None:
     for number in range(4):
         goal(gateway, f"e{number}", "eve")
     goal(gateway, "a", "ann")
-    assert [name for name, _ in passed(link)] == ["e0", "e1", "a"]  # two of each at most
+    assert [name for name, _ in passed(link)] == ["e0", "e1", "e2", "a"]  # three of each at most
     accepted(gateway, 1)
-    assert [name for name, _ in passed(link)] == ["e0", "e1", "a", "e2"]
+    assert [name for name, _ in passed(link)] == ["e0", "e1", "e2", "a", "e3"]
 
 
 def test_what_the_loop_has_at_once_is_bounded_for_all_users_together(rig: Rig) -> None:

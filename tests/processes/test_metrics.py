@@ -29,7 +29,7 @@ from trirail.processes.measured import (
     KINDS_OF_FAULT,
     SETTLE_BOUNDS,
     Histogram,
-    Measured,
+    Measurements,
     Meter,
     RecorderMeasured,
     ServiceMeasured,
@@ -39,7 +39,7 @@ from trirail.processes.metrics_server import MetricsServer
 from trirail.processes.process import MEASURED
 from trirail.processes.state import StateMaker
 from trirail.telemetry.sinks import free_port
-from trirail.wire.messages import Event, Fault
+from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.records import DTYPE
 
 TURN = 0.1
@@ -90,7 +90,7 @@ def test_what_passes_the_gateway_is_counted() -> None:
     told.meter.event(event(2, kind="goal", id="b", outcome="rejected"))
     told.meter.event(event(3, kind="goal", id="c", outcome="done"))
     for seq in (4, 5):
-        told.meter.event(event(seq, kind="fault", level="error", fault=Fault("emcy", "B", 0x8700)))
+        told.meter.event(event(seq, kind="fault", level="error", fault=FaultDetail("emcy", "B", 0x8700)))
     text = exposed(told.newest(), RecorderMeasured(3, 20, 5))
     assert 'trirail_mode{mode="moving"} 1.0' in text
     assert 'trirail_mode{mode="holding"} 0.0' in text
@@ -117,7 +117,7 @@ def test_what_is_told_fits_into_a_pipe_at_once_and_loses_no_fault(faults: list[t
         ("done", "rejected", "preempted", "stopped", "expired", "faulted", "unsettled"), 10**12
     )
     for seq, (drive, code) in enumerate(faults, 1):
-        told.meter.event(event(seq, kind="fault", fault=Fault("following_error", drive, code)))
+        told.meter.event(event(seq, kind="fault", fault=FaultDetail("following_error", drive, code)))
     newest = told.newest()
     assert sum(count.times for count in newest.faults) == len(faults)
     assert len(newest.faults) <= KINDS_OF_FAULT + 1
@@ -133,7 +133,7 @@ def health() -> tuple[Health, Heartbeats, list[float]]:
 
 def exposed(service: ServiceMeasured | None, recorder: RecorderMeasured | None) -> str:
     """What Prometheus reads."""
-    measured = Measured()
+    measured = Measurements()
     if service is not None:
         measured.take("gateway", service)
     if recorder is not None:
@@ -153,7 +153,7 @@ def test_the_dashboard_shows_every_metric_and_no_other() -> None:
     told = Told()
     told.rows()
     told.meter.event(event(1, kind="goal", id="a", outcome="done", settle=0.03))
-    told.meter.event(event(2, kind="fault", fault=Fault("bus")))
+    told.meter.event(event(2, kind="fault", fault=FaultDetail("bus")))
     families = list(text_string_to_metric_families(exposed(told.newest(), RecorderMeasured(0, 0, 0))))
     samples = {sample.name: family.name for family in families for sample in family.samples}
     dashboard = json.loads((SIM.parent / "grafana.json").read_text())
@@ -215,7 +215,7 @@ def served(config: Config, **telemetry: object) -> tuple[Config, MetricsServer, 
     changed = msgspec.structs.replace(config.telemetry, metrics_port=free_port(), **telemetry)
     config = msgspec.structs.replace(config, telemetry=changed)
     looked, _, _ = health()
-    return config, MetricsServer(config, looked, Measured()), looked
+    return config, MetricsServer(config, looked, Measurements()), looked
 
 
 def get(url: str, context: ssl.SSLContext | None = None) -> tuple[int, str]:
@@ -273,7 +273,7 @@ def test_connections_that_say_nothing_keep_nobody_out(local: tuple[str, Health])
 def test_a_port_that_is_taken_is_told_with_the_remedy() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         telemetry = msgspec.structs.replace(CONFIG.telemetry, metrics_port=taken.getsockname()[1])
-        server = MetricsServer(msgspec.structs.replace(CONFIG, telemetry=telemetry), health()[0], Measured())
+        server = MetricsServer(msgspec.structs.replace(CONFIG, telemetry=telemetry), health()[0], Measurements())
         with pytest.raises(ServiceError, match=r"set telemetry\.metrics_port to a free port"), server:
             pass
 

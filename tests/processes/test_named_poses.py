@@ -89,7 +89,7 @@ def test_a_pose_is_taught_without_power_and_gone_to(robot: Robot) -> None:
         robot.teach("pick")
     assert refused.value.code is RefusalCode.MOVING
     goal.cancel()
-    with pytest.raises(RefusedError, match="no pose 'nowhere': there is park, pick, rest"):
+    with pytest.raises(RefusedError, match="no pose 'nowhere': `trirail poses` lists those that there are"):
         robot.move_to_named("nowhere")
     told = [event for event in robot.events(history=True, timeout=1.0) if event.kind == "pose"]
     assert [event.user for event in told] == ["ann"] * 6
@@ -152,7 +152,7 @@ def test_from_the_command_line(place: Place, robot: Robot) -> None:
     assert told["park"] == {"name": "park", "x": 0.0, "y": 0.05, "phi": 0.0, "taught": False}
     unknown = trirail(place, "goto", "nowhere")
     assert (unknown.returncode, unknown.stdout) == (1, "")
-    assert unknown.stderr == "trirail: no pose 'nowhere': there is park, pick\n"
+    assert unknown.stderr == "trirail: no pose 'nowhere': `trirail poses` lists those that there are\n"
     for words, names in ((("goto", ""), ["park", "pick"]), (("forget", ""), ["pick"])):
         assert trirail(place, "__complete", *words).stdout.splitlines()[-len(names) :] == names
     assert trirail(place, "forget", "pick").returncode == 0

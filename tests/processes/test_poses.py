@@ -23,8 +23,8 @@ from trirail.processes.inbox import Incoming, Kind
 from trirail.processes.pose_file import PoseFile, state_directory
 from trirail.processes.poses import MOST, UNDER_WAY, Poses
 from trirail.telemetry.provenance import toml
-from trirail.wire.messages import NamedGoal, OwnLimits, PoseGoal
-from trirail.wire.packets import PoseChanged
+from trirail.wire.messages import ErrorReply, NamedGoal, OwnLimits, PoseGoal
+from trirail.wire.packets import PoseChanged, Refused
 from trirail.wire.records import DTYPE
 from trirail.wire.state import NamedPose
 from trirail.wire.vocabulary import MODES, Mode
@@ -52,8 +52,11 @@ class Asked:
         self.poses = Poses(config, self._reply, self._refuse, self.told.append, self.woken.set)
 
     def _reply(self, incoming: Incoming, reply: msgspec.Struct) -> None:
-        assert isinstance(reply, NamedPose)
-        self.replies.append(reply)
+        if isinstance(reply, ErrorReply):
+            self.refusals.append(RefusedError(reply.code, reply.message))
+        else:
+            assert isinstance(reply, NamedPose)
+            self.replies.append(reply)
 
     def _refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
         self.refusals.append(refusal)
@@ -101,7 +104,7 @@ def test_a_pose_is_taught_where_the_next_record_has_the_robot_and_kept(make: Mak
     asked.poses.measure(record())
     asked.write()
     assert asked.replies == [NamedPose("pick", *POSE, taught=True)]
-    assert asked.told == [PoseChanged("ann", "pose pick taught by ann: x 0.020000 m, y -0.010000 m, phi 0.100000 rad")]
+    assert asked.told == [PoseChanged("ann", "pose pick taught by ann: x 20 mm, y -10 mm, phi 5.7296°")]
     assert asked.known() == make(CONFIG).known() == {"pick": POSE}
     asked.teach("pick", record((0.0, 0.0, 0.0), Mode.DISABLED))
     assert asked.known() == {"pick": (0.0, 0.0, 0.0)}
@@ -146,6 +149,17 @@ def test_a_disk_that_takes_nothing_is_told_and_the_pose_stays_what_it_was(
     assert refusal.code is RefusalCode.FAILED
     assert str(refusal) == "pick is as it was: poses.json: No space left on device"
     assert asked.known() == {"pick": POSE}
+
+
+def test_the_end_of_the_gateway_answers_what_is_under_way(make: Make) -> None:
+    asked = make(CONFIG)
+    asked.ask("teach", "pick")
+    asked.poses.measure(record())
+    asked.ask("teach", "late")
+    asked.poses.close()
+    assert [reply.name for reply in asked.replies] == ["pick"]
+    assert [refusal.code for refusal in asked.refusals] == [RefusalCode.ENDED]
+    assert make(CONFIG).known() == {"pick": POSE}
 
 
 @pytest.mark.parametrize("mode", Mode)
@@ -216,13 +230,19 @@ def test_a_goal_of_a_name_is_that_pose_with_all_that_it_asks_for(make: Make) -> 
     asked.teach("pick")
     limits = OwnLimits(velocity=(0.1, 0.1, 0.5))
     goal = NamedGoal("pick", id="g", speed=0.5, valid_for=2.0, limits=limits, blend=0.01)
-    assert asked.poses.stated(goal) == PoseGoal(*POSE, id="g", speed=0.5, valid_for=2.0, limits=limits, blend=0.01)
-    assert asked.poses.stated(NamedGoal("park")) == PoseGoal(0.0, 0.05, 0.0)
+    assert asked.poses.of_name(goal) == PoseGoal(*POSE, id="g", speed=0.5, valid_for=2.0, limits=limits, blend=0.01)
+    assert asked.poses.of_name(NamedGoal("park")) == PoseGoal(0.0, 0.05, 0.0)
     other = PoseGoal(0.0, 0.0, 0.0)
-    assert asked.poses.stated(other) is other
-    with pytest.raises(RefusedError, match="no pose 'pikc': there is park, pick") as refused:
-        asked.poses.stated(NamedGoal("pikc"))
-    assert refused.value.code is RefusalCode.UNKNOWN_POSE
+    assert asked.poses.of_name(other) is other
+    assert asked.poses.of_name(NamedGoal("pikc")) == NamedGoal("pikc")
+
+
+def test_a_goal_of_a_name_that_there_is_not_ends_as_rejected_by_its_id(rig: Rig) -> None:
+    rig.enable()
+    answer = rig.send("g", NamedGoal("pikc", id="g"))
+    assert isinstance(answer, Refused)
+    assert answer.code is RefusalCode.UNKNOWN_POSE
+    assert rig.outcomes() == [("g", "rejected")]
 
 
 def test_a_name_that_the_configuration_takes_later_is_the_configuration_s_and_told(make: Make) -> None:

@@ -334,6 +334,58 @@ def test_other_ways_to_send_a_goal(shared: tuple[Service, Robot, zenoh.Session])
     until(robot, lambda state: state.mode == "holding" and abs(state.pose[0]) < 1e-5)
 
 
+def test_a_target_is_followed_from_the_plain_wire(shared: tuple[Service, Robot, zenoh.Session]) -> None:
+    """By puts, which have no answer: the state says how far it is behind, and when messages cease it is over."""
+    _, robot, session = shared
+    assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
+    over = threading.Event()
+
+    def tell() -> None:
+        begins = time.time()
+        while not over.wait(0.01):
+            at = time.time()
+            target = {"x": 0.02 * (at - begins), "y": 0, "phi": 0, "velocity": [0.02, 0, 0], "time": at}
+            track = {"kind": "track", "id": "target", "timeout": 1.0, **target}
+            session.put("trirail/demo/goal/ann", json.dumps(track))
+
+    ends = (event for event in robot.events(history=True, timeout=20.0) if event.id == "target")
+    sender = threading.Thread(target=tell)
+    sender.start()
+    try:
+        goal = until(robot, lambda state: state.pose[0] > 0.01).goal
+    finally:
+        over.set()
+        sender.join()
+    assert goal is not None
+    assert (goal.id, goal.lag is None, goal.target is None) == ("target", False, False)
+    assert next(ends).outcome == "done"
+    late = json.dumps({"kind": "track", "x": 0, "y": 0, "phi": 0, "time": time.time() - 2.0})
+    (reply,) = session.get("trirail/demo/goal/ann", payload=late)
+    assert reply.err is not None
+    assert json.loads(reply.err.payload.to_string())["code"] == "wrong_time"
+
+
+def test_the_client_tells_of_a_target_and_its_end_brakes(shared: tuple[Service, Robot, zenoh.Session]) -> None:
+    _, robot, _ = shared
+    assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
+    with robot.track(timeout=1.0) as track:
+        track.update((0.01, 0.0, 0.0))
+        for state in robot.states():
+            track.update((0.01, 0.0, 0.0))
+            if abs(state.pose[0] - 0.01) < 1e-4 and track.lag is not None and track.lag < 1e-4:
+                break
+    assert track.result is not None
+    assert track.result.outcome == "stopped"
+    with pytest.raises(RefusedError, match="the track is over"):
+        track.update((0.0, 0.0, 0.0))
+    assert robot.state().mode == "holding"
+    with robot.track(timeout=0.05) as silent:
+        silent.update((0.0, 0.0, 0.0))
+        until(robot, lambda _: silent.result is not None)
+    assert silent.result is not None
+    assert silent.result.outcome == "done"
+
+
 def test_every_kind_of_goal(shared: tuple[Service, Robot, zenoh.Session], tmp_path: Path) -> None:
     service, robot, _ = shared
     assert robot.move_sliders(0.01, 0.0, -0.01).wait(timeout=10.0).outcome == "done"

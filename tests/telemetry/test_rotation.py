@@ -273,7 +273,7 @@ def faulted(folder: Path, seconds: float, at: float, after: float) -> tuple[list
     """Let the drives fault at a time, and go on for another; return the black boxes."""
     time, told = Time(), list[str]()
     config = configured(rotate_mb=1.0, capture_can=True)
-    box = BlackBox(1000, lambda name: recorder(folder, time, config, name=name), told.append)
+    box = BlackBox(1000, lambda name, _: recorder(folder, time, config, name=name), told.append)
     sent = made.records(seconds)
     cycle = round(at * 1000)
     box.stands("stands", Standing(None, (0.01, 0.02, 0.1)))
@@ -307,7 +307,7 @@ def test_a_fault_keeps_the_minute_before_and_the_stop(tmp_path: Path) -> None:
 def test_a_flood_of_messages_before_a_fault_leaves_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blackbox, "SAID_MB", 0.05)
     time, told = Time(), list[str]()
-    box = BlackBox(1000, lambda name: recorder(tmp_path, time, configured(), name=name), told.append)
+    box = BlackBox(1000, lambda name, _: recorder(tmp_path, time, configured(), name=name), told.append)
     box.stands("stands", Standing(None, (0.01, 0.02, 0.1)))
     sent = made.records(3.0)
     for number in range(100):
@@ -332,7 +332,7 @@ def test_a_service_that_ends_right_after_a_fault_keeps_it_too(tmp_path: Path) ->
 
 def test_without_a_fault_there_is_no_black_box(tmp_path: Path) -> None:
     time = Time()
-    box = BlackBox(1000, lambda name: recorder(tmp_path, time, configured(), name=name), print)
+    box = BlackBox(1000, lambda name, _: recorder(tmp_path, time, configured(), name=name), print)
     feed(box, made.records(1.0), time)
     box.event(Event(1, 0.5, 500, WALL_NS * 1e-9, "mode", "info", "holding: enable by ann", mode="holding"))
     box.close()

@@ -2,6 +2,7 @@
 
 import ast
 import csv
+import math
 import os
 import pty
 import subprocess
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import nbformat
 import pytest
 from trirail import Robot
 from trirail.client import own_service
@@ -49,6 +51,8 @@ def pose(service: Service) -> tuple[float, float, float]:
 
 def test_each_is_short_begins_with_what_it_does_and_is_run_here() -> None:
     here = Path(__file__).read_text(encoding="utf-8")
+    for path in EXAMPLES.glob("*.ipynb"):
+        assert f'"{path.name}"' in here, f"{path.name} is not run by any test"
     for path in EXAMPLES.glob("*.py"):
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= 40, path.name
@@ -67,6 +71,15 @@ def test_the_kinematics_alone() -> None:
 def test_move_and_wait(service: Service) -> None:
     assert "done: arrived, settled in" in run("move_and_wait.py", "demo", service.locator)[-1]
     assert pose(service) == pytest.approx((0.02, -0.01, 0.1), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_move_and_wait_with_asyncio(service: Service) -> None:
+    *watched, last = run("move_and_wait_async.py", "demo", service.locator)
+    assert last.startswith("done goal")
+    assert all(line.startswith("x ") for line in watched)
+    assert len(watched) >= 2
+    assert pose(service) == pytest.approx((-0.02, 0.01, -0.1), abs=1e-9)
 
 
 @pytest.mark.slow
@@ -109,6 +122,20 @@ def test_a_jog_lasts_while_the_key_is_held(service: Service) -> None:
 
 
 @pytest.mark.slow
+def test_a_camera_is_followed(service: Service) -> None:
+    with Robot("demo", service.locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.02, y=0.0, phi=0.0).wait(WITHIN)
+    followed, stands = run("follow_a_camera.py", "demo", service.locator)
+    assert followed.startswith("400 updates, at most ")
+    assert float(followed.split()[4]) < 20.0  # it has followed; how closely, simulated time tells
+    words, x, y, phi = stands.rsplit(maxsplit=3)
+    assert words == "stands at"
+    assert math.hypot(float(x), float(y)) == pytest.approx(0.02, abs=5e-3)
+    assert abs(float(phi)) < 1e-3
+
+
+@pytest.mark.slow
 def test_a_file_is_followed(service: Service) -> None:
     lines = run("follow_a_file.py", EXAMPLES / "circle.csv", "demo", service.locator)
     assert lines[0] == "41 points in 4.0 s"
@@ -129,6 +156,29 @@ def test_a_recording_is_read_while_it_is_written(service: Service) -> None:
     lines = run("recording_to_numpy.py", service.recording)
     assert "cycles" in lines[0]
     assert lines[1].count("µm") == 3
+
+
+@pytest.mark.slow
+def test_the_notebook_plots_a_recording(service: Service) -> None:
+    """Its cells one after the other, as Jupyter runs them; every axis has something finite drawn in it."""
+    notebook = nbformat.read(EXAMPLES / "plot_recording.ipynb", as_version=4)  # type: ignore[no-untyped-call]
+    nbformat.validate(notebook)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(not cell.outputs and cell.execution_count is None for cell in cells), "clear its outputs"
+    drawn = """
+for axes in (axes for number in plt.get_fignums() for axes in plt.figure(number).axes):
+    curves = [line.get_ydata() for line in axes.lines] or [[patch.get_height() for patch in axes.patches]]
+    print("drawn", axes.get_ylabel(), all(np.all(np.isfinite(curve)) and len(curve) > 10 for curve in curves))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join([*(cell.source for cell in cells), drawn])],
+        env=os.environ | {"MPLBACKEND": "Agg", "RECORDING": str(service.recording)},
+        capture_output=True, text=True, timeout=WITHIN, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    said = [line for line in done.stdout.splitlines() if line.startswith("drawn")]
+    names = ("x [mm]", "y [mm]", "φ [°]", "y [mm]", "following error [µm]", "cycles")
+    assert said == [f"drawn {name} True" for name in names]
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from trirail.cli.commands import app
 from trirail.cli.units import numbers
 from trirail.config import Config
 from trirail.errors import TrirailError
-from trirail.wire.messages import SentGoal
+from trirail.wire.messages import Goal
 
 ROOT = Path(__file__).parents[2]
 GUIDES = sorted(
@@ -105,7 +105,7 @@ def test_every_command_can_be_typed_as_it_is_shown(guide: Path) -> None:
 @every_guide
 def test_every_message_is_one(guide: Path) -> None:
     for line in "".join(blocks(guide, "json")).splitlines():
-        msgspec.convert(json.loads(line), SentGoal)
+        msgspec.convert(json.loads(line), Goal)
 
 
 @every_guide

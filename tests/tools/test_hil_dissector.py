@@ -40,6 +40,7 @@ def test_a_sound_log_has_no_problem_and_is_counted(tmp_path: Path) -> None:
         ("(2.0) can1 602#4060600000000000\n", "node 2 leaves 6060:00 without an answer"),
         ("(2.0) can1 602#4060600000000000\n(2.1) can1 582#4F61600008000000\n", "node 2 is asked for 6060:00 and"),
         ("(2.0) can1 702#7F\n", "node 2 is operational no more but 7F"),
+        ("(2.0) can1 000#8003\n(2.1) can1 702#7F\n", "node 2 is operational no more but 7F"),
         ("(2.0) can1 082#8130110000000000\n", "node 2 sends EMCY 3081"),
         ("(2.0) can1 602#40\n", "malformed"),
     ],
@@ -47,6 +48,12 @@ def test_a_sound_log_has_no_problem_and_is_counted(tmp_path: Path) -> None:
 def test_what_is_wrong_is_told(tmp_path: Path, frames: str, problem: str) -> None:
     (found,) = problems(tmp_path, frames)
     assert problem in found
+
+
+@pytest.mark.parametrize("command", ["8002", "8000", "0202", "8102"])
+def test_a_node_that_was_told_to_leave_operational_has_not_fallen(tmp_path: Path, command: str) -> None:
+    """As when a second session of a service sets the drives up again."""
+    assert problems(tmp_path, f"(2.0) can1 000#{command}\n(2.1) can1 702#7F\n") == []
 
 
 def test_what_comes_of_a_disturbance_is_no_problem(tmp_path: Path) -> None:

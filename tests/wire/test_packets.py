@@ -14,6 +14,7 @@ from trirail.wire.packets import (
     GoalRequest,
     Happened,
     Kind,
+    PoseChanged,
     Refused,
     RefusedRequest,
     Request,
@@ -30,6 +31,7 @@ from trirail.wire.vocabulary import Command
         GoalRequest(1, "ann", "g", PoseGoal(x=0.1, y=0.2, phi=0.3, speed=0.5, valid_for=1.0), 5),
         CommandRequest(2, "ann", Command.STOP),
         RefusedRequest("ann", "no"),
+        PoseChanged("ann", "pose pick removed by ann"),
     ],
 )
 def test_requests(request_: Request) -> None:

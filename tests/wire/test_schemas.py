@@ -74,7 +74,7 @@ def test_the_schema_of_an_error_reply_tells_what_each_code_means() -> None:
     st.fixed_dictionaries(
         {},
         optional={
-            "kind": st.sampled_from(["pose", "sliders", "velocity", "trajectory", "dance"]),
+            "kind": st.sampled_from(["pose", "sliders", "velocity", "track", "trajectory", "dance"]),
             "x": FINITE | st.text(max_size=3),
             "y": FINITE,
             "phi": FINITE,
@@ -101,6 +101,7 @@ def test_the_service_takes_no_goal_that_the_schema_refuses(goal: dict[str, Any])
         {"kind": "pose", "x": 0, "y": 0, "phi": 0, "blend": 0.01, "limits": {"velocity": [0.1, 0.1, 0.5]}},
         {"kind": "sliders", "position": [0.01, 0.0, -0.01]},
         {"kind": "velocity", "x": 0.01, "y": 0.0, "phi": 0.0, "timeout": 0.1, "id": "jog-1"},
+        {"kind": "track", "x": 0.01, "y": 0, "phi": 0, "velocity": [0.05, 0, 0], "time": 1.8e9, "id": "t-1"},
         {"kind": "trajectory", "points": [{"t": 0, "x": 0, "y": 0, "phi": 0}, {"t": 1, "x": 0.01, "y": 0, "phi": 0}]},
     ],
     ids=lambda goal: goal["kind"],

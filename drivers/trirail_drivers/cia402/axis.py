@@ -6,6 +6,7 @@ import math
 
 from trirail_drivers.cia402 import frames, ways
 from trirail_drivers.cia402.codes import words
+from trirail_drivers.cia402.second_node import AnswersPerSync
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
@@ -20,10 +21,6 @@ REGISTER_TIME = 0.5
 STILL = 2e-5
 """A slider that has been within this [m] of a place for STILL_FOR [s] stands."""
 STILL_FOR = 0.1
-APART = 0.005
-"""Positions that answer one SYNC and are so far apart [m] are those of two sliders."""
-SECOND_ANSWERS = 3
-"""So many SYNCs in a row that are answered twice are answered by two nodes."""
 RESET_TIME = 2 * frames.STATUS_PERIOD
 """How long a drive may take to leave fault after a fault reset, in which it tells its state twice [s]."""
 
@@ -40,8 +37,7 @@ class Cia402Axis(Axis):
     """One drive's newest feedback; the `on_` methods take a frame's data or raise struct.error."""
 
     __slots__ = (
-        "_answered_twice",
-        "_came",
+        "_answers_per_sync",
         "_followed",
         "_operational",
         "_register_until",
@@ -125,7 +121,7 @@ class Cia402Axis(Axis):
         """Its error register 1001h is to be asked for."""
         self._operational = self._restarted = self._followed = self.stopped = False
         self._unfollowed_since: float | None = None
-        self._came = self._answered_twice = 0
+        self._answers_per_sync = AnswersPerSync(scale.counts_per_metre)
         self._stands_at, self._stands_since = 0, math.inf
 
     def on_position(self, data: bytes | bytearray, now: float) -> None:
@@ -134,8 +130,7 @@ class Cia402Axis(Axis):
         if abs(counts - self._stands_at) > max(1.0, abs(self.scale.counts_per_metre) * STILL):
             self._stands_at, self._stands_since = counts, now
         self._stands_since = min(self._stands_since, now)
-        apart = abs(counts - self.actual) > abs(self.scale.counts_per_metre) * APART
-        self._came += not self._came or apart  # about the same again is a frame, or a SYNC, that came twice
+        self._answers_per_sync.come(counts)
         self.take_position(counts)
         self.answers.come()
         if statusword is not None:
@@ -185,10 +180,7 @@ class Cia402Axis(Axis):
 
     def cycle_over(self) -> None:
         """Note that the frames of a cycle are in: a node answers a SYNC once."""
-        self._answered_twice = self._answered_twice + 1 if self._came > 1 else 0
-        self._came = 0
-        if self._answered_twice >= SECOND_ANSWERS:
-            self._answered_twice = 0
+        if self._answers_per_sync.from_two_nodes():
             self.tell("frame", 0, f"two nodes answer as node {self.node}: each SYNC has two positions")
 
     @property

@@ -43,17 +43,33 @@ def _give_guarding(drive: Differences, period: int, node: int) -> bool:
     remote = drive.remote
     if not (remote.has(0x100C) and remote.has(0x100D)):
         return False
-    if remote.look(0x1017) and not drive.apply:
-        return True  # it may answer no guarding while it sends heartbeats; setting it up will tell
+    found = remote.look(0x100C), remote.look(0x100D)
     if drive.apply and remote.look(0x1017):
         drive.give(0x1017, 0, 0)  # CiA 301: a node has heartbeats or is guarded, not both
-    if not _answers(drive, node):
-        drive.tell("object 100C:00 (Guard time) is there, but the drive answers no guarding")
-        return False
-    drive.give(0x100C, 0, period)
-    drive.give(0x100D, 0, MISSED)
-    drive.tell("has no heartbeat consumer (1016): node guarding instead")
-    return True
+    unset = 0 in found
+    if not drive.apply and (remote.look(0x1017) or unset):
+        _set_guarding(drive, period, MISSED)  # it may answer none as it is; setting it up will tell
+        return True
+    # Asked before it is set, for with the first guarding after that its life time begins (CiA 301, 7.2.8.2.2).
+    answers = _answers(drive, node)
+    if answers or unset:
+        _set_guarding(drive, period, MISSED)
+    if not answers and unset:
+        answers = _answers(drive, node)  # some, as lely-core, answer only once it is set
+        if not answers:
+            _set_guarding(drive, *found)
+    drive.tell(
+        "has no heartbeat consumer (1016): node guarding instead"
+        if answers
+        else "object 100C:00 (Guard time) is there, but the drive answers no guarding"
+    )
+    return answers
+
+
+def _set_guarding(drive: Differences, guard_time: int | None, life_time_factor: int | None) -> None:
+    for index, value in ((0x100C, guard_time), (0x100D, life_time_factor)):
+        if value is not None:
+            drive.give(index, 0, value)
 
 
 def _answers(drive: Differences, node: int) -> bool:

@@ -41,6 +41,9 @@ USES: Final = {
     "1001": Use(_R, "Error register", "whether an EMCY is still in force", "EMCY 00xxh alone tells", "CiA 301, 1001h"),
     "1005": Use(_R, "COB-ID SYNC", "that it hears SYNC 080h", "080h, the predefined one", "CiA 301, 1005h"),
     "1006": Use(_P, "Communication cycle period", "its watch on SYNC", "it goes on without SYNC", "CiA 301, 1006h"),
+    "1007": Use(
+        _R, "Synchronous window length", "that setpoints count whenever they come", "there is none", "CiA 301, 1007h"
+    ),
     "100C": Use(_R, "Guard time", "node guarding, for want of 1016", "heartbeats", "CiA 301, 100Ch"),
     "100D": Use(_R, "Life time factor", "node guarding, for want of 1016", "heartbeats", "CiA 301, 100Dh"),
     "1014": Use(_R, "COB-ID EMCY", "its EMCY", "080h + node, the predefined one", "CiA 301, 1014h"),
@@ -51,6 +54,7 @@ USES: Final = {
     "1017": Use(
         _R, "Producer heartbeat time", "this service's watch on it", "its answers to SYNC alone", "CiA 301, 1017h"
     ),
+    "1019": Use(_R, "Synchronous counter overflow", "SYNC without a counter", "there is none", "CiA 301, 1019h"),
     "1029": Use(
         _R,
         "Error behaviour",
@@ -58,6 +62,7 @@ USES: Final = {
         "the standard's default is that",
         "CiA 301, 1029h",
     ),
+    "1400:05": Use(_R, "Event timer", "that nothing has to come unchanged", "there is none", "CiA 301, 1400h"),
     "1800:03": Use(_R, "Inhibit time", "that a statusword comes at once", "there is none", "CiA 301, 1800h"),
     "1800:05": Use(
         _R, "Event timer", "that statuswords come also unchanged", "beside the position, or polled", "CiA 301, 1800h"
@@ -102,7 +107,7 @@ PROTECTIONS: Final = {name: used for name, used in USES.items() if used.need is 
 """What `accept_without` may name."""
 
 _WIDTHS: Final = {
-    **dict.fromkeys((0x1001, 0x1029, 0x6060, 0x6061, 0x6098, 0x60C2), 1),
+    **dict.fromkeys((0x1001, 0x1019, 0x1029, 0x6060, 0x6061, 0x6098, 0x60C2), 1),
     **dict.fromkeys((0x100C, 0x1015, 0x1017, 0x603F, 0x6040, 0x6041), 2),
     **dict.fromkeys((0x6007, 0x605A, 0x605E, 0x60C0), 2),
     0x100D: 1,
@@ -133,8 +138,8 @@ def signed(key: Key) -> bool:
 def use(key: Key) -> tuple[str, Use] | None:
     """What an object is used for, and as what USES names it; None for what is not asked of drives."""
     index, subindex = key
-    if 0x1800 <= index < 0x1A00:
-        index = 0x1800
+    if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
+        index &= 0xFE00
     for name in (f"{index:04X}:{subindex:02X}", f"{index:04X}"):
         if name in USES:
             return name, USES[name]

@@ -145,7 +145,7 @@ class Pdos:
         found = self._pdo(index)
         sending = index >= TPDO
         cob_id = identifier | (NO_REMOTE_REQUEST if sending else 0)
-        timer = self._parameter(index, 5, round(1000 * frames.STATUS_PERIOD)) if kind == ON_CHANGE and sending else None
+        timer = self._event_timer(index, kind)
         inhibit = self._parameter(index, 3, 0) if sending else None
         alike = found.valid and found.identifier == identifier and found.kind == kind and found.maps(entries)
         if alike and not (timer or inhibit):
@@ -202,6 +202,12 @@ class Pdos:
             write(index, 1, cob_id)
             self._drive.confirm((index, 1), cob_id)
         return cob_id & _IDENTIFIER
+
+    def _event_timer(self, index: int, kind: int) -> tuple[int, int] | None:
+        """What repeats a statusword; of an RPDO it is a deadline, and controlwords come on change (CiA 301, 1400h)."""
+        if index < TPDO:
+            return self._parameter(index, 5, 0)
+        return self._parameter(index, 5, round(1000 * frames.STATUS_PERIOD)) if kind == ON_CHANGE else None
 
     def _parameter(self, index: int, subindex: int, value: int) -> tuple[int, int] | None:
         """A communication parameter that the drive has and that is to change."""

@@ -31,8 +31,27 @@ NO_REMOTE_REQUEST: Final = 1 << 30
 _BIT_FIELDS: Final = (0x1005, 0x1014, 0x60A8, 0x60A9, 0x60AA, 0x6502)
 
 
+SECOND_ANSWERS: Final = 10
+"""So many requests of one set-up that are answered twice are answered by two nodes."""
+
+
+class TwoNodesError(SdoCommunicationError):
+    """Requests are answered twice."""
+
+    def __init__(self, node: int) -> None:
+        super().__init__(f"two nodes answer as node {node}; give each its own node id")
+
+
+class NoAnswerError(SdoCommunicationError):
+    """The drive has not answered in time."""
+
+
 class Client(SdoClient):
-    """An SDO client that reads the bus itself while it waits, where canopen would have a thread do it."""
+    """An SDO client that reads the bus itself while it waits, where canopen would have a thread do it.
+
+    A drive may still answer what somebody asked before, this service's last run or an attempt that was given up.
+    So what is taken for the answer to a request is of its kind, and names the same object.
+    """
 
     def __init__(self, bus: can.BusABC, node: int, objects: ObjectDictionary, timeout: float, clock: Clock) -> None:
         super().__init__(frames.SDO_REQUEST + node, frames.SDO_ANSWER + node, objects)  # type: ignore[no-untyped-call]
@@ -40,6 +59,13 @@ class Client(SdoClient):
         self.bus = bus
         self.timeout = timeout
         self.clock = clock
+        self._asked = self._answered = bytes(8)
+        self._again = 0
+
+    def send_request(self, request: bytes | bytearray) -> None:
+        """Send a request, whose answer the next one is that `read_response` takes."""
+        self._asked, self._answered = bytes(request), self._asked
+        super().send_request(request)  # type: ignore[no-untyped-call]
 
     def read_response(self) -> bytes:
         """Wait for the drive's answer; other frames are let go, for the cycle starts afresh."""
@@ -47,11 +73,37 @@ class Client(SdoClient):
         while self.responses.empty():
             message = self.bus.recv(max(0.0, deadline - self.clock()))
             if message is None:
-                raise SdoCommunicationError("no answer")
+                raise NoAnswerError("no answer")
             if message.arbitration_id == self.tx_cobid and not message.is_error_frame:
-                self.responses.put(bytes(message.data))
+                data = bytes(message.data)
+                if answers(self._asked, data):
+                    self.responses.put(data)
+                elif answers(self._answered, data):
+                    self._note_second_answer()
         response: bytes = super().read_response()  # type: ignore[no-untyped-call]
         return response
+
+    def _note_second_answer(self) -> None:
+        """The request before was answered already: once may be chance, so many times are two servers."""
+        self._again += 1
+        if self._again >= SECOND_ANSWERS:
+            raise TwoNodesError(self.rx_cobid - frames.SDO_REQUEST)
+
+
+def answers(request: bytes, data: bytes) -> bool:
+    """Whether a frame of an SDO server can be the answer to a request (CiA 301, 7.2.4.3: the first byte's top bits)."""
+    if len(data) != 8:
+        return False
+    asked, answered = request[0] >> 5, data[0] >> 5
+    same_object = asked in _SEGMENTS or data[1:4] == request[1:4]
+    return same_object and answered in (_ANSWERS[asked], _ABORT)
+
+
+_ANSWERS: Final = {0: 1, 1: 3, 2: 2, 3: 0, 4: 4}
+"""Command specifiers: the client's for download segment, download, upload, upload segment, abort; the answer's."""
+_SEGMENTS: Final = (0, 3)
+"""Those whose frames name no object."""
+_ABORT: Final = 4
 
 
 class SdoRefused(DriveError):
@@ -149,8 +201,12 @@ class Remote:
             raise SdoRefused(
                 f"drive {self.name}: cannot {attempt} {called}: {reason} (SDO abort {error.code:08X})", error.code
             ) from error
-        except SdoCommunicationError as error:
+        except TwoNodesError as error:
+            raise DriveError(f"drive {self.name}: {error}") from error
+        except NoAnswerError as error:
             raise DriveTimeout(self.name, f"answer about {called}", self.client.timeout) from error
+        except SdoCommunicationError as error:
+            raise DriveError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
         except (can.CanError, OSError) as error:
             raise BusError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Final
 
 from trirail_drivers.cia402.differences import Differences
-from trirail_drivers.cia402.objects import title
-from trirail_drivers.cia402.sdo import SdoRefused
+from trirail_drivers.cia402.objects import Key, title
+from trirail_drivers.cia402.sdo import SdoRefused, shown
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives, Homing
 from trirail_drivers.errors import DriveError
@@ -52,16 +53,34 @@ def heartbeat_of(drives: Drives) -> int:
 
 
 def give_cycle(drive: Differences, period: float) -> None:
-    """Tell the drive the cycle's period [s]: 1005h, 1006h, 60C2h."""
-    sync = drive.remote.look(0x1005)
-    if sync is not None and sync & 0x4000_07FF != 0x80:  # bit 30: it would make SYNC itself
-        drive.give(0x1005, 0, 0x80)
-        if drive.apply and (drive.remote.look(0x1005) or 0) & 0x4000_07FF != 0x80:
-            raise DriveError(
-                f"drive {drive.remote.name}: {title((0x1005, 0))} is {sync:08X}h and stays; wanted SYNC 080h"
-            )
+    """Tell the drive the cycle's period [s]: 1005h, 1006h, 60C2h; and that SYNC is plain: 1007h, 1019h."""
+    for key, wanted, bits in PLAIN_SYNC:
+        _give_plain(drive, key, wanted, bits)
     drive.give(0x1006, 0, round(1e6 * period))
     _give_interpolation(drive, interpolation_periods(period))
+
+
+PLAIN_SYNC: Final = (
+    ((0x1005, 0), 0x80, 0x4000_07FF),  # bit 30: it would make SYNC itself
+    ((0x1007, 0), 0, 0xFFFF_FFFF),  # setpoints, and positions, that come later than this are thrown away
+    ((0x1019, 0), 0, 0xFF),  # a SYNC that has no counter is EMCY 8240h to a drive that waits for one
+)
+"""Objects by which another master may have changed what a SYNC is to a drive: what they must hold, in these bits."""
+
+
+def _give_plain(drive: Differences, key: Key, wanted: int, bits: int) -> None:
+    remote = drive.remote
+    found = remote.look(*key)
+    if found is None or found & bits == wanted:
+        return
+    if key == (0x1019, 0) and drive.apply and remote.look(0x1006):
+        with suppress(SdoRefused):
+            remote.write(0x1006, 0, 0)  # CiA 301: the counter changes only while the period is 0
+    drive.give(*key, wanted)
+    if drive.apply and (remote.look(*key) or 0) & bits != wanted:
+        raise DriveError(
+            f"drive {remote.name}: {title(key)} is {shown(*key, found)} and stays; wanted {shown(*key, wanted)}"
+        )
 
 
 def _give_interpolation(drive: Differences, periods: list[tuple[int, int]]) -> None:

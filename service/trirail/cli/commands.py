@@ -20,6 +20,7 @@ from trirail.cli import (
     panel_command,
     recording_commands,
     robot_commands,
+    sessions_command,
     terminal,
     units,
     workspace_command,
@@ -156,11 +157,12 @@ app.command(workspace_command.workspace)
 app.command(recording_commands.replay)
 app.command(recording_commands.report)
 app.command(recording_commands.export)
+app.command(sessions_command.sessions)
 
 
 @app.command
 def completion(shell: Shell | None = None, /, *, install: Annotated[bool, Flag] = False) -> int:
-    """Print a script for tab completion, of the robots that answer too, or install it for this user.
+    """Print a script for tab completion, of robots, poses, tools and frames too, or install it for this user.
 
     Parameters
     ----------
@@ -206,6 +208,6 @@ def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
         said = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
     elif isinstance(error, CoercionError) and error.msg and error.argument and not said.startswith("Invalid value"):
         said = f"Invalid value for {error.argument.name.strip('-')}: {said}"
-    by_command = error.command_chain is None  # who raises it does not know how it was called
+    by_command = type(error) is CycloptsError  # raised by the command itself, which is not told how it was called
     command = " ".join(("trirail", *(words[:1] if by_command else error.command_chain or ())))
     return f"{said} ({command} --help tells the usage)"

@@ -45,7 +45,12 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         ),
         "move": ("trirail move 5mm 0 0 --frame platform", "trirail move 0 0 1deg --tool 20mm 0 --wait"),
         "sliders": ("trirail sliders 20mm 0 -10mm --wait",),
-        "jog": ("trirail jog", "trirail jog 10mm/s 0 0", "trirail jog 0 0 -2deg/s --seconds 3"),
+        "jog": (
+            "trirail jog",
+            "trirail jog --gamepad",
+            "trirail jog 10mm/s 0 0",
+            "trirail jog 0 0 -2deg/s --seconds 3",
+        ),
         "follow": ("trirail follow path.csv --wait", "trirail follow path.csv --stretch"),
         "teach": ("trirail teach pick",),
         "forget": ("trirail forget pick",),
@@ -67,6 +72,11 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         ),
     },
     "Recordings": {
+        "sessions": (
+            "trirail sessions",
+            "trirail sessions --since 2026-01-31 --fault emcy",
+            "trirail sessions /var/lib/trirail --user ann --outcome faulted --json",
+        ),
         "report": ("trirail report session.rrd", "trirail report session.rrd --plot session.png"),
         "export": ("trirail export session.rrd", "trirail export session.rrd --out session.parquet"),
         "replay": (

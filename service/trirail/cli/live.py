@@ -131,7 +131,10 @@ def _mode(state: State) -> str:
 
 
 def _add_goal(grid: Table, goal: GoalState, pose: Sequence[float]) -> None:
-    grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {left(goal)}")
+    if goal.lag is not None:
+        grid.add_row("goal", f"{plain(goal.id)}  follows its target, {units.written(goal.lag, 'm', 6)} behind")
+    else:
+        grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {left(goal)}")
     if goal.target is not None:
         grid.add_row("  target", units.pose(goal.target, 9))
         grid.add_row("  to go", units.pose([end - at for end, at in zip(goal.target, pose, strict=True)], 9))

@@ -11,7 +11,7 @@ import termios
 import threading
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
@@ -19,7 +19,8 @@ import msgspec
 from rich.live import Live
 from rich.text import Text
 
-from trirail.cli import terminal
+from trirail.cli import gamepad, terminal
+from trirail.cli.gamepad import Gamepad, Pad
 from trirail.cli.keyboard import keys
 from trirail.client.client import Robot
 from trirail.client.held_jog import SPEEDS, USUAL, HeldJog, Velocity
@@ -65,9 +66,7 @@ class Pendant:
     def press(self, key: str, now: float) -> None:
         """Take in a key, pressed or repeated by the terminal, at a time of the monotonic clock."""
         if key in AXES:
-            x, y, phi = (sign * speed for sign, speed in zip(AXES[key], self.speed, strict=True))
-            self._until = now + REPEAT
-            self._jog.hold((x, y, phi))
+            self.hold(AXES[key], now)
             return
         self.let_go()
         if key in (" ", "escape"):
@@ -76,6 +75,12 @@ class Pendant:
             self._choice = min(max(self._choice + (1 if key == "+" else -1), 0), len(SPEEDS) - 1)
         elif key == "q":
             self.over = True
+
+    def hold(self, direction: Sequence[float], now: float) -> None:
+        """Take in that the hand wants to go along x, y and φ, each by a share of the speed, -1 to 1."""
+        x, y, phi = (share * speed for share, speed in zip(direction, self.speed, strict=True))
+        self._until = now + REPEAT
+        self._jog.hold((x, y, phi))
 
     def tick(self, now: float) -> None:
         """Let go of a key that has not come again."""
@@ -118,18 +123,20 @@ class _Newest:
             self.state = None
 
 
-def run(robot: Robot) -> int:
-    """Serve the operator until he leaves or his terminal is gone; return the exit code.
+def run(robot: Robot, pad: Pad | None = None) -> int:
+    """Serve the operator, at his terminal and a gamepad, until he leaves or his terminal is gone; return the exit code.
 
-    Raises ServiceError where standard input is no terminal, or nobody answers.
+    Raises ServiceError where standard input is no terminal, nobody answers, or the gamepad is gone.
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ServiceError("a jog by keys needs a terminal; without one: trirail jog VX VY W --seconds S")
     top = msgspec.convert(robot.info().limits, Limits).platform.velocity
     pendant, newest = Pendant(robot, top), _Newest(robot)
+    if pad is not None:
+        pendant.said = f"{pad.name}: {gamepad.HELP}"
     try:
         with Live(console=terminal.out, auto_refresh=False, transient=True) as live, _raw(pendant):
-            _serve(pendant, newest, live)
+            _serve(pendant, newest, live, pad)
     except (KeyboardInterrupt, _HungUp, OSError):
         pass  # an OSError is that of a terminal that is gone
     finally:
@@ -137,26 +144,45 @@ def run(robot: Robot) -> int:
     return 0
 
 
-def _serve(pendant: Pendant, newest: _Newest, live: Live) -> None:
+def _serve(pendant: Pendant, newest: _Newest, live: Live, pad: Pad | None) -> None:
     descriptor = sys.stdin.fileno()
     drawn, last = -math.inf, time.monotonic()
     while not pendant.over:
-        ready, _, _ = select.select([descriptor], [], [], REPEAT / 5.0)
+        ready, _, _ = select.select([descriptor, *([pad] if pad else [])], [], [], REPEAT / 5.0)
         now = time.monotonic()
+        if pad is not None:
+            pad.take(now)
         if now - last > STALLED:  # stopped and continued: what waits in the terminal is from before
             pendant.let_go()
             termios.tcflush(descriptor, termios.TCIFLUSH)
-        elif ready:
+            if pad is not None:
+                pad.gamepad.let_go()
+        elif descriptor in ready:
             typed = os.read(descriptor, 1024)
             if not typed:
                 return  # the terminal is gone
             for key in keys(typed):
                 pendant.press(key, now)
+        if pad is not None:
+            follow(pendant, pad.gamepad, now)
         pendant.tick(now)
         last = now
         if now - drawn > DRAWN:
             live.update(_shown(pendant, newest.state), refresh=True)
             drawn = now
+
+
+def follow(pendant: Pendant, gamepad: Gamepad, now: float) -> None:
+    """Have the pendant do what a gamepad says."""
+    while gamepad.keys:
+        pendant.press(gamepad.keys.pop(0), now)
+    direction = gamepad.direction(now)
+    if direction is not None:
+        pendant.hold(direction, now)
+        gamepad.moving = True
+    elif gamepad.moving:
+        pendant.let_go()
+        gamepad.moving = False
 
 
 def _shown(pendant: Pendant, state: State | None) -> Text:

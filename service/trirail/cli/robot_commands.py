@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -164,6 +165,7 @@ def jog(
     /,
     *,
     seconds: units.Time | None = None,
+    gamepad: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
     """Move at a velocity while the command lasts: until Ctrl-C, or for some seconds. Without one, while a key is held.
@@ -178,16 +180,22 @@ def jog(
         Rate of the platform's angle [rad/s], or with a unit: 2deg/s.
     seconds
         How long [s].
+    gamepad
+        By a gamepad too, whose sticks move the robot while one of its shoulder buttons is held.
     """
     from trirail.client.client import Robot
 
     if vx is None:
         from trirail.cli import pendant
+        from trirail.cli.gamepad import Pad
 
-        with Robot(service.robot, service.connect, tls=service.tls) as robot:
-            return pendant.run(robot)
-    if vy is None or w is None:
-        raise CycloptsError(msg="jog takes VX, VY and W, or none of them: then keys move the robot while they are held")
+        with ExitStack() as opened:
+            pad = opened.enter_context(Pad.first()) if gamepad else None
+            return pendant.run(opened.enter_context(Robot(service.robot, service.connect, tls=service.tls)), pad)
+    if vy is None or w is None or gamepad:
+        raise CycloptsError(
+            msg="jog takes VX, VY and W, or none of them: then keys, or a gamepad, move the robot while they are held"
+        )
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         try:
             with robot.jog(x=vx, y=vy, phi=w) as jogging:

@@ -22,6 +22,7 @@ import zenoh
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import GoalHandle, Jog, Result
 from trirail.client.lease import Lease
+from trirail.client.track import Taker, Track
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.credentials import Credentials, credentials_for
@@ -29,13 +30,13 @@ from trirail.wire.messages import (
     AcquireLease,
     CommandReply,
     Event,
+    Goal,
     GoalReply,
     MoveGoal,
     NamedGoal,
     Override,
     OwnLimits,
     PoseGoal,
-    SentGoal,
     SlidersGoal,
     Tool,
     TrajectoryGoal,
@@ -46,7 +47,7 @@ from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command
 
-__all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot"]
+__all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot", "Track"]
 
 HOME_WITHIN = 600.0
 """How long homing may take [s]: three drives of the greatest time-out there is."""
@@ -243,8 +244,24 @@ class Robot:
         """
         return Jog(self.send, (x, y, phi), timeout)
 
-    def send(self, make: Callable[[str], SentGoal], id: str | None = None) -> GoalHandle:  # noqa: A002
-        """Send the goal that `make` makes for an id, a trirail.wire.messages.SentGoal; return once it is accepted."""
+    def track(self, *, timeout: float = 0.25, id: str | None = None) -> Track:  # noqa: A002 - the field's name on the wire
+        """Follow a moving target while the context lasts, told of 10 to 200 times a second; brake when it ends.
+
+        with robot.track() as track:
+            for pose, velocity, time in camera:
+                track.update(pose, velocity, time)
+
+        The robot goes on with the target's velocity between two updates, within every limit, and brakes on its path
+        when none has come for `timeout` seconds of real time. `id` as of move_to.
+        """
+
+        def post(goal: Goal, take: Taker) -> None:
+            self._connection.post(("goal", self.user), GoalReply, msgspec.json.encode(goal), take)
+
+        return Track(self.send, post, id or uuid.uuid4().hex[:12], timeout)
+
+    def send(self, make: Callable[[str], Goal], id: str | None = None) -> GoalHandle:  # noqa: A002
+        """Send the goal that `make` makes for an id, a trirail.wire.messages.Goal; return once it is accepted."""
         goal_id = id or uuid.uuid4().hex[:12]
         message = message_of(make, goal_id)
         goal = GoalHandle(goal_id, self.command)
@@ -404,7 +421,7 @@ def result_of(event: Event) -> Result | None:
     return Result(event.id, event.outcome, event.message, event.settle, event.residual, event.overshoot)
 
 
-def message_of(make: Callable[[str], SentGoal], goal_id: str) -> bytes:
+def message_of(make: Callable[[str], Goal], goal_id: str) -> bytes:
     """Return the goal that `make` makes for an id, as JSON. Raises RefusedError for one that cannot be."""
     try:
         return msgspec.json.encode(make(goal_id))

@@ -13,7 +13,7 @@ import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.samples import SampleReader
-from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import least_role
 from trirail.wire.credentials import Credentials
@@ -26,6 +26,8 @@ ROLE_WITHIN = 0.8
 """How long the answer may take which role a user has [s]."""
 REPLY_WITHIN = 20.0
 """How long a command may take to be carried out [s]."""
+POST_WITHIN = 2.0
+"""How long the answer may take to what is posted [s]."""
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -93,6 +95,29 @@ class Connection:
         if isinstance(refused, RefusedError):
             raise refused
         return refused
+
+    def post(
+        self, parts: tuple[str, ...], kind: type[T], payload: bytes, take: Callable[[T | TrirailError], None]
+    ) -> None:
+        """Query the key of these parts without waiting: `take` gets a message of `kind`, or why there is none.
+
+        It is called once, by a thread of the connection: it must be quick.
+        """
+        answers: list[T | TrirailError] = []
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            try:
+                answers.append(self.read(reply, kind))
+            except RefusedError as error:
+                answers.append(error)
+
+        def on_end() -> None:
+            silent = ServiceError(f"no robot {self._robot!r} answers at {self._connect}: is its service running?")
+            take(answers[0] if answers else silent)
+
+        handler = zenoh.handlers.Callback(on_reply, on_end, indirect=False)
+        asked = self.query(parts, payload, POST_WITHIN) | {"congestion_control": zenoh.CongestionControl.DROP}
+        self._session.get(**asked, handler=handler)
 
     def nobody(self, *parts: str) -> ServiceError | RefusedError:
         """Return what to raise where nobody answers on the key of these parts.

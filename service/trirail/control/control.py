@@ -27,7 +27,7 @@ from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import take_up
-from trirail.wire.messages import Fault, Outcome
+from trirail.wire.messages import FaultDetail, Outcome, TrackGoal
 from trirail.wire.packets import (
     CommandRequest,
     Disturbance,
@@ -149,7 +149,7 @@ class Control:
             drive, cause, code, message = feedback.fault
             if mode is Mode.FAULT and feedback.fault != before.fault:
                 # The first one stays, but this came of it.
-                self.ledger.tell("fault", "error", message, fault=Fault(cause, drive, code))
+                self.ledger.tell("fault", "error", message, fault=FaultDetail(cause, drive, code))
             self.trip(message, cause, drive, code)
         elif mode is Mode.ENABLING:
             self._power_up()
@@ -200,7 +200,7 @@ class Control:
             self._change_lease(over)
         released = self.ledger.release(self.cycles) if self.state.mode is Mode.MOVING else None
         if released is not None:
-            self._go(ModeEvent.JOG_OVER, f"goal {released.id} of {released.user} is not renewed")
+            self._go(ModeEvent.NOT_RENEWED, f"goal {released.id} of {released.user} is not renewed")
         beginning = self.goal_queue.think(self.cycles, self._admit, self._place)
         if beginning is not None:
             self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
@@ -253,19 +253,21 @@ class Control:
 
     @property
     def target(self) -> Triple | None:
-        """The pose that the running goal leads to; None without one, and for a jog."""
-        last = self._schedule.last
-        if self.ledger.goal is None or self.ledger.goal.is_jog or last is None:
+        """The pose that the running goal leads to, or that its target was last told to have; None for a jog."""
+        last, goal = self._schedule.last, self.ledger.goal
+        if goal is None or last is None:
             return None
+        if goal.renewed is not None:
+            return goal.target
         x, y, phi = last.destination(self.commanded.pose)
         return (x, y, phi)
 
     def trip(self, reason: str, cause: str, drive: str = "", code: int = 0) -> None:
-        """Stop all three drives in this cycle and latch the reason; cause, drive and code as wire.messages.Fault."""
+        """Stop all three drives in this cycle and latch the reason; cause, drive and code as of a FaultDetail."""
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason
-        self.ledger.tell("fault", "error", reason, fault=Fault(cause, drive, code))
+        self.ledger.tell("fault", "error", reason, fault=FaultDetail(cause, drive, code))
         self._go(ModeEvent.FAULT, reason)
         self._withdraw(ModeEvent.FAULT, reason)
 
@@ -285,7 +287,7 @@ class Control:
         if origin == "measured":
             return self.measured.pose
         last, goal = self._schedule.last, self.ledger.goal
-        if last is None or goal is None or goal.is_jog:
+        if last is None or goal is None or goal.renewed is not None:
             return self.commanded.pose
         return last.end(self.commanded.pose)
 
@@ -312,8 +314,8 @@ class Control:
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             raise RefusedError(decided.code, self._because(decided))
-        if event is ModeEvent.PAUSE and self.ledger.goal is not None and self.ledger.goal.is_jog:
-            event = ModeEvent.STOP  # nobody would be at the key when it is resumed
+        if event is ModeEvent.PAUSE and self.ledger.goal is not None and self.ledger.goal.renewed is not None:
+            event = ModeEvent.STOP  # nobody would be at the key, nor where the target was, when it is resumed
         if decided.action is Action.POWER_UP:
             self.setpoints.check_rest()
             if self.measured.homed:
@@ -424,6 +426,8 @@ class Control:
         goal, settling = self.ledger.goal, self.measured.settling
         if not run.arrived:
             self._go(ModeEvent.STANDSTILL, "standstill")
+        elif self.state.mode is Mode.MOVING and goal is not None and goal.renewed is TrackGoal:
+            return  # it waits for its target to move on, for as long as it is renewed
         elif goal is None or not goal.settles:
             self._go(ModeEvent.ARRIVED, "standstill")
         elif not settling.under_way:

@@ -7,14 +7,19 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
+from msgspec import structs
+
 from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger, Withdrawal
 from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.frames import NamedFrames, Place
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import Outcome, PoseGoal, VelocityGoal
+from trirail.wire.messages import Outcome, PlannedGoal, PoseGoal, RenewedGoal, TrackGoal, VelocityGoal
 from trirail.wire.packets import GoalRequest
+
+FURTHEST = 0.5
+"""How long ago, or how far ahead, a target may have been where a track says [s]: farther nobody knows where it is."""
 
 
 class _Sent(NamedTuple):
@@ -22,6 +27,10 @@ class _Sent(NamedTuple):
 
     request: GoalRequest
     cycle: float
+
+    def known_since(self, period: float) -> float:
+        """Return when a target was where a track says, as a cycle."""
+        return self.cycle - self.request.age / period
 
 
 class GoalQueue:
@@ -55,11 +64,19 @@ class GoalQueue:
         return not self._waiting and not self._planner.busy
 
     def take(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
-        """Take a goal in a cycle, at a time of the monotonic clock; it waits for its user's turn."""
+        """Take a goal in a cycle, at a time of the monotonic clock; it waits for its user's turn.
+
+        What is told of a target takes the place of what has been told before and still waits.
+        """
         age = (now_ns - request.received_ns) * 1e-9 / self._period
         sent = _Sent(request, cycle - age)
         if self.idle:
             self._served.clear()
+        if isinstance(request.goal, TrackGoal) and self._waiting and self._ledger.renewed_by(request):
+            before = self._waiting[-1].request
+            if self._ledger.renewed_by(before):
+                self._waiting.pop()
+                self._ledger.pass_over(before)
         self._waiting.append(sent)
         self._ledger.keep_alive(request, self._alive_until(sent))
 
@@ -77,7 +94,7 @@ class GoalQueue:
                 self._ledger.refuse(self._planned.request, refusal)
         try:
             if self._planner.busy and self._planned is not None:
-                self._ledger.check_id(self._planned.request)  # a jog may end while its renewal is being planned
+                self._ledger.check_id(self._planned.request)  # it may end while its renewal is being planned
                 self._lease.check(self._planned.request.user)  # and the lease may have another holder by now
                 self._check_age(self._planned, cycle)
             at_end = self._planner.busy and self._schedule.ended
@@ -153,12 +170,28 @@ class GoalQueue:
             )
         moving = admit()
         self._check_age(sent, cycle)
-        planned = self._frames.planned(goal, place)
+        planned = self._timed(self._frames.planned(goal, place), sent, cycle)
         blend = ledger.goals[-1].blend if moving and ledger.goals and isinstance(planned, PoseGoal) else None
         if blend is not None and len(ledger.goals) > self._queue:
             text = f"{self._queue} goals are waiting already (motion.queue): send it when one has ended"
             raise RefusedError(RefusalCode.QUEUE_FULL, text, value=len(ledger.goals), limit=self._queue)
         self._planner.plan(planned, blend)
+
+    def _timed(self, planned: PlannedGoal, sent: _Sent, cycle: int) -> PlannedGoal:
+        """Return a goal with its time as the schedule counts it. Raises RefusedError where that is too far from now.
+
+        The setpoints of the schedule's cycle, which is commanded now, are taken up at this cycle's SYNC: that is now.
+        """
+        if not isinstance(planned, TrackGoal):
+            return planned
+        ago = (cycle - sent.known_since(self._period)) * self._period
+        if not abs(ago) <= FURTHEST:
+            when = f"{ago:.3f} s ago" if ago > 0.0 else f"in {-ago:.3f} s"
+            text = (
+                f"the target is said to be there {when}, by the clock of this machine: {FURTHEST:g} s at most is taken"
+            )
+            raise RefusedError(RefusalCode.WRONG_TIME, text, value=ago, limit=math.copysign(FURTHEST, ago))
+        return structs.replace(planned, time=self._schedule.cycle * self._period - ago)
 
     def _check_age(self, sent: _Sent, cycle: int) -> None:
         """Refuse what can no more begin in time."""
@@ -166,12 +199,12 @@ class GoalQueue:
         if valid is not None and cycle - sent.cycle > valid / self._period:
             raise RefusedError(RefusalCode.EXPIRED, f"the goal came too late: it was valid for {valid:g} s")
         if cycle > self._alive_until(sent):
-            raise RefusedError(RefusalCode.EXPIRED, "the jog came too late: its timeout was over before it could begin")
+            raise RefusedError(RefusalCode.EXPIRED, "it came too late: its timeout was over before it could begin")
 
     def _alive_until(self, sent: _Sent) -> float:
-        """Return the cycle in which a jog ends that nobody renews; infinite for other goals."""
+        """Return the cycle in which a goal ends that nobody renews; infinite for those that need not be."""
         goal = sent.request.goal
-        return sent.cycle + goal.timeout / self._period if isinstance(goal, VelocityGoal) else math.inf
+        return sent.cycle + goal.timeout / self._period if isinstance(goal, RenewedGoal) else math.inf
 
     def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: str) -> None:
         """End a goal that waits, and those behind it."""

@@ -39,7 +39,8 @@ class LeaseArbiter:
         self._required = policy == "required"
         self._period = period
         self._held: _Held | None = None
-        self._over: dict[tuple[str, str], None] = {}
+        self._over: dict[tuple[str, str], str] = {}
+        """Leases that have ended, by user and id, and why."""
 
     @property
     def user(self) -> str | None:
@@ -62,42 +63,37 @@ class LeaseArbiter:
     def acquire(self, request: CommandRequest, cycle: int) -> LeaseChange | None:
         """Let a user have the lease; None for a sign of life of who has it. Raises RefusedError."""
         user, before = request.user, self._held
-        if request.lease is not None and (user, request.lease) in self._over:
-            raise RefusedError(RefusalCode.LEASE_OVER, f"lease {request.lease!r} of {user} is over: acquire a new one")
+        if request.lease is not None and (why := self._over.get((user, request.lease))) is not None:
+            raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: acquire a new one")
         again = before is not None and (before.user, before.id) == (user, request.lease)
+        change = None if again else LeaseChange("info", f"lease acquired by {user}")
         if before is not None and not again:
             if not request.force:
                 whose = "another client of the same user" if before.user == user else before.user
-                raise RefusedError(
-                    RefusalCode.LEASED, f"{whose} holds the lease: wait until it is free, or take it over"
-                )
-            self._end()
+                problem = f"{whose} holds the lease: wait until it is free, or take it over"
+                raise RefusedError(RefusalCode.LEASED, problem)
+            change = self._end("warning", f"lease taken over by {user} from {before.user}")
         self._held = _Held(user, request.lease, request.timeout, cycle + round(request.timeout / self._period))
-        if again:
-            return None
-        if before is not None:
-            return LeaseChange("warning", f"lease taken over by {user} from {before.user}")
-        return LeaseChange("info", f"lease acquired by {user}")
+        return change
 
     def release(self, request: CommandRequest) -> LeaseChange | None:
         """Let a user give his lease back; None where he has none, or not that one."""
         held = self._held
         if held is None or held.user != request.user or request.lease not in (None, held.id):
             return None
-        self._end()
-        return LeaseChange("info", f"lease released by {held.user}")
+        return self._end("info", f"lease released by {held.user}")
 
     def silent(self, cycle: int) -> LeaseChange | None:
         """End the lease where no sign of life has come in time."""
         held = self._held
         if held is None or cycle <= held.alive_until:
             return None
-        self._end()
-        return LeaseChange("warning", f"lease of {held.user} is over: no sign of life for {held.timeout:g} s")
+        return self._end("warning", f"lease of {held.user} is over: no sign of life for {held.timeout:g} s")
 
-    def _end(self) -> None:
+    def _end(self, level: Level, why: str) -> LeaseChange:
         held, self._held = self._held, None
         if held is not None and held.id is not None:
-            self._over[held.user, held.id] = None
+            self._over[held.user, held.id] = why
             if len(self._over) > REMEMBERED_IDS:
                 del self._over[next(iter(self._over))]
+        return LeaseChange(level, why)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -11,7 +12,18 @@ from trirail_drivers.interface import Triple
 from trirail.control.in_position import Settled
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.messages import Fault, Level, MoveGoal, Outcome, PoseGoal, Residual, TrajectoryGoal, VelocityGoal
+from trirail.wire.messages import (
+    FaultDetail,
+    Level,
+    MoveGoal,
+    Outcome,
+    PoseGoal,
+    RenewedGoal,
+    Residual,
+    TrackGoal,
+    TrajectoryGoal,
+    VelocityGoal,
+)
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -54,7 +66,7 @@ class Notice(NamedTuple):
     settle: float | None = None
     residual: Residual | None = None
     overshoot: Triple | None = None
-    fault: Fault | None = None
+    fault: FaultDetail | None = None
 
 
 class ActiveGoal(NamedTuple):
@@ -62,19 +74,24 @@ class ActiveGoal(NamedTuple):
 
     id: str
     user: str
-    is_jog: bool
+    renewed: type[RenewedGoal] | None
+    """Of which kind the goals are that renew it: a jog by velocities, a track by targets; None for all others."""
     blend: float | None
     """How far from its end the next goal may begin [m]; None where that preempts it."""
     expires: float
     """In which cycle it is too late to begin."""
     alive_until: float
-    """In which cycle it ends unless it has been renewed, for a jog."""
+    """In which cycle it ends unless it has been renewed."""
     released: bool = False
-    """Whether that has happened: a jog that nobody renewed does not come back."""
+    """Whether that has happened: what nobody renewed does not come back."""
     bound: str | None = None
-    """The limit before which a jog comes to rest."""
+    """The limit before which a jog comes to rest, or beyond which a track's target is."""
     settles: bool = True
     """Whether it is done only when the robot is in position."""
+    target: Triple | None = None
+    """The pose that a track's target was last told to have."""
+    lag: float | None = None
+    """Likewise, trirail.wire.messages.GoalReply."""
 
 
 class Ledger:
@@ -88,6 +105,8 @@ class Ledger:
         self._commands: dict[Command, deque[tuple[CommandRequest, int]]] = {}
         self._ended: dict[str, str | None] = {}
         """Goals that have ended, and the limit at which that was, for a jog."""
+        self._refused: tuple[str, RefusalCode] | None = None
+        """The track of which something was refused last, and why."""
 
     # ------------------------------------------------------------------ goals
 
@@ -97,7 +116,7 @@ class Ledger:
         return self.goals[0] if self.goals else None
 
     def check_id(self, request: GoalRequest) -> None:
-        """Raise RefusedError if the id has been used; a jog's own velocities share one."""
+        """Raise RefusedError if the id has been used; what renews a goal shares its own."""
         goal_id = request.id
         running = any(goal.id == goal_id for goal in self.goals)
         if isinstance(request.goal, VelocityGoal) and (bound := self._ended.get(goal_id)):
@@ -107,16 +126,20 @@ class Ledger:
             raise RefusedError(RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has been used: every goal needs its own")
         if self.goal is not None and self.goal.released and self.renewed_by(request):
             raise RefusedError(
-                RefusalCode.JOG_OVER, f"jog {goal_id!r} was not renewed in time and is over: begin a new one"
+                RefusalCode.JOG_OVER, f"goal {goal_id!r} was not renewed in time and is over: begin a new one"
             )
 
+    def pass_over(self, request: GoalRequest) -> None:
+        """Accept a renewal in whose place a newer one is taken up."""
+        self.answers.append(Accepted(request.ticket, request.id, math.inf, 1.0, stops_first=False, queued=False))
+
     def keep_alive(self, request: GoalRequest, until: float) -> None:
-        """Let the jog under way go on until a cycle, if this renews it."""
+        """Let the goal under way go on until a cycle, if this renews it."""
         if self.renewed_by(request):
             self.goals[0] = self.goals[0]._replace(alive_until=until)
 
     def release(self, cycle: int) -> ActiveGoal | None:
-        """Return the jog under way if it has not been renewed in time, the first time that this is so."""
+        """Return the goal under way if it has not been renewed in time, the first time that this is so."""
         goal = self.goal
         if goal is None or goal.released or cycle <= goal.alive_until:
             return None
@@ -126,30 +149,40 @@ class Ledger:
     def begin(
         self, request: GoalRequest, taken: AcceptedPlan, expires: float, alive_until: float, *, at_end: bool = False
     ) -> None:
-        """Accept a goal; those before it are preempted, unless it follows them or is the same jog afresh.
+        """Accept a goal; those before it are preempted, unless it follows them or renews the one under way.
 
         `at_end` tells whether the motion before it has ended: to a goal with a blend, that goal is done.
         """
         self.answers.append(
-            Accepted(request.ticket, request.id, taken.duration, taken.slowed, taken.stops_first, taken.queued)
+            Accepted(
+                request.ticket, request.id, taken.duration, taken.slowed, taken.stops_first, taken.queued, taken.lag
+            )
         )
         if self.renewed_by(request):
-            self.goals[0] = self.goals[0]._replace(bound=taken.bound)
+            self._renew(request, taken)
             return
         goal, last = request.goal, self.goals[-1] if self.goals else None
         passes = at_end and last is not None and last.blend is not None and isinstance(goal, PoseGoal | MoveGoal)
         if not taken.queued and not passes:
             self.end("preempted", f"preempted by goal {request.id}")
         blend = goal.blend if isinstance(goal, PoseGoal | MoveGoal) else None
-        is_jog = isinstance(goal, VelocityGoal)
-        settles = goal.settle if isinstance(goal, TrajectoryGoal) else not is_jog
-        self.goals.append(
-            ActiveGoal(
-                request.id, request.user, is_jog, blend, expires, alive_until, bound=taken.bound, settles=settles
-            )
-        )
+        renewed = type(goal) if isinstance(goal, RenewedGoal) else None
+        settles = goal.settle if isinstance(goal, TrajectoryGoal) else renewed is None
+        self.goals.append(ActiveGoal(request.id, request.user, renewed, blend, expires, alive_until, settles=settles))
         if passes:
             self.pass_on()
+        if renewed is not None:
+            self._renew(request, taken)
+
+    def _renew(self, request: GoalRequest, taken: AcceptedPlan) -> None:
+        """Take in what was told of the goal under way; where a target is out of reach, everyone is to know."""
+        goal, told = request.goal, self.goals[0]
+        target = (goal.x, goal.y, goal.phi) if isinstance(goal, TrackGoal) else None
+        if target is not None and taken.bound not in (None, told.bound):
+            text = f"the target of goal {told.id} is beyond the limit of {taken.bound}: the robot waits there"
+            self.tell("service", "warning", text, user=told.user)
+        bound = taken.bound or (told.bound if target is not None else None)  # a limit is told of once
+        self.goals[0] = told._replace(bound=bound, target=target, lag=taken.lag)
 
     def pass_on(self) -> None:
         """The first goal is reached, and the one that waited for it has begun."""
@@ -161,7 +194,8 @@ class Ledger:
         kept = [self.goals.popleft() for _ in range(min(but, len(self.goals)))]
         while self.goals:
             goal = self.goals.popleft()
-            bound = goal.bound if outcome == "done" and not goal.released else None
+            at_limit = outcome == "done" and not goal.released and goal.renewed is VelocityGoal
+            bound = goal.bound if at_limit else None
             words = f"at the limit of {bound}" if bound else reason
             self._ending(goal.id, goal.user, outcome, words, bound, settled)
         self.goals.extend(kept)
@@ -181,14 +215,22 @@ class Ledger:
         return all(sender == user for sender in senders)
 
     def refuse(self, request: Request, refusal: RefusedError) -> None:
-        """Answer that a request is not carried out. A goal that is refused has ended; a used id has its own ending."""
+        """Answer that a request is not carried out. A goal that is refused has ended; a used id has its own ending.
+
+        Everyone is told, of a track's renewals once: hundreds may follow before their sender hears of it.
+        """
         if isinstance(request, RefusedRequest | PoseChanged):
             return
         text = str(refusal)
         self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))
         if isinstance(request, CommandRequest):
             self.tell("refused", "warning", f"{request.name} refused: {text}", user=request.user)
-        elif refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT):
+            return
+        if isinstance(request.goal, TrackGoal):
+            before, self._refused = self._refused, (request.id, refusal.code)
+            if before == self._refused:
+                return
+        if refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT):
             self.tell("refused", "warning", text, user=request.user)
         else:
             outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
@@ -198,13 +240,12 @@ class Ledger:
                 self._ending(request.id, request.user, outcome, text)
 
     def renewed_by(self, request: GoalRequest) -> bool:
-        """Whether it renews the jog that is under way; only its own user can."""
+        """Whether it renews the goal that is under way; only its own user can."""
         goal = self.goal
         return (
             goal is not None
             and (goal.id, goal.user) == (request.id, request.user)
-            and goal.is_jog
-            and isinstance(request.goal, VelocityGoal)
+            and type(request.goal) is goal.renewed
         )
 
     def _ending(
@@ -216,6 +257,8 @@ class Ledger:
         bound: str | None = None,
         settled: Settled | None = None,
     ) -> None:
+        if goal_id in self._ended:  # by what also withdraws its renewals
+            return
         level = _LEVELS.get(outcome, "info")
         self._ended[goal_id] = bound
         if len(self._ended) > REMEMBERED_IDS:
@@ -258,7 +301,7 @@ class Ledger:
         reason: str | None = None,
         goal: str | None = None,
         user: str | None = None,
-        fault: Fault | None = None,
+        fault: FaultDetail | None = None,
     ) -> None:
         """Note something that everyone is to know."""
         self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, goal, user, fault=fault))

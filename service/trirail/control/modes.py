@@ -20,7 +20,7 @@ class ModeEvent(Enum):
     RESET = auto()
     PAUSE = auto()
     RESUME = auto()
-    JOG_OVER = auto()  # nobody keeps the jog alive any more
+    NOT_RENEWED = auto()  # nobody renews the jog or the track any more
     HOME = auto()
     POWERED = auto()  # all drives reached operation enabled
     HOMED = auto()  # all drives know where they are, and follow setpoints again
@@ -175,7 +175,7 @@ _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
         ModeEvent.GOAL: Step(MOVING, Action.START),
         ModeEvent.STOP: Step(STOPPING, Action.BRAKE),
         ModeEvent.PAUSE: Step(PAUSING, Action.BRAKE),
-        ModeEvent.JOG_OVER: Step(RELEASING, Action.BRAKE),
+        ModeEvent.NOT_RENEWED: Step(RELEASING, Action.BRAKE),
         ModeEvent.HOME: _MOVING,
         ModeEvent.RESET: _NO_FAULT,
         ModeEvent.ARRIVED: Step(HOLDING),

@@ -26,7 +26,7 @@ from trirail.motion.runs import STILL, MotionState, Run, nominal, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import planned_limits
 from trirail.motion.time_scaling import SHARES, TimeScaling
-from trirail.wire.messages import PlannedGoal
+from trirail.wire.messages import PlannedGoal, TrackGoal
 from trirail.wire.planning import Extended, NotPlanned, PlanAnswer, Planned, PlanRequest
 
 LEADS = (0.003, 0.012, 0.048)
@@ -58,7 +58,9 @@ class AcceptedPlan(NamedTuple):
     queued: bool
     """Whether it begins when the one before it is reached."""
     bound: str | None = None
-    """The limit before which a jog comes to rest."""
+    """The limit before which a jog comes to rest, or beyond which a track's target is."""
+    lag: float | None = None
+    """Of a track: trirail.wire.messages.GoalReply."""
 
 
 class PlanRequests:
@@ -84,8 +86,12 @@ class PlanRequests:
         self._answer: PlanAnswer | None = None
         self._lost: str | None = None
         self._times = 0
+        self._took = 0
+        """Cycles from the last question to its answer."""
         self._since: int | None = None
         self._change: RateChange | None = None
+        self._greatest_rate = math.inf
+        """Of the motion under way: what follows a target is not to be ahead of it."""
 
     @property
     def busy(self) -> bool:
@@ -110,7 +116,7 @@ class PlanRequests:
 
     def run_at(self, rate: float) -> None:
         """Let the goal's motion run at another rate, as soon as the sliders allow."""
-        self._change = RateChange(self._scaling, self._schedule, rate, self._period)
+        self._change = RateChange(self._scaling, self._schedule, min(rate, self._greatest_rate), self._period)
 
     def leave_rate(self) -> None:
         """The motion has ended: leave its rate alone."""
@@ -121,6 +127,7 @@ class PlanRequests:
         asked = self._asked
         if asked is not None and (answer.number, answer.version) == (asked.number, asked.version) and not self._answer:
             self._answer, self._since = answer, None
+            self._took = self._schedule.cycle - asked.cycle
 
     def lose(self, reason: str) -> None:
         """The planner will not answer what it was asked: a goal that waits for that is refused."""
@@ -169,8 +176,8 @@ class PlanRequests:
             schedule.version,
             self._revision,
             schedule.cycle,
-            self._leads[self._times],
-            self.override,
+            self._lead(goal),
+            min(self.override, _greatest_rate(goal)),
             (_triple(pose), _triple(velocity), _triple(acceleration)),
             tuple(map(pack_run, schedule.runs)),
             goal,
@@ -179,6 +186,11 @@ class PlanRequests:
         self._times += 1
         self._since = self._since if self._since is not None else schedule.cycle
         self._port.ask(self._asked)
+
+    def _lead(self, goal: PlannedGoal) -> int:
+        """Return in how many cycles a motion is to begin: of a target, which is told of often, as the last one came."""
+        lead = self._leads[self._times]
+        return max(lead, self._took + 1) if isinstance(goal, TrackGoal) and self._times == 0 else lead
 
     def _take(self, answer: PlanAnswer) -> AcceptedPlan | None:
         """Carry out what the planner has decided, once its time has come; ask anew where it does not fit any more."""
@@ -204,10 +216,12 @@ class PlanRequests:
             self._asked = None
             return None
         schedule.take(runs)
-        self._change = None
-        if run.target != self.override:
+        self._change, self._greatest_rate = None, _greatest_rate(self._goal)
+        if run.target != min(self.override, self._greatest_rate):
             self.run_at(self.override)
-        return AcceptedPlan(planned.duration, planned.slowed, planned.stops_first, queued=False, bound=planned.bound)
+        return AcceptedPlan(
+            planned.duration, planned.slowed, planned.stops_first, queued=False, bound=planned.bound, lag=planned.lag
+        )
 
     def _stopping(self, under_way: Run, planned: Planned) -> Run:
         """Return the motion under way as it stops, with no goal on its way."""
@@ -242,6 +256,11 @@ class PlanRequests:
         schedule.append(extended.s, path)
         duration = schedule.remaining if run.target else math.inf
         return AcceptedPlan(duration, extended.slowed, stops_first=False, queued=True)
+
+
+def _greatest_rate(goal: PlannedGoal | None) -> float:
+    """Return the greatest rate at which a goal's motion is run: a target has a time of its own."""
+    return 1.0 if isinstance(goal, TrackGoal) else math.inf
 
 
 def _same(one: MotionState, other: MotionState) -> bool:

@@ -155,6 +155,14 @@ class Checker:
         violation = self._beyond(*rows) if rows is not None else None
         return violation.bound if violation is not None else "the workspace"
 
+    def stands_beyond(self, pose: Sequence[float]) -> str | None:
+        """Name the limit beyond which the robot would be at a pose; None where it can stand there."""
+        motion, rows = np.array((pose, STILL, STILL)), np.zeros((6, 3))
+        if inverse_into(self._legs, motion, rows):
+            return "the workspace"
+        violation = self._beyond(motion, rows)
+        return violation.bound if violation is not None else None
+
     def _rows(self, path: Path, time: float, pose: Sequence[float]) -> tuple[Array, Array] | None:
         """Return the platform's motion and the sliders' at a time along a path; None where the robot is singular."""
         rows, near, law = np.zeros((6, 3)), np.array(pose, dtype=np.float64), constant(1.0)

@@ -16,10 +16,12 @@ from trirail.motion.runs import of_tool, rest
 from trirail.wire.messages import (
     Goal,
     MoveGoal,
+    NamedGoal,
     PlannedGoal,
     PoseGoal,
     SlidersGoal,
     Tool,
+    TrackGoal,
     TrajectoryGoal,
     VelocityGoal,
 )
@@ -41,7 +43,11 @@ class NamedFrames:
                 return self._pose(goal)
             case MoveGoal():
                 return self._move(goal, place)
-            case SlidersGoal() | VelocityGoal() | TrajectoryGoal():
+            case NamedGoal(name=name):  # what there is has a pose in its place when it comes here
+                raise RefusedError(
+                    RefusalCode.UNKNOWN_POSE, f"no pose {name!r}: `trirail poses` lists those that there are"
+                )
+            case SlidersGoal() | VelocityGoal() | TrackGoal() | TrajectoryGoal():
                 return goal
 
     def _pose(self, goal: PoseGoal) -> PoseGoal:

@@ -16,7 +16,8 @@ from trirail.motion.quintic import Point
 from trirail.motion.runs import MotionState, Run, nominal, rest, stretched
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import TimeScaling
-from trirail.wire.messages import PlannedGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
+from trirail.motion.tracking import Tracker
+from trirail.wire.messages import PlannedGoal, PoseGoal, SlidersGoal, TrackGoal, TrajectoryGoal, VelocityGoal
 
 SLOWEST = 0.05
 """Where the time along a path runs slower than this, a new goal is planned from a standstill."""
@@ -43,7 +44,9 @@ class PlannedMotion(NamedTuple):
     first: int | None = None
     """In which cycle of the schedule it begins; None where the robot stands, and it may begin at any time."""
     bound: str | None = None
-    """The limit before which a jog comes to rest."""
+    """The limit before which a jog comes to rest, or beyond which a track's target is."""
+    lag: float | None = None
+    """How far a point of the platform is at most from where a track's target has it, when it begins [m]."""
 
 
 class Extension(NamedTuple):
@@ -64,6 +67,8 @@ class Goals:
         self._checker = checker
         self._period = period
         self._planner = Planner(geometry, limits.platform, limits.slider, bounds, checker, period)
+        platform = Kinodynamic(limits.platform.velocity, limits.platform.acceleration, limits.platform.jerk)
+        self._tracker = Tracker(self._planner, platform, bounds, checker)
         self.time_scaling = TimeScaling(geometry, limits.platform, checker, period)
 
     def plan(self, goal: PlannedGoal, schedule: Schedule, rate: float, lead: int) -> PlannedMotion:
@@ -127,23 +132,23 @@ class Goals:
 
     def _set_out(self, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
         """Plan from the commanded motion."""
-        start = schedule.commanded
+        start, begins = schedule.commanded, schedule.cycle * self._period
         if start.at_rest:
-            plan = self._plan(goal, start)
+            plan = self._plan(goal, start, rate, begins)
             run = self.time_scaling.begin(plan.path, rate, start.pose)
-            return PlannedMotion(run, run.ends if rate else math.inf, plan.slowed, bound=plan.bound)
+            return PlannedMotion(run, run.ends if rate else math.inf, plan.slowed, bound=plan.bound, lag=plan.lag)
         if schedule.runs[0].at.rate < SLOWEST:
             raise TOO_FAST_IN_MOTION
         for now in (schedule.runs[0].at.rate, 1.0):  # an override that the old path could take the new one may not
             # The new path's time goes on at the rate of the old one's: in it, the motion is that much slower.
             velocity = [value / now for value in start.velocity]
             acceleration = [value / now**2 for value in start.acceleration]
-            plan = self._plan(goal, MotionState(start.pose, velocity, acceleration))
+            plan = self._plan(goal, MotionState(start.pose, velocity, acceleration), now, begins)
             run = self.time_scaling.begin(plan.path, now, start.pose)
             if run.target >= now:
                 final = self.time_scaling.possible(plan.path, rate, start.pose)
                 duration = plan.path.duration / final if final else math.inf
-                return PlannedMotion(run, duration, plan.slowed, bound=plan.bound)
+                return PlannedMotion(run, duration, plan.slowed, bound=plan.bound, lag=plan.lag)
         raise TOO_FAST_IN_MOTION
 
     def _stop_first(self, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
@@ -155,12 +160,13 @@ class Goals:
                 stop.change_law(law, 0.0)
         left = stop.ends - stop.time
         end = stop.state(left, schedule.commanded.pose).pose
-        plan = self._plan(goal, rest(end))
+        plan = self._plan(goal, rest(end), rate, schedule.cycle * self._period + left)
         run = self.time_scaling.begin(plan.path, rate, end)
         duration = left + run.ends if rate else math.inf
-        return PlannedMotion(run, duration, plan.slowed, stops_first=True, stop=law, bound=plan.bound)
+        return PlannedMotion(run, duration, plan.slowed, stops_first=True, stop=law, bound=plan.bound, lag=plan.lag)
 
-    def _plan(self, goal: PlannedGoal, start: MotionState) -> Plan:
+    def _plan(self, goal: PlannedGoal, start: MotionState, rate: float, begins: float) -> Plan:
+        """Plan from a state of motion; where a target is asks when that is [s], and at which rate the path is run."""
         planner = self._planner
         match goal:
             case PoseGoal():
@@ -169,6 +175,8 @@ class Goals:
                 return planner.to_sliders(start, goal.position, goal.speed)
             case VelocityGoal():
                 return planner.jog(start, (goal.x, goal.y, goal.phi), goal.timeout)
+            case TrackGoal():
+                return self._to_target(goal, start, rate or 1.0, begins)
             case TrajectoryGoal():
                 points = [Point(p.t, (p.x, p.y, p.phi), p.velocity, p.acceleration) for p in goal.points]
                 return planner.follow(start, points, goal.stretch)
@@ -176,6 +184,13 @@ class Goals:
     def _to_pose(self, goal: PoseGoal, start: MotionState) -> Plan:
         target = goal.x, goal.y, goal.phi
         return self._planner.to_pose(start, target, goal.speed, self._limits(goal), tool_of(goal))
+
+    def _to_target(self, goal: TrackGoal, start: MotionState, rate: float, begins: float) -> Plan:
+        """Plan to a target as it is when the path begins, in the path's own time."""
+        late = begins - goal.time if goal.time is not None else 0.0
+        pose = [at + late * v for at, v in zip((goal.x, goal.y, goal.phi), goal.velocity, strict=True)]
+        plan = self._tracker.follow(start, pose, [v / rate for v in goal.velocity], goal.timeout)
+        return plan._replace(lag=self._planner.nearness(start.pose, pose))
 
     def _limits(self, goal: PoseGoal) -> Kinodynamic | None:
         own = goal.limits

@@ -222,6 +222,12 @@ class Bounds:
         bounds["platform"] = np.transpose((platform.velocity, platform.acceleration, platform.jerk))
         bounds["period"] = period
 
+    @property
+    def box(self) -> Array:
+        """Low and high of x, y [m] and phi [rad], (2, 3)."""
+        box: Array = self.packed[0]["pose"].T
+        return box
+
     def pose(self, pose: ArrayLike) -> Violation | None:
         """Check a pose x, y [m], phi [rad] alone."""
         return self.violation(check_pose(self.packed, np.array(pose, dtype=np.float64), self.found))

@@ -17,7 +17,7 @@ from trirail.motion.feasibility import Checker, excess, fastest
 from trirail.motion.limits import COORDINATES, Bounds, beyond, told_apart
 from trirail.motion.paths import Path, constant
 from trirail.motion.quintic import Point, quintic
-from trirail.motion.ruckig_call import solved
+from trirail.motion.ruckig_call import solve_within
 from trirail.motion.runs import STILL, MotionState, from_ruckig, joined, of_centre, of_tool, rest, stretched, tools_of
 from trirail.motion.straight_lines import time_optimal
 
@@ -33,9 +33,6 @@ JOGS = 5
 """How often a jog is tried slower or shorter before it only brakes."""
 FASTEST_OVERRIDE = 2.0
 """At how many times its nominal rate the time along a path may be told to run."""
-JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
-"""Ruckig finds no solution just where one kind of profile gives way to another, as for a distance of 2 a³ / j²
-from rest to rest: there a hair less jerk has one."""
 A_HAIR_MORE = 1.0 + 1e-6
 """What rounding may lose."""
 START = 1e-4
@@ -67,7 +64,9 @@ class Plan(NamedTuple):
     slowed: float = 1.0
     """How many times slower it is than was asked for, for the limits' sake."""
     bound: str | None = None
-    """The limit before which a jog comes to rest."""
+    """The limit before which a jog comes to rest, or beyond which a track's target is."""
+    lag: float | None = None
+    """How far a point of the platform is at most from where a track's target has it, at the start [m]."""
 
 
 class Planner:
@@ -186,7 +185,7 @@ class Planner:
                 hold = max(0.0, found.leaves_at - ramp - brake)  # to rest where it would have been out of reach
             else:
                 share /= 2.0
-        path = self._to_velocity(start, STILL, self._platform)
+        path = self.to_velocity(start, STILL)
         if not self._checker.bears(self._checker.whole(path, start.pose)):
             raise TOO_FAST_IN_MOTION
         return Plan(path, bound=bound)
@@ -212,6 +211,10 @@ class Planner:
             )
         path, slower = self._slowed(path, slower, start.pose)
         return Plan(path, slower)
+
+    def to_velocity(self, start: MotionState, velocity: Sequence[float]) -> Path:
+        """Return the quickest way to a velocity within the platform's limits, not looked at. Raises RefusedError."""
+        return self._solve(start, self._platform, velocity=velocity)
 
     def nearness(self, pose: Sequence[float], target: Sequence[float]) -> float:
         """Return how far a point of the platform is at most from where it is to be [m]."""
@@ -281,7 +284,7 @@ class Planner:
 
     def _jog(self, start: MotionState, velocity: Sequence[float], hold: float) -> tuple[float, float, Path]:
         """Return how long it takes to reach a velocity, and to brake from it, and the whole path."""
-        ramp = self._to_velocity(start, velocity, self._platform)
+        ramp = self.to_velocity(start, velocity)
         if not any(velocity):
             return ramp.duration, 0.0, ramp
         pose = ramp.end
@@ -289,11 +292,8 @@ class Planner:
         held[0, :, 0], held[0, :, 1] = pose, velocity
         hold = max(hold, self._period)
         end = [value + hold * rate for value, rate in zip(pose, velocity, strict=True)]
-        brake = self._to_velocity(MotionState(end, velocity, STILL), STILL, self._platform)
+        brake = self.to_velocity(MotionState(end, velocity, STILL), STILL)
         return ramp.duration, brake.duration, joined([ramp, Path(np.array([0.0, hold]), held), brake])
-
-    def _to_velocity(self, start: MotionState, velocity: Sequence[float], limits: Kinodynamic) -> Path:
-        return self._solve(start, limits, velocity=velocity)
 
     def _solve(
         self,
@@ -358,13 +358,8 @@ class Planner:
         tool: Sequence[float] = NO_TOOL,
     ) -> Path:
         """Return Ruckig's answer as a path; the request lacks its limits of jerk. Raises RefusedError."""
-        for share in JERK_SHARES:
-            request.max_jerk = [share * limit for limit in jerk]
-            if solved(ruckig, request, trajectory):
-                return from_ruckig(trajectory, in_sliders, tool)
-        raise RefusedError(
-            RefusalCode.NO_PLAN, "no motion leads there from the present one: send the goal again when it holds"
-        )
+        solve_within(ruckig, request, trajectory, jerk)
+        return from_ruckig(trajectory, in_sliders, tool)
 
 
 def _check_ends(points: Sequence[Point], start: MotionState) -> None:

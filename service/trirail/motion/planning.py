@@ -18,7 +18,7 @@ from trirail.motion.packing import pack_path, pack_run, unpack_run
 from trirail.motion.runs import MotionState
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import planned_limits
-from trirail.wire.messages import PoseGoal, SlidersGoal
+from trirail.wire.messages import PoseGoal, SlidersGoal, TrackGoal
 from trirail.wire.planning import Extended, NotPlanned, PackedRun, PlanAnswer, Planned, PlanRequest
 
 
@@ -61,13 +61,15 @@ class MotionPlanner:
             decided.stops_first,
             pack_path(decided.stop) if decided.stop is not None else None,
             decided.bound,
+            decided.lag,
         )
 
     def warm_up(self) -> None:
         """Plan a motion of each kind: what runs for the first time is slow."""
         start = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         runs: tuple[PackedRun, ...] = ()
-        for goal in (PoseGoal(0.02, 0.01, 0.1), PoseGoal(-0.01, 0.0, 0.0, blend=0.01), SlidersGoal((0.01, 0.0, 0.0))):
+        pose, blended = PoseGoal(0.02, 0.01, 0.1), PoseGoal(-0.01, 0.0, 0.0, blend=0.01)
+        for goal in (pose, blended, SlidersGoal((0.01, 0.0, 0.0)), TrackGoal(0.0, 0.0, 0.0, (0.01, 0.0, 0.0), 0.0)):
             answer = self.plan(PlanRequest(0, 0, self._revision, 0, 2, 1.0, start, runs, goal))
             if isinstance(answer, Planned):
                 runs = (answer.run,)

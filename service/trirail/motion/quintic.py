@@ -31,11 +31,21 @@ def quintic(points: Sequence[Point], start: Sequence[float]) -> Path:
     v = _filled([point.velocity for point in points], t, p)
     v[0] = v[-1] = 0.0
     a = _filled([point.acceleration for point in points], t, v)
+    return _joined(t, p, v, a)
+
+
+def between(begin: Point, end: Point) -> Path:
+    """Return the quintic from one point to another, of which all is given: the way of least squared jerk."""
+    t, p, v, a = (np.array(values) for values in zip(begin, end, strict=True))
+    return _joined(t, p, v, a)
+
+
+def _joined(t: Array, p: Array, v: Array, a: Array) -> Path:
     h = np.diff(t)[:, None]
     gap = p[1:] - p[:-1] - h * v[:-1] - h**2 / 2.0 * a[:-1]
     speed = v[1:] - v[:-1] - h * a[:-1]
     pull = a[1:] - a[:-1]
-    pieces = np.zeros((len(points) - 1, 3, 6))
+    pieces = np.zeros((len(h), 3, 6))
     pieces[:, :, 0], pieces[:, :, 1], pieces[:, :, 2] = p[:-1], v[:-1], a[:-1] / 2.0
     pieces[:, :, 3] = 10.0 * gap / h**3 - 4.0 * speed / h**2 + pull / (2.0 * h)
     pieces[:, :, 4] = -15.0 * gap / h**4 + 7.0 * speed / h**3 - pull / h**2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import select
 import signal
@@ -36,13 +37,14 @@ from trirail.wire.messages import (
     CommandReply,
     ErrorReply,
     Event,
+    Goal,
     GoalReply,
     NoContent,
     Override,
     ReleaseLease,
     RoleReply,
-    SentGoal,
     Stop,
+    TrackGoal,
 )
 from trirail.wire.packets import (
     Accepted,
@@ -68,9 +70,10 @@ SWITCH_EVERY = 0.0005
 """After so long a thread lets another have the interpreter, which Zenoh's threads need to hand a message over [s]."""
 AT_ONCE = 256
 """Messages from Zenoh that are read before the loop is listened to again."""
-AHEAD = 2
-"""Goals of one user that the loop has at once, so that it has the next one when it is done with the last. The others
-wait here: a command overtakes them, and what waits when the robot is told to stop does not begin any more."""
+AHEAD = 3
+"""Goals of one user that the loop has at once: one that is planned, the next one, and one more, which takes the next
+one's place where both tell of the same target. The others wait here: a command overtakes them, and what waits when the
+robot is told to stop does not begin any more."""
 AHEAD_OF_ALL = 16
 """Goals that the loop has at once, of all users: what it takes in four cycles."""
 UNDER_WAY = 8
@@ -157,7 +160,8 @@ class Gateway:
         except Closed:
             self._tell_of_its_end()
         finally:
-            self._poses.close()
+            with contextlib.suppress(Closed):
+                self._poses.close()
             for incoming in [
                 *(waiting.incoming for waiting in self._waiting.values()),
                 *(goal.incoming for goal in self._backlog),
@@ -202,12 +206,14 @@ class Gateway:
 
     def _goal(self, incoming: Incoming) -> None:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
-        sent: SentGoal = boundary.decode(incoming.payload, SentGoal, "not a goal", incoming.encoding)
-        goal = self._poses.stated(sent)
+        sent: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
+        goal = self._poses.of_name(sent)
         self._backlog.check_room(user, incoming.size)
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
-        self._backlog.add(incoming, GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns()))
+        told_of = goal.time if isinstance(goal, TrackGoal) else None
+        age = time.time() - told_of if told_of is not None else 0.0
+        self._backlog.add(incoming, GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns(), age=age))
         self._send_goals()
 
     def _send_goals(self) -> None:
@@ -332,9 +338,9 @@ class Gateway:
                 self._happened(event)
             case Status() | Welcome():
                 self._states.update(answer)
-            case Accepted(ticket, goal_id, duration, slowed, stops_first, queued):
+            case Accepted(ticket, goal_id, duration, slowed, stops_first, queued, lag):
                 expected = duration if math.isfinite(duration) else None
-                self._answer(ticket, GoalReply(goal_id, expected, slowed, stops_first, queued))
+                self._answer(ticket, GoalReply(goal_id, expected, slowed, stops_first, queued, lag))
             case Confirmed(ticket, name, mode):
                 self._answer(ticket, CommandReply(name, mode))
             case Refused(ticket, code, text, slider, value, limit):

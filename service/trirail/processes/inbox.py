@@ -128,7 +128,7 @@ class Inbox:
 
     def _next(self, now: float) -> Incoming | None:
         for queue, pace in self._lanes:
-            user = next((user for user in queue.users if not pace.wait(user, now)), None)
+            user = next((user for user in queue.users if not _wait(pace, user, now)), None)
             if user is not None:
                 pace.count(user, now)
                 incoming = queue.take(user)
@@ -137,7 +137,7 @@ class Inbox:
         return None
 
     def _due(self, now: float) -> float:
-        return min((pace.wait(user, now) for queue, pace in self._lanes for user in queue.users), default=math.inf)
+        return min((_wait(pace, user, now) for queue, pace in self._lanes for user in queue.users), default=math.inf)
 
     def _on_query(self, kind: Kind, query: zenoh.Query) -> None:
         encoding = str(query.encoding) if query.encoding is not None else ""
@@ -167,3 +167,8 @@ class Inbox:
             self.wake()
         else:
             self._too_much(incoming._replace(payload=b""))
+
+
+def _wait(pace: Pace, user: str, now: float) -> float:
+    """Return how long a user's next message has to wait; what names nobody only asks, and waits for its turn alone."""
+    return pace.wait(user, now) if user else 0.0

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 
 from trirail.control.ledger import REMEMBERED_IDS, Notice
-from trirail.wire.messages import Event, Fault
+from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.packets import Answer, ControlInput, Farewell, GoalRequest, Happened, Status
 from trirail.wire.vocabulary import FaultCause, Mode
 
@@ -73,7 +73,7 @@ class LastWords:
         reason = self.reason
         if not reason:
             return []
-        missing = [Notice("fault", "error", reason, fault=Fault(FaultCause.LOOP))]
+        missing = [Notice("fault", "error", reason, fault=FaultDetail(FaultCause.LOOP))]
         for goal_id, user in self._open.items():
             words = f"goal {goal_id} faulted: {reason}"
             missing.append(Notice("goal", "error", words, id=goal_id, outcome="faulted", reason=reason, user=user))

@@ -303,8 +303,8 @@ class Loop:
         """Tell what records do not say, where that has changed."""
         control, goal = self.control, self.control.ledger.goal
         goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
-        fault = quoted(control.fault) if control.fault else None
-        said = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user
+        fault, lag = quoted(control.fault) if control.fault else None, goal.lag if goal else None
+        said = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user, lag
         status = message(Status(*said))
         if status != self._status:
             self._status = status

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from trirail.wire.messages import Event, Fault
+from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.state import FrameCounts, State
 
 TOLD_EVERY: Final = 1.0
@@ -21,7 +21,7 @@ SETTLE_BOUNDS: Final = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Of that of settle times [s]."""
 KINDS_OF_FAULT: Final = 20
 """So many faults are told apart, by cause, drive and code; what more there are count as one."""
-OTHER: Final = Fault("other")
+OTHER: Final = FaultDetail("other")
 
 
 class Histogram(Struct):
@@ -50,7 +50,7 @@ class Histogram(Struct):
 class FaultCount(Struct, frozen=True):
     """How often there was a fault of a kind."""
 
-    fault: Fault
+    fault: FaultDetail
     times: int
 
 
@@ -88,7 +88,7 @@ class RecorderMeasured(Struct, frozen=True):
     """Cycles that the recorder itself was too slow for."""
 
 
-class Measured:
+class Measurements:
     """What gateway and recorder told last, and when."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -120,7 +120,7 @@ class Meter:
         self._lateness, self._cycle = Histogram.of(CYCLE_BOUNDS), Histogram.of(CYCLE_BOUNDS)
         self._settle = Histogram.of(SETTLE_BOUNDS)
         self._goals: dict[str, int] = {}
-        self._faults: dict[Fault, int] = {}
+        self._faults: dict[FaultDetail, int] = {}
 
     def records(self, rows: NDArray[np.void]) -> None:
         """Take in a batch of records."""

@@ -13,7 +13,7 @@ from prometheus_client.registry import Collector
 from trirail_drivers.interface import NAMES
 
 from trirail.processes.health import Health, Running
-from trirail.processes.measured import Histogram, Measured, ServiceMeasured
+from trirail.processes.measured import Histogram, Measurements, ServiceMeasured
 from trirail.wire.vocabulary import MODES
 
 PREFIX: Final = "trirail"
@@ -26,7 +26,7 @@ TICKS: Final = os.sysconf("SC_CLK_TCK")
 class ServiceMetrics(Collector):
     """All metrics of a service."""
 
-    def __init__(self, robot: str, version: str, health: Health, measured: Measured) -> None:
+    def __init__(self, robot: str, version: str, health: Health, measured: Measurements) -> None:
         self._robot = robot
         self._version = version
         self._health = health

@@ -24,7 +24,7 @@ from prometheus_client import CollectorRegistry, make_wsgi_app
 from trirail.config import Config, metrics_url
 from trirail.errors import ServiceError
 from trirail.processes.health import Health
-from trirail.processes.measured import Measured
+from trirail.processes.measured import Measurements
 from trirail.processes.metrics import ServiceMetrics
 from trirail.telemetry.provenance import software
 from trirail.wire.credentials import Credentials, with_role
@@ -40,7 +40,7 @@ _Start = Callable[..., Any]
 class MetricsServer:
     """Serves while the context lasts. Raises ServiceError where the port is taken or a certificate is no good."""
 
-    def __init__(self, config: Config, health: Health, measured: Measured) -> None:
+    def __init__(self, config: Config, health: Health, measured: Measurements) -> None:
         telemetry = config.telemetry
         self._address = telemetry.metrics_address, telemetry.metrics_port
         self._health = health

@@ -11,7 +11,7 @@ import msgspec
 from trirail.config import Config
 from trirail.processes.health import Health, Running
 from trirail.processes.heartbeats import Heartbeats
-from trirail.processes.measured import Measured, RecorderMeasured, ServiceMeasured
+from trirail.processes.measured import Measurements, RecorderMeasured, ServiceMeasured
 
 KINDS: Final = {"gateway": ServiceMeasured, "recorder": RecorderMeasured}
 """What each process measures."""
@@ -23,7 +23,7 @@ class Monitor:
     def __init__(self, config: Config, heartbeats: Heartbeats, turn: float) -> None:
         self._config = config
         self.health = Health(heartbeats, config.period, turn)
-        self.measured = Measured()
+        self.measured = Measurements()
         self._serving = ExitStack()
 
     def __enter__(self) -> Monitor:

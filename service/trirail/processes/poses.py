@@ -21,7 +21,7 @@ from trirail.kinematics.geometry import travels
 from trirail.processes.inbox import Incoming
 from trirail.processes.pose_file import PoseFile, state_directory
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.messages import Coordinates, Goal, NamedGoal, NoContent, PoseGoal, SentGoal
+from trirail.wire.messages import Coordinates, ErrorReply, Goal, NamedGoal, NoContent, PoseGoal
 from trirail.wire.packets import PoseChanged
 from trirail.wire.state import NamedPose, NamedPoses
 from trirail.wire.vocabulary import MODES, Mode
@@ -84,14 +84,11 @@ class Poses:
             tuple(NamedPose(name, *found[name], taught=name not in self._configured) for name in sorted(found))
         )
 
-    def stated(self, goal: SentGoal) -> Goal:
-        """Return the goal that the loop is to be given. Raises RefusedError for a name that there is not."""
-        if not isinstance(goal, NamedGoal):
-            return goal
-        pose = self._configured.get(goal.name) or self._taught.get(goal.name)
+    def of_name(self, goal: Goal) -> Goal:
+        """Return the pose goal that a named one means; any other, and one of a name that there is not, as it is."""
+        pose = (self._configured.get(goal.name) or self._taught.get(goal.name)) if isinstance(goal, NamedGoal) else None
         if pose is None:
-            there_are = ", ".join(sorted({*self._taught, *self._configured})) or "none: teach one"
-            raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {goal.name!r}: there is {there_are}")
+            return goal
         same = {name: getattr(goal, name) for name in ("id", "speed", "valid_for", "limits", "blend")}
         return PoseGoal(*pose, **same)
 
@@ -143,12 +140,16 @@ class Poses:
                 self._taught[change.name] = pose
             else:
                 del self._taught[change.name]
-            self._tell(PoseChanged(change.user, _words(change)))
             self._reply(change.incoming, NamedPose(change.name, *pose, taught=True))
+            self._tell(PoseChanged(change.user, _words(change)))
 
     def close(self) -> None:
-        """Write what is to be written, and no more."""
+        """Write what is to be written and answer it; what waits for a record has none any more."""
+        for wanted in self._to_measure:
+            self._reply(wanted.incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
+        self._to_measure.clear()
         self._writer.shutdown()
+        self.settle()
 
     def _check_known(self, name: str) -> None:
         if name in self._taught:
@@ -191,5 +192,5 @@ class Poses:
 def _words(change: _Change) -> str:
     if change.pose is None:
         return f"pose {change.name} removed by {change.user}"
-    x, y, phi = change.pose
-    return f"pose {change.name} taught by {change.user}: x {x:.6f} m, y {y:.6f} m, phi {phi:.6f} rad"
+    x, y, phi = (f"{round(value, 4) + 0.0:g}" for value in np.array(change.pose) * (1e3, 1e3, np.degrees(1.0)))
+    return f"pose {change.name} taught by {change.user}: x {x} mm, y {y} mm, phi {phi}°"

@@ -21,6 +21,7 @@ from trirail.processes.measured import TOLD_EVERY, RecorderMeasured
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.session_index import SessionIndex
 from trirail.wire.links import Closed, PacketLink
 from trirail.wire.messages import Level
 from trirail.wire.packets import Answer, ControlInput, Happened, Kind, Remark, Status, Welcome, decode_answer, message
@@ -45,11 +46,15 @@ class Intake:
         self._cycle = 0
         self._last_words = LastWords(config.period)
         path = Path(record) if record else None
-        self.recorder = recorder = Recorder(config, Path(config.telemetry.directory), path=path, warn=self._warn)
+        directory = Path(config.telemetry.directory)
+        index = None if path else SessionIndex(directory)  # where somebody wants one file he finds it by himself
+        self.recorder = recorder = Recorder(config, directory, path=path, index=index, warn=self._warn)
         folder = recorder.path.parent
-        self._box = BlackBox(
-            config.loop.rate_hz, lambda name: Recorder(config, folder, name=name, live=False), self._warn
-        )
+
+        def box(name: str, reason: str) -> Recorder:
+            return Recorder(config, folder, name=name, reason=reason, index=index, live=False)
+
+        self._box = BlackBox(config.loop.rate_hz, box, self._warn)
 
     def take(self, packet: bytes) -> None:
         """Take a packet."""

@@ -102,7 +102,7 @@ class StateMaker:
                 status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
                 traffic=(FrameCounts(*a), FrameCounts(*b), FrameCounts(*c)),
             ),
-            goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._status.target)
+            goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._status.target, self._status.lag)
             if goal
             else None,
             settled=bool(row["settled"]),

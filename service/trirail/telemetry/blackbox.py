@@ -12,13 +12,12 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable
-from datetime import datetime
 from operator import methodcaller
 from typing import NamedTuple
 
 from trirail.errors import ServiceError
+from trirail.telemetry.contents import box_name
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.retention import BLACK_BOX
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput, Happened, decode_answer, encode
 from trirail.wire.records import last_cycle
@@ -34,6 +33,8 @@ SAID_MB = 32.0
 """How much is kept of what was said and asked, packed [1e6 bytes]: a flood of messages may say more in a minute."""
 
 Fill = Callable[[Recorder], None]
+Begin = Callable[[str, str], Recorder]
+"""Makes the recorder of a black box of this name, kept for this reason."""
 
 
 class Kept(NamedTuple):
@@ -50,9 +51,9 @@ class Kept(NamedTuple):
 
 
 class BlackBox:
-    """Takes all that the recorder takes. `begin` makes a recorder for a name; `say` tells of the file, or why not."""
+    """Takes all that the recorder takes. `begin` makes a recorder; `say` tells of the file, or why not."""
 
-    def __init__(self, rate_hz: int, begin: Callable[[str], Recorder], say: Callable[[str], None]) -> None:
+    def __init__(self, rate_hz: int, begin: Begin, say: Callable[[str], None]) -> None:
         self._rate_hz = rate_hz
         self._begin = begin
         self._say = say
@@ -129,7 +130,7 @@ class BlackBox:
 
     def _fill(self, fault: Event, fills: list[Fill]) -> None:
         try:
-            recorder = self._begin(f"{BLACK_BOX}{datetime.fromtimestamp(fault.time).astimezone():%Y%m%d-%H%M%S}")
+            recorder = self._begin(box_name(fault.time), fault.message)
         except ServiceError as error:
             self._say(f"the last minute before the fault is not kept: {error}")
             return

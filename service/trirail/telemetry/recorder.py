@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sqlite3
 import time
 from collections.abc import Callable
 from datetime import datetime
@@ -17,8 +18,10 @@ from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.telemetry import provenance, retention
 from trirail.telemetry.candump import CandumpLog
+from trirail.telemetry.contents import STAMP, Contents
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.rotation import RotatedFiles, claim
+from trirail.telemetry.session_index import SessionIndex
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
@@ -42,7 +45,8 @@ class Recorder:
 
     Its files are `path` or `<robot>-<date>-<time>.rrd` in `directory`, and where it is rotated the same with
     `-part2` and so on; with telemetry.capture_can, every CAN frame goes to a .log file beside the first. A black
-    box, given its `name` and not a path, is one file, which takes what room there is.
+    box, given its `name` and `reason` and not a path, is one file, which takes what room there is. What is in each
+    file is entered into the `index` when it is complete.
 
     `warn` is told what is missing; else that stands in the log alone. Raises ServiceError if the file cannot be
     written or the live port is taken, FileError if `path` is no regular file.
@@ -55,6 +59,8 @@ class Recorder:
         *,
         path: Path | None = None,
         name: str | None = None,
+        reason: str | None = None,
+        index: SessionIndex | None = None,
         live: bool = True,
         warn: Callable[[str], None] | None = None,
         wall_ns: Callable[[], int] = time.time_ns,
@@ -64,7 +70,7 @@ class Recorder:
         self._config = config
         self._is_black_box = name is not None
         self._own_folder = directory if path is None and name is None else None
-        session = name or f"{config.robot.name}-{datetime.fromtimestamp(started_ns * 1e-9).astimezone():%Y%m%d-%H%M%S}"
+        session = name or f"{config.robot.name}-{datetime.fromtimestamp(started_ns * 1e-9).astimezone():{STAMP}}"
         telemetry = config.telemetry
         server = live_server(telemetry.live_port, telemetry.live_mb) if live and telemetry.live_port else None
         try:
@@ -79,6 +85,8 @@ class Recorder:
             ) from error
         self._streams = streams = Streams(ShownRobot.configured(config), session, started_ns - monotonic_ns())
         self._warn = warn or (lambda words: streams.say("warning", words))
+        self._index, self._reason, self._wall_offset_ns = index, reason, started_ns - monotonic_ns()
+        self._contents: Contents | None = None
         reserve = 0 if self._is_black_box else RESERVE
         self._files = RotatedFiles(first, self._open, streams.drop, reserve, lambda: monotonic_ns() * 1e-9)
         self._records = Batches(config.loop.rate_hz // RECORDS_HZ, self._record)
@@ -135,6 +143,8 @@ class Recorder:
             self._look_after()
         self._records.add(batch)
         self._streams.records(batch)
+        if self._contents is not None:
+            self._contents.records(batch, self._wall_offset_ns)
 
     def save(self) -> None:
         """Write all records that have been taken, and what was said: they outlive this process."""
@@ -144,10 +154,14 @@ class Recorder:
     def event(self, event: Event) -> None:
         """Take an event."""
         self._streams.event(event)
+        if self._contents is not None:
+            self._contents.event(event)
 
     def given(self, what: ControlInput) -> None:
         """Take what the control was given."""
         self._streams.given(what)
+        if self._contents is not None:
+            self._contents.given(what)
 
     def stands(self, standing: Standing) -> None:
         """Take what holds from now on and records do not say."""
@@ -169,6 +183,7 @@ class Recorder:
             self._streams.say("warning", words)
             self._streams.save()
         self._files.close()
+        self._enter()
         if self._frames:
             self._frames.close()
         if self._live:
@@ -176,11 +191,22 @@ class Recorder:
 
     def _open(self, path: Path) -> rr.RecordingStream:
         """Begin a file: with all in it that it takes to be looked at by itself."""
+        self._enter()
+        self._contents = Contents(path.name, self._config.robot.name, reason=self._reason)
         stream = self._streams.open(rr.FileSink(path))
         for entity, text in provenance.texts(self._config).items():
             stream.log(entity, rr.TextDocument(text), static=True)
         self._streams.begin_anew()
         return stream
+
+    def _enter(self) -> None:
+        """Enter what is in the file that is complete now into the index."""
+        if self._index is None or self._contents is None:
+            return
+        try:
+            self._index.put([self._contents])
+        except (sqlite3.Error, OSError) as error:
+            self._warn(f"the index of sessions takes no more, trirail sessions makes it anew: {error}")
 
     def _record(self, records: NDArray[np.void]) -> None:
         self._files.send(self._streams.scene.complete(records))
@@ -213,9 +239,11 @@ class Recorder:
 
     def _tidy(self, folder: Path, at_most: float) -> None:
         try:
-            retention.tidy(folder, at_most)
-        except OSError as error:
-            words = f"cannot delete old recordings: {error}"
+            deleted = retention.tidy(folder, at_most)
+            if deleted and self._index is not None:
+                self._index.forget([path.name for path in deleted])
+        except (OSError, sqlite3.Error) as error:
+            words = f"cannot delete old recordings, or their rows in the index: {error}"
             if words != self._untidy:
                 self._untidy = words
                 self._warn(words)

@@ -35,6 +35,7 @@ Coordinates = tuple[Coordinate, Coordinate, Coordinate]
 Speed = Annotated[float, Meta(ge=1e-3, le=1.0)]
 Validity = Annotated[float, Meta(ge=1e-3, le=86_400.0)]
 Moment = Annotated[float, Meta(ge=-86_400.0, le=86_400.0)]
+Clock = Annotated[float, Meta(ge=-1e11, le=1e11)]
 OwnTriple = tuple[OwnLimit, OwnLimit, OwnLimit]
 FrameName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
 PoseName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
@@ -175,6 +176,36 @@ class VelocityGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="k
         _check(self)
 
 
+class TrackGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="track"):
+    """Follow a moving target, renewed 10 to 200 times a second, until `timeout` passes without a fresh one of its id.
+
+    Between two messages the target is taken to go on with its velocity. What is too fast is followed as fast as the
+    limits allow; where the target is out of reach the platform waits at the border. Who does not renew it in time has
+    the robot brake on its path.
+    """
+
+    x: Coordinate
+    """Where the target is at `time`: there the platform's centre is to be, in the base frame [m]."""
+    y: Coordinate
+    """Likewise [m]."""
+    phi: Coordinate
+    """The angle that the platform is to have then, counterclockwise [rad]."""
+    velocity: Coordinates = (0.0, 0.0, 0.0)
+    """Of x, y and phi then [m/s, m/s, rad/s]."""
+    time: Clock | None = None
+    """When that is so, by the wall clock of the service's machine [s since 1970]: clocks of two machines must agree to
+    a millisecond or so. At most half a second ago or ahead; without it, when the message comes."""
+    id: Identifier | None = None
+    """The same for every renewal of one track."""
+    timeout: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.25
+    """Real time, at every override, after which a track that is not renewed brakes [s]."""
+    valid_for: Validity | None = None
+    """As of a pose goal [s]."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
 class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
     """Where the platform is at a time [s]: x, y [m], phi [rad]; how fast and how accelerated, where given."""
 
@@ -219,11 +250,11 @@ class TrajectoryGoal(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
                 )
 
 
-PlannedGoal = PoseGoal | SlidersGoal | VelocityGoal | TrajectoryGoal
-"""What the planner is asked for; its tools are points and its poses those of the base frame."""
-Goal = PlannedGoal | MoveGoal
-SentGoal = Goal | NamedGoal
-"""What clients send. The gateway puts poses in the place of their names: the loop, and recordings, know none."""
+RenewedGoal = VelocityGoal | TrackGoal
+"""What lasts only while it is renewed, by goals of its own kind, id and user."""
+PlannedGoal = PoseGoal | SlidersGoal | VelocityGoal | TrackGoal | TrajectoryGoal
+"""What the planner is asked for; its tools are points, its poses those of the base frame, its times the loop's."""
+Goal = PlannedGoal | MoveGoal | NamedGoal
 
 
 class Override(Struct, frozen=True, forbid_unknown_fields=True):
@@ -300,7 +331,8 @@ class GoalReply(Struct, frozen=True):
     id: str
     """The goal's own, or the one that was made for it."""
     duration: float | None
-    """Expected time from now to the end of its path [s]; None while the override is zero: then it has no expected end.
+    """Expected time from now to the end of its path [s]; None while the override is zero: then it has no expected end,
+    and for what was told of a target before something newer took its place.
     It is done when the robot has been in position for the dwell of [limits.in_position] after that."""
     slowed: float = 1.0
     """How many times slower it is than was asked for, since a slider or the platform may not move so fast."""
@@ -308,6 +340,9 @@ class GoalReply(Struct, frozen=True):
     """The robot stops on its old path first: from its present motion it could not, or would be later."""
     queued: bool = False
     """It begins when the goals before it are reached."""
+    lag: float | None = None
+    """Of a track: how far a point of the platform was at most from where the target had it, when this was taken up
+    [m]."""
     accepted: Literal[True] = True
 
 
@@ -354,7 +389,7 @@ class Residual(Struct, frozen=True):
     """Of x, y [m] and phi [rad]."""
 
 
-class Fault(Struct, frozen=True, omit_defaults=True):
+class FaultDetail(Struct, frozen=True, omit_defaults=True):
     """What a fault is about, for programs."""
 
     cause: str
@@ -405,5 +440,5 @@ class Event(Struct, frozen=True, omit_defaults=True):
     overshoot: Triple | None = None
     """Likewise, how far each of the sliders A, B, C was beyond its target at most since the end of the path, in the
     direction in which it was last commanded to move; of one that was not to move, to either side [m]."""
-    fault: Fault | None = None
+    fault: FaultDetail | None = None
     """What it is about, with kind fault."""

@@ -35,6 +35,8 @@ class GoalRequest(Struct, frozen=True, tag=True):
     """When it came, by the monotonic clock."""
     withdrawn: str | None = None
     """Why it must not begin any more, for a goal that waited when the robot was told to stop."""
+    age: float = 0.0
+    """How old what it says was when it came, of a track's target: negative where that is ahead [s]."""
 
 
 class CommandRequest(Struct, frozen=True, tag=True):
@@ -75,11 +77,12 @@ class Accepted(Struct, frozen=True, tag=True):
     ticket: int
     id: str
     duration: float
-    """Expected time from now to the end of its path [s]; infinite at override 0."""
+    """Expected time from now to the end of its path [s]; infinite at override 0, and where something newer is taken."""
     slowed: float
-    """As in trirail.wire.messages.GoalReply, and the two below."""
+    """As in trirail.wire.messages.GoalReply, and the three below."""
     stops_first: bool
     queued: bool
+    lag: float | None = None
 
 
 class Confirmed(Struct, frozen=True, tag=True):
@@ -134,12 +137,14 @@ class Status(Struct, frozen=True, tag=True):
     fault: str | None
     """Why the robot is in fault."""
     target: Triple | None = None
-    """The pose that the goal leads to; None for a jog."""
+    """The pose that the goal leads to, of a track that its target was last told to have; None for a jog."""
     bus_load: float = 0.0
     """Share of the bus that was in use in the last second."""
     counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
     lease: str | None = None
     """The user who holds the lease."""
+    lag: float | None = None
+    """Of a track, as in trirail.wire.messages.GoalReply, when it was last renewed."""
 
 
 class Disturbance(Struct, frozen=True, tag="Mishap"):  # as recordings have it

@@ -76,7 +76,9 @@ class Planned(Struct, frozen=True, tag=True):
     stop: PackedPath | None = None
     """The law of that stop; None where the law that the motion under way has is the one to stand by."""
     bound: str | None = None
-    """The limit before which a jog comes to rest."""
+    """The limit before which a jog comes to rest, or beyond which a track's target is."""
+    lag: float | None = None
+    """How far a point of the platform is at most from where a track's target has it, when the run begins [m]."""
 
 
 class Extended(Struct, frozen=True, tag=True):

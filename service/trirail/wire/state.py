@@ -70,7 +70,10 @@ class GoalState(Struct, frozen=True):
     remaining: float
     """Time to the end of its path [s]; 0 while it settles."""
     target: Triple | None = None
-    """The pose that it leads to; None for a jog."""
+    """The pose that it leads to, of a track that its target was last told to have; None for a jog."""
+    lag: float | None = None
+    """Of a track: how far a point of the platform was at most from where the target had it, when it was last renewed
+    [m]."""
 
 
 class Percentiles(Struct, frozen=True):

@@ -1,0 +1,144 @@
+"""`trirail sessions`: which sessions were recorded, by robot, time, fault, user and outcome."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+from cyclopts import Parameter
+from rich.table import Table
+
+from trirail.cli import terminal
+from trirail.cli.options import Flag
+from trirail.errors import ServiceError
+from trirail.telemetry import palette
+from trirail.wire.messages import Outcome
+from trirail.wire.text import wall_clock
+
+if TYPE_CHECKING:
+    from trirail.telemetry.session_index import RecordedSession, SessionIndex
+
+FOLDER = Path("recordings")
+"""Where a service records that was started in this folder."""
+
+
+def sessions(
+    folder: Path = FOLDER,
+    /,
+    *,
+    robot: Annotated[str | None, Parameter(env_var="TRIRAIL_ROBOT")] = None,
+    since: datetime | None = None,
+    until: datetime | None = None,
+    fault: str | None = None,
+    user: str | None = None,
+    outcome: Outcome | None = None,
+    last: int = 20,
+    rebuild: Annotated[bool, Flag] = False,
+    json: Annotated[bool, Flag] = False,
+) -> int:
+    """List recorded sessions, the newest last: when, whose goals ended how, faults, and why a black box was kept.
+
+    What the index of the folder lacks, as after a kill, is read first.
+
+    Parameters
+    ----------
+    folder
+        Folder of recordings, [telemetry] directory; recordings/ here if absent.
+    robot
+        Only those of this robot.
+    since
+        Only those that went on then or later: 2026-01-31 or 2026-01-31T12:00:00, local time.
+    until
+        Only those that had begun by then.
+    fault
+        Only those with a fault whose cause, code or message has this: emcy, 0x8700, "drive A".
+    user
+        Only those in which this user sent something.
+    outcome
+        Only those with a goal that ended so; with --user, a goal of his.
+    last
+        At most so many, the newest; 0 for all.
+    rebuild
+        Throw the index away and read every recording.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail.telemetry.session_index import SessionIndex, Wanted
+
+    if not folder.is_dir():
+        raise ServiceError(f"{folder}: no such folder: name that of [telemetry] directory")
+    wanted = Wanted(
+        robot, since.timestamp() if since else None, until.timestamp() if until else None, fault, user, outcome
+    )
+    index = SessionIndex(folder)
+    try:
+        if rebuild:
+            index.clear()
+        _update(index)
+        found = index.find(wanted)
+    except (sqlite3.Error, OSError) as error:
+        raise ServiceError(f"{folder}: the index of its recordings cannot be used: {error}") from error
+    shown = found[-last:] if last else found
+    if json:
+        terminal.json({"folder": str(folder), "found": len(found), "sessions": msgspec.to_builtins(shown)})
+        return 0
+    _print(shown, len(found))
+    return 0
+
+
+SAID_EVERY = 1.0
+"""How often it is said how far reading has come [s]."""
+
+
+def _update(index: SessionIndex) -> None:
+    """Read what the index lacks, and say so where that takes long."""
+    due = time.monotonic() + SAID_EVERY
+    for number, path in enumerate(index.update(), 1):
+        if time.monotonic() >= due:
+            due = time.monotonic() + SAID_EVERY
+            print(f"reading {path.name}, recording {number} that the index lacks", file=sys.stderr)  # noqa: T201
+
+
+def _print(found: list[RecordedSession], of: int) -> None:
+    table = Table("began", "lasted", "robot", "goals", "users", "faults", "files", box=None, pad_edge=False)
+    for session in found:
+        table.add_row(
+            wall_clock(session.began) if session.began is not None else "nothing recorded",
+            _lasted(session),
+            terminal.plain(session.robot),
+            " ".join(
+                f"[{palette.code(palette.OUTCOMES[outcome])}]{times} {outcome}[/]"
+                for outcome, times in session.goals.items()
+            ),
+            terminal.plain(" ".join(session.users)),
+            _faults(session),
+            terminal.plain(" ".join(session.files)),
+        )
+    if found:
+        terminal.out.print(table)
+    terminal.say(f"{len(found)} of {of} sessions" if len(found) < of else f"{of} sessions")
+
+
+def _lasted(session: RecordedSession) -> str:
+    if session.began is None or session.ended is None:
+        return ""
+    minutes, seconds = divmod(round(session.ended - session.began), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}"
+
+
+def _faults(session: RecordedSession) -> str:
+    """Why a black box was kept; of a session its first fault, and how many more there were."""
+    if session.trouble is not None:
+        return f"[yellow]{terminal.plain(session.trouble)}[/]"
+    if session.reason is not None:
+        return f"[bold red]kept for:[/] {terminal.plain(session.reason)}"
+    if not session.faults:
+        return ""
+    more = len(session.faults) - 1
+    return f"[red]{terminal.plain(session.faults[0])}[/]{f' and {more} more' if more else ''}"

@@ -1,0 +1,106 @@
+"""What an asyncio program holds of a goal that the service has accepted."""
+
+from __future__ import annotations
+
+import asyncio
+import uuid
+from collections.abc import Awaitable, Callable
+from typing import Self
+
+import msgspec
+
+from trirail.client.goal import STANDS_WITHIN, AcceptedGoal, Result
+from trirail.errors import RefusalCode, RefusedError, TrirailError
+from trirail.wire.messages import Goal, Stop, VelocityGoal
+from trirail.wire.vocabulary import Command
+
+
+class AsyncGoalHandle(AcceptedGoal):
+    """A goal that the service has accepted: this object only follows it.
+
+    `command` sends a command with its content, as AsyncRobot.command does.
+    """
+
+    def __init__(self, goal_id: str, command: Callable[[Command, bytes], Awaitable[object]]) -> None:
+        super().__init__(goal_id)
+        self._command = command
+        self._ended = asyncio.Event()
+
+    async def cancel(self) -> None:
+        """Stop it, as GoalHandle.cancel does. To cancel a task that waits for it does not stop it."""
+        await self._command(Command.STOP, msgspec.json.encode(Stop(self.id)))
+
+    async def wait(self, timeout: float | None = None) -> Result:
+        """Wait for its end, however it ends; look at `outcome` of the result.
+
+        Raises TimeoutError if that takes longer than `timeout` seconds; the goal itself goes on.
+        """
+        try:
+            async with asyncio.timeout(timeout):
+                await self._ended.wait()
+        except TimeoutError as error:
+            raise TimeoutError(f"goal {self.id} has not ended within {timeout:g} s") from error
+        assert self._result is not None
+        return self._result
+
+    def end(self, result: Result) -> None:
+        """Take in how it ended."""
+        self._result = result
+        self._ended.set()
+
+
+class AsyncJog:
+    """A velocity that is kept alive while the context lasts, as trirail.client.goal.Jog; renewed by a task."""
+
+    def __init__(
+        self,
+        send: Callable[[Callable[[str], Goal], str], Awaitable[AsyncGoalHandle]],
+        velocity: tuple[float, float, float],
+        timeout: float,
+    ) -> None:
+        self._send_goal = send
+        self._velocity = velocity
+        self._timeout = timeout
+        self._id = uuid.uuid4().hex[:12]
+        self._goal: AsyncGoalHandle | None = None
+        self._over = asyncio.Event()
+        self._renewing: asyncio.Task[None] | None = None
+        self.error: Exception | None = None
+        """Why it could not be renewed any more."""
+
+    @property
+    def result(self) -> Result | None:
+        """How it ended, None while it has not."""
+        return self._goal.result if self._goal else None
+
+    async def __aenter__(self) -> Self:
+        self._goal = await self._send()
+        self._renewing = asyncio.create_task(self._renew(), name="jog")
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._over.set()
+        if self._renewing is not None:
+            await self._renewing  # a renewal that is on its way is not taken back
+        if self._goal is not None and self.error is None:
+            await self._goal.wait(self._timeout + STANDS_WITHIN)
+
+    async def _is_over(self, within: float) -> bool:
+        try:
+            async with asyncio.timeout(within):
+                return await self._over.wait()
+        except TimeoutError:
+            return False
+
+    async def _send(self) -> AsyncGoalHandle:
+        x, y, phi = self._velocity
+        return await self._send_goal(lambda name: VelocityGoal(x, y, phi, timeout=self._timeout, id=name), self._id)
+
+    async def _renew(self) -> None:
+        while not await self._is_over(self._timeout / 3.0):
+            try:
+                await self._send()
+            except TrirailError as error:
+                at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
+                self.error = None if at_limit else error  # at a limit it has ended as it should
+                return

@@ -1,0 +1,73 @@
+"""The lease as an asyncio program holds it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import uuid
+from collections.abc import Awaitable, Callable
+from typing import Self
+
+import msgspec
+
+from trirail.client.lease import SIGNS
+from trirail.errors import TrirailError
+from trirail.wire.messages import AcquireLease, CommandReply, ReleaseLease
+from trirail.wire.vocabulary import Command, Mode
+
+
+class AsyncLease:
+    """The lease while the context lasts, as trirail.client.lease.Lease; kept by a task.
+
+    Of a task that is cancelled while it asks for the lease no sign follows: it ends by its time-out.
+    """
+
+    def __init__(
+        self, command: Callable[[Command, bytes], Awaitable[CommandReply]], *, force: bool, timeout: float
+    ) -> None:
+        self._command = command
+        self._sign = AcquireLease(uuid.uuid4().hex[:12], timeout)
+        self._force = force
+        self._over = asyncio.Event()
+        self._keeping: asyncio.Task[None] | None = None
+        self.lost: TrirailError | None = None
+        """Why it is not held any more."""
+
+    async def wait(self, timeout: float | None = None) -> bool:
+        """Wait until it is lost, for so many seconds at most; whether it is."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                await self._over.wait()
+        return self._over.is_set()
+
+    async def __aenter__(self) -> Self:
+        asked = msgspec.structs.replace(self._sign, force=self._force)
+        reply = await self._command(Command.ACQUIRE, msgspec.json.encode(asked))
+        self._keeping = asyncio.create_task(self._keep(), name="lease")
+        if reply.mode == Mode.STOPPING:
+            try:
+                await self._command(Command.STOP, b"")  # answered when the robot stands
+            except BaseException:
+                await self.__aexit__()
+                raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._over.set()
+        if self._keeping is not None:
+            self._keeping.cancel()
+            await asyncio.wait([self._keeping])
+        if self.lost is None:
+            with contextlib.suppress(TrirailError):  # nobody answers any more: then it ends by its time-out
+                await self._command(Command.RELEASE, msgspec.json.encode(ReleaseLease(self._sign.id)))
+
+    async def _keep(self) -> None:
+        sign = msgspec.json.encode(self._sign)
+        while True:
+            await asyncio.sleep(self._sign.timeout / SIGNS)
+            try:
+                await self._command(Command.ACQUIRE, sign)
+            except TrirailError as error:
+                self.lost = error
+                self._over.set()
+                return

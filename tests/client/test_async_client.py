@@ -1,0 +1,279 @@
+"""The client for asyncio: the names of Robot, no thread for a call, and nothing left of what is cancelled."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import json
+import queue
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+from trirail.client.async_client import AsyncRobot
+from trirail.client.async_goal import AsyncGoalHandle, AsyncJog
+from trirail.client.async_lease import AsyncLease
+from trirail.client.async_track import AsyncTrack
+from trirail.client.client import Robot
+from trirail.client.goal import GoalHandle, Jog
+from trirail.client.lease import Lease
+from trirail.client.track import Track
+from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.wire import zenoh_session
+from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply
+from trirail.wire.state import State
+
+WITHIN = 20.0
+
+
+def public(kind: type) -> list[str]:
+    return [name for name in vars(kind) if not name.startswith("_")]
+
+
+# ---------------------------------------------------------------------- the same names
+
+
+@pytest.mark.parametrize("name", public(Robot))
+def test_every_public_name_of_robot_has_its_twin(name: str) -> None:
+    ours, theirs = getattr(AsyncRobot, name), getattr(Robot, name)
+    if isinstance(theirs, property):
+        assert isinstance(ours, property)
+        return
+    assert list(inspect.signature(ours).parameters.values()) == list(inspect.signature(theirs).parameters.values())
+    assert inspect.getdoc(ours)
+    waits = not (
+        inspect.isgeneratorfunction(theirs) or name in ("jog", "lease", "track", "states", "events", "records")
+    )
+    assert inspect.iscoroutinefunction(ours) == waits
+
+
+TWINS = [(AsyncGoalHandle, GoalHandle), (AsyncJog, Jog), (AsyncLease, Lease), (AsyncTrack, Track)]
+
+
+@pytest.mark.parametrize(("ours", "theirs"), TWINS)
+def test_goals_jogs_leases_and_tracks_have_the_same_names_too(ours: type, theirs: type) -> None:
+    assert {name for name in dir(ours) if name[0] != "_"} == {name for name in dir(theirs) if name[0] != "_"}
+
+
+def test_robot_has_no_name_that_robots_have_not() -> None:
+    assert set(public(AsyncRobot)) == set(public(Robot))
+
+
+# ---------------------------------------------------------------------- before a service that says nothing
+
+
+class Silent:
+    """A robot's keys, on which what is asked is kept and answered when the test says so."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self.asked: queue.Queue[zenoh.Query] = queue.Queue()
+        keep = zenoh.handlers.Callback(self.asked.put, indirect=False)
+        self._declared = session.declare_queryable("trirail/demo/**", keep)
+
+    def key(self) -> str:
+        with self.asked.get(timeout=WITHIN) as query:
+            return str(query.key_expr).removeprefix("trirail/demo/")
+
+    def answer(self, message: msgspec.Struct) -> str:
+        with self.asked.get(timeout=WITHIN) as query:
+            payload = msgspec.json.encode(message)
+            if isinstance(message, ErrorReply):
+                query.reply_err(payload)
+            else:
+                query.reply(query.key_expr, payload)
+            return str(query.key_expr).removeprefix("trirail/demo/")
+
+    def publish(self, key: str, message: msgspec.Struct) -> None:
+        self._session.put(f"trirail/demo/{key}", msgspec.json.encode(message))
+
+
+@pytest.fixture
+def locator(tmp_path: Path) -> str:
+    return f"unixsock-stream/{tmp_path}/zenoh"
+
+
+@pytest.fixture
+def silent(locator: str) -> Iterator[Silent]:
+    with zenoh_session.open_service([locator]) as session:
+        yield Silent(session)
+
+
+Work = Callable[[AsyncRobot], Coroutine[Any, Any, None]]
+
+
+def run(locator: str, work: Work) -> None:
+    """Run work with a robot; afterwards nothing may be left of it in the event loop."""
+
+    async def main() -> None:
+        async with asyncio.timeout(WITHIN), AsyncRobot("demo", locator, user="ann") as robot:
+            await work(robot)
+            await asyncio.sleep(0)
+            left = asyncio.all_tasks() - {asyncio.current_task()}
+            assert not left
+            assert not robot._goals
+
+    asyncio.run(main())
+
+
+async def cancelled(awaitable: Awaitable[object], begun: Callable[[], object]) -> None:
+    """Cancel a task once it has begun, and wait for its end."""
+    task = asyncio.ensure_future(awaitable)
+    await asyncio.to_thread(begun)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+
+
+def test_a_hundred_calls_at_once_take_no_thread(silent: Silent, locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        before = threading.active_count()
+        calls = [asyncio.ensure_future(robot.enable()) for _ in range(100)]
+        queries = await asyncio.to_thread(lambda: [silent.asked.get(timeout=WITHIN) for _ in range(100)])
+        assert threading.active_count() <= before + 1  # the one in which this test waits
+        for query in queries:
+            with query:
+                query.reply(query.key_expr, msgspec.json.encode(CommandReply("enable", "holding")))
+        await asyncio.gather(*calls)
+
+    run(locator, work)
+
+
+CALLS: dict[str, Callable[[AsyncRobot], Awaitable[object]]] = {
+    "cmd/ann/enable": lambda robot: robot.enable(),
+    "cmd/ann/home": lambda robot: robot.home(),
+    "info": lambda robot: robot.info(),
+    "poses": lambda robot: robot.poses(),
+    "teach/ann/pick": lambda robot: robot.teach("pick"),
+}
+
+
+@pytest.mark.parametrize("key", CALLS)
+def test_a_call_that_is_cancelled_leaves_nothing(silent: Silent, locator: str, key: str) -> None:
+    keys: list[str] = []
+
+    async def work(robot: AsyncRobot) -> None:
+        await cancelled(CALLS[key](robot), lambda: keys.append(silent.key()))
+
+    run(locator, work)
+    assert keys == [key]
+    assert silent.asked.empty()
+
+
+def test_a_goal_whose_sending_is_cancelled_is_stopped_if_it_was_taken(silent: Silent, locator: str) -> None:
+    keys: list[str] = []
+
+    async def work(robot: AsyncRobot) -> None:
+        await cancelled(robot.move_to(x=0.0, y=0.0, phi=0.0, id="g"), lambda: keys.append(silent.key()))
+        with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as query:
+            assert query.payload is not None
+            keys.append(f"{query.key_expr} {query.payload.to_string()}")
+
+    run(locator, work)
+    assert keys == ["goal/ann", 'trirail/demo/cmd/ann/stop {"goal":"g"}']
+
+
+def test_a_goal_that_is_refused_is_forgotten_and_one_that_is_none_is_not_sent(silent: Silent, locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        sending = asyncio.ensure_future(robot.move_to(x=9.0, y=0.0, phi=0.0))
+        await asyncio.to_thread(silent.answer, ErrorReply(RefusalCode.OUT_OF_WORKSPACE, "too far"))
+        with pytest.raises(RefusedError, match="too far"):
+            await sending
+        wrong: list[Callable[[], Awaitable[object]]] = [
+            lambda: robot.move_to(x=0.0, y=0.0, phi=0.0, id="\n"),
+            lambda: robot.override(0.5),
+            lambda: robot.teach("a b"),
+        ]
+        for call in wrong:
+            with pytest.raises(RefusedError):
+                await call()
+
+    run(locator, work)
+    assert silent.asked.empty()
+
+
+def test_a_goal_is_waited_for_and_cancelling_the_wait_does_not_stop_it(silent: Silent, locator: str) -> None:
+    end = Event(7, 0.0, 0, 5.0, "goal", "info", "goal g done: arrived", id="g", outcome="done", settle=0.01)
+
+    async def work(robot: AsyncRobot) -> None:
+        sending = asyncio.ensure_future(robot.move_to(x=0.0, y=0.0, phi=0.0, id="g"))
+        await asyncio.to_thread(silent.answer, GoalReply("g", 1.0))
+        goal = await sending
+        assert (goal.duration, goal.result) == (1.0, None)
+        with pytest.raises(TimeoutError, match=r"goal g has not ended within 0\.01 s"):
+            await goal.wait(0.01)
+        await cancelled(goal.wait(), lambda: None)
+        waiting = [asyncio.ensure_future(goal.wait(WITHIN)) for _ in range(3)]
+        await asyncio.to_thread(silent.publish, "event", end)
+        assert {(await each).outcome for each in waiting} == {"done"}
+        assert goal.result is not None
+        assert goal.result.settle == 0.01
+
+    run(locator, work)
+    assert silent.asked.empty()
+
+
+def test_a_jog_that_is_left_while_it_is_renewed_hears_its_end_and_is_not_stopped(silent: Silent, locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        jog = robot.jog(x=0.01)
+        entering = asyncio.ensure_future(jog.__aenter__())
+        await asyncio.to_thread(silent.answer, GoalReply("any", 1.0))
+        await entering
+        renewal = await asyncio.to_thread(silent.asked.get, timeout=WITHIN)
+        leaving = asyncio.ensure_future(jog.__aexit__())
+        await asyncio.sleep(0)
+        with renewal:
+            assert renewal.payload is not None
+            name = json.loads(renewal.payload.to_string())["id"]
+            renewal.reply(renewal.key_expr, msgspec.json.encode(GoalReply(name, 1.0)))
+        end = Event(7, 0.0, 0, 5.0, "goal", "info", "goal done: not renewed", id=name, outcome="done")
+        await asyncio.to_thread(silent.publish, "event", end)
+        await leaving
+        assert jog.result is not None
+        assert jog.result.outcome == "done"
+
+    run(locator, work)
+    assert silent.asked.empty()
+
+
+def test_a_subscription_ends_with_who_iterates(silent: Silent, locator: str) -> None:
+    """However it ends: by its time-out, by being left, by being cancelled."""
+    heard: list[object] = []
+
+    async def work(robot: AsyncRobot) -> None:
+        async def iterate(states: AsyncIterator[State | Event]) -> None:
+            heard.extend([state async for state in states])
+
+        for states in (robot.states, robot.events):
+            await iterate(states(timeout=0.01))
+            await cancelled(iterate(states()), lambda: None)
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(anext(states()), 0.01)
+        with pytest.raises(ServiceError, match="no robot"):
+            await robot.state(timeout=0.01)
+
+    run(locator, work)
+    assert heard == []
+
+
+def test_opening_that_is_cancelled_leaves_no_connection(silent: Silent, locator: str) -> None:
+    async def main() -> None:
+        opening = asyncio.ensure_future(AsyncRobot("demo", locator).__aenter__())
+        await asyncio.sleep(0)
+        opening.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await opening
+
+    asyncio.run(main())  # which waits for the thread that opens
+    with pytest.raises(ServiceError, match="no service at"):
+        asyncio.run(AsyncRobot("demo", "tcp/127.0.0.1:1").__aenter__())
+
+
+def test_outside_of_its_context_it_says_so() -> None:
+    with pytest.raises(ServiceError, match="use it within `async with AsyncRobot"):
+        asyncio.run(AsyncRobot("demo").enable())

@@ -1,0 +1,148 @@
+"""The client for asyncio with a whole service: every call of it, several at once, and what a cancelled task leaves."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import aclosing
+
+import pytest
+from trirail.client import own_service
+from trirail.client.async_client import AsyncRobot
+from trirail.errors import RefusedError
+from trirail.wire.messages import TrajectoryPoint
+from trirail.wire.records import unpack
+from trirail.wire.state import State
+
+pytestmark = pytest.mark.slow
+
+WITHIN = 30.0
+Work = Callable[[AsyncRobot], Awaitable[None]]
+
+
+@pytest.fixture(scope="module")
+def locator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("async")
+    config, locator = own_service.private(folder)
+    with own_service.service(config, folder / "async.rrd"):
+        yield locator
+
+
+def run(locator: str, work: Work) -> None:
+    async def main() -> None:
+        async with asyncio.timeout(WITHIN), AsyncRobot("demo", locator, user="ann") as robot:
+            await robot.enable()
+            assert (await (await robot.move_to(x=0.0, y=0.0, phi=0.0)).wait()).outcome == "done"
+            await work(robot)
+            assert asyncio.all_tasks() == {asyncio.current_task()}
+
+    asyncio.run(main())
+
+
+async def until(robot: AsyncRobot, condition: Callable[[State], bool]) -> State:
+    async with aclosing(robot.states(WITHIN)) as states:
+        async for state in states:
+            if condition(state):
+                return state
+    raise AssertionError("the service has gone silent")
+
+
+def test_a_session(locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        assert (await robot.info()).robot == "demo"
+        first, second = await asyncio.gather(
+            robot.move(x=0.01, blend=0.005, id="first"), robot.move(y=0.01, speed=0.5, id="second")
+        )
+        assert {(await goal.wait()).outcome for goal in (first, second)} == {"done"}
+        assert (await robot.state()).pose == pytest.approx((0.01, 0.01, 0.0), abs=1e-5)
+        assert (await robot.teach("corner")).taught
+        assert (await (await robot.move_sliders(0.0, 0.0, 0.0)).wait()).outcome == "done"
+        points = [TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(1.0, 0.01, 0.0, 0.0)]
+        assert (await (await robot.follow(points)).wait()).outcome == "done"
+        assert (await (await robot.move_to_named("corner")).wait()).outcome == "done"
+        await robot.forget("corner")
+        assert "corner" not in await robot.poses()
+        with pytest.raises(RefusedError, match="is beyond its limit"):
+            await robot.move_to(x=0.5, y=0.0, phi=0.0)
+        goal = await robot.move_to(x=0.1, y=0.0, phi=0.0, speed=0.2)
+        await robot.pause()
+        await robot.resume()
+        await robot.override(50)
+        await goal.cancel()
+        assert (await goal.wait()).outcome == "stopped"
+        await robot.override(100)
+        await robot.stop()
+        batches: list[int] = []
+        with robot.records(lambda batch: batches.append(len(unpack(batch)))):
+            await until(robot, lambda _: sum(batches) > 100)
+        told = [event.id async for event in robot.events(history=True, timeout=1.0) if event.outcome == "done"]
+        assert {"first", "second"} <= set(told)
+        await robot.quick_stop()
+        await robot.reset()
+        await robot.disable()
+
+    run(locator, work)
+
+
+def test_a_jog_lasts_while_its_context_does(locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        async with robot.jog(x=0.02) as jog:
+            await until(robot, lambda state: state.pose[0] > 0.01)
+        assert jog.result is not None
+        assert jog.result.outcome == "done"
+        assert max(map(abs, (await robot.state()).commanded.pose_velocity)) == 0.0
+        await robot.disable()
+        with pytest.raises(RefusedError, match="send enable first"):
+            async with robot.jog(x=0.02):
+                raise AssertionError("it has begun")
+
+    run(locator, work)
+
+
+def test_a_lease_is_kept_by_a_task_and_given_back(locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        async with AsyncRobot("demo", locator, user="bob") as bob:
+            async with robot.lease(timeout=0.5) as lease:
+                assert not await lease.wait(1.5)  # three time-outs long: it is kept
+                with pytest.raises(RefusedError, match="ann"):
+                    await bob.move_to(x=0.01, y=0.0, phi=0.0)
+                assert (await (await robot.move_to(x=0.01, y=0.0, phi=0.0)).wait()).outcome == "done"
+            assert (await (await bob.move_to(x=0.0, y=0.0, phi=0.0)).wait()).outcome == "done"
+
+    run(locator, work)
+
+
+def test_a_task_that_is_cancelled_while_it_jogs_moves_nothing_any_more(locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        async def jog() -> None:
+            async with robot.jog(x=0.02):
+                await asyncio.Event().wait()
+
+        jogging = asyncio.create_task(jog())
+        await until(robot, lambda state: state.mode == "moving")
+        jogging.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await jogging
+        assert (await until(robot, lambda state: state.mode == "holding")).goal is None
+
+    run(locator, work)
+
+
+def test_a_goal_whose_sender_is_cancelled_does_not_go_on(locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        for number in range(20):  # cancelled as early, or as late, as it comes
+            sending = asyncio.create_task(robot.move_to(x=0.1, y=0.0, phi=0.0, speed=0.1, id=f"g{number}"))
+            for _ in range(number):
+                await asyncio.sleep(0)
+            sending.cancel()
+            try:
+                await sending
+            except asyncio.CancelledError:
+                pass
+            else:
+                raise AssertionError("it was not cancelled")
+        state = await until(robot, lambda state: state.mode == "holding" and state.goal is None)
+        later = await until(robot, lambda newer: newer.seq > state.seq + 500)
+        assert later.commanded.pose == pytest.approx(state.commanded.pose, abs=1e-12)
+
+    run(locator, work)

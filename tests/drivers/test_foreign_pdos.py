@@ -1,0 +1,52 @@
+"""PDOs of drives that others made, as the set-up leaves them: prompt, none beside those that are used, or refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from drivers.foreign import Habits
+from drivers.test_foreign import MAKES, Rig
+from trirail_drivers.errors import DriveError
+
+FIXED = {(0x1600, 0): 0, (0x1601, 0): 1, (0x1601, 1): 0x60FF_0020}
+"""No controlword, and a target velocity where setpoints would be."""
+
+
+@pytest.fixture
+def rigs() -> Iterator[list[Rig]]:
+    made: list[Rig] = []
+    yield made
+    for rig in made:
+        rig.drives.close()
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_no_pdo_is_on_but_those_that_are_used_and_none_of_them_waits(rigs: list[Rig], name: str) -> None:
+    rig = Rig(name)
+    rigs.append(rig)
+    rig.ready()
+    for node, axis in zip(rig.nodes, rig.drives._axes, strict=True):
+        way = axis.way
+        used = {way.setpoints.identifier, way.controlword, way.feedback.identifier, way.status} - {None}
+        on = [index for base in (0x1400, 0x1800) for index in node._pdos(base)]
+        assert {node.value(index, 1) & 0x7FF for index in on} == used
+        assert [node.value(index, 3) for index in on if index >= 0x1800] == [0] * (1 + (way.status is not None))
+
+
+def test_a_statusword_that_may_be_held_back_is_taken_from_beside_the_position(rigs: list[Rig]) -> None:
+    rig = Rig("elmo_gold", Habits(values={(0x1800, 3): 1000}, access={(0x1800, 3): "ro"}))
+    rigs.append(rig)
+    rig.ready()
+    for axis in rig.drives._axes:
+        assert axis.way.feedback.has_status
+        assert axis.way.status is None
+    assert any("object 1800:03 (Inhibit time)" in warning for warning in rig.warnings)
+    rig.enable()
+
+
+def test_a_fixed_mapping_that_does_not_fit_is_refused_by_its_object(rigs: list[Rig]) -> None:
+    rig = Rig("elmo_gold", Habits(fixed_pdos=True, values=FIXED))
+    rigs.append(rig)
+    with pytest.raises(DriveError, match=r"drive A: object 1601 .*no PDO fits setpoints 607A: it has 1601 = 60FF0020h"):
+        rig.ready()

@@ -1,0 +1,153 @@
+"""From the motion under way to another goal: begun in motion, after a stop, or where the path before it ends."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import CONFIG, Rig
+from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits
+from motion.test_motion import only_from_rest
+from trirail.kinematics.geometry import Geometry
+from trirail.motion.feasibility import Checker
+from trirail.motion.goals import Extension, Goals
+from trirail.motion.limits import Bounds
+from trirail.motion.planner import Planner
+from trirail.motion.runs import rest
+from trirail.motion.schedule import Schedule
+from trirail.wire.messages import PoseGoal, VelocityGoal
+from trirail.wire.packets import Accepted
+
+
+def accepted(rig: Rig, name: str, goal: PoseGoal) -> Accepted:
+    answer = rig.send(name, goal)
+    assert isinstance(answer, Accepted), answer
+    return answer
+
+
+@pytest.mark.parametrize(("override", "stops"), [(0.05, False), (0.049, True)])
+def test_from_a_path_that_runs_slower_than_a_twentieth_the_robot_stops_first(
+    rig: Rig, override: float, stops: bool
+) -> None:
+    rig.enable()
+    rig.command("override", override)
+    accepted(rig, "g1", PoseGoal(0.1, 0.0, 0.0))
+    rig.cycles(1000)
+    assert accepted(rig, "g2", PoseGoal(0.0, 0.02, 0.0)).stops_first is stops
+    rig.command("override", 1.0)
+    rig.until(rig.holds, 20_000)
+    assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
+    assert_within_limits(rig)
+
+
+def test_a_goal_that_stops_the_robot_first_stops_it_within_a_share_of_the_path_before_it() -> None:
+    """It stands on the old path, at once and not where that leads, and the time to arrival is told to a few cycles."""
+    rig = Rig(SLOW)
+    rig.enable()
+    accepted(rig, "g1", PoseGoal(0.08, 0.02, 0.3))
+    rig.cycles(400)
+    answer = accepted(rig, "g2", PoseGoal(-0.05, 0.05, -0.3))
+    assert answer.stops_first
+    begun = len(rig.rows)
+    schedule = rig.control._schedule
+    rig.until(lambda: len(schedule.runs) == 1)
+    stood = rig.control.commanded.pose
+    assert 0.0 < stood[0] < 0.075
+    assert stood[1] / stood[0] == pytest.approx(0.25, abs=1e-6)
+    rig.until(rig.holds)
+    assert (len(rig.rows) - begun) * PERIOD == pytest.approx(answer.duration, abs=0.03)
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("before", [10, 30, 90])
+def test_a_robot_that_stops_first_beyond_a_waiting_goals_seam_is_still_on_its_way(
+    monkeypatch: pytest.MonkeyPatch, before: int
+) -> None:
+    """It passes where the goal that waited would have begun: that ends nothing, for the goal it stops for has begun."""
+    monkeypatch.setattr(Goals, "_set_out", only_from_rest)
+    rig = Rig()
+    rig.enable()
+    accepted(rig, "q0", PoseGoal(0.05, 0.0, 0.0, blend=0.03))
+    accepted(rig, "q1", PoseGoal(0.1, 0.05, 0.0))
+    run = rig.control._schedule.runs[0]
+    seam = run.seams[0].s
+    rig.until(lambda: run.at.s > seam - before * PERIOD)
+    assert accepted(rig, "g2", PoseGoal(0.0, -0.05, 0.2)).stops_first
+    rig.until(lambda: rig.control._schedule.runs[0].at.s > seam)
+    rig.cycles(2)
+    assert rig.control.ledger.goal is not None
+    assert rig.control.ledger.goal.id == "g2"
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("q0", "preempted"), ("q1", "preempted"), ("g2", "done")]
+    assert rig.control.commanded.pose == pytest.approx((0.0, -0.05, 0.2), abs=1e-9)
+    rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("blend", [0.0, 0.01, 1.0])
+@pytest.mark.parametrize("passed", [0.0, 0.4, 0.999])
+def test_a_goal_follows_from_where_the_path_comes_near_its_end_and_is_ahead(blend: float, passed: float) -> None:
+    """Not before it, by more than a hair; nor where the path has been, or will be before the answer comes."""
+    goals, lead = Goals(ROBOT, CONFIG.limits, PERIOD), 3
+    run = goals.plan(PoseGoal(0.02, 0.0, 0.0), Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 1.0, lead).run
+    run.time = passed * run.path.duration
+    extension = goals.append(PoseGoal(0.02, 0.02, 0.0), run, blend, lead)
+    assert isinstance(extension, Extension)
+    soonest = min(run.time + lead * PERIOD, run.path.duration)
+    assert soonest - 1e-12 <= extension.s <= run.path.duration
+    run.time = extension.s
+    left = 0.02 - run.state(0.0, (0.0, 0.0, 0.0)).pose[0]
+    assert left <= blend + 1e-9
+    if extension.s > soonest + 1e-9:
+        assert left == pytest.approx(blend, abs=1e-6)
+    assert extension.slowed == 1.0
+
+
+def test_behind_a_goal_at_override_zero_another_one_is_planned_at_full_speed() -> None:
+    """At which rate the two will run is not known yet."""
+    goals = Goals(ROBOT, CONFIG.limits, PERIOD)
+    run = goals.plan(PoseGoal(0.05, 0.0, 0.0), Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 0.0, 3).run
+    assert run.target == 0.0
+    behind = goals.append(PoseGoal(0.0, 0.0, 0.0), run, 0.0, 3)
+    assert behind.slowed == 1.0
+    assert (behind.s, behind.path.duration) == pytest.approx((run.path.duration,) * 2, abs=1e-4)
+
+
+# ---------------------------------------------------------------------- what is planned
+
+
+def test_a_jog_holds_its_velocity_for_as_long_as_it_may_last_at_the_greatest_override() -> None:
+    """Twice its time-out: time along the path runs at up to twice its rate, and the control ends the jog."""
+    goals = Goals(ROBOT, CONFIG.limits, PERIOD)
+    jog = VelocityGoal(0.02, 0.0, 0.0, timeout=0.5)
+    path = goals.plan(jog, Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 1.0, 3).run.path
+    held = np.abs(path.pieces[:, 0, 1] - 0.02) + np.abs(path.pieces[:, 0, 2:]).sum(axis=1) < 1e-9
+    assert np.diff(path.knots)[held].sum() == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("distance", [0.01, 0.01000000000000001])
+def test_where_ruckig_changes_its_profile_the_way_takes_no_more_jerk_and_hardly_longer(distance: float) -> None:
+    goals = Goals(ROBOT, CONFIG.limits, PERIOD)
+    motion = goals.plan(PoseGoal(distance, 0.0, 0.0), Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 1.0, 3)
+    jerk, acceleration = CONFIG.limits.platform.jerk[0], CONFIG.limits.platform.acceleration[0]
+    assert distance == pytest.approx(2.0 * acceleration**3 / jerk**2)
+    assert np.abs(6.0 * motion.run.path.pieces[:, 0, 3]).max() == pytest.approx(jerk, rel=2e-6)
+    assert motion.duration == pytest.approx(4.0 * acceleration / jerk, rel=1e-3)
+    assert motion.slowed == 1.0
+
+
+@pytest.mark.parametrize("far", range(3))
+def test_how_near_a_pose_is_counts_the_edge_that_is_farthest_from_the_centre(far: int) -> None:
+    """A turn moves that edge most: goals blend where every point of the platform is near enough."""
+    a, b, c = (
+        replace(leg, edge_point=(2.0 * leg.edge_point[0], 2.0 * leg.edge_point[1])) if number == far else leg
+        for number, leg in enumerate(ROBOT.legs)
+    )
+    limits, robot = CONFIG.limits, Geometry((a, b, c))
+    bounds = Bounds(limits, PERIOD)
+    checker = Checker(robot, limits, bounds, PERIOD)
+    planner = Planner(robot, limits.platform, limits.slider, bounds, checker, PERIOD)
+    reach = max(math.hypot(*leg.edge_point) for leg in robot.legs)
+    assert planner.nearness((0.03, 0.04, 0.2), (0.0, 0.0, 0.1)) == pytest.approx(0.05 + 0.1 * reach)

@@ -1,0 +1,32 @@
+"""Follow a target that a camera sees a hundred times a second, here a simulated one. [ROBOT [LOCATOR]]."""
+
+import math
+import sys
+import time
+from collections.abc import Iterator
+
+from trirail import Robot
+
+RATE, SECONDS = 100.0, 4.0
+RADIUS, TURN = 0.02, math.pi  # a circle in two seconds [m], [rad/s]
+
+
+def camera() -> Iterator[tuple[tuple[float, float, float], tuple[float, float, float], float]]:
+    """Yield pose and velocity of the target, and when that was, by this machine's wall clock."""
+    begins = time.time()
+    for n in range(round(RATE * SECONDS)):
+        taken = begins + n / RATE
+        time.sleep(max(0.0, taken - time.time()))
+        c, s = math.cos(TURN * (taken - begins)), math.sin(TURN * (taken - begins))
+        yield (RADIUS * c, RADIUS * s, 0.0), (-RADIUS * TURN * s, RADIUS * TURN * c, 0.0), taken
+
+
+with Robot(*sys.argv[1:]) as robot:
+    robot.enable()
+    lags = []
+    with robot.track() as track:  # when the updates cease, for whatever reason, the robot brakes on its path
+        for pose, velocity, taken in camera():
+            track.update(pose, velocity, taken)
+            lags.append(track.lag or 0.0)
+    print(f"{len(lags)} updates, at most {1e3 * max(lags[len(lags) // 4 :]):.2f} mm behind after the first second")
+    print("stands at", *(f"{value:.4f}" for value in robot.state().pose))
