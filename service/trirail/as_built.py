@@ -123,7 +123,7 @@ def told(file: str | None, found: AsBuilt | None, backlash: Triple) -> Correctio
     if found is None:
         return CorrectionTold("", "", (0.0, 0.0, 0.0), backlash) if any(backlash) else None
     x, y, phi = correction(found).greatest.tolist()
-    return CorrectionTold(file or "", found.made, (x, y, phi), backlash)
+    return CorrectionTold(file or "as_built", found.made, (x, y, phi), backlash)
 
 
 def check(found: AsBuilt, robot: Geometry, platform: Platform, sliders: Sequence[float]) -> None:

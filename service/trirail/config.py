@@ -471,7 +471,8 @@ def _check(config: Config) -> None:
         if low >= high:
             raise ConfigError(f"{key} = [{low:g}, {high:g}]: the lower limit must be below the upper one")
     _check_correction(config, robot)
-    off = corrected_geometry(config).correction
+    corrected = corrected_geometry(config)
+    off = corrected.correction
     x, y, phi = np.zeros(3) if off is None else off.bound  # the legs are told places that far beyond
     (low, high), margin = (platform.phi[0] - phi, platform.phi[1] + phi), config.limits.singularity_margin
     # On a robot as built the singular angles move with the centre: linearly in x and y, so the corners bound them.
@@ -494,7 +495,7 @@ def _check(config: Config) -> None:
     for name in config.frames.work:
         if name in (BASE, PLATFORM):
             raise ConfigError(f"frames.work.{name}: every robot has a frame of that name; give this one another")
-    _check_poses(config, robot)
+    _check_poses(config, corrected)
     nodes = [config.drives.master_node, *(drive.node for drive in config.drives.each)]
     if len(set(nodes)) < len(nodes):
         raise ConfigError(

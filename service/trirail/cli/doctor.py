@@ -12,6 +12,7 @@ from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
 from trirail import as_built
+from trirail.cli import units
 from trirail.config import Config
 from trirail.processes.clock import Tick
 from trirail.processes.guard import Guard
@@ -150,14 +151,7 @@ def corrected(config: Config) -> list[Check]:
     """What as-built errors are corrected by: nobody should have to guess that it is on."""
     section = config.correction
     told = as_built.told(section.map, section.as_built, section.backlash)
-    if told is None:
-        return []
-    x, y, phi = told.greatest
-    found = f"{told.file}, measured {told.made}: " if told.file else ""
-    if any(told.greatest):
-        found += f"up to {x * 1e6:.3g} µm in x, {y * 1e6:.3g} µm in y, {phi * 1e3:.3g} mrad; "
-    width = ", ".join(f"{each * 1e6:.3g}" for each in told.backlash)
-    return [Check("correction", "ok", f"{found}backlash of A, B, C {width} µm")]
+    return [] if told is None else [Check("correction", "ok", units.correction(told))]
 
 
 def can_interface(config: Config, machine: Machine) -> list[Check]:

@@ -22,7 +22,7 @@ from trirail.errors import KinematicsError
 from trirail.kinematics.algebra import Array, Matrix, Vector, add, scale, subtract
 from trirail.kinematics.compiled import compiled
 
-__all__ = ["DEGREE", "STEEPEST", "Correction", "corrected_motion", "is_corrected", "real_motion"]
+__all__ = ["DEGREE", "STEEPEST", "Correction", "corrected_motion", "is_corrected", "real_motion", "splines"]
 
 DEGREE = 3
 """Of the splines: so many nodes more than cells along each axis."""
@@ -134,6 +134,24 @@ def real_motion(legs: Array, told: Matrix) -> Matrix:
     return motion
 
 
+def splines(poses: Array, low: Sequence[float], high: Sequence[float], cells: Sequence[int]) -> tuple[Array, Array]:
+    """Return the value of every spline at poses (N, 3), (N, nodes), and the poses' cells, (N, 3).
+
+    For who looks at a few poses, or at many once.
+    """
+    rows, at = np.ones((len(poses), 1)), np.zeros((len(poses), 3), dtype=np.int64)
+    for axis, (begin, end, number) in enumerate(zip(low, high, cells, strict=True)):
+        place = np.clip((poses[:, axis] - begin) / (end - begin) * number, 0.0, number)
+        at[:, axis] = np.minimum(place.astype(np.int64), number - 1)
+        t = place - at[:, axis]
+        s = 1.0 - t
+        values = np.stack([s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3], axis=1) / 6.0
+        along = np.zeros((len(poses), number + DEGREE))
+        np.put_along_axis(along, at[:, axis, None] + np.arange(DEGREE + 1), values, axis=1)
+        rows = (rows[:, :, None] * along[:, None, :]).reshape(len(poses), -1)
+    return rows, at
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Correction:
     """The map: its box, x, y [m] and phi [rad], and the coefficients of its splines [m, m, rad].
@@ -161,6 +179,10 @@ class Correction:
         """Return it as compiled code takes it, behind the legs: as many numbers as some legs have."""
         numbers = np.concatenate([self.low, 1.0 / self.size, self.nodes.shape[:3], self.nodes.ravel()])
         return np.concatenate([numbers, np.zeros(-len(numbers) % LEG)])
+
+    def at(self, poses: Array) -> Array:
+        """Return c at poses, both (N, 3) [m, m, rad]."""
+        return splines(poses, self.low, self.high, self.cells)[0] @ self.nodes.reshape(-1, 3)
 
     @property
     def cells(self) -> tuple[int, int, int]:

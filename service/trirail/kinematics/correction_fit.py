@@ -17,7 +17,7 @@ import numpy as np
 from trirail.errors import KinematicsError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.calibration import CalibrationError
-from trirail.kinematics.correction import DEGREE, Correction
+from trirail.kinematics.correction import DEGREE, Correction, splines
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import forward, inverse
 
@@ -85,17 +85,17 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
     wanted[:, 2] -= 2.0 * math.pi * np.round(wanted[:, 2] / (2.0 * math.pi))
 
     shape = [n + DEGREE for n in cells]
-    splines, at = _splines(poses, low, high, cells)
+    rows, at = splines(poses, low, high, cells)
     curvature = _curvature(shape)
     fold = np.random.default_rng(SEED).permutation(len(poses)) % FOLDS
     scale = np.maximum(wanted.std(axis=0), 1e-12)
-    trials = [_foretold(splines, wanted, curvature * weight, fold) for weight in WEIGHTS]
+    trials = [_foretold(rows, wanted, curvature * weight, fold) for weight in WEIGHTS]
     best = int(np.argmin([float(((left / scale) ** 2).sum()) for left in trials]))
-    nodes = _solve(splines, wanted, curvature * WEIGHTS[best])
+    nodes = _solve(rows, wanted, curvature * WEIGHTS[best])
     return Fit(
         Correction(_triple(low), _triple(high), nodes.reshape(*shape, 3)),
         before=-wanted,
-        residuals=wanted - splines @ nodes,
+        residuals=wanted - rows @ nodes,
         foretold=trials[best],
         empty=math.prod(cells) - len(np.unique(at, axis=0)),
     )
@@ -115,21 +115,6 @@ def _reached(geometry: Geometry, room: Room) -> Array:
     return reached
 
 
-def _splines(poses: Array, low: Sequence[float], high: Sequence[float], cells: Sequence[int]) -> tuple[Array, Array]:
-    """Return the value of every spline at every pose, (N, nodes), and the poses' cells, (N, 3)."""
-    rows, at = np.ones((len(poses), 1)), np.zeros((len(poses), 3), dtype=np.int64)
-    for axis, (begin, end, number) in enumerate(zip(low, high, cells, strict=True)):
-        place = np.clip((poses[:, axis] - begin) / (end - begin) * number, 0.0, number)
-        at[:, axis] = np.minimum(place.astype(np.int64), number - 1)
-        t = place - at[:, axis]
-        s = 1.0 - t
-        values = np.stack([s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3], axis=1) / 6.0
-        along = np.zeros((len(poses), number + DEGREE))
-        np.put_along_axis(along, at[:, axis, None] + np.arange(DEGREE + 1), values, axis=1)
-        rows = (rows[:, :, None] * along[:, None, :]).reshape(len(poses), -1)
-    return rows, at
-
-
 def _curvature(shape: Sequence[int]) -> Array:
     """Return the matrix whose form is the sum of the squares of the nodes' second differences along x, y and phi."""
     total = np.zeros((math.prod(shape), math.prod(shape)))
@@ -141,21 +126,21 @@ def _curvature(shape: Sequence[int]) -> Array:
     return total
 
 
-def _solve(splines: Array, wanted: Array, penalty: Array) -> Array:
+def _solve(rows: Array, wanted: Array, penalty: Array) -> Array:
     """Return the nodes, (nodes, 3)."""
     try:
-        found: Array = np.linalg.solve(splines.T @ splines + penalty, splines.T @ wanted)
+        found: Array = np.linalg.solve(rows.T @ rows + penalty, rows.T @ wanted)
     except np.linalg.LinAlgError as error:
         raise CalibrationError("the poses tell too little for a map: vary x, y and phi independently") from error
     return found
 
 
-def _foretold(splines: Array, wanted: Array, penalty: Array, fold: Array) -> Array:
+def _foretold(rows: Array, wanted: Array, penalty: Array, fold: Array) -> Array:
     """Return what is left of each pose's error by a correction that was made without its fold."""
     left = np.empty_like(wanted)
     for number in range(FOLDS):
         out = fold == number
-        left[out] = wanted[out] - splines[out] @ _solve(splines[~out], wanted[~out], penalty)
+        left[out] = wanted[out] - rows[out] @ _solve(rows[~out], wanted[~out], penalty)
     return left
 
 

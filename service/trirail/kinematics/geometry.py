@@ -128,7 +128,7 @@ def travels(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
     For who looks at a few poses and has no use for the compiled trirail.kinematics.robot.inverse. Not finite where an
     edge is parallel to its rail.
     """
-    x, y, phi = pose
+    x, y, phi = pose if geometry.correction is None else (geometry.correction.at(np.array([pose]))[0] + pose).tolist()
     found = np.empty((2, 3))
     for i, leg in enumerate(geometry.legs):
         along, across = _theta(phi + leg.edge_angle)[:2, :2]  # the edge
