@@ -140,11 +140,8 @@ def calibrate(options: argparse.Namespace) -> None:
 def map_text(options: argparse.Namespace, robot: Geometry, poses: Array, sliders: Array) -> str:
     """Fit the map, report, and return its file. Raises CalibrationError, also where the service would refuse it."""
     limits = config.load(options.config).limits
-    platform, slider = limits.platform, limits.slider
-    low, high = np.transpose([platform.x, platform.y, platform.phi]).tolist()
     try:
-        room = correction_fit.Room(low, high, slider.position, slider.passive)
-        found = correction_fit.fit(robot, poses, sliders, room, options.cells)
+        found = correction_fit.fit(robot, poses, sliders, config.room(limits), options.cells)
         made = as_built.AsBuilt(
             made=datetime.datetime.now(datetime.UTC).date().isoformat(),
             geometry=as_built.geometry_of(robot),
@@ -153,8 +150,7 @@ def map_text(options: argparse.Namespace, robot: Geometry, poses: Array, sliders
             nodes=found.correction.nodes.tolist(),
         )
         text = as_built.written(made)
-        allowed = as_built.Platform(low, high, platform.velocity, platform.acceleration, platform.jerk)
-        as_built.check(as_built.parse(text), robot, allowed, (slider.velocity, slider.acceleration, slider.jerk))
+        config.check_as_built(as_built.parse(text), robot, limits)
     except (CalibrationError, ConfigError) as error:
         raise CalibrationError(f"{options.poses}: {error}") from error
     print(describe_map(found), file=sys.stderr)
@@ -195,7 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--cells",
         type=int,
         nargs=3,
-        default=(4, 4, 4),
+        default=(4, 4, 8),
         choices=range(1, 9),
         metavar="N",
         help="of the map, 1 to 8",

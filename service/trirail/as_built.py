@@ -6,16 +6,17 @@ the nodes of trirail.kinematics.correction.
 
 from __future__ import annotations
 
-import itertools
+import dataclasses
 import tomllib
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
+from numpy.typing import ArrayLike
 from trirail_drivers import files
 from trirail_drivers.errors import FileError
 from trirail_drivers.interface import Triple
@@ -23,7 +24,7 @@ from trirail_drivers.interface import Triple
 from trirail.errors import ConfigError
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.correction import STEEPEST, Correction
-from trirail.kinematics.geometry import LEGS, Geometry, gains
+from trirail.kinematics.geometry import LEGS, Geometry, Room, travels
 from trirail.wire.state import CorrectionTold
 
 RESERVE = (0.02, 0.02, 0.07)
@@ -31,13 +32,17 @@ RESERVE = (0.02, 0.02, 0.07)
 path is looked at with the correction in it; what it adds between two looks must find room in this, wherever it is."""
 QUANTITIES = (("velocity", "m/s"), ("acceleration", "m/s²"), ("jerk", "m/s³"))
 MAKE = "python tools/calibrate.py --map"
+PARTS = 4
+"""Of a cell along each axis, at whose ends it is looked at what the map adds."""
+BEYOND = 0.03
+"""Of the sliders' travel, up to where it is looked: from between two places one of them is nearer [m]."""
 COORDINATES = (("x", "m"), ("y", "m"), ("phi", "rad"))
 
 Error = Annotated[float, Meta(ge=-0.02, le=0.02)]
 """A coefficient of the correction [m] or [rad]: whoever needs more has another geometry."""
 Node = tuple[Error, Error, Error]
-Row = Annotated[tuple[Node, ...], Meta(min_length=4, max_length=19)]
-Face = Annotated[tuple[Row, ...], Meta(min_length=4, max_length=19)]
+Row = Annotated[tuple[Node, ...], Meta(min_length=4, max_length=11)]
+Face = Annotated[tuple[Row, ...], Meta(min_length=4, max_length=11)]
 Place = Annotated[float, Meta(ge=-100.0, le=100.0)]
 Words = Annotated[str, Meta(max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
@@ -53,18 +58,8 @@ class AsBuilt(Struct, frozen=True, forbid_unknown_fields=True):
     """Least x, y [m] and phi [rad] of the places that it is for."""
     high: tuple[Place, Place, Place]
     """Greatest x, y [m] and phi [rad]."""
-    nodes: Annotated[tuple[Face, ...], Meta(min_length=4, max_length=19)]
+    nodes: Annotated[tuple[Face, ...], Meta(min_length=4, max_length=11)]
     """Coefficients of uniform cubic B-splines, by x, y, phi, of what is added to a pose in x, y [m] and phi [rad]."""
-
-
-class Platform(NamedTuple):
-    """What the platform may do, rows of x, y, phi."""
-
-    low: Sequence[float]
-    high: Sequence[float]
-    velocity: Sequence[float]
-    acceleration: Sequence[float]
-    jerk: Sequence[float]
 
 
 def geometry_of(robot: Geometry) -> str:
@@ -126,10 +121,11 @@ def told(file: str | None, found: AsBuilt | None, backlash: Triple) -> Correctio
     return CorrectionTold(file or "as_built", found.made, (x, y, phi), backlash)
 
 
-def check(found: AsBuilt, robot: Geometry, platform: Platform, sliders: Sequence[float]) -> None:
+def check(found: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, sliders: Sequence[float]) -> None:
     """Refuse a map that is another robot's, that does not reach all places, or that could break a limit anywhere.
 
-    `robot` is without it; `sliders` are the limits of velocity, acceleration and jerk [m, s]. Raises ConfigError.
+    `robot` is without it; `platform` (3, 3) are the limits of velocity, acceleration and jerk of x, y, phi, `sliders`
+    those of the sliders [m, rad, s]. Raises ConfigError.
     """
     errors = correction(found)
     if found.geometry != geometry_of(robot):
@@ -138,37 +134,60 @@ def check(found: AsBuilt, robot: Geometry, platform: Platform, sliders: Sequence
             f"measure again, and {MAKE} with this configuration"
         )
     for k, (name, unit) in enumerate(COORDINATES):
-        if found.low[k] > platform.low[k] or found.high[k] < platform.high[k]:
+        if found.low[k] > room.low[k] or found.high[k] < room.high[k]:
             raise ConfigError(
                 f"it is for {name} from {found.low[k]:g} to {found.high[k]:g} {unit}, limits.platform.{name} is "
-                f"[{platform.low[k]:g}, {platform.high[k]:g}]: measure as far, or keep the limit within"
+                f"[{room.low[k]:g}, {room.high[k]:g}]: measure as far, or keep the limit within"
             )
-    adds = errors.adds(platform.velocity, platform.acceleration, platform.jerk)
+    rates = np.array(platform, dtype=np.float64)
+    slopes, cells = errors.adds(rates[0]), np.array(errors.low) + errors.size / 2.0
     for k, (name, _) in enumerate(COORDINATES):
-        share = adds[..., 0, k] / platform.velocity[k]
+        share = slopes[..., k] / rates[0, k]
         if share.max() > STEEPEST:
+            place = cells + np.array(np.unravel_index(int(share.argmax()), share.shape)) * errors.size
             what = f"adds up to {share.max():.1%} to the rate of {name}"
-            raise ConfigError(_steep(errors, share, what, f"{STEEPEST:.0%}"))
-    within = adds @ _most(robot, platform).T
+            raise ConfigError(_steep(place, what, f"{STEEPEST:.0%}"))
+    places, adds = _adds(errors, robot, room, rates)
     for order, ((quantity, unit), limit, kept) in enumerate(zip(QUANTITIES, sliders, RESERVE, strict=True)):
         for i, leg in enumerate(LEGS):
-            more = within[..., order, i]
-            if more.max() > kept * limit:
+            more = adds[order, :, i]
+            if not more.max() <= kept * limit:
                 what = f"adds up to {more.max():.3g} {unit} to slider {leg}'s {quantity}"
-                raise ConfigError(_steep(errors, more, what, f"{kept * limit:.3g} {unit}"))
+                raise ConfigError(_steep(places[more.argmax()], what, f"{kept * limit:.3g} {unit}"))
 
 
-def _most(robot: Geometry, platform: Platform) -> Array:
-    """Return by how much each slider moves for x, y [m] and phi [rad], at most, (3, 3)."""
-    axes = [np.linspace(low, high, 3) for low, high in zip(platform.low, platform.high, strict=True)]
-    most: Array = np.max([np.abs(np.linalg.inv(gains(robot, place))) for place in itertools.product(*axes)], axis=0)
-    return most
+def _adds(errors: Correction, robot: Geometry, room: Room, rates: Array) -> tuple[Array, Array]:
+    """Return the places where it is looked, (N, 3), and what is added there to the sliders' rates at most, (3, N, 3).
+
+    That is of s, their places with the correction less those without, as a function of the pose, with derivatives by
+    differences: ds/dt is at most the sum of |s_i| v_i, and so on. Infinite where that is not known.
+    """
+    axes = [
+        np.linspace(low, high, PARTS * n + 1)
+        for low, high, n in zip(errors.low, errors.high, errors.cells, strict=True)
+    ]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    told = travels(dataclasses.replace(robot, correction=errors), places)
+
+    def slopes(of: Array) -> Array:
+        return np.stack(np.gradient(of, *axes, axis=(-4, -3, -2)))
+
+    first = slopes(told[0] - travels(robot, places)[0])
+    second = slopes(first)
+    once, twice, thrice = np.abs(first), np.abs(second), np.abs(slopes(second))
+    v, a, j = rates
+    velocity = np.tensordot(v, once, 1)
+    acceleration = np.tensordot(a, once, 1) + np.tensordot(np.outer(v, v), twice, 2)
+    jerk = np.tensordot(j, once, 1) + np.tensordot(3.0 * np.outer(a, v), twice, 2)
+    jerk += np.tensordot(np.multiply.outer(np.outer(v, v), v), thrice, 3)
+    reached = room.holds(told, BEYOND)
+    adds = np.stack([velocity, acceleration, jerk])[:, reached]
+    return places[reached], np.nan_to_num(adds, nan=np.inf)
 
 
-def _steep(errors: Correction, more: Array, what: str, right: str) -> str:
-    cell = [int(k) for k in np.unravel_index(int(more.argmax()), more.shape)]
-    x, y, phi = errors.centre(cell).tolist()
+def _steep(place: Array, what: str, right: str) -> str:
+    x, y, phi = place.tolist()
     return (
         f"too steep near x {x:.4g} m, y {y:.4g} m, phi {phi:.4g} rad: it {what}, and the limits have room for {right}; "
-        "measure there again, or take fewer cells"
+        "measure there again, take fewer cells, or let calibrate.py find [geometry] before"
     )

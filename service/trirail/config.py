@@ -25,7 +25,7 @@ from trirail_drivers.interface import NAMES
 from trirail import as_built
 from trirail.as_built import AsBuilt
 from trirail.errors import ConfigError
-from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles, travels
+from trirail.kinematics.geometry import Geometry, Leg, Room, gains, singular_angles, travels
 from trirail.wire.endpoints import ReachableBy, endpoint_of, is_local, reach
 from trirail.wire.vocabulary import LeasePolicy, Role
 
@@ -365,6 +365,18 @@ def corrected_geometry(config: Config) -> Geometry:
     return dataclasses.replace(robot, correction=as_built.correction(found)) if found is not None else robot
 
 
+def room(limits: Limits) -> Room:
+    """Return where the robot may be."""
+    low, high = np.transpose([limits.platform.x, limits.platform.y, limits.platform.phi]).tolist()
+    return Room(low, high, limits.slider.position, limits.slider.passive)
+
+
+def check_as_built(found: AsBuilt, robot: Geometry, limits: Limits) -> None:
+    """Refuse a map that is not this robot's, or that could break a limit anywhere. Raises ConfigError."""
+    rates = [(each.velocity, each.acceleration, each.jerk) for each in (limits.platform, limits.slider)]
+    as_built.check(found, robot, room(limits), *rates)
+
+
 def _leaves(value: object, key: str = "") -> Iterator[tuple[str, object]]:
     if isinstance(value, dict):
         for name, inner in value.items():
@@ -525,15 +537,13 @@ def _check(config: Config) -> None:
 
 def _check_correction(config: Config, robot: Geometry) -> None:
     """Refuse a map that is not this robot's, or that the limits have no room for."""
-    platform, slider, told = config.limits.platform, config.limits.slider, config.correction
+    told = config.correction
     if told.as_built is None:
         if told.map is not None:
             raise ConfigError(f"correction.map = {told.map!r}: a file, which only a configuration in a file can name")
         return
-    low, high = np.transpose([platform.x, platform.y, platform.phi]).tolist()
-    allowed = as_built.Platform(low, high, platform.velocity, platform.acceleration, platform.jerk)
     try:
-        as_built.check(told.as_built, robot, allowed, (slider.velocity, slider.acceleration, slider.jerk))
+        check_as_built(told.as_built, robot, config.limits)
     except ConfigError as error:
         raise ConfigError(f"correction.map: {told.map or 'as_built'}: {error}") from error
 

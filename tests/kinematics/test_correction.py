@@ -72,24 +72,24 @@ def test_the_jacobians_are_those_of_the_corrected_robot(cells: tuple[int, int, i
     assert_allclose(np.einsum("nij,nj->ni", j1, sliders), j2 @ velocity, atol=1e-12)
 
 
-@given(cells=SIZES, seed=SEEDS, rates=st.tuples(*[st.floats(0.0, 2.0)] * 9))
+@given(cells=SIZES, seed=SEEDS, rates=st.tuples(*[st.floats(0.0, 2.0)] * 3))
 def test_what_it_adds_is_bounded_in_every_cell(
-    cells: tuple[int, int, int], seed: int, rates: tuple[float, ...]
+    cells: tuple[int, int, int], seed: int, rates: tuple[float, float, float]
 ) -> None:
-    """Velocity, acceleration and jerk of c along a cubic through a cell stay within what `adds` says of that cell."""
+    """The velocity of c on the way through a cell stays within what `adds` says of that cell."""
     made, random = random_map(cells, seed), np.random.default_rng(seed)
-    v, a, j = np.array(rates).reshape(3, 3) * random.choice((-1.0, 1.0), (3, 3))
-    cell = tuple(random.integers(0, made.cells))
-    place = made.centre(cell) + random.uniform(-0.45, 0.45, 3) * made.size
-    bound = made.adds(*np.abs([v, a, j]))[cell]
-    h = 1e-4
-    times = h * np.arange(-2, 3)[:, None]
-    poses = place + times * v + times**2 / 2.0 * a + times**3 / 6.0 * j
-    c = told_more(made, poses)
-    assert (np.abs(c[3] - c[1]) / (2.0 * h) <= bound[0] + 1e-8).all()
-    assert (np.abs(c[3] - 2.0 * c[2] + c[1]) / h**2 <= bound[1] * (1.0 + 1e-2) + 1e-5).all()
-    assert (np.abs(c[4] - 2.0 * c[3] + 2.0 * c[1] - c[0]) / (2.0 * h**3) <= bound[2] * (1.0 + 1e-1) + 2e-3).all()
-    assert (np.abs(c) <= made.bound).all()
+    cell = random.integers(0, made.cells)
+    place = np.array(made.low) + (cell + random.uniform(0.05, 0.95, 3)) * made.size
+    way = 1e-4 * np.array(rates) * random.choice((-1.0, 1.0), 3)
+    before, after = told_more(made, np.array([place - way, place + way]))
+    assert (np.abs(after - before) / 2e-4 <= made.adds(rates)[tuple(cell)] + 1e-9).all()
+    assert (np.abs([before, after]) <= made.bound).all()
+
+
+@given(cells=SIZES, seed=SEEDS)
+def test_its_splines_are_those_of_scipy(cells: tuple[int, int, int], seed: int) -> None:
+    made, poses = random_map(cells, seed), places(seed)
+    assert_allclose(made.at(poses), told_more(made, poses), rtol=0.0, atol=1e-17)
 
 
 def told_more(made: Correction, poses: Array) -> Array:

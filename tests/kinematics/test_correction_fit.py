@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from trirail.kinematics.correction import Correction
-from trirail.kinematics.correction_fit import FEWEST, Room, fit
-from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.correction_fit import FEWEST, fit
+from trirail.kinematics.geometry import Geometry, Room
 from trirail.kinematics.robot import inverse
 
 Array = NDArray[np.float64]

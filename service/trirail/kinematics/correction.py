@@ -2,14 +2,13 @@
 
 At the pose p the legs as configured have to be solved for q = p + c(p). The correction c is a tensor product of uniform
 cubic B-splines in x, y and phi: twice differentiable, so that a motion whose acceleration is continuous keeps that, and
-with bounds on its derivatives that its coefficients give. Beyond its box c stays what it is at the border.
+with a bound on its slope that its coefficients give. Beyond its box c stays what it is at the border.
 
 Compiled, with motions as rows pose, velocity, acceleration. `legs` is Geometry.packed().
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -211,37 +210,16 @@ class Correction:
         greatest: Array = np.abs(at).max(axis=(0, 1, 2))
         return greatest
 
-    def centre(self, cell: Sequence[int]) -> Array:
-        """Return the middle of a cell, (3,) [m, m, rad]."""
-        return np.array(self.low) + (np.array(cell) + 0.5) * self.size
+    def adds(self, velocity: Sequence[float]) -> Array:
+        """Return bounds on what it adds to a pose's velocity in each cell, (l, m, n, 3), where that is at most given.
 
-    def adds(self, velocity: Sequence[float], acceleration: Sequence[float], jerk: Sequence[float]) -> Array:
-        """Return bounds on what it adds to a pose's velocity, acceleration and jerk in each cell: (l, m, n, 3, 3).
-
-        The next to last axis is velocity, acceleration, jerk, the last one x, y, phi; given is what those of the
-        platform are at most. A spline's derivative is a spline whose coefficients are differences of these, and is
-        nowhere beyond the greatest of those that count in a cell.
+        A spline's derivative is a spline whose coefficients are differences of these, and is nowhere beyond the
+        greatest of those that count in a cell.
         """
-        v, a, j = (np.array(each, dtype=np.float64) for each in (velocity, acceleration, jerk))
-        total = np.zeros((*self.cells, 3, 3))
-        for i in range(3):
-            first = self._derivative((i,))
-            total[..., 0, :] += first * v[i]
-            total[..., 1, :] += first * a[i]
-            total[..., 2, :] += first * j[i]
-        for i, k in itertools.product(range(3), repeat=2):
-            second = self._derivative((i, k))
-            total[..., 1, :] += second * v[i] * v[k]
-            total[..., 2, :] += 3.0 * second * a[i] * v[k]
-        for i, k, m in itertools.product(range(3), repeat=3):
-            total[..., 2, :] += self._derivative((i, k, m)) * v[i] * v[k] * v[m]
-        return total
-
-    def _derivative(self, axes: Sequence[int]) -> Array:
-        """Return a bound on the derivative along these axes in each cell, (l, m, n, 3)."""
-        by, window = self.nodes, [DEGREE + 1] * 3
-        for axis in axes:
-            by = np.diff(by, axis=axis) / self.size[axis]
+        total = np.zeros((*self.cells, 3))
+        for axis, most in enumerate(velocity):
+            window = [DEGREE + 1] * 3
             window[axis] -= 1
-        bound: Array = sliding_window_view(np.abs(by), window, axis=(0, 1, 2)).max(axis=(-3, -2, -1))
-        return bound
+            slopes = np.abs(np.diff(self.nodes, axis=axis)) / self.size[axis]
+            total += most * sliding_window_view(slopes, window, axis=(0, 1, 2)).max(axis=(-3, -2, -1))
+        return total

@@ -1,9 +1,12 @@
-"""A correction from measured poses: what the robot does beside its geometry, by penalised splines (P-splines).
+"""A correction from measured poses: what the robot does beside its geometry, by errors of the geometry and splines.
 
-At a measured pose p the sliders stand where the geometry has the pose q: the correction there is q - p. Sought are the
-nodes whose correction differs least from these, with as little curvature as tells nothing of poses that were left out:
-the weight of the nodes' second differences is the one with which a fit to four fifths of the poses foretells the rest
-best (Eilers and Marx, Flexible smoothing with B-splines and penalties, 1996, and cross-validation).
+At a measured pose p the sliders stand where the geometry has the pose q: the correction there is q - p. Near a singular
+angle small errors of the geometry become large ones of the pose, over a short way: no smooth map through measured poses
+would know that. So what is sought first is how much of all these differences errors of the geometry explain, by the
+derivatives of trirail.kinematics.calibration, written as splines. What they leave is fitted by penalised splines
+(P-splines): with as little curvature as tells nothing of poses that were left out. The weight of the nodes' second
+differences is the one with which a fit to four fifths of the poses foretells the rest best (Eilers and Marx, Flexible
+smoothing with B-splines and penalties, 1996, and cross-validation).
 """
 
 from __future__ import annotations
@@ -13,22 +16,27 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trirail.errors import KinematicsError
 from trirail.kinematics.algebra import Array
-from trirail.kinematics.calibration import CalibrationError
+from trirail.kinematics.calibration import CalibrationError, pose_derivatives
 from trirail.kinematics.correction import DEGREE, Correction, splines
-from trirail.kinematics.geometry import Geometry
-from trirail.kinematics.robot import forward, inverse
+from trirail.kinematics.geometry import Geometry, Room, travels
+from trirail.kinematics.robot import forward
 
-__all__ = ["FEWEST", "Fit", "Room", "fit"]
+__all__ = ["FEWEST", "Fit", "fit"]
 
 FEWEST = 30
 """Poses: a grid of three in x, y and phi, and a few more."""
-ENDS = 0.1
+ENDS = 0.15
 """Share of what the robot reaches, at either end, in which poses may lack."""
-SAMPLES = 15
-"""Along each axis, to see what the robot reaches."""
+SAMPLES = 21
+"""Along each axis, to see what the robot reaches, and what errors of its geometry do there."""
+BEYOND = 0.02
+"""Of the sliders' travel, where that is looked at too: so that it is known to the ends of it [m]."""
+STIFF = 2e-4
+"""The weight of curvature where there are so many samples: enough for what lies beyond them."""
 WEIGHTS = tuple(10.0**k for k in range(-6, 4))
 """Of curvature, that are tried."""
 FOLDS = 5
@@ -49,15 +57,6 @@ class Fit(NamedTuple):
     """What a correction leaves that was made without the pose in question: what to expect elsewhere."""
     empty: int
     """Cells without a measured pose: what is there comes from beside it."""
-
-
-class Room(NamedTuple):
-    """Where a robot may be: the least and the greatest of x, y [m] and phi [rad], of lambda_10 and of lambda_32 [m]."""
-
-    low: Sequence[float]
-    high: Sequence[float]
-    position: tuple[float, float]
-    passive: tuple[float, float]
 
 
 def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Sequence[int]) -> Fit:
@@ -89,29 +88,36 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
     curvature = _curvature(shape)
     fold = np.random.default_rng(SEED).permutation(len(poses)) % FOLDS
     scale = np.maximum(wanted.std(axis=0), 1e-12)
-    trials = [_foretold(rows, wanted, curvature * weight, fold) for weight in WEIGHTS]
+    by_geometry = _by_geometry(geometry, room, cells, curvature)
+
+    def nodes(among: NDArray[np.bool], weight: float) -> Array:
+        return _nodes(rows[among], by_geometry, wanted[among], scale, curvature * weight)
+
+    def foretold(weight: float) -> Array:
+        left = np.empty_like(wanted)
+        for out in (fold == number for number in range(FOLDS)):
+            left[out] = wanted[out] - rows[out] @ nodes(~out, weight)
+        return left
+
+    trials = [foretold(weight) for weight in WEIGHTS]
     best = int(np.argmin([float(((left / scale) ** 2).sum()) for left in trials]))
-    nodes = _solve(rows, wanted, curvature * WEIGHTS[best])
+    found = nodes(fold >= 0, WEIGHTS[best])
     return Fit(
-        Correction(_triple(low), _triple(high), nodes.reshape(*shape, 3)),
+        Correction(_triple(low), _triple(high), found.reshape(*shape, 3)),
         before=-wanted,
-        residuals=wanted - rows @ nodes,
+        residuals=wanted - rows @ found,
         foretold=trials[best],
         empty=math.prod(cells) - len(np.unique(at, axis=0)),
     )
 
 
-def _reached(geometry: Geometry, room: Room) -> Array:
-    """Return poses all over the room that the sliders' travel allows, (N, 3)."""
+def _reached(geometry: Geometry, room: Room, beyond: float = 0.0) -> Array:
+    """Return poses all over the room that the sliders' travel allows, or so much more of it [m]: (N, 3)."""
     axes = [np.linspace(low, high, SAMPLES) for low, high in zip(room.low, room.high, strict=True)]
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    joints = inverse(geometry, poses)
-    within = np.ones(len(poses), dtype=np.bool)
-    for places, (low, high) in ((joints.position, room.position), (joints.passive_position, room.passive)):
-        within &= ((places >= low) & (places <= high)).all(axis=1)
-    if not within.any():
+    reached: Array = poses[room.holds(travels(geometry, poses), beyond)]
+    if not len(reached):
         raise CalibrationError("the limits leave the robot nowhere to go")
-    reached: Array = poses[within]
     return reached
 
 
@@ -135,13 +141,20 @@ def _solve(rows: Array, wanted: Array, penalty: Array) -> Array:
     return found
 
 
-def _foretold(rows: Array, wanted: Array, penalty: Array, fold: Array) -> Array:
-    """Return what is left of each pose's error by a correction that was made without its fold."""
-    left = np.empty_like(wanted)
-    for number in range(FOLDS):
-        out = fold == number
-        left[out] = wanted[out] - rows[out] @ _solve(rows[~out], wanted[~out], penalty)
-    return left
+def _by_geometry(geometry: Geometry, room: Room, cells: Sequence[int], curvature: Array) -> Array:
+    """Return the nodes of what each parameter of the calibration does to a pose, (nodes, 3, 15)."""
+    reached = _reached(geometry, room, BEYOND)
+    moved = pose_derivatives(geometry, geometry, reached).reshape(len(reached), -1)
+    rows, _ = splines(reached, room.low, room.high, cells)
+    return _solve(rows, moved, curvature * STIFF).reshape(rows.shape[1], 3, -1)
+
+
+def _nodes(rows: Array, by_geometry: Array, wanted: Array, scale: Array, penalty: Array) -> Array:
+    """Return the nodes, (nodes, 3): those of a geometry's errors, and those of what these leave."""
+    each = np.tensordot(rows, by_geometry, 1) / scale[:, None]
+    parameters, *_ = np.linalg.lstsq(each.reshape(wanted.size, -1), (wanted / scale).ravel(), rcond=None)
+    nodes: Array = by_geometry @ parameters
+    return nodes + _solve(rows, wanted - rows @ nodes, penalty)
 
 
 def _triple(values: Sequence[float]) -> tuple[float, float, float]:

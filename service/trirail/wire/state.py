@@ -23,11 +23,11 @@ class Commanded(Struct, frozen=True):
     pose_acceleration: Triple
     """[m/s², m/s², rad/s²]."""
     position: Triple
-    """lambda_10 of the sliders A, B, C [m]."""
+    """lambda_10 of the sliders A, B, C [m], without what takes up backlash."""
     velocity: Triple
-    """[m/s]."""
+    """Of the drives, with what takes up backlash [m/s]."""
     acceleration: Triple
-    """[m/s²]."""
+    """Of the drives, with what takes up backlash [m/s²]."""
 
 
 class FrameCounts(Struct, frozen=True):
@@ -47,7 +47,7 @@ class Sliders(Struct, frozen=True):
     """What the drives say, of A, B, C."""
 
     position: Triple
-    """[m]."""
+    """lambda_10 [m]: what the drives say, without what takes up backlash."""
     velocity: Triple
     """[m/s]."""
     following_error: Triple
@@ -121,7 +121,8 @@ class State(Struct, frozen=True):
     mode: str
     """A trirail.wire.vocabulary.Mode."""
     pose: Triple
-    """Measured: x, y [m] and phi [rad] in the base frame, by the forward kinematics of the measured sliders."""
+    """Measured: x, y [m] and phi [rad] in the base frame, by the forward kinematics of the measured sliders,
+    with [correction] where there is one."""
     velocity: Triple
     """Measured, as a difference over a batch of records [m/s, m/s, rad/s]."""
     acceleration: Triple
