@@ -8,7 +8,9 @@ import itertools
 import math
 import os
 import tempfile
+import traceback
 import tracemalloc
+import warnings
 from collections.abc import Callable, Iterator
 from typing import cast
 
@@ -237,26 +239,48 @@ class Followers:
         self._due = self._due[1], position
 
 
+def alone(check: Callable[[], None]) -> None:
+    """Check something in a copy of this process, in which no thread of another test runs; fail as it fails."""
+    gc.collect()  # what others have left is not taken apart in the copy
+    reading, writing = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # the copy takes no lock that another thread may hold
+        pid = os.fork()
+    if pid == 0:
+        said = ""
+        try:
+            check()
+        except BaseException:  # noqa: BLE001 - all of it is told
+            said = traceback.format_exc()
+        os.write(writing, said.encode()[-60_000:])  # a pipe holds that much
+        os._exit(0)
+    os.close(writing)
+    with open(reading, encoding="utf-8", errors="replace") as told:
+        said = told.read()
+    _, status = os.waitpid(pid, 0)
+    if said or status:
+        pytest.fail(said or f"the copy ended with status {status}", pytrace=False)
+
+
 def what_memory_takes(cycle: Callable[[], None], cycles: int) -> tuple[int, int]:
     """Return by how many bytes memory grows in so many cycles, and how many are in use for a moment at most.
 
-    Without the garbage collector, as the loop runs. The cycles before are for what is made once, and for the tuples
-    that CPython keeps for later: 2000 of each length, then no more. Only what is allocated below this function counts
-    as grown, and the least of five rounds as in use: threads of earlier tests allocate too.
+    Of all threads: to be called `alone`. Without the garbage collector, as the loop runs. The cycles before are for
+    what is made once, and for the tuples that CPython keeps for later: 2000 of each length, then no more. Only what
+    code of the package has allocated, called from here, counts as grown.
     """
-    gc.collect()
     gc.disable()
     tracemalloc.start(FRAMES)
     try:
         for _ in range(2500):
             cycle()
         before = _allocated_here()
-        peaks = [_peak(cycle, cycles // 5) for _ in range(5)]
+        in_use = _peak(cycle, cycles)
         grown = _allocated_here().compare_to(before, "lineno")
     finally:
         tracemalloc.stop()
         gc.enable()
-    return sum(line.size_diff for line in grown), min(peaks)
+    return sum(line.size_diff for line in grown), in_use
 
 
 def _peak(cycle: Callable[[], None], cycles: int) -> int:

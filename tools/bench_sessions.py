@@ -37,7 +37,7 @@ def recordings(number: int) -> Iterator[Contents]:
             {(user, outcome): 10 for user in users for outcome in ("done", "faulted", "stopped")[: 1 + n % 3]}
         )
         faults = [
-            FaultEntry(began + k, FaultDetail("emcy", "B", 0x8611 if n % 500 == 0 else 0x8700), "drive B")
+            FaultEntry(began + k, FaultDetail("emcy", "B", 0x8611 if n % 500 == 1 else 0x8700), "drive B")
             for k in range(n % 4)
         ]
         name = f"robot-{n % 10}-{time.strftime('%Y%m%d-%H%M%S', time.gmtime(began))}.rrd"

@@ -204,6 +204,11 @@ class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
     listen: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=64)] = ("tcp/127.0.0.1:7447",)
     """Zenoh locators at which clients find the service: tcp on the loopback for every user of this machine,
     unixsock-stream for those whom the socket's file lets, tls with [zenoh.tls] for the network."""
+    connect: Annotated[tuple[Name, ...], Meta(max_length=8)] = ()
+    """Zenoh locators of routers that the service dials, again and again while they are gone: users reach it there."""
+    router: UserName | None = None
+    """The common name of the routers' certificate: with [zenoh.tls] the robot obeys no other router, and this one in
+    every user's name, since the users' roles stand at the router."""
     insecure: bool = False
     """Listen beyond this machine without certificates: whoever reaches the address can move the robot."""
     tls: Tls | None = None
@@ -497,7 +502,7 @@ def _check(config: Config) -> None:
                 f"to the singular angle {angle:.4f}: keep {'below ' if angle > 0 else 'above '}"
                 f"{angle - math.copysign(margin, angle):.4f}"
             )
-    _check_reach(config.zenoh)
+    check_reach(config.zenoh)
     _check_metrics(config)
     settling = config.limits.in_position
     if settling.timeout <= settling.dwell:
@@ -588,12 +593,20 @@ def _check_metrics(config: Config) -> None:
         )
 
 
-def _check_reach(zenoh: Zenoh) -> None:
+def check_reach(zenoh: Zenoh) -> None:
     """Refuse a door that is open by accident, and certificates or users that would not be looked at."""
+    if zenoh.tls is not None and zenoh.connect and zenoh.router is None:
+        raise ConfigError("zenoh.connect: with [zenoh.tls] give zenoh.router, the name in the router's certificate")
+    if zenoh.router is not None and not (zenoh.tls and zenoh.connect):
+        raise ConfigError("zenoh.router: it is looked at only with [zenoh.tls] and zenoh.connect")
+    if zenoh.router in zenoh.users:
+        raise ConfigError(f"zenoh.router: {zenoh.router} is a user: give the router a name of its own")
     if zenoh.users and zenoh.tls is None:
         raise ConfigError("zenoh.users: without [zenoh.tls] nobody's name is known: add it, or leave users out")
-    for index, endpoint in enumerate(zenoh.listen):
-        key, by = f"zenoh.listen[{index}] = {endpoint!r}", reach(endpoint)
+    named = [(f"listen[{index}]", endpoint) for index, endpoint in enumerate(zenoh.listen)]
+    named += [(f"connect[{index}]", endpoint) for index, endpoint in enumerate(zenoh.connect)]
+    for name, endpoint in named:
+        key, by = f"zenoh.{name} = {endpoint!r}", reach(endpoint)
         if zenoh.tls is not None and by is not ReachableBy.CERTIFICATE:
             raise ConfigError(f"{key}: with [zenoh.tls] every endpoint is tls/ADDRESS:PORT, or it would go round it")
         if zenoh.tls is not None and "#" in endpoint:

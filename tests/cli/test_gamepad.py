@@ -250,6 +250,7 @@ def test_the_pad_stops_the_robot_and_the_operator_leaves_by_the_terminal() -> No
         leaving.start()
         assert pendant.run(operator.robot.robot(), pad) == 0
         leaving.join()
+    assert not [thread for thread in threading.enumerate() if thread.name == "states"]
     operator.pendant.close()
 
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Followers, Rig, what_memory_takes
+from conftest import CONFIG, Followers, Rig, alone, what_memory_takes
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from trirail.config import geometry
@@ -183,7 +183,7 @@ def test_a_cycle_that_changes_nothing_takes_no_memory(rig: Rig, goal: Any) -> No
         rig.send("g1", goal)
         rig.cycles(100)
     assert rig.mode is (Mode.MOVING if goal else Mode.HOLDING)
-    takes_no_memory(rig)
+    alone(lambda: takes_no_memory(rig))
 
 
 def test_a_cycle_in_which_a_goal_waits_to_settle_takes_no_memory(rig: Rig) -> None:
@@ -193,8 +193,12 @@ def test_a_cycle_in_which_a_goal_waits_to_settle_takes_no_memory(rig: Rig) -> No
     settling.monitored["window"] = -1.0  # nothing is ever inside
     settling._timeout = 10**6
     rig.until(lambda: settling.under_way)
-    takes_no_memory(rig)
-    assert settling.under_way
+
+    def waits() -> None:
+        takes_no_memory(rig)
+        assert settling.under_way
+
+    alone(waits)
 
 
 def takes_no_memory(rig: Rig) -> None:

@@ -258,6 +258,23 @@ def test_nobody_else_renews_it_nor_does_another_kind(rig: Rig) -> None:
     assert rig.mode is Mode.MOVING
 
 
+def test_what_is_told_anew_takes_the_place_of_what_waits_whoever_else_does(rig: Rig) -> None:
+    rig.enable()
+    track(rig, sine(), regular(100.0, 0.3))
+    rig.planner.delay = 40
+    told = TrackGoal(0.02, 0.0, 0.0, timeout=1.0)
+    for ticket, user, name in [
+        (1, "ann", "t1"),
+        (2, "ann", "t1"),
+        (3, "bob", "t1"),
+        (4, "ann", "t1"),
+        (5, "ann", "t1"),
+    ]:
+        rig.cycle(GoalRequest(ticket, user, name, told, round(rig.now * 1e9)))
+    passed = [answer.ticket for answer in rig.answers if isinstance(answer, Accepted) and answer.ticket < 10]
+    assert passed == [1, 2, 4]
+
+
 def test_a_pose_preempts_it_and_it_preempts_a_pose(rig: Rig) -> None:
     rig.enable()
     rig.goal("g1", 0.05, 0.0, 0.0)

@@ -191,7 +191,7 @@ def test_the_gateway_takes_any_message(
     gateway: tuple[Gateway, FakeLink], kind: Kind, key: str, payload: bytes, encoding: str
 ) -> None:
     served, link = gateway
-    served._refusals_since = -math.inf
+    served._refusals._told_since = -math.inf
     link.sent.clear()
     served._handle(Incoming(kind, key, len(payload), payload, encoding, None))
     for packet in link.sent:

@@ -22,7 +22,7 @@ MESSAGES = ("put", "delete", "query", "reply", "declare_subscriber", "declare_qu
 """All that Zenoh's access control tells apart."""
 FLOWS = ("ingress", "egress")
 
-PUBLISHED = {"state", "event", "records"}
+PUBLISHED = {"state", "summary", "event", "records"}
 OPERATORS = {"enable", "disable", "quick_stop", "pause", "resume", "override", "acquire", "release"}
 MAINTAINERS = {"reset", "home"}
 
@@ -52,7 +52,7 @@ def allowed(role: Role | None, flow: str, message: str) -> set[str]:
     table: dict[tuple[str, str], set[str]] = {
         ("ingress", "query"): roles | (mine | told | adv if seeing else set()),
         ("ingress", "put"): {"goal/ME"} if sends else set(),
-        ("ingress", "declare_subscriber"): PUBLISHED | adv if seeing else set(),
+        ("ingress", "declare_subscriber"): PUBLISHED | adv | {"../other/state"} if seeing else set(),
         ("ingress", "liveliness_query"): {"alive"} | adv if seeing else set(),
         ("ingress", "declare_liveliness_subscriber"): {"alive"} | adv if seeing else set(),
         ("egress", "put"): PUBLISHED | adv if seeing else set(),

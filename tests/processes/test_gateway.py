@@ -13,9 +13,11 @@ from pathlib import Path
 import pytest
 from conftest import CONFIG
 from trirail.processes.backlog import MOST_OF_ONE, PATIENCE
-from trirail.processes.gateway import AHEAD, AHEAD_OF_ALL, REFUSALS_PER_SECOND, UNDER_WAY, Gateway
+from trirail.processes.gateway import Gateway
 from trirail.processes.guard import Guard
 from trirail.processes.inbox import Incoming
+from trirail.processes.refusals import REFUSALS_PER_SECOND
+from trirail.processes.requests import AHEAD, AHEAD_OF_ALL, UNDER_WAY
 from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.messages import Event
 from trirail.wire.packets import (

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import cast
 
 import pytest
-from conftest import Followers, Rig, what_memory_takes
+from conftest import Followers, Rig, alone, what_memory_takes
 from trirail.motion.planning import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
@@ -138,10 +138,13 @@ def test_a_cycle_that_changes_nothing_takes_no_memory(shell: Shell, in_motion: b
         heart.beat()
         shell.loop.cycle(tick)
 
-    grown, in_use = what_memory_takes(cycle, 500)
-    assert shell.mode() is (Mode.MOVING if in_motion else Mode.HOLDING)
-    assert grown <= 256
-    assert in_use <= 4096
+    def takes_none() -> None:
+        grown, in_use = what_memory_takes(cycle, 500)
+        assert shell.mode() is (Mode.MOVING if in_motion else Mode.HOLDING)
+        assert grown <= 256
+        assert in_use <= 4096
+
+    alone(takes_none)
 
 
 def test_missed_ticks_are_counted(shell: Shell) -> None:

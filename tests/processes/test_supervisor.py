@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from trirail.config import SIM, load
 from trirail.kinematics.compiled import FUNCTIONS
-from trirail.processes import supervisor
+from trirail.processes import child_process, supervisor
 
 CHILD = """
 import os, sys, time
@@ -55,7 +55,7 @@ def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What the supervisor says. Its children do what is written in files of their name and number."""
     script = tmp_path / "child.py"
     script.write_text(CHILD.format(folder=str(tmp_path)))
-    monkeypatch.setattr(supervisor, "python", lambda *arguments: [sys.executable, str(script), *arguments[2:]])
+    monkeypatch.setattr(child_process, "python", lambda *arguments: [sys.executable, str(script), *arguments[2:]])
     monkeypatch.setattr(supervisor, "END_WITHIN", 0.5)
     return []
 

@@ -14,12 +14,14 @@ from trirail.cli import (
     commission,
     config_commands,
     drives_command,
+    fleet_command,
     help_pages,
     keys_command,
     math_commands,
     panel_command,
     recording_commands,
     robot_commands,
+    router_command,
     sessions_command,
     terminal,
     units,
@@ -139,6 +141,8 @@ def view(
     return viewer.run(file, service.robot, service.connect, service.tls, web=web, records=records, say=say)
 
 
+app.command(router_command.router)
+app.command(fleet_command.fleet)
 app.command(drives_command.drives)
 app.command(commission.commission)
 app.command(panel_command.panel)

@@ -22,6 +22,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
             "trirail keys add ann --role operator",
             "trirail keys list",
         ),
+        "router": ("trirail router router.toml", "trirail router router.toml --print-config"),
         "completion": ("trirail completion bash --install", "trirail completion zsh"),
     },
     "Power and stops": {
@@ -63,6 +64,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
     "Look": {
         "status": ("trirail status", "trirail status --json"),
         "watch": ("trirail watch",),
+        "fleet": ("trirail fleet --connect tls/192.168.1.9:7447", "trirail fleet --json"),
         "events": ("trirail events", "trirail events --json"),
         "view": (
             "trirail view",

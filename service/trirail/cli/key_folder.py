@@ -57,8 +57,11 @@ class KeyFolder:
             _write_pair(made, issue(by, robot, days, addresses, serves=True))
         return Credentials.read(self.folder)
 
-    def add(self, user: str, days: float) -> Credentials:
-        """Make a user's folder. A name that was revoked is never given again: the old certificate would be good too."""
+    def add(self, user: str, days: float, addresses: Sequence[str] = ()) -> Credentials:
+        """Make a user's folder; with addresses that of a further robot, which clients find there.
+
+        A name that was revoked is never given again: the old certificate would be good too.
+        """
         folder = self.folder / USERS / user
         if user in revoked(self.folder):
             raise ServiceError(f"{user} was revoked, and what was lost has that name: choose another one")
@@ -69,7 +72,7 @@ class KeyFolder:
         by = self._authority()
         with _made_whole(folder) as made:
             _write(made / AUTHORITY, by.certificate, PUBLIC)
-            _write_pair(made, issue(by, user, days))
+            _write_pair(made, issue(by, user, days, addresses, serves=bool(addresses)))
         return Credentials.read(folder)
 
     def renew(self, name: str, days: float) -> Issued:

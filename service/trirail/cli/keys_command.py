@@ -110,6 +110,43 @@ def add(
     return 0
 
 
+@app.command(name="robot")
+def further(
+    name: str,
+    /,
+    *,
+    address: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    days: Days = 365.0,
+    folder: Folder = HERE,
+    json: Annotated[bool, Flag] = False,
+) -> int:
+    """Make the certificate of a further robot of this authority, as one that dials a router has it.
+
+    Parameters
+    ----------
+    name
+        Name of the robot, as in its configuration.
+    address
+        Host names and IP addresses at which clients find it without the router, beside those of its own machine.
+    days
+        How long the certificate is good.
+    folder
+        That of the authority.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail.cli.key_folder import KeyFolder
+
+    addresses = tuple(dict.fromkeys((*LOCAL, *address)))
+    made = KeyFolder(folder).add(check_name(name, "robot"), days, addresses)
+    if json:
+        terminal.json({"robot": name, "folder": str(made.folder), "addresses": addresses, "expires": made.expires})
+        return 0
+    terminal.say(f"{made.folder}: the certificate of {name} at {', '.join(addresses)}, until {made.expires:%Y-%m-%d}")
+    terminal.say("give it to that robot's machine alone, and name it there: [zenoh.tls] directory")
+    return 0
+
+
 @app.default
 @app.command(name="list")
 def show(*, folder: Folder = HERE, json: Annotated[bool, Flag] = False) -> int:

@@ -14,6 +14,7 @@ import tty
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from typing import Self
 
 import msgspec
 from rich.live import Live
@@ -109,16 +110,27 @@ class Pendant:
 
 
 class _Newest:
-    """The newest state, heard by a thread of its own; None where the service is silent."""
+    """The newest state, heard by a thread of its own until the context ends; None where the service is silent."""
 
     def __init__(self, robot: Robot) -> None:
         self.state: State | None = None
         self._robot = robot
-        threading.Thread(target=self._hear, name="states", daemon=True).start()
+        self._over = False
+        self._thread = threading.Thread(target=self._hear, name="states", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over = True
+        self._thread.join()
 
     def _hear(self) -> None:
-        while True:
+        while not self._over:
             for state in self._robot.states(SILENT):
+                if self._over:
+                    return
                 self.state = state
             self.state = None
 
@@ -131,16 +143,17 @@ def run(robot: Robot, pad: Pad | None = None) -> int:
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ServiceError("a jog by keys needs a terminal; without one: trirail jog VX VY W --seconds S")
     top = msgspec.convert(robot.info().limits, Limits).platform.velocity
-    pendant, newest = Pendant(robot, top), _Newest(robot)
+    pendant = Pendant(robot, top)
     if pad is not None:
         pendant.said = f"{pad.name}: {gamepad.HELP}"
-    try:
-        with Live(console=terminal.out, auto_refresh=False, transient=True) as live, _raw(pendant):
-            _serve(pendant, newest, live, pad)
-    except (KeyboardInterrupt, _HungUp, OSError):
-        pass  # an OSError is that of a terminal that is gone
-    finally:
-        pendant.close()
+    with _Newest(robot) as newest:
+        try:
+            with Live(console=terminal.out, auto_refresh=False, transient=True) as live, _raw(pendant):
+                _serve(pendant, newest, live, pad)
+        except (KeyboardInterrupt, _HungUp, OSError):
+            pass  # an OSError is that of a terminal that is gone
+        finally:
+            pendant.close()
     return 0
 
 

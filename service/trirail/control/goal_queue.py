@@ -72,11 +72,11 @@ class GoalQueue:
         sent = _Sent(request, cycle - age)
         if self.idle:
             self._served.clear()
-        if isinstance(request.goal, TrackGoal) and self._waiting and self._ledger.renewed_by(request):
-            before = self._waiting[-1].request
-            if self._ledger.renewed_by(before):
-                self._waiting.pop()
-                self._ledger.pass_over(before)
+        if isinstance(request.goal, TrackGoal) and self._ledger.renewed_by(request):
+            before = next((other for other in self._waiting if self._ledger.renewed_by(other.request)), None)
+            if before is not None:
+                self._waiting.remove(before)
+                self._ledger.pass_over(before.request)
         self._waiting.append(sent)
         self._ledger.keep_alive(request, self._alive_until(sent))
 

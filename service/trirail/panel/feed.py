@@ -20,7 +20,7 @@ EVENTS = 200
 
 
 class Feed:
-    """Hears one robot for as long as the program lasts. Raises ServiceError where that does not answer at first.
+    """Hears one robot from its start until it is closed. Raises ServiceError where that does not answer at first.
 
     What a tab has not sent yet is read under `changed`, which is notified whenever there is something new.
     """
@@ -38,16 +38,19 @@ class Feed:
         """When that came: milliseconds of this process's monotonic clock."""
         self._closed = False
         self._events: deque[tuple[int, bytes]] = deque(maxlen=EVENTS)
+
+    def start(self) -> None:
+        """Begin to hear."""
         for hear in (self._hear_states, self._hear_events):
             threading.Thread(target=hear, name=hear.__name__.strip("_"), daemon=True).start()
-
-    def events(self, after: int) -> list[tuple[int, bytes]]:
-        """Return the events that came after that number, numbered as they came, as JSON."""
-        return [event for event in self._events if event[0] > after]
 
     def close(self) -> None:
         """Gather no more states; what hears events ends with the robot's connection."""
         self._closed = True
+
+    def events(self, after: int) -> list[tuple[int, bytes]]:
+        """Return the events that came after that number, numbered as they came, as JSON."""
+        return [event for event in self._events if event[0] > after]
 
     def _hear_states(self) -> None:
         while not self._closed:

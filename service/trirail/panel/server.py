@@ -62,6 +62,7 @@ class Panel:
         self._thread = threading.Thread(target=self._server.serve_forever, name="panel", daemon=True)
 
     def __enter__(self) -> Panel:
+        self._feed.start()
         self._thread.start()
         return self
 

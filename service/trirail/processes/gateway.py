@@ -8,17 +8,13 @@ import select
 import signal
 import sys
 import time
-import uuid
-from collections import Counter, deque
 from collections.abc import Callable
-from typing import NamedTuple
 
 import msgspec
 import zenoh
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.backlog import Backlog
 from trirail.processes.guard import Guard
 from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox, Incoming
@@ -27,71 +23,47 @@ from trirail.processes.last_words import LastWords
 from trirail.processes.measured import Meter
 from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications
+from trirail.processes.refusals import Refusals
 from trirail.processes.replies import Replies
+from trirail.processes.requests import Requests
 from trirail.processes.state import StateMaker
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.links import Closed, PacketLink
 from trirail.wire.messages import (
     CONTENT,
-    AcquireLease,
     CommandReply,
     ErrorReply,
     Event,
     Goal,
     GoalReply,
     NoContent,
-    Override,
-    ReleaseLease,
     RoleReply,
     Stop,
-    TrackGoal,
 )
 from trirail.wire.packets import (
     Accepted,
     Answer,
-    CommandRequest,
     Confirmed,
-    GoalRequest,
     Happened,
     Kind,
     PoseChanged,
     Refused,
-    RefusedRequest,
     Status,
     Welcome,
     decode_answer,
     message,
 )
 from trirail.wire.records import unpack
-from trirail.wire.text import is_name, quoted
+from trirail.wire.state import summary_of
+from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command, Mode
 
 SWITCH_EVERY = 0.0005
 """After so long a thread lets another have the interpreter, which Zenoh's threads need to hand a message over [s]."""
 AT_ONCE = 256
 """Messages from Zenoh that are read before the loop is listened to again."""
-AHEAD = 3
-"""Goals of one user that the loop has at once: one that is planned, the next one, and one more, which takes the next
-one's place where both tell of the same target. The others wait here: a command overtakes them, and what waits when the
-robot is told to stop does not begin any more."""
-AHEAD_OF_ALL = 16
-"""Goals that the loop has at once, of all users: what it takes in four cycles."""
-UNDER_WAY = 8
-"""Commands of one user that the loop has at once; beyond that they are refused, but for those that stop the robot."""
-UNDER_WAY_OF_ALL = 64
-"""Likewise, of all users."""
-REPLY_WITHIN = 15.0
-"""A command that the loop has not carried out by then is answered with an error [s]."""
-TOO_MUCH = "too many messages at once: send fewer"
-REFUSALS_PER_SECOND = 10
-"""What is refused of one user that is told to everyone; the rest only gets its error reply."""
-REFUSALS_OF_ALL = 50
-"""Likewise, of all users."""
-
-
-class _Waiting(NamedTuple):
-    incoming: Incoming
-    deadline: float
+SUMMARY_EVERY = 1.0
+"""How often the summary is published [s]."""
 
 
 class Gateway:
@@ -109,31 +81,20 @@ class Gateway:
     ) -> None:
         self._log = log
         self._robot = config.robot.name
-        homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
-        self._home_within = REPLY_WITHIN + sum(homing)
         self._link = link
         self._beat = beat
         self._guard = guard
-        self._takeover = config.control.takeover
         self._last_words = LastWords(config.period)
         self._info = info(config)
         self._states = StateMaker(config)
         self._meter = Meter(measured) if config.telemetry.metrics_port else None
         self._state_every = 1.0 / config.telemetry.state_hz
-        self._state_due = 0.0
+        self._state_due = self._summary_due = self._heard = 0.0
         self._replies = Replies(self._robot)
-        self._inbox = Inbox(opened, self._robot, self._too_much)
-        self._poses = Poses(config, self._replies.send, self._refuse, self._tell_of_pose, self._inbox.wake)
-        self._backlog = Backlog()
-        self._ahead: dict[int, str] = {}
-        """The tickets of the goals that the loop has, and whose they are."""
-        self._commands: dict[int, str] = {}
-        """Likewise, of the commands."""
-        self._waiting: dict[int, _Waiting] = {}
-        self._tickets = 0
-        self._refusals: Counter[str] = Counter()
-        self._refusals_since = 0.0
-        self._overruns: deque[str] = deque(maxlen=REFUSALS_OF_ALL)
+        self._refusals = Refusals(link, self._replies)
+        self._inbox = Inbox(opened, self._robot, self._refusals.too_much)
+        self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._tell_of_pose, self._inbox.wake)
+        self._requests = Requests(config, link, guard, self._replies, self._last_words)
         self._ending = False
         self._publications = Publications(opened, self._robot)
 
@@ -153,19 +114,17 @@ class Gateway:
                     self._beat()
                     self._last_words.heard()
                     self._hear(packet, ready)
-                self._send_goals()  # those for which there was no room
+                self._requests.send_goals()  # those for which there was no room
                 self._poses.settle()
-                self._give_up_late()
-                self._tell_of_overruns()
+                self._requests.give_up_late()
+                self._summarize()
+                self._refusals.tell_of_overruns()
         except Closed:
             self._tell_of_its_end()
         finally:
             with contextlib.suppress(Closed):
                 self._poses.close()
-            for incoming in [
-                *(waiting.incoming for waiting in self._waiting.values()),
-                *(goal.incoming for goal in self._backlog),
-            ]:
+            for incoming in self._requests:
                 self._replies.send(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
             self._replies.close()
 
@@ -198,38 +157,18 @@ class Gateway:
             else:
                 self._command(incoming)
         except RefusedError as refusal:
-            self._refuse(incoming, refusal)
+            self._refusals.refuse(incoming, refusal)
         except Closed:
             raise
         except Exception as error:  # noqa: BLE001 - a message that is read wrongly must not end the gateway
-            self._refuse(incoming, RefusedError(RefusalCode.INTERNAL, f"internal error, please report it: {error!r}"))
+            self._refusals.refuse(
+                incoming, RefusedError(RefusalCode.INTERNAL, f"internal error, please report it: {error!r}")
+            )
 
     def _goal(self, incoming: Incoming) -> None:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
         sent: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
-        goal = self._poses.of_name(sent)
-        self._backlog.check_room(user, incoming.size)
-        self._tickets += 1
-        goal_id = goal.id or uuid.uuid4().hex[:12]
-        told_of = goal.time if isinstance(goal, TrackGoal) else None
-        age = time.time() - told_of if told_of is not None else 0.0
-        self._backlog.add(incoming, GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns(), age=age))
-        self._send_goals()
-
-    def _send_goals(self) -> None:
-        """Pass on as many goals of each user as the loop is to have."""
-        of = Counter(self._ahead.values())
-        for user in self._backlog.users:
-            if len(self._ahead) >= AHEAD_OF_ALL:
-                return
-            if of[user] < AHEAD:
-                incoming, request = self._backlog.first(user)
-                if not self._link.send(message(request)):
-                    return
-                self._backlog.take(user)
-                self._ahead[request.ticket] = user
-                self._last_words.take(request)
-                self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
+        self._requests.goal(incoming, user, self._poses.of_name(sent))
 
     def _command(self, incoming: Incoming) -> None:
         user, called = boundary.names(incoming.key, self._key("cmd"), ("user", "command"))
@@ -242,73 +181,15 @@ class Gateway:
         content = boundary.decode(incoming.payload, CONTENT.get(name, NoContent | None), takes, incoming.encoding)
         goal = content.goal if isinstance(content, Stop) else None
         reason = f"{name} by {user}"
-        if goal is not None and self._backlog.withdraw(goal, reason):  # before the loop has it
+        if goal is not None and self._requests.backlog.withdraw(goal, reason):  # before the loop has it
             self._replies.send(incoming, CommandReply(Command.STOP, self._states.newest().mode))
             return
-        if not name.stops:
-            self._check_under_way(user)
-        request = self._request(user, name, content)
-        if not self._link.send(message(request)):
-            raise RefusedError(RefusalCode.BUSY, "too many requests at once: send it again")
-        self._commands[request.ticket] = user
-        within = self._home_within if name is Command.HOME else REPLY_WITHIN
-        self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + within)
+        self._requests.command(incoming, user, name, content)
         if name.stops and goal is None and (name.everybodys or self._states.lease in (None, user)):
-            self._backlog.withdraw_all(reason, incoming.number)
-
-    def _check_under_way(self, user: str) -> None:
-        """Raise RefusedError where the loop has as many commands of a user, or of all, as it is to have."""
-        own = sum(sender == user for sender in self._commands.values())
-        if own >= UNDER_WAY:
-            raise RefusedError(RefusalCode.BUSY, f"{own} commands of {user} are under way already: send fewer")
-        if len(self._commands) >= UNDER_WAY_OF_ALL:
-            raise RefusedError(RefusalCode.BUSY, f"{len(self._commands)} commands are under way already: send fewer")
-
-    def _request(self, user: str, name: Command, content: msgspec.Struct | None) -> CommandRequest:
-        """Make of a command and what it carries what the loop takes. Raises RefusedError for what a role forbids."""
-        self._tickets += 1
-        match content:
-            case Override(percent):
-                return CommandRequest(self._tickets, user, name, percent / 100.0)
-            case Stop(goal):
-                return CommandRequest(self._tickets, user, name, goal=goal)
-            case AcquireLease(lease, timeout, force):
-                if force:
-                    self._guard.check(user, self._takeover, "taking the lease over")
-                return CommandRequest(self._tickets, user, name, lease=lease, timeout=timeout, force=force)
-            case ReleaseLease(lease):
-                return CommandRequest(self._tickets, user, name, lease=lease)
-        return CommandRequest(self._tickets, user, name)
-
-    def _too_much(self, incoming: Incoming) -> None:
-        """Answer what there is no room for; called by Zenoh's threads."""
-        self._overruns.append(incoming.user)
-        self._replies.send(incoming, ErrorReply(RefusalCode.BUSY, TOO_MUCH))
-
-    def _tell_of_overruns(self) -> None:
-        """Tell everyone whose messages there was no room for: a put has no answer."""
-        while self._overruns:
-            user = self._overruns.popleft()
-            self._tell(TOO_MUCH, user if is_name(user) else "")
-
-    def _refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
-        """Answer what cannot be taken; tell everyone too, since a put has no answer."""
-        text = quoted(str(refusal))
-        self._replies.send(incoming, ErrorReply(refusal.code, text))
-        self._tell(text, incoming.user if is_name(incoming.user) else "")
+            self._requests.backlog.withdraw_all(reason, incoming.number)
 
     def _tell_of_pose(self, changed: PoseChanged) -> None:
         self._link.send(message(changed))
-
-    def _tell(self, text: str, user: str = "") -> None:
-        """Have the loop tell everyone, but not too often."""
-        now = time.monotonic()
-        if now - self._refusals_since >= 1.0:
-            self._refusals.clear()
-            self._refusals_since = now
-        if self._refusals[user] < REFUSALS_PER_SECOND and self._refusals.total() < REFUSALS_OF_ALL:
-            self._refusals[user] += 1
-            self._link.send(message(RefusedRequest(user, text)))
 
     # ------------------------------------------------------------------ loop to Zenoh
 
@@ -324,7 +205,7 @@ class Gateway:
         except Closed:
             raise
         except Exception as error:  # noqa: BLE001 - it would come again after every restart
-            self._tell(quoted(f"the gateway could not read what the loop said, please report it: {error!r}"))
+            self._refusals.tell(quoted(f"the gateway could not read what the loop said, please report it: {error!r}"))
             return
         if isinstance(answer, Welcome):
             self._info = msgspec.structs.replace(self._info, missing_protections=answer.missing_protections)
@@ -340,11 +221,11 @@ class Gateway:
                 self._states.update(answer)
             case Accepted(ticket, goal_id, duration, slowed, stops_first, queued, lag):
                 expected = duration if math.isfinite(duration) else None
-                self._answer(ticket, GoalReply(goal_id, expected, slowed, stops_first, queued, lag))
+                self._requests.answer(ticket, GoalReply(goal_id, expected, slowed, stops_first, queued, lag))
             case Confirmed(ticket, name, mode):
-                self._answer(ticket, CommandReply(name, mode))
+                self._requests.answer(ticket, CommandReply(name, mode))
             case Refused(ticket, code, text, slider, value, limit):
-                self._answer(ticket, ErrorReply(code, text, slider, value, limit))
+                self._requests.answer(ticket, ErrorReply(code, text, slider, value, limit))
 
     def _publish(self, batch: memoryview) -> None:
         """Take in a batch of records and pass it on; publish the newest state when it is time."""
@@ -355,15 +236,22 @@ class Gateway:
         if self._meter is not None:
             self._meter.records(rows)
             self._meter.tell(self._states.newest)
-        now = time.monotonic()
+        now = self._heard = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
             self._publications.state(self._states.newest(self.warnings()))
 
+    def _summarize(self) -> None:
+        """Publish the summary when it is time, also while the loop says nothing: then it tells since when."""
+        now = time.monotonic()
+        if now >= self._summary_due and self._states.cycle:
+            self._summary_due = now + SUMMARY_EVERY
+            self._publications.summary(summary_of(self._states.newest(), now - self._heard, self._info.version))
+
     def _happened(self, event: Event) -> None:
         """Tell everyone of an event, and the service's log; what others have sent under a new holder does not begin."""
         if event.kind == "lease":
-            self._backlog.withdraw_others(event.user, event.message)
+            self._requests.backlog.withdraw_others(event.user, event.message)
         self._publications.event(event)
         self._log(event)
         if self._meter is not None:
@@ -376,19 +264,6 @@ class Gateway:
         if (reason := self._last_words.reason) and self._states.cycle:
             state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason,))
             self._publications.state(state)
-
-    def _answer(self, ticket: int, content: msgspec.Struct) -> None:
-        waiting = self._waiting.pop(ticket, None)
-        self._commands.pop(ticket, None)
-        if waiting is not None:
-            self._replies.send(waiting.incoming, content)
-        if self._ahead.pop(ticket, None) is not None:
-            self._send_goals()
-
-    def _give_up_late(self) -> None:
-        now = time.monotonic()
-        for ticket in [ticket for ticket, waiting in self._waiting.items() if waiting.deadline < now]:
-            self._answer(ticket, ErrorReply(RefusalCode.TIMEOUT, "not carried out in time"))
 
     def _key(self, *parts: str) -> str:
         return zenoh_session.key(self._robot, *parts)

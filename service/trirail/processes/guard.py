@@ -23,7 +23,7 @@ class Guard:
 
     def __init__(self, config: Config) -> None:
         self._robot = config.robot.name
-        self._listen = config.zenoh.listen
+        self._listen, self._connect, self._router = config.zenoh.listen, config.zenoh.connect, config.zenoh.router
         self._credentials: Credentials | None = None
         self.users: dict[str, Role] = {}
         """The role of each user who has one."""
@@ -37,10 +37,10 @@ class Guard:
     def open(self) -> zenoh.Session:
         """Open the session. Raises ServiceError where an address cannot be listened on."""
         if self._credentials is None:
-            opened = zenoh_session.open_service(self._listen)
+            opened = zenoh_session.open_service(self._listen, connect=self._connect)
         else:
-            rules = access_control(self._robot, self.users)
-            opened = zenoh_session.open_service(self._listen, self._credentials, rules)
+            rules = access_control(self._robot, self.users, self._router)
+            opened = zenoh_session.open_service(self._listen, self._credentials, rules, self._connect)
         for path in filter(None, map(socket_file, self._listen)):
             path.chmod(SOCKET_MODE)
         return opened
@@ -60,7 +60,7 @@ class Guard:
         """Return what people should know of the door, one line each, with the remedy."""
         insecure = [
             f"insecure: whoever reaches {endpoint} can move the robot; trirail keys init makes certificates"
-            for endpoint in self._listen
+            for endpoint in (*self._listen, *self._connect)
             if reach(endpoint) is ReachableBy.NETWORK
         ]
         return (*insecure, *self.certificate_warnings())

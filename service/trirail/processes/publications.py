@@ -8,7 +8,7 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_a
 
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import Event
-from trirail.wire.state import State
+from trirail.wire.state import State, Summary
 
 EVENTS_KEPT = 1000
 """So many events a client hears that asks for the past."""
@@ -30,6 +30,7 @@ class Publications:
             )
 
         self._state = dropping("state", boundary.JSON, zenoh.Priority.DATA_HIGH)
+        self._summary = dropping("summary", boundary.JSON, zenoh.Priority.DATA)
         self._records = dropping("records", boundary.BINARY, zenoh.Priority.DATA_LOW)
         self._event = declare_advanced_publisher(
             opened,
@@ -44,6 +45,10 @@ class Publications:
     def state(self, state: State) -> None:
         """Publish the newest state."""
         self._state.put(msgspec.json.encode(state))
+
+    def summary(self, summary: Summary) -> None:
+        """Publish the newest summary."""
+        self._summary.put(msgspec.json.encode(summary))
 
     def records(self, batch: bytes) -> None:
         """Publish packed records, laid out as in wire.records."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import selectors
 import signal
-import socket
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable
@@ -18,12 +16,13 @@ from msgspec import structs
 
 from trirail.config import Config
 from trirail.errors import ServiceError
+from trirail.processes.child_process import ChildProcess
 from trirail.processes.compiling import Progress
 from trirail.processes.health import Running
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
-from trirail.processes.interpreter import CHILD, python
 from trirail.processes.monitor import Monitor
-from trirail.processes.process import COMPILING, HAPPENED, MEASURED, Order
+from trirail.processes.process import Order
+from trirail.processes.signals import Signals
 from trirail.processes.systemd import Watchdog, notify
 from trirail.wire import links
 from trirail.wire.messages import Event, Level
@@ -57,72 +56,6 @@ RETRY = 10.0
 """How long it is waited before any more, for recorder and planner; the gateway's are the service's end [s]."""
 
 
-class _Child:
-    """A child process, and a pipe on which it says that it is ready and whose end is its end."""
-
-    def __init__(self, name: str, order: bytes, runtime: Path, beats: int, sockets: list[int]) -> None:
-        self.name = name
-        self.began = time.monotonic()
-        self.compiling: list[str] = []
-        self.happened: list[Event] = []
-        self.measured: list[dict[str, Any]] = []
-        self._begun_line = b""
-        self.ready_with: dict[str, Any] | None = None
-        self._hung_for = 0.0
-        self.pipe, write = os.pipe()
-        arguments = [name, str(runtime), str(write), str(beats), *map(str, sockets)]
-        self.process = subprocess.Popen(
-            python("-m", CHILD, *arguments), stdin=subprocess.PIPE, pass_fds=[write, beats, *sockets]
-        )
-        os.close(write)
-        os.set_blocking(self.pipe, False)
-        if self.process.stdin is not None:
-            self.process.stdin.write(order)
-            self.process.stdin.close()
-
-    def listen(self) -> bool:
-        """Read what the child says; False once it has ended."""
-        try:
-            content = os.read(self.pipe, 65_536)
-        except BlockingIOError:
-            return False
-        *lines, self._begun_line = (self._begun_line + content).split(b"\n")
-        for line in lines:
-            said = msgspec.json.decode(line)
-            if COMPILING in said:
-                self.compiling.append(said[COMPILING])
-            elif HAPPENED in said:
-                self.happened.append(msgspec.convert(said[HAPPENED], Event))
-            elif MEASURED in said:
-                self.measured.append(said[MEASURED])
-            else:
-                self.ready_with = said
-        return bool(content)
-
-    def wait(self, deadline: float) -> bool:
-        """Wait for its end until a time of the monotonic clock."""
-        try:
-            self.process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            return False
-        return True
-
-    def kill_hung(self, silent: float) -> None:
-        """Kill it for having given no sign of life for so long [s]; SIGTERM would wait, if it is stopped."""
-        self._hung_for = silent
-        self.process.kill()
-
-    @property
-    def how(self) -> str:
-        """How it ended, for people."""
-        code = self.process.returncode
-        if self._hung_for and code == -signal.SIGKILL:
-            return f"no sign of life for {self._hung_for:g} s, so it was killed"
-        if code == 0:
-            return "another process sent it SIGTERM"
-        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-
-
 class Supervisor:
     """Runs the service in the foreground; `say` takes what it has to say of the processes, `tell` every event."""
 
@@ -137,7 +70,7 @@ class Supervisor:
         self._orders["recorder"] = Order(config, str(record) if record else None)
         self._say = say
         self._tell = tell
-        self._children: dict[str, _Child] = {}
+        self._children: dict[str, ChildProcess] = {}
         self._selector = selectors.DefaultSelector()
         self._restarts: dict[str, list[float]] = {name: [] for name in CHILDREN}
         self._due: dict[str, float] = {}
@@ -168,7 +101,7 @@ class Supervisor:
         """
         parent = os.environ.get("XDG_RUNTIME_DIR")
         runtime = tempfile.TemporaryDirectory(prefix="trirail-", dir=parent)
-        with runtime as folder, _Signals() as signals, self._monitor:
+        with runtime as folder, Signals() as signals, self._monitor:
             self._runtime = Path(folder)
             self._listening = [links.listen(self._runtime / name) for name in PORTS]
             self._selector.register(signals.reader, selectors.EVENT_READ, None)
@@ -188,16 +121,16 @@ class Supervisor:
             self._heartbeats.of(name).rest()
         beats = self._heartbeats.descriptor
         self._started[name] += 1
-        child = _Child(name, msgspec.json.encode(self._orders[name]), self._runtime, beats, sockets)
+        child = ChildProcess(name, msgspec.json.encode(self._orders[name]), self._runtime, beats, sockets)
         self._children[name] = child
         self._selector.register(child.pipe, selectors.EVENT_READ, child)
 
-    def _watch(self, up: Callable[[dict[str, dict[str, Any]]], None], signals: _Signals) -> None:
+    def _watch(self, up: Callable[[dict[str, dict[str, Any]]], None], signals: Signals) -> None:
         progress = Progress(lambda words: self._say(words, "info"), START_WITHIN)
         began = time.monotonic()
         is_up = False
         while not self._ending:
-            heard: list[_Child | None] = [key.data for key, _ in self._selector.select(TURN)]
+            heard: list[ChildProcess | None] = [key.data for key, _ in self._selector.select(TURN)]
             # The loop first: the others end because it has ended, and not by themselves.
             for child in sorted(heard, key=lambda child: child is not self._children.get("loop")):
                 if child is None:
@@ -246,7 +179,7 @@ class Supervisor:
             return Running(None, ready=False, restarts=restarts)
         return Running(child.process.pid, child.ready_with is not None, restarts)
 
-    def _on_end(self, child: _Child) -> None:
+    def _on_end(self, child: ChildProcess) -> None:
         """Decide what the end of a process means."""
         self._forget(child)
         child.process.wait()
@@ -294,13 +227,13 @@ class Supervisor:
         if reason:
             self._say(reason, "error")
 
-    def _pass_on(self, child: _Child) -> None:
+    def _pass_on(self, child: ChildProcess) -> None:
         while child.happened:
             self._tell(child.happened.pop(0))
         while child.measured:
             self._monitor.take(child.name, child.measured.pop(0))
 
-    def _forget(self, child: _Child) -> None:
+    def _forget(self, child: ChildProcess) -> None:
         while child.listen():
             pass
         self._pass_on(child)
@@ -334,30 +267,7 @@ class Supervisor:
             self._failed = self._failed or child.process.returncode != 0
             self._forget(child)
 
-    def _kill(self, child: _Child) -> None:
+    def _kill(self, child: ChildProcess) -> None:
         self._say(f"the {child.name} does not end: killing it", "warning")
         child.process.kill()
         child.process.wait()
-
-
-class _Signals:
-    """SIGTERM and SIGINT as something to select on."""
-
-    def __enter__(self) -> _Signals:
-        self.reader, self._writer = socket.socketpair()
-        self._writer.setblocking(False)
-        self._before = {
-            number: signal.signal(number, lambda _signal, _frame: None) for number in (signal.SIGTERM, signal.SIGINT)
-        }
-        self._wakeup = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-        return self
-
-    def take(self) -> signal.Signals:
-        return signal.Signals(self.reader.recv(1)[0])
-
-    def __exit__(self, *_: object) -> None:
-        signal.set_wakeup_fd(self._wakeup)
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        self.reader.close()
-        self._writer.close()

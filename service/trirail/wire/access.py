@@ -8,7 +8,7 @@ A rule holds where its key includes the message's: who asks for `goal/*` is not 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from trirail.wire.vocabulary import Command, Role
@@ -33,6 +33,9 @@ COMMANDS: dict[Command, Role] = {
 }
 """The least role that may send each command."""
 
+PUBLISHED = ("state", "summary", "event", "records")
+"""What the robot alone publishes."""
+
 _Rule = dict[str, Any]
 
 
@@ -45,14 +48,19 @@ def least_role(*parts: str) -> Role:
     return COMMANDS[Command(parts[2])] if parts[0] == "cmd" else Role.VIEWER
 
 
-def access_control(robot: str, users: Mapping[str, Role]) -> dict[str, Any]:
+def access_control(robot: str, users: Mapping[str, Role], router: str | None = None) -> dict[str, Any]:
     """Return section access_control of Zenoh's configuration for the service of a robot with these users.
 
     A user sends in his own name only: the key has it, and the rule is for the certificate of that common name. Every
-    certificate may ask for its role, so that who is denied all else can learn why.
+    certificate may ask for its role, so that who is denied all else can learn why. What comes through a router has no
+    user's certificate: the certificate of that common name may all, in every name, and has its users' rules itself.
     """
     asking, using = list(_of_every_certificate(robot)), list(_of_every_user(robot))
     rules, policies = asking + using, [_policy("every certificate", asking)]
+    if router is not None:
+        through = list(_of_router(robot))
+        rules += through
+        policies.append(_policy(router, using + through))
     for user, role in users.items():
         own = list(_of_user(robot, user, role))
         rules += own
@@ -63,10 +71,25 @@ def access_control(robot: str, users: Mapping[str, Role]) -> dict[str, Any]:
         "rules": rules,
         "subjects": [
             {"id": "every certificate", "link_protocols": ["tls"]},  # no user is called so: his name has no space
-            *({"id": user, "link_protocols": ["tls"], "cert_common_names": [user]} for user in users),
+            *map(_subject, (*users, *([router] if router is not None else []))),
         ],
         "policies": policies,
     }
+
+
+def router_access_control(robots: Sequence[str], users: Mapping[str, Role]) -> dict[str, Any]:
+    """Return section access_control for a router between these robots and users.
+
+    Its users may with every robot what they may with one; a robot may what it lets its router do, the other way round,
+    and that with its own keys only. Nobody's role is a robot's to tell: the router knows it.
+    """
+    section = access_control("*", users)
+    for robot in robots:
+        mirrored = [_mirrored(robot, rule) for rule in (*_of_every_user(robot), *_of_router(robot))]
+        section["rules"] += mirrored
+        section["policies"].append(_policy(robot, mirrored))
+        section["subjects"].append(_subject(robot))
+    return section
 
 
 def _of_every_certificate(robot: str) -> Iterator[_Rule]:
@@ -75,9 +98,20 @@ def _of_every_certificate(robot: str) -> Iterator[_Rule]:
     yield _rule("answer with a role", "egress", ("declare_queryable", "reply"), role)
 
 
+def _of_router(robot: str) -> Iterator[_Rule]:
+    """Yield what only a router may beside what every user may: pass on what users send, in the name of each."""
+    yield from _of_user(robot, "*", Role.MAINTAINER)
+
+
+def _mirrored(robot: str, rule: _Rule) -> _Rule:
+    """A rule of a robot's, as its other side has it: what may leave here comes in there."""
+    (flow,) = rule["flows"]
+    return rule | {"id": f"{robot}: {rule['id']}", "flows": ["egress" if flow == "ingress" else "ingress"]}
+
+
 def _of_every_user(robot: str) -> Iterator[_Rule]:
     """Yield what a viewer may, but for what has his name in its key; and what the robot may send to him."""
-    published = [key(robot, name) for name in ("state", "event", "records")]
+    published = [key(robot, name) for name in PUBLISHED]
     # Of the advanced publisher: its past, that it is there, and the number of its last event.
     past, alive = key(robot, "event", "@adv", "**"), key(robot, "alive")
     told = [key(robot, "info"), key(robot, "poses")]
@@ -85,6 +119,8 @@ def _of_every_user(robot: str) -> Iterator[_Rule]:
     asked = [key(robot, "goal", "*"), key(robot, "cmd", "*", "*"), *taught, *told]
     yield _rule("publish", "egress", ("put",), *published, past)
     yield _rule("subscribe", "ingress", ("declare_subscriber",), *published, past)
+    # A fleet's clients subscribe to all robots at once; what they then see of this one is its own.
+    yield _rule("subscribe to all", "ingress", ("declare_subscriber",), *(key("*", name) for name in PUBLISHED))
     yield _rule("ask", "ingress", ("query",), *told, past)
     yield _rule("listen", "egress", ("declare_queryable",), *asked, past)
     yield _rule("listen to puts", "egress", ("declare_subscriber",), key(robot, "goal", "*"))
@@ -108,6 +144,10 @@ def _of_user(robot: str, user: str, role: Role) -> Iterator[_Rule]:
 
 def _rule(name: str, flow: str, messages: tuple[str, ...], *keys: str) -> _Rule:
     return {"id": name, "permission": "allow", "flows": [flow], "messages": list(messages), "key_exprs": list(keys)}
+
+
+def _subject(name: str) -> dict[str, Any]:
+    return {"id": name, "link_protocols": ["tls"], "cert_common_names": [name]}
 
 
 def _policy(subject: str, rules: Iterable[_Rule]) -> dict[str, list[str]]:

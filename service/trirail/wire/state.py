@@ -148,6 +148,47 @@ class State(Struct, frozen=True):
     """The user who holds the lease: his goals and commands alone move the robot; None where nobody does."""
 
 
+SUMMARY_BYTES = 300
+"""A summary is shorter than that, as JSON."""
+SUMMARY_TEXT = 80
+"""What a text of a summary takes at most, as JSON [bytes]; longer ones end in …."""
+
+
+class Summary(Struct, frozen=True):
+    """What a fleet reads of a robot, published once a second."""
+
+    mode: str
+    """A trirail.wire.vocabulary.Mode."""
+    fault: str | None
+    """Why the robot is in fault, shortened; None where it is not."""
+    goal: str | None
+    """The id of the goal under way, shortened."""
+    lateness: float
+    """99.9 % of the last minute's cycles began no later after their deadlines [µs]."""
+    missed: int
+    """Ticks missed since the service started."""
+    age: float
+    """How long ago the loop last said something, when this was sent [s]."""
+    version: str
+    """Of the service's software."""
+
+
+def summary_of(state: State, age: float, version: str) -> Summary:
+    """Make the summary of a state that is so old [s]."""
+    fault = _shortened("; ".join(state.faults)) if state.faults else None
+    goal = _shortened(state.goal.id) if state.goal else None
+    loop = state.loop
+    return Summary(state.mode, fault, goal, loop.lateness_us.p999, loop.overruns, round(age, 2), version)
+
+
+def _shortened(text: str) -> str:
+    if len(msgspec.json.encode(text)) <= SUMMARY_TEXT:
+        return text
+    while len(msgspec.json.encode(f"{text}…")) > SUMMARY_TEXT:
+        text = text[:-1]
+    return f"{text}…"
+
+
 class CorrectionTold(Struct, frozen=True):
     """What the robot's as-built errors are corrected by."""
 

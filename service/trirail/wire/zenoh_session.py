@@ -34,33 +34,96 @@ def key(robot: str, *parts: str) -> str:
 
 
 def open_service(
-    listen: Sequence[str], credentials: Credentials | None = None, access_control: Mapping[str, Any] | None = None
+    listen: Sequence[str],
+    credentials: Credentials | None = None,
+    access_control: Mapping[str, Any] | None = None,
+    connect: Sequence[str] = (),
 ) -> zenoh.Session:
     """Open the service's session: a peer that listens on the given locators and nowhere else.
 
     With credentials it asks every client for a certificate of the same authority; `access_control`, that section of
-    Zenoh's configuration, is what each may do.
+    Zenoh's configuration, is what each may do. It dials the routers of `connect`, and again whenever they are gone.
     """
+    settings = {"mode": "peer", **serving(listen, credentials, access_control, connect)}
     return _open(
-        {
-            "mode": "peer",
-            "listen/endpoints": list(listen),
-            "connect/endpoints": [],
-            # Connections on which nothing comes must not keep others out.
-            "transport/unicast/accept_pending": 1000,
-            "transport/unicast/accept_timeout": 3000,
-            "transport/unicast/max_sessions": SESSIONS,
-            "timestamping/enabled": True,  # advanced publishers order their history by it
-            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-            "transport/link/tx/queue/congestion_control/block/wait_before_close": round(GIVEN_UP_AFTER * 1e6),
-            "transport/link/tx/queue/size/data_high": 16,
-            "transport/link/tx/queue/size/real_time": 16,  # answers come in bursts
-            **_tls(credentials),
-            **({"access_control": access_control} if access_control is not None else {}),
-        },
+        settings,
         f"cannot listen on {', '.join(listen)}",
         "another service may hold it: end that, or set zenoh.listen to another address",
     )
+
+
+def open_router(settings: Mapping[str, Any]) -> zenoh.Session:
+    """Open a router's session, of what `router` returns."""
+    listen = ", ".join(settings["listen/endpoints"])
+    return _open(dict(settings), f"cannot listen on {listen}", "another one may hold it: end that, or choose another")
+
+
+def router(
+    listen: Sequence[str],
+    credentials: Credentials | None,
+    access_control: Mapping[str, Any] | None,
+    connect: Sequence[str],
+    thinned: Mapping[str, float],
+) -> dict[str, Any]:
+    """Return the settings of a router, by their paths in Zenoh's configuration.
+
+    Of the keys in `thinned` no more leaves for each client than so often a second: its newest is dropped, so that this
+    is for states alone. Zenoh keeps one time for a rule, hence a rule for each key.
+    """
+    return {
+        "mode": "router",
+        **serving(listen, credentials, access_control, connect, len(thinned) + SESSIONS),
+        "downsampling": [
+            {
+                "id": f"thinned {number}",
+                "messages": ["put"],
+                "flows": ["egress"],
+                "rules": [{"key_expr": expression, "freq": most}],
+            }
+            for number, (expression, most) in enumerate(thinned.items())
+        ],
+    }
+
+
+def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings as one object, with what every session of ours has: a configuration file of Zenoh's."""
+    whole: dict[str, Any] = {}
+    for path, value in (_ALWAYS | dict(settings)).items():
+        *tables, name = path.split("/")
+        inner = whole
+        for table in tables:
+            inner = inner.setdefault(table, {})
+        inner[name] = value
+    return whole
+
+
+def serving(
+    listen: Sequence[str],
+    credentials: Credentials | None,
+    access_control: Mapping[str, Any] | None,
+    connect: Sequence[str],
+    sessions: int = SESSIONS,
+) -> dict[str, Any]:
+    """Return the settings of who serves others, by their paths in Zenoh's configuration."""
+    return {
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        # Begin without a router that is not there, and try again and again: with 0 in place of -1 it is tried once.
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+        # Connections on which nothing comes must not keep others out.
+        "transport/unicast/accept_pending": 1000,
+        "transport/unicast/accept_timeout": 3000,
+        "transport/unicast/max_sessions": sessions,
+        "timestamping/enabled": True,  # advanced publishers order their history by it
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(GIVEN_UP_AFTER * 1e6),
+        "transport/link/tx/queue/size/data_high": 16,
+        "transport/link/tx/queue/size/real_time": 16,  # answers come in bursts
+        **_tls(credentials),
+        **({"access_control": access_control} if access_control is not None else {}),
+    }
 
 
 def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.Session:

@@ -1,0 +1,75 @@
+"""`trirail fleet`: all robots that a user may see, live, who needs somebody first."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import msgspec
+from rich.live import Live
+from rich.table import Table
+
+from trirail.cli import terminal
+from trirail.cli.options import HERE, Service
+
+if TYPE_CHECKING:
+    from trirail.client.fleet import Member
+
+LOOK = 2.5
+"""How long it is listened before what was heard is printed with --json [s]: each robot says something once a second."""
+REFRESH = 0.5
+"""How often the table is drawn [s]."""
+
+
+def fleet(*, service: Service = HERE) -> int:
+    """Show all robots that answer at --connect, a router as a rule, until Ctrl-C: who needs somebody stands first.
+
+    A robot is silent where its loop has said nothing for 3 s. With --json, one look of 2.5 s.
+    """
+    from trirail.client.fleet import Fleet
+
+    never = threading.Event()
+    with Fleet(service.connect, service.robot, service.tls) as seen:
+        if service.json:
+            never.wait(LOOK)
+            now = time.monotonic()
+            terminal.json({"robots": [_described(member, now) for member in seen.members()]})
+            return 0
+        with contextlib.suppress(KeyboardInterrupt), Live(console=terminal.out, auto_refresh=False) as live:
+            while not never.wait(REFRESH):
+                live.update(table(seen.members(), time.monotonic()), refresh=True)
+    return 0
+
+
+def _described(member: Member, now: float) -> dict[str, object]:
+    fields = msgspec.to_builtins(member.summary)
+    return {"robot": member.robot, "need": member.need(now).name.lower(), **fields, "age": round(member.age(now), 2)}
+
+
+def table(members: Sequence[Member], now: float) -> Table:
+    """Draw the robots, a line each."""
+    from trirail.client.fleet import Need
+
+    drawn = Table("robot", "mode", "needs", "goal", "lateness p99.9", "missed", "version", box=None, pad_edge=False)
+    for member in members:
+        said, need = member.summary, member.need(now)
+        needs = {
+            Need.SILENT: f"[bold red]silent for {member.age(now):.0f} s[/]",
+            Need.FAULT: f"[bold red]{terminal.plain(said.fault or 'reset')}[/]",
+            Need.NOTHING: "",
+        }[need]
+        mode = f"[{terminal.COLOURS.get(said.mode, 'white')}]{terminal.plain(said.mode)}[/]"
+        drawn.add_row(
+            terminal.plain(member.robot),
+            "[dim]unknown[/]" if need is Need.SILENT else mode,
+            needs,
+            terminal.plain(said.goal or ""),
+            f"{said.lateness:.0f} µs",
+            str(said.missed),
+            terminal.plain(said.version),
+        )
+    drawn.caption = f"{len(members)} robots, {sum(m.need(now) is not Need.NOTHING for m in members)} need somebody"
+    return drawn

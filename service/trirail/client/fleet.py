@@ -1,0 +1,88 @@
+"""All robots that a user may see at a locator, mostly a router: the newest summary of each, and who needs somebody."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from enum import IntEnum
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import zenoh
+
+from trirail.errors import RefusedError
+from trirail.wire import boundary, zenoh_session
+from trirail.wire.credentials import credentials_for
+from trirail.wire.state import Summary
+from trirail.wire.vocabulary import Mode
+
+SILENT: Final = 3.0
+"""A robot from which, or a loop from which its gateway, has heard nothing for so long is silent [s]: a summary comes
+once a second. Liveliness tokens outlive an unclean death, so they are not asked."""
+
+
+class Need(IntEnum):
+    """How much a robot needs somebody, the most first."""
+
+    SILENT = 0
+    FAULT = 1
+    NOTHING = 2
+
+
+class Member(NamedTuple):
+    """A robot of the fleet."""
+
+    robot: str
+    summary: Summary
+    heard: float
+    """When that came, by the monotonic clock here [s]."""
+
+    def age(self, now: float) -> float:
+        """How old what is known of it is: since its loop has said something [s]."""
+        return now - self.heard + self.summary.age
+
+    def need(self, now: float) -> Need:
+        """Whether it needs somebody."""
+        if self.age(now) > SILENT:
+            return Need.SILENT
+        return Need.FAULT if self.summary.mode == Mode.FAULT else Need.NOTHING
+
+
+class Fleet:
+    """Listens to every robot's summary while the context lasts. Raises ServiceError where nobody answers."""
+
+    def __init__(
+        self,
+        connect: str,
+        robot: str,
+        tls: Path | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock = clock
+        self._members: dict[str, Member] = {}
+        self._lock = threading.Lock()
+        self._session = zenoh_session.open_client(connect, credentials_for(robot, connect, tls))
+        callback = zenoh.handlers.Callback(self._take, indirect=False)
+        self._subscriber = self._session.declare_subscriber(zenoh_session.key("*", "summary"), callback)
+
+    def __enter__(self) -> Fleet:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        zenoh_session.close(self._session)
+
+    def members(self) -> list[Member]:
+        """Return the robots that have been heard, who needs somebody most first; among equals by name."""
+        now = self._clock()
+        with self._lock:
+            return sorted(self._members.values(), key=lambda member: (member.need(now), member.robot))
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        _, robot, *_ = str(sample.key_expr).split("/")
+        try:
+            summary = boundary.decode(sample.payload.to_bytes(), Summary, "not a summary", str(sample.encoding))
+        except RefusedError:  # nobody but the robot should publish there; what is no summary is not heard
+            return
+        with self._lock:
+            self._members[robot] = Member(robot, summary, self._clock())

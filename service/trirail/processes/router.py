@@ -1,0 +1,100 @@
+"""A router between robots and users, `trirail router`: Zenoh's own, out of the wheel, with the roles of its users."""
+
+from __future__ import annotations
+
+import signal
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import zenoh
+from msgspec import Meta, Struct
+from trirail_drivers import files
+from trirail_drivers.errors import FileError
+
+from trirail.config import UserName, Zenoh, check_reach
+from trirail.errors import ConfigError, RefusedError
+from trirail.wire import boundary, zenoh_session
+from trirail.wire.access import router_access_control
+from trirail.wire.credentials import Credentials, with_role
+from trirail.wire.messages import RoleReply
+
+
+class RouterConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """A router's configuration file."""
+
+    robots: Annotated[tuple[UserName, ...], Meta(min_length=1, max_length=10_000)]
+    """The robots that may dial it, each by the common name of its certificate, which is its name in every key."""
+    zenoh: Zenoh
+    """As in a robot's: where it listens, certificates, and the users of all its robots; `connect` is another router."""
+    state_hz: Annotated[float, Meta(gt=0.0, le=200.0)] = 5.0
+    """So often a second a user is sent each robot's state at most."""
+
+
+def load(path: Path) -> RouterConfig:
+    """Read a router's configuration. Raises ConfigError."""
+    try:
+        config = msgspec.convert(tomllib.loads(files.text(path)), RouterConfig)
+        check_reach(config.zenoh)
+    except FileError as error:
+        raise ConfigError(str(error)) from error
+    except (ConfigError, msgspec.ValidationError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+    if config.zenoh.tls is not None:
+        tls = msgspec.structs.replace(config.zenoh.tls, directory=str(path.parent / config.zenoh.tls.directory))
+        config = msgspec.structs.replace(config, zenoh=msgspec.structs.replace(config.zenoh, tls=tls))
+    if both := set(config.robots) & set(config.zenoh.users):
+        raise ConfigError(f"{path}: robots: {', '.join(sorted(both))} is a user as well: names must differ")
+    return config
+
+
+def settings(config: RouterConfig) -> dict[str, Any]:
+    """Return the settings of Zenoh's router. Raises ServiceError for certificates that are no good."""
+    thinned = {zenoh_session.key(robot, "state"): config.state_hz for robot in config.robots}
+    listen, connect = config.zenoh.listen, config.zenoh.connect
+    if config.zenoh.tls is None:
+        return zenoh_session.router(listen, None, None, connect, thinned)
+    folder = Path(config.zenoh.tls.directory)
+    rules = router_access_control(config.robots, with_role(config.zenoh.users, folder))
+    return zenoh_session.router(listen, Credentials.read(folder), rules, connect, thinned)
+
+
+@contextmanager
+def routing(config: RouterConfig) -> Iterator[zenoh.Session]:
+    """Route while the context lasts. Raises ServiceError where an address cannot be listened on."""
+    opened = zenoh_session.open_router(settings(config))
+    try:
+        if config.zenoh.tls is not None:
+            _tell_roles(opened, config, Path(config.zenoh.tls.directory))
+        yield opened
+    finally:
+        zenoh_session.close(opened)
+
+
+def run(config: RouterConfig) -> None:
+    """Route until SIGTERM or SIGINT."""
+    ends = {signal.SIGTERM, signal.SIGINT}
+    signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # before Zenoh's threads begin, that they have it too
+    with routing(config):
+        signal.sigwait(ends)
+
+
+def _tell_roles(opened: zenoh.Session, config: RouterConfig, folder: Path) -> None:
+    """Answer every certificate that asks for its role: the robots know only their router."""
+    users = with_role(config.zenoh.users, folder)
+    asked = zenoh_session.key("*", "role", "*")
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            _, robot, *_ = str(query.key_expr).split("/")
+            try:
+                (user,) = boundary.names(str(query.key_expr), zenoh_session.key(robot, "role"), ("user",))
+            except RefusedError:
+                return
+            reply = RoleReply(user, users.get(user))
+            query.reply(query.key_expr, msgspec.json.encode(reply), encoding=boundary.JSON)
+
+    opened.declare_queryable(asked, zenoh.handlers.Callback(answer, indirect=False))

@@ -1,0 +1,30 @@
+"""Signals as something to wait for, beside pipes and sockets."""
+
+from __future__ import annotations
+
+import signal
+import socket
+
+
+class Signals:
+    """SIGTERM and SIGINT as something to select on."""
+
+    def __enter__(self) -> Signals:
+        self.reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        self._before = {
+            number: signal.signal(number, lambda _signal, _frame: None) for number in (signal.SIGTERM, signal.SIGINT)
+        }
+        self._wakeup = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        return self
+
+    def take(self) -> signal.Signals:
+        """Return the signal that came first; wait for one."""
+        return signal.Signals(self.reader.recv(1)[0])
+
+    def __exit__(self, *_: object) -> None:
+        signal.set_wakeup_fd(self._wakeup)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self.reader.close()
+        self._writer.close()

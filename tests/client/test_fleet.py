@@ -1,0 +1,116 @@
+"""A fleet as its members' summaries tell it: who is alive by age, who needs somebody, and that live in a table."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+from trirail.cli import fleet_command, terminal
+from trirail.cli.commands import app
+from trirail.client.fleet import SILENT, Fleet, Member, Need
+from trirail.wire import zenoh_session
+from trirail.wire.state import Summary
+
+OK = Summary("holding", None, None, 80.0, 0, 0.01, "0.1.0")
+FAULT = msgspec.structs.replace(OK, mode="fault", fault="drive B: EMCY 8700")
+
+
+@given(st.floats(0.0, 10.0), st.floats(0.0, 10.0), st.sampled_from([OK, FAULT]))
+def test_a_robot_lives_by_the_age_of_what_its_loop_said(waited: float, age: float, summary: Summary) -> None:
+    member = Member("demo", msgspec.structs.replace(summary, age=age), 100.0)
+    assert member.age(100.0 + waited) == pytest.approx(waited + age)
+    if waited + age > SILENT + 1e-6:
+        assert member.need(100.0 + waited) is Need.SILENT
+    elif waited + age < SILENT - 1e-6:
+        assert member.need(100.0 + waited) is (Need.FAULT if summary is FAULT else Need.NOTHING)
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[tuple[str, zenoh.Session]]:
+    locator = f"unixsock-stream/{tmp_path}/hub"
+    with zenoh_session.open_service([locator]) as opened:
+        yield locator, opened
+
+
+def until(condition: object, publish: object) -> None:
+    """Publish until something holds."""
+    enough = threading.Event()
+    for _ in range(200):
+        publish()  # type: ignore[operator]
+        if condition():  # type: ignore[operator]
+            return
+        enough.wait(0.05)
+    raise AssertionError("not within 10 s")
+
+
+def test_who_needs_somebody_stands_first(hub: tuple[str, zenoh.Session]) -> None:
+    locator, service = hub
+    now = [100.0]
+    with Fleet(locator, "demo", clock=lambda: now[0]) as fleet:
+
+        def publish(robots: dict[str, bytes]) -> None:
+            for robot, content in robots.items():
+                service.put(f"trirail/{robot}/summary", content, encoding="application/json")
+
+        said = {name: msgspec.json.encode(FAULT if name == "c" else OK) for name in "abcd"}
+        said |= {"odd": b"\xff nonsense", "later": b'{"mode": "holding"}'}
+        until(lambda: len(fleet.members()) == 4, lambda: publish(said))
+        assert [member.robot for member in fleet.members()] == ["c", "a", "b", "d"]
+        last = {"z": msgspec.json.encode(OK)}  # behind all that was said before
+        until(lambda: len(fleet.members()) == 5, lambda: publish(last))
+        now[0] += SILENT - 0.5
+        again = {name: said[name] for name in "acd"} | last
+        until(lambda: sum(member.heard == now[0] for member in fleet.members()) == 4, lambda: publish(again))
+        now[0] += 1.0
+        assert [(member.robot, member.need(now[0])) for member in fleet.members()] == [
+            ("b", Need.SILENT),
+            ("c", Need.FAULT),
+            *((name, Need.NOTHING) for name in "adz"),
+        ]
+
+
+def test_one_look_as_json(
+    hub: tuple[str, zenoh.Session], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    locator, service = hub
+    ended = threading.Event()
+
+    def publish() -> None:
+        while not ended.wait(0.05):
+            service.put("trirail/demo/summary", msgspec.json.encode(FAULT), encoding="application/json")
+
+    publisher = threading.Thread(target=publish)
+    publisher.start()
+    try:
+        monkeypatch.setattr(fleet_command, "LOOK", 1.0)
+        words = ["fleet", "--connect", locator, "--json"]
+        assert app(words, exit_on_error=False, result_action="return_value") == 0
+    finally:
+        ended.set()
+        publisher.join()
+    (robot,) = json.loads(capsys.readouterr().out)["robots"]
+    assert (robot["robot"], robot["need"], robot["fault"]) == ("demo", "fault", "drive B: EMCY 8700")
+
+
+def test_the_table_says_what_each_needs_and_hides_what_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    console = Console(width=150, force_terminal=False)
+    monkeypatch.setattr(terminal, "out", console)
+    now = time.monotonic()
+    members = [Member("a", OK, now - 60.0), Member("b", FAULT, now), Member("c", OK, now)]
+    with console.capture() as captured:
+        console.print(fleet_command.table(members, now))
+    lines = captured.get().splitlines()
+    assert "silent for 60 s" in lines[1]
+    assert "holding" not in lines[1]
+    assert "drive B: EMCY 8700" in lines[2]
+    assert "holding" in lines[3]
+    assert "3 robots, 2 need somebody" in lines[-1]

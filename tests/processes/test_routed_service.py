@@ -1,0 +1,125 @@
+"""Whole services behind a router that is a program of its own: seen and stopped through it, whatever becomes of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from processes.test_service import Service, trirail, wait_readable
+from trirail.client.client import Robot
+from trirail.client.fleet import Fleet, Member, Need
+from trirail.errors import ServiceError
+from trirail.processes.interpreter import python
+
+pytestmark = pytest.mark.slow
+
+WITHIN = 10.0
+"""For a robot to be back behind its router [s]."""
+
+
+class Hub:
+    """`trirail router` for the robot demo."""
+
+    def __init__(self, folder: Path) -> None:
+        self.locator = f"unixsock-stream/{folder}/hub"
+        self._file = folder / "router.toml"
+        self._file.write_text(f'robots = ["demo"]\nstate_hz = 5.0\n[zenoh]\nlisten = ["{self.locator}"]\n')
+        self.start()
+
+    def start(self) -> None:
+        """Start it, and wait until it says that it routes."""
+        self.process = subprocess.Popen(
+            python("-u", "-m", "trirail", "router", str(self._file)), stdout=subprocess.PIPE, text=True
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline().startswith("routing")
+
+    def kill(self) -> None:
+        """Kill it at once."""
+        self.process.kill()
+        self.process.wait()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[Hub]:
+    made = Hub(tmp_path)
+    yield made
+    made.kill()
+
+
+@pytest.fixture
+def service(hub: Hub, tmp_path: Path) -> Iterator[Service]:
+    locator = f"unixsock-stream/{tmp_path}/zenoh"
+    made = Service(tmp_path, **{f'listen = ["{locator}"]': f'listen = ["{locator}"]\nconnect = ["{hub.locator}"]'})
+    try:
+        made.wait_up()
+        yield made
+    finally:
+        if made.process.poll() is None:
+            made.end()
+
+
+def seen(fleet: Fleet, condition: Callable[[Member, float], bool], within: float, service: Service) -> None:
+    """Wait until the robot is seen so."""
+    deadline = time.monotonic() + within
+    while not any(condition(member, time.monotonic()) for member in fleet.members()):
+        assert time.monotonic() < deadline, fleet.members()
+        wait_readable(service.process, 0.02)
+
+
+def through(hub: Hub) -> Robot:
+    """A client that is there once the robot is behind the router."""
+    deadline = time.monotonic() + WITHIN
+    while True:
+        try:
+            robot = Robot("demo", hub.locator, user="ann")
+            robot.info()
+        except ServiceError:
+            assert time.monotonic() < deadline
+        else:
+            return robot
+
+
+def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub: Hub, service: Service) -> None:
+    with through(hub) as robot, Fleet(hub.locator, "demo") as fleet:
+        robot.enable()
+        assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(20.0).outcome == "done"
+        seen(fleet, lambda member, _: member.summary.mode == "holding", 5.0, service)
+        robot.quick_stop()
+        seen(fleet, lambda member, now: member.need(now) is Need.FAULT, 3.0, service)
+        robot.reset()
+    hub.kill()
+    with service.robot() as robot:  # local control does not need it
+        robot.enable()
+        moving = robot.move_to(x=-0.02, y=0.0, phi=0.0)
+        hub.start()
+        assert moving.wait(20.0).outcome == "done"
+    with through(hub) as robot:
+        assert robot.state().mode == "holding"
+        robot.disable()
+
+
+def test_a_robot_that_is_killed_is_silent_to_the_fleet(hub: Hub, service: Service) -> None:
+    with Fleet(hub.locator, "demo") as fleet:
+        seen(fleet, lambda member, now: member.need(now) is Need.NOTHING, WITHIN, service)
+        processes = [service.child(name) for name in ("gateway", "loop", "recorder", "planner")]
+        for each in (service.process.pid, *processes):  # all at once, as a machine that loses its power
+            os.kill(each, signal.SIGSTOP)
+        for each in (service.process.pid, *processes):
+            os.kill(each, signal.SIGKILL)
+        seen(fleet, lambda member, now: member.need(now) is Need.SILENT, 5.0, service)
+
+
+def test_the_command_sees_it_too(hub: Hub, service: Service) -> None:
+    through(hub).close()
+    said = trirail("fleet", "--connect", hub.locator, "--json")
+    (robot,) = json.loads(said.stdout)["robots"]
+    assert (robot["robot"], robot["need"], robot["mode"]) == ("demo", "nothing", "disabled")

@@ -1,0 +1,245 @@
+"""A router between robots and users, with real certificates: users have their roles there, robots obey it alone."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import pytest
+import zenoh
+from certificates import ROLES, user
+from conftest import CONFIG
+from trirail.cli.key_folder import KeyFolder
+from trirail.config import Config, Tls, Zenoh
+from trirail.errors import ConfigError
+from trirail.processes import router
+from trirail.processes.guard import Guard
+from trirail.processes.router import RouterConfig
+from trirail.telemetry.sinks import free_port
+from trirail.wire import zenoh_session
+from trirail.wire.credentials import Credentials
+from trirail.wire.vocabulary import Role
+
+ROBOTS = ("demo", "other")
+LOCAL = ("127.0.0.1", "localhost")
+WITHIN = 20.0
+
+
+class Net(NamedTuple):
+    """A router's configuration, and where its authority's folder is."""
+
+    config: RouterConfig
+    folder: Path
+
+    @property
+    def locator(self) -> str:
+        return self.config.zenoh.listen[0]
+
+    def robot(self, name: str) -> Config:
+        """A robot that dials it, and listens for users of its own."""
+        own = Zenoh(
+            listen=(f"tls/127.0.0.1:{free_port()}",), connect=(self.locator,), router="hub",
+            tls=Tls(str(user(self.folder, name))), users={"max": Role.MAINTAINER},
+        )  # fmt: skip
+        renamed = msgspec.structs.replace(CONFIG.robot, name=name)
+        return msgspec.structs.replace(CONFIG, robot=renamed, zenoh=own)
+
+    def session(self, name: str, locator: str = "") -> zenoh.Session:
+        """A user's session, through the router if nothing else is said."""
+        return zenoh_session.open_client(locator or self.locator, Credentials.read(user(self.folder, name)))
+
+
+@pytest.fixture(scope="module")
+def net(tmp_path_factory: pytest.TempPathFactory) -> Net:
+    folder = tmp_path_factory.mktemp("net")
+    keys = KeyFolder(folder / "keys")
+    keys.create("hub", LOCAL, 100.0)
+    for name in (*ROBOTS, "stray"):
+        keys.add(name, 100.0, LOCAL)
+    for name in (*ROLES, "una"):
+        keys.add(name, 100.0)
+    listen = (f"tls/127.0.0.1:{free_port()}",)
+    return Net(RouterConfig(ROBOTS, Zenoh(listen=listen, tls=Tls(str(keys.folder)), users=ROLES)), folder)
+
+
+@pytest.fixture
+def routed(net: Net) -> Iterator[Net]:
+    with router.routing(net.config):
+        yield net
+
+
+def listening(session: zenoh.Session, key: str) -> Any:
+    return session.declare_subscriber(key, zenoh.handlers.RingChannel(100))
+
+
+def heard(subscriber: object, publish: object) -> str:
+    """Publish until something is heard; return its key, "" for nothing."""
+    enough = threading.Event()
+    for _ in range(round(WITHIN / 0.1)):
+        publish()  # type: ignore[operator]
+        enough.wait(0.1)
+        if (sample := subscriber.try_recv()) is not None:  # type: ignore[attr-defined]
+            return str(sample.key_expr)
+    return ""
+
+
+def answers(session: zenoh.Session, key: str) -> list[bytes]:
+    return [bytes(reply.ok.payload) for reply in session.get(key, timeout=5.0) if reply.ok]
+
+
+def until_answered(session: zenoh.Session, key: str) -> bytes:
+    """Ask until somebody answers."""
+    enough = threading.Event()
+    for _ in range(round(WITHIN / 0.1)):
+        if found := answers(session, key):
+            return found[0]
+        enough.wait(0.1)
+    raise AssertionError(f"nobody answers {key}")
+
+
+class Robot:
+    """A robot's session that dials the router, and answers what it is asked with its name."""
+
+    def __init__(self, net: Net, name: str) -> None:
+        self.config = net.robot(name)
+        self.guard = Guard(self.config)
+        self.session = self.guard.open()
+        self.asked: list[str] = []
+        for key in ("goal/*", "cmd/*/*", "info"):
+            callback = zenoh.handlers.Callback(self._answer, indirect=False)
+            self.session.declare_queryable(zenoh_session.key(name, *key.split("/")), callback)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            self.asked.append(str(query.key_expr))
+            query.reply(query.key_expr, self.config.robot.name.encode())
+
+    def __enter__(self) -> Robot:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        zenoh_session.close(self.session)
+
+
+def test_each_role_may_through_the_router_what_it_may_with_the_robot(routed: Net) -> None:
+    with Robot(routed, "demo") as demo, Robot(routed, "other"):
+        for name, role in ROLES.items():
+            with routed.session(name) as session:
+                for robot in ROBOTS:
+                    assert until_answered(session, f"trirail/{robot}/info") == robot.encode()
+                tried = {
+                    "stop": Role.VIEWER, "enable": Role.OPERATOR, "reset": Role.MAINTAINER,
+                }  # fmt: skip
+                for command, least in tried.items():
+                    found = answers(session, f"trirail/demo/cmd/{name}/{command}")
+                    assert bool(found) == role.includes(least), (name, command)
+                assert bool(answers(session, f"trirail/demo/goal/{name}")) == role.includes(Role.OPERATOR)
+                assert not answers(session, "trirail/demo/cmd/bob/stop")  # nobody speaks in another's name
+                assert f'"role":"{role}"'.encode() in answers(session, f"trirail/demo/role/{name}")[0]
+        assert not [key for key in demo.asked if "bob" in key]
+        with routed.session("una") as session:
+            assert b'"role":null' in until_answered(session, "trirail/demo/role/una")
+            assert not answers(session, "trirail/demo/info")
+
+
+def test_what_robots_publish_reaches_users_and_nobody_publishes_for_them(routed: Net) -> None:
+    with Robot(routed, "demo") as demo, Robot(routed, "other") as other, routed.session("eva") as eva:
+        for name in ("state", "summary", "event", "records"):
+            subscriber = listening(eva, f"trirail/*/{name}")
+            key = f"trirail/demo/{name}"
+            assert heard(subscriber, partial(demo.session.put, key, b"x")) == key
+        false = listening(eva, "trirail/demo/summary")
+        with routed.session("max") as forger:
+            for _ in range(5):
+                forger.put("trirail/demo/summary", b"false")
+                other.session.put("trirail/demo/summary", b"false")  # nor does another robot
+        # An answer comes behind what was sent before it.
+        until_answered(eva, "trirail/other/info")
+        true = heard(false, lambda: demo.session.put("trirail/demo/summary", b"true"))
+        assert true == "trirail/demo/summary"
+        samples = []
+        while (sample := false.try_recv()) is not None:
+            samples.append(bytes(sample.payload))
+        assert b"false" not in samples
+
+
+def test_a_robot_obeys_its_router_alone_and_its_own_users(routed: Net) -> None:
+    with Robot(routed, "demo") as demo:
+        own = demo.config.zenoh.listen[0]
+        with routed.session("max", own) as local:
+            assert answers(local, "trirail/demo/cmd/max/reset")
+        with routed.session("ann", own) as elsewhere:  # an operator at the router, nobody at the robot
+            assert not answers(elsewhere, "trirail/demo/cmd/ann/enable")
+        with routed.session("stray", own) as robot:
+            assert not answers(robot, "trirail/demo/cmd/stray/enable")
+
+
+def test_a_robot_is_there_before_its_router_and_after_it_is_gone(net: Net) -> None:
+    with Robot(net, "demo") as demo:
+        own = demo.config.zenoh.listen[0]
+        for _ in range(2):
+            with net.session("max", own) as local:
+                assert answers(local, "trirail/demo/info") == [b"demo"]
+            with router.routing(net.config), net.session("eva") as eva:
+                assert until_answered(eva, "trirail/demo/info") == b"demo"
+
+
+def test_the_state_is_thinned_for_each_robot_by_itself(net: Net) -> None:
+    config = msgspec.structs.replace(net.config, state_hz=0.01)
+    with router.routing(config), Robot(net, "demo") as demo, Robot(net, "other") as other, net.session("eva") as eva:
+        subscribers = [listening(eva, f"trirail/*/{name}") for name in ("state", "summary")]
+
+        def publish() -> None:
+            for robot in (demo, other):
+                for name in ("state", "summary"):
+                    robot.session.put(f"trirail/{robot.config.robot.name}/{name}", b"x")
+
+        for robot in ROBOTS:
+            until_answered(eva, f"trirail/{robot}/info")
+        found: list[str] = []
+        for _ in range(200):
+            publish()
+            threading.Event().wait(0.02)
+            for subscriber in subscribers:
+                while (sample := subscriber.try_recv()) is not None:
+                    found.append(str(sample.key_expr))
+            if min(found.count(f"trirail/{robot}/summary") for robot in ROBOTS) >= 10:
+                break
+        for robot in ROBOTS:
+            assert found.count(f"trirail/{robot}/summary") >= 10
+            assert found.count(f"trirail/{robot}/state") == 1  # the first; the next is due in 100 s
+
+
+def test_zenohd_is_given_the_same(net: Net) -> None:
+    whole = zenoh_session.nested(router.settings(net.config))
+    assert whole["mode"] == "router"
+    assert whole["access_control"]["default_permission"] == "deny"
+    assert whole["transport"]["link"]["tls"]["enable_mtls"] is True
+    zenoh.Config.from_json5(msgspec.json.encode(whole).decode())  # raises for a key that Zenoh does not know
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('robots = ["demo"]', "zenoh"),
+        ('robots = []\n[zenoh]\nlisten = ["tcp/127.0.0.1:1"]', "robots"),
+        ('robots = ["a b"]\n[zenoh]\n', "robots"),
+        ('robots = ["demo"]\nodd = 1\n[zenoh]\n', "odd"),
+        ('robots = ["demo"]\n[zenoh]\nlisten = ["tcp/0.0.0.0:7447"]', "insecure = true"),
+        (
+            'robots = ["ann"]\n[zenoh]\nlisten = ["tls/0.0.0.0:7447"]\n[zenoh.tls]\n[zenoh.users]\nann = "viewer"',
+            "names",
+        ),
+        ("robots = [", "Invalid"),
+    ],
+)
+def test_a_routers_file_that_is_wrong_is_refused_with_its_name(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "router.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=said) as refused:
+        router.load(path)
+    assert str(refused.value).startswith(str(path))
