@@ -41,7 +41,7 @@ QUICK = msgspec.structs.replace(
 )
 """Few cycles, and `done` only where the drives really are."""
 GRID = list(itertools.product(*[np.linspace(-0.147, 0.147, 8)] * 2, np.linspace(-0.9, 0.84, 8)))
-"""Of which a third is within the sliders' travel."""
+"""Of which four in ten are within the sliders' travel."""
 
 
 def as_built() -> Geometry:

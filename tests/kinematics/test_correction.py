@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import NdBSpline  # type: ignore[import-untyped]
 from trirail.errors import KinematicsError
 from trirail.kinematics.correction import Correction
-from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.geometry import Geometry, travels
 from trirail.kinematics.robot import forward, inverse, jacobians
 
 Array = NDArray[np.float64]
@@ -84,6 +84,13 @@ def test_what_it_adds_is_bounded_in_every_cell(
     before, after = told_more(made, np.array([place - way, place + way]))
     assert (np.abs(after - before) / 2e-4 <= made.adds(rates)[tuple(cell)] + 1e-9).all()
     assert (np.abs([before, after]) <= made.bound).all()
+
+
+@given(cells=SIZES, seed=SEEDS)
+def test_travels_are_those_of_the_corrected_robot(cells: tuple[int, int, int], seed: int) -> None:
+    robot, poses = Geometry(PLAIN.legs, random_map(cells, seed)), places(seed)
+    joints = inverse(robot, poses)
+    assert_allclose(travels(robot, poses), [joints.position, joints.passive_position], rtol=0.0, atol=1e-12)
 
 
 @given(cells=SIZES, seed=SEEDS)
