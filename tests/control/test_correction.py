@@ -40,7 +40,7 @@ QUICK = msgspec.structs.replace(
     limits=msgspec.structs.replace(CONFIG.limits, in_position=WINDOWS),
 )
 """Few cycles, and `done` only where the drives really are."""
-GRID = list(itertools.product(*[np.linspace(-0.147, 0.147, 8)] * 2, np.linspace(-0.9, 0.84, 8)))
+GRID = list(itertools.product(*[np.linspace(-0.147, 0.147, 7)] * 2, np.linspace(-0.9, 0.84, 5)))
 """Of which four in ten are within the sliders' travel."""
 
 

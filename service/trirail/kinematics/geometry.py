@@ -133,8 +133,8 @@ class Room(NamedTuple):
     position: tuple[float, float]
     passive: tuple[float, float]
 
-    def holds(self, travelled: Array, spare: Array | float = 0.0) -> NDArray[np.bool]:
-        """Whether sliders and passive joints (2, ..., 3) have no more than `spare` to go back to their travel: (...)."""
+    def holds(self, travelled: Array, spare: float = 0.0) -> NDArray[np.bool]:
+        """Whether sliders and passive joints (2, ..., 3) are within their travel, or `spare` beyond it [m]: (...)."""
         low, high = np.array([self.position, self.passive]).T.reshape(2, 2, *[1] * (travelled.ndim - 1))
         within: NDArray[np.bool] = ((travelled >= low - spare) & (travelled <= high + spare)).all(axis=(0, -1))
         return within
