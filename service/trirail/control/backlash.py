@@ -3,8 +3,9 @@
 A slider with play stands half its width beside its motor, behind it as the motor last went. So the setpoints are the
 sliders' places plus an offset of half a width to the side to which the slider last went, and what the drives measure,
 less the offset, is where the slider is. From one side to the other the offset goes by trirail.motion.take_up, one way
-at a time: a slider that turns back again meanwhile waits for the end of it. Where nobody knows to which side a slider
-last went, as after power-on, the offset is zero.
+at a time: a slider that turns back again meanwhile waits for the end of it, and where it has turned twice goes to the
+other side first, since it may have been left anywhere in its play. Where nobody knows to which side a slider last went,
+as after power-on, the offset is zero.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ BACKLASH = np.dtype(
         ("begin", "<f8", 3),  # where the offset comes from, and where it goes [m]
         ("end", "<f8", 3),
         ("done", "<f8", 3),  # which part of that is done; one where all is
+        ("turns", "<i8", 3),  # how often a slider has turned back since it began
         ("heading", "<f8", 3),  # to which side a slider last went: 1 or -1; 0 where nobody knows
         ("farthest", "<f8", 3),  # how far, as a place of the slider [m]; not a number before it is commanded anywhere
         ("offsets", "<f8", (KEPT, 3)),  # in the setpoints of the cycles before, the newest last
@@ -70,9 +72,7 @@ def add_offset(kept: NDArray[np.void], sliders: Array) -> None:
         elif abs(place - farthest) > TURNS:
             tried.heading[i] = math.copysign(1.0, place - farthest)
             tried.farthest[i] = place
-        side = tried.heading[i] * tried.half[i]
-        if tried.done[i] >= 1.0 and tried.heading[i] != 0.0 and tried.end[i] != side:
-            tried.begin[i], tried.end[i], tried.done[i] = tried.end[i], side, 0.0
+            tried.turns[i] += 1
         if tried.done[i] < 1.0:
             tried.done[i] = min(1.0, tried.done[i] + tried.step)
             u, way, rate = tried.done[i], tried.end[i] - tried.begin[i], tried.step / tried.period
@@ -80,6 +80,10 @@ def add_offset(kept: NDArray[np.void], sliders: Array) -> None:
             sliders[1, i] += way * rate * 30.0 * u * u * (1.0 - u) * (1.0 - u)
             sliders[2, i] += way * rate * rate * 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u)
         sliders[0, i] += tried.offset[i]
+        side = tried.heading[i] * tried.half[i]
+        if side != 0.0 and tried.done[i] >= 1.0 and (tried.turns[i] > 0 or tried.end[i] != side):
+            tried.begin[i], tried.end[i] = tried.end[i], side if tried.end[i] != side else -side
+            tried.done[i], tried.turns[i] = 0.0, 0
 
 
 @compiled()
@@ -109,4 +113,4 @@ def let_go(kept: NDArray[np.void]) -> None:
     for i in range(3):
         if kept[0].done[i] < 1.0:
             kept[0].end[i], kept[0].done[i], kept[0].heading[i] = kept[0].offset[i], 1.0, 0.0
-        kept[0].farthest[i] = math.nan
+        kept[0].farthest[i], kept[0].turns[i] = math.nan, 0
