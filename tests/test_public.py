@@ -38,6 +38,8 @@ def top_level(*packages: ModuleType) -> Iterator[ast.stmt]:
         ("from trirail import Robot", {"numpy", "zenoh"}),
         ("from trirail import Geometry, Leg, inverse, forward, jacobians", {"numba", "numpy"}),
         ("from trirail import read", {"numpy", "rerun"}),
+        ("from trirail.cli import commands", {"numpy", "zenoh", "rich", "cyclopts"}),
+        ("from trirail.telemetry.session_index import SessionIndex", set()),
     ],
 )
 def test_each_name_loads_what_it_needs_and_no_more(statement: str, loaded: set[str]) -> None:

@@ -47,6 +47,14 @@ def fairness(*, goals: int = 1000, json: bool = False) -> None:
 
 
 @app.command
+def fleet(*, gateways: int = 98, seconds: float = 10.0, stops: int = 200, faults: int = 10, json: bool = False) -> None:
+    """Two whole services and robots that stand for whole ones behind a router: what is seen when, and what it costs."""
+    import bench_fleet
+
+    bench_fleet.main(gateways, seconds, stops, faults, json)
+
+
+@app.command
 def frames(*, cycles: int = 3000, json: bool = False) -> None:
     """Time one cycle's frames by python-can, and on the bus's own socket."""
     import bench_frames
@@ -92,6 +100,14 @@ def recorder(*, seconds: float = 60.0, json: bool = False) -> None:
     import bench_recorder
 
     bench_recorder.main(seconds, json)
+
+
+@app.command
+def scrape(*, seconds: float = 65.0, json: bool = False) -> None:
+    """Lateness with a scrape of the metrics each second, and without, by turns in one run of three times as long."""
+    import bench_scrape
+
+    bench_scrape.main(seconds, json)
 
 
 @app.command(name="all")

@@ -28,11 +28,13 @@ COMMANDS = {
 BRIEF = {
     "fairness": ("--goals", "20"),
     "machine": ("--cycles", "200"),
+    "fleet": ("--gateways", "4", "--seconds", "1", "--stops", "5", "--faults", "1"),
     "frames": ("--cycles", "50"),
     "latency": ("--goals", "3"),
     "loop": ("--rates", "1000", "--seconds", "2", "--runs", "1"),
     "peers": ("--seconds", "1"),
     "recorder": ("--seconds", "2"),
+    "scrape": ("--seconds", "5"),
     "settle": ("--goals", "3"),
 }
 """What they take for a look."""

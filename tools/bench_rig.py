@@ -36,11 +36,11 @@ class Rig:
 
 
 @contextlib.contextmanager
-def rig(rate_hz: int, inside: bool = False) -> Iterator[Rig]:
+def rig(rate_hz: int, inside: bool = False, metrics_port: int = 0) -> Iterator[Rig]:
     """A service on simulated drives at a rate, enabled; `inside` keeps the drives in the loop's process."""
     with tempfile.TemporaryDirectory(prefix="trirail-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
-        config, locator = configured(folder, rate_hz, inside)
+        config, locator = configured(folder, rate_hz, inside, metrics_port)
         bus = None if inside else str(folder / "can")
         if bus is not None:
             stack.enter_context(drives(config, bus))
@@ -52,11 +52,11 @@ def rig(rate_hz: int, inside: bool = False) -> Iterator[Rig]:
             robot.disable()
 
 
-def configured(folder: Path, rate_hz: int, inside: bool) -> tuple[Path, str]:
+def configured(folder: Path, rate_hz: int, inside: bool, metrics_port: int = 0) -> tuple[Path, str]:
     """Write the configuration; return the file, and the locator of the service."""
     config, locator = own_service.private(folder)
     text = config.read_text(encoding="utf-8")
-    changes = {"rate_hz": str(rate_hz), "bitrate": str(BITRATE)}
+    changes = {"rate_hz": str(rate_hz), "bitrate": str(BITRATE), "live_port": f"0\nmetrics_port = {metrics_port}"}
     if not inside:
         changes["interface"] = f'"unix"\nchannel = "{folder}/can"'
     for key, value in changes.items():

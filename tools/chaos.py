@@ -211,6 +211,7 @@ def main() -> int:
     if options.sample is not None and options.sample < len(cases):
         cases = random.Random(options.seed).sample(cases, options.sample)
     results: dict[str, str] = {}
+    interrupted = False
     with tempfile.TemporaryDirectory(prefix="trirail-chaos-") as folder:
         rig = Rig(Path(folder))
         try:
@@ -219,6 +220,8 @@ def main() -> int:
                 results[str(case)] = result = attempt(rig, case)
                 if not options.json:
                     print(f"{case.mode:9} {case.victim:11} {case.harm:10} {result}", flush=True)
+        except KeyboardInterrupt:
+            interrupted = True
         finally:
             rig.clean_up()
             rig.close()
@@ -226,8 +229,9 @@ def main() -> int:
     if options.json:
         print(json.dumps({"ok": counts[True], "failed": counts[False], "cases": results}))
     else:
-        print(f"{counts[True]} of {len(results)} cases ok")
-    return 1 if counts[False] else 0
+        left = f"; interrupted, {len(cases) - len(results)} not run" if interrupted else ""
+        print(f"{counts[True]} of {len(results)} cases ok{left}")
+    return 130 if interrupted else int(counts[False] > 0)
 
 
 if __name__ == "__main__":

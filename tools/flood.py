@@ -337,7 +337,11 @@ def main() -> int:
     parser.add_argument("--rate", type=float, default=3000.0, help="messages a second at most, of all sessions")
     arguments = parser.parse_args()
     logging.getLogger("trirail").disabled = True  # every client would say what it skips
-    failures = run(arguments.seconds, arguments.rate)
+    try:
+        failures = run(arguments.seconds, arguments.rate)
+    except KeyboardInterrupt:
+        print("interrupted")
+        return 130
     for failure in failures:
         print(f"does not hold: {failure}")
     print("held" if not failures else "did not hold")

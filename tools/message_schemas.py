@@ -31,7 +31,7 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "command-reply": (messages.CommandReply, "The reply to a command that has been carried out."),
     "error-reply": (messages.ErrorReply, "The error reply to a goal or command that is refused, or that fails."),
     "state": (state.State, "What is published on state."),
-    "summary": (state.Summary, "What is published on summary."),
+    "summary": (state.RobotSummary, "What is published on summary."),
     "event": (messages.Event, "What is published on event."),
     "role": (messages.RoleReply, "The reply to a query on role/<user>."),
     "pose": (state.NamedPose, "The reply to a query on teach/<user>/<name> or forget/<user>/<name>."),

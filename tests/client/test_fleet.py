@@ -16,22 +16,22 @@ from hypothesis import strategies as st
 from rich.console import Console
 from trirail.cli import fleet_command, terminal
 from trirail.cli.commands import app
-from trirail.client.fleet import SILENT, Fleet, Member, Need
+from trirail.client.fleet import SILENT, Attention, Fleet, Member
 from trirail.wire import zenoh_session
-from trirail.wire.state import Summary
+from trirail.wire.state import RobotSummary
 
-OK = Summary("holding", None, None, 80.0, 0, 0.01, "0.1.0")
+OK = RobotSummary("holding", None, None, 80.0, 0, 0.01, "0.1.0")
 FAULT = msgspec.structs.replace(OK, mode="fault", fault="drive B: EMCY 8700")
 
 
 @given(st.floats(0.0, 10.0), st.floats(0.0, 10.0), st.sampled_from([OK, FAULT]))
-def test_a_robot_lives_by_the_age_of_what_its_loop_said(waited: float, age: float, summary: Summary) -> None:
+def test_a_robot_lives_by_the_age_of_what_its_loop_said(waited: float, age: float, summary: RobotSummary) -> None:
     member = Member("demo", msgspec.structs.replace(summary, age=age), 100.0)
     assert member.age(100.0 + waited) == pytest.approx(waited + age)
     if waited + age > SILENT + 1e-6:
-        assert member.need(100.0 + waited) is Need.SILENT
+        assert member.need(100.0 + waited) is Attention.SILENT
     elif waited + age < SILENT - 1e-6:
-        assert member.need(100.0 + waited) is (Need.FAULT if summary is FAULT else Need.NOTHING)
+        assert member.need(100.0 + waited) is (Attention.FAULT if summary is FAULT else Attention.NOTHING)
 
 
 @pytest.fixture
@@ -72,9 +72,9 @@ def test_who_needs_somebody_stands_first(hub: tuple[str, zenoh.Session]) -> None
         until(lambda: sum(member.heard == now[0] for member in fleet.members()) == 4, lambda: publish(again))
         now[0] += 1.0
         assert [(member.robot, member.need(now[0])) for member in fleet.members()] == [
-            ("b", Need.SILENT),
-            ("c", Need.FAULT),
-            *((name, Need.NOTHING) for name in "adz"),
+            ("b", Attention.SILENT),
+            ("c", Attention.FAULT),
+            *((name, Attention.NOTHING) for name in "adz"),
         ]
 
 

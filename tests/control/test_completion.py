@@ -58,7 +58,7 @@ def test_a_drive_that_keeps_its_power_in_the_end_fails_the_command(name: Command
     assert verdict(Command.STOP, Mode.STOPPING, WHY, saying(OFF, ON, OFF, fault=late), settled=True) is NOT_YET
 
 
-@pytest.mark.parametrize("name", [Command.STOP, Command.PAUSE])
+@pytest.mark.parametrize("name", [Command.STOP, Command.PAUSE, Command.RELEASE])
 @pytest.mark.parametrize("mode", Mode)
 def test_a_stop_is_over_when_the_robot_stands(name: Command, mode: Mode) -> None:
     expected = NOT_YET if mode is Mode.STOPPING else DONE
@@ -76,9 +76,9 @@ def test_home_is_done_when_every_drive_is_homed(mode: Mode, homed: tuple[bool, b
         assert verdict(Command.HOME, mode, latched, measured, settled=True) == expected
 
 
-@pytest.mark.parametrize("name", [Command.RESUME, Command.OVERRIDE])
+@pytest.mark.parametrize("name", [Command.RESUME, Command.OVERRIDE, Command.ACQUIRE])
 @pytest.mark.parametrize("mode", Mode)
-def test_what_changes_the_rate_is_done_at_once(name: Command, mode: Mode) -> None:
+def test_what_changes_the_rate_or_the_lease_is_done_at_once(name: Command, mode: Mode) -> None:
     assert verdict(name, mode, None, saying(ON, ON, ON), settled=False) == DONE
 
 

@@ -270,7 +270,7 @@ def test_mishaps_stop_within_the_limits(rig: Rig, event: ModeEvent, end: Mode) -
     rig.enable()
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(200)
-    rig.control.happen(event, "it happened")
+    rig.control.modes.happen(event, "it happened")
     assert rig.mode is Mode.STOPPING
     rig.until(lambda: rig.mode is end)
     assert rig.outcomes() == [("g1", "stopped")]
@@ -299,7 +299,7 @@ def test_goals_in_the_wrong_mode(rig: Rig) -> None:
     rig.enable()
     rig.goal("g2", 0.1, 0.0, 0.0)
     rig.cycles(100)
-    rig.control.happen(ModeEvent.GATEWAY_LOST, "gone")
+    rig.control.modes.happen(ModeEvent.GATEWAY_LOST, "gone")
     assert refusal(rig.goal("g3", 0.0, 0.0, 0.1)).code == "stopping"
     assert rig.outcomes() == [("g1", "rejected"), ("g2", "stopped"), ("g3", "rejected")]
 
@@ -689,7 +689,7 @@ def test_any_sequence_is_smooth_and_ends_every_goal_once(config: Config, steps: 
     ids = []
     for number, (what, wait) in enumerate(steps):
         if what == "lost":
-            rig.control.happen(ModeEvent.GATEWAY_LOST, "gone")
+            rig.control.modes.happen(ModeEvent.GATEWAY_LOST, "gone")
         elif isinstance(what, str):
             rig.command(what)
         elif isinstance(what, float):

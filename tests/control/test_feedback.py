@@ -47,6 +47,17 @@ def test_only_a_slider_that_goes_twice_as_far_as_one_can_has_jumped(place: Tripl
     assert measured.velocity == pytest.approx([share * STEP / PERIOD for share in shares], abs=1e-9)
 
 
+@given(place=PLACES)
+def test_the_first_cycle_is_no_jump_wherever_the_robot_stands(place: Triple) -> None:
+    a, b, c = inverse(ROBOT, place).position.tolist()
+    measured = Measured(ROBOT.packed(), PERIOD, STEP)
+    measured.start(Feedback((a, b, c), ON, None))
+    measured.take(Feedback((a, b, c), ON, None))
+    assert measured.jumps == (False, False, False)
+    assert measured.velocity == measured.following_error == (0.0, 0.0, 0.0)
+    assert measured.pose == pytest.approx(place, abs=1e-9)
+
+
 def test_before_the_first_answer_nothing_has_jumped() -> None:
     assert Measured(ROBOT.packed(), PERIOD, STEP).jumps == (False, False, False)
 

@@ -206,7 +206,7 @@ def test_a_command_ends_it(late: Rig, name: str, outcome: str, mode: Mode) -> No
     [(ModeEvent.GATEWAY_LOST, Mode.HOLDING), (ModeEvent.LATE, Mode.HOLDING), (ModeEvent.SHUTDOWN, Mode.DISABLED)],
 )
 def test_a_disturbance_ends_it(late: Rig, event: ModeEvent, mode: Mode) -> None:
-    late.control.happen(event, "it happened")
+    late.control.modes.happen(event, "it happened")
     late.until(lambda: late.mode is mode)
     late.cycles(1000)
     assert late.outcomes() == [("g1", "stopped")]
@@ -365,6 +365,18 @@ def test_in_position_is_all_inside_in_every_cycle_of_the_dwell(cycles: list[Cycl
         if found is not None and found.settle is not None:
             streak = next((n for n, was in enumerate(reversed(inside)) if not was), number)
             assert found.settle == pytest.approx((number + 1 - streak) * PERIOD)
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_a_residual_as_large_as_its_window_is_inside_and_a_larger_one_is_not(number: int) -> None:
+    """Each of the sliders' and the pose's by itself, on either side."""
+    limits = msgspec.structs.replace(WINDOWS, sliders=(1e-4, 2e-4, 4e-4), pose=(1e-3, 2e-3, 8e-3), dwell=PERIOD)
+    settling, record = Settling(limits, PERIOD), np.zeros(1, DTYPE)
+    for share, inside in ((1.0, True), (-1.0, True), (1.001, False), (-1.001, False)):
+        off = np.array(but_one((0.0,) * 6, number, share))
+        record["position"], record["pose"] = -off[:3] * limits.sliders, -off[3:] * limits.pose
+        monitor(record, True, True, settling.monitored)
+        assert bool(record["settled"][0]) is inside
 
 
 SPEEDS = st.lists(st.tuples(*[st.sampled_from((0.0, 0.01, -0.02, 5e-10, -5e-10))] * 3), max_size=5)

@@ -257,6 +257,7 @@ TABLE: dict[ModeState, dict[ModeEvent, tuple[ModeState, Action] | None]] = {
 
 def test_the_table_names_every_state_and_event() -> None:
     assert set(TABLE) == set(STATES)
+    assert len(set(STATES)) == len(STATES)
     assert all(set(row) == set(ModeEvent) for row in TABLE.values())
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.config import Config
 from trirail.control.modes import ModeEvent
@@ -38,10 +38,14 @@ def confirmed_after(rig: Rig, name: str, within: int) -> int:
 
 
 def braking(config: Config) -> int:
-    """Cycles from full speed to rest, at the platform's acceleration and jerk, and once more for those of a path."""
+    """Cycles in which any motion can be stopped: three times those from full speed to rest.
+
+    A path out of a motion may turn back first, from full speed to as much the other way, at the platform's limits all
+    along: nothing is left of them to brake it, and it is stopped where it has turned.
+    """
     platform = config.limits.platform
     rows = zip(platform.velocity, platform.acceleration, platform.jerk, strict=True)
-    return round(2.0 * max(v / a + a / j for v, a, j in rows) / config.period)
+    return round(3.0 * max(v / a + a / j for v, a, j in rows) / config.period)
 
 
 @pytest.mark.parametrize("name", ["stop", "quick_stop", "disable", "override"])
@@ -106,7 +110,7 @@ def planned(rig: Rig, goal: PoseGoal, name: str) -> None:
 @pytest.mark.parametrize("event", [ModeEvent.GATEWAY_LOST, ModeEvent.LATE, ModeEvent.SHUTDOWN])
 def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: Rig, event: ModeEvent) -> None:
     planned(slow, FAR, "g1")
-    slow.control.happen(event, "gone")
+    slow.control.modes.happen(event, "gone")
     slow.until(lambda: slow.mode in (Mode.HOLDING, Mode.DISABLED))
     pose = slow.control.commanded.pose
     slow.cycles(200)
@@ -116,7 +120,7 @@ def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: R
 
 def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow: Rig) -> None:
     slow.post("g1", FAR)
-    slow.control.happen(ModeEvent.GATEWAY_LOST, "gone")
+    slow.control.modes.happen(ModeEvent.GATEWAY_LOST, "gone")
     slow.cycles(100)
     assert slow.mode is Mode.HOLDING
     assert slow.outcomes() == [("g1", "stopped")]
@@ -382,6 +386,9 @@ def play(rig: Rig, steps: list[tuple[object, int]]) -> None:
 @pytest.mark.parametrize("name", ["stop", "disable", "quick_stop"])
 @settings(max_examples=40)
 @given(st.lists(STEP, min_size=1, max_size=14))
+@example(
+    [(TrackGoal(0.0, 0.048, -0.3738, timeout=0.3), 200), (PoseGoal(0.0456, 0.0, 0.0), 0), (PoseGoal(0.0, 0.0, 0.0), 0)]
+)
 def test_after_any_sequence_a_stop_is_confirmed_in_time(name: str, steps: list[tuple[object, int]]) -> None:
     rig = Rig()
     rig.command("enable")

@@ -292,7 +292,7 @@ def test_a_stop_halts_it_and_it_can_begin_again(event: str | ModeEvent, end: Mod
     rig.enable()
     begin(rig, when)
     if isinstance(event, ModeEvent):
-        rig.control.happen(event, "it happened")
+        rig.control.modes.happen(event, "it happened")
         rig.until(lambda: rig.mode is end, 400)
     else:
         assert isinstance(rig.command(event), Confirmed)

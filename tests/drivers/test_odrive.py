@@ -665,6 +665,24 @@ class TestReset:
         assert ready.cycle().fault is None
         ready.found("fault", within=100)
 
+    def test_what_a_drive_said_before_its_errors_were_cleared_is_no_new_fault(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.devices[1].fail(Error.MOTOR_OVER_TEMP)
+        ready.found("fault", within=40)
+        ready.drives.reset()
+        said = frames.BEAT.pack(Error.MOTOR_OVER_TEMP, AxisState.IDLE, ProcedureResult.SUCCESS, 0)
+        ready.bus.inject(frames.identifier(CONFIG.B.node, frames.HEARTBEAT), said)
+        assert ready.cycles(300).fault is None
+
+    def test_an_error_after_they_were_cleared_is_a_fault_as_soon_as_it_is_told(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.devices[1].fail(Error.MOTOR_OVER_TEMP)
+        ready.found("fault", within=40)
+        ready.drives.reset()
+        assert ready.cycles(35).fault is None  # so long it takes to ask each drive once
+        ready.devices[1].fail(Error.CURRENT_LIMIT_VIOLATION)
+        ready.found("fault", within=35)
+
     def test_nothing_is_enabled_while_a_fault_is_latched(self, enabled: Rig) -> None:
         enabled.devices[0].fail(Error.SPINOUT_DETECTED)
         enabled.found("fault", within=40)

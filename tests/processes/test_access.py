@@ -13,7 +13,7 @@ import zenoh
 from certificates import ROLES, tls_config, user
 from trirail.config import Config
 from trirail.wire import zenoh_session
-from trirail.wire.access import COMMANDS, access_control
+from trirail.wire.access import COMMANDS, access_control, least_role
 from trirail.wire.credentials import Credentials
 from trirail.wire.vocabulary import Command, Role
 
@@ -271,6 +271,13 @@ def test_what_is_tried_does_pass_where_it_is_allowed(
 
 def test_every_command_has_a_least_role() -> None:
     assert set(COMMANDS) == set(Command)
+
+
+@pytest.mark.parametrize("key", ["info", "poses", *(key for key in KEYS if "/ME" in key and "dance" not in key)])
+def test_a_client_is_told_the_least_role_that_may(key: str) -> None:
+    may = [role for role in Role if key in allowed(role, "ingress", "query")]
+    assert least_role(*key.split("/")) is may[0]
+    assert all(role.includes(may[0]) == (role in may) for role in Role)
 
 
 def test_a_service_never_asks_its_clients() -> None:

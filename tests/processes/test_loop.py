@@ -296,7 +296,7 @@ def test_whatever_the_fault_says_the_gateway_and_the_recorder_can_read_it(shell:
     """It is told anew whenever one of them is started again: one that it ended would end for good."""
     shell.enabled()
     shell.received()
-    shell.loop.control.trip("x" * 200_000 + "\n\x1b[2J", "internal")
+    shell.loop.control.modes.trip("x" * 200_000 + "\n\x1b[2J", "internal")
     shell.cycles(60)
     for link in (shell.gateway, shell.recorder):
         said = [decode_answer(packet[1:]) for packet in shell.received(link) if packet[0] == Kind.MESSAGE]

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from processes.test_service import Service, trirail, wait_readable
 from trirail.client.client import Robot
-from trirail.client.fleet import Fleet, Member, Need
+from trirail.client.fleet import Attention, Fleet, Member
 from trirail.errors import ServiceError
 from trirail.processes.interpreter import python
 
@@ -94,7 +94,7 @@ def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub
         assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(20.0).outcome == "done"
         seen(fleet, lambda member, _: member.summary.mode == "holding", 5.0, service)
         robot.quick_stop()
-        seen(fleet, lambda member, now: member.need(now) is Need.FAULT, 3.0, service)
+        seen(fleet, lambda member, now: member.need(now) is Attention.FAULT, 3.0, service)
         robot.reset()
     hub.kill()
     with service.robot() as robot:  # local control does not need it
@@ -109,13 +109,13 @@ def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub
 
 def test_a_robot_that_is_killed_is_silent_to_the_fleet(hub: Hub, service: Service) -> None:
     with Fleet(hub.locator, "demo") as fleet:
-        seen(fleet, lambda member, now: member.need(now) is Need.NOTHING, WITHIN, service)
+        seen(fleet, lambda member, now: member.need(now) is Attention.NOTHING, WITHIN, service)
         processes = [service.child(name) for name in ("gateway", "loop", "recorder", "planner")]
         for each in (service.process.pid, *processes):  # all at once, as a machine that loses its power
             os.kill(each, signal.SIGSTOP)
         for each in (service.process.pid, *processes):
             os.kill(each, signal.SIGKILL)
-        seen(fleet, lambda member, now: member.need(now) is Need.SILENT, 5.0, service)
+        seen(fleet, lambda member, now: member.need(now) is Attention.SILENT, 5.0, service)
 
 
 def test_the_command_sees_it_too(hub: Hub, service: Service) -> None:

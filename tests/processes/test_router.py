@@ -34,6 +34,7 @@ class Net(NamedTuple):
 
     config: RouterConfig
     folder: Path
+    name: str = "hub"
 
     @property
     def locator(self) -> str:
@@ -42,7 +43,7 @@ class Net(NamedTuple):
     def robot(self, name: str) -> Config:
         """A robot that dials it, and listens for users of its own."""
         own = Zenoh(
-            listen=(f"tls/127.0.0.1:{free_port()}",), connect=(self.locator,), router="hub",
+            listen=(f"tls/127.0.0.1:{free_port()}",), connect=(self.locator,), router=self.name,
             tls=Tls(str(user(self.folder, name))), users={"max": Role.MAINTAINER},
         )  # fmt: skip
         renamed = msgspec.structs.replace(CONFIG.robot, name=name)
@@ -58,12 +59,12 @@ def net(tmp_path_factory: pytest.TempPathFactory) -> Net:
     folder = tmp_path_factory.mktemp("net")
     keys = KeyFolder(folder / "keys")
     keys.create("hub", LOCAL, 100.0)
-    for name in (*ROBOTS, "stray"):
+    for name in (*ROBOTS, "stray", "north"):
         keys.add(name, 100.0, LOCAL)
     for name in (*ROLES, "una"):
         keys.add(name, 100.0)
     listen = (f"tls/127.0.0.1:{free_port()}",)
-    return Net(RouterConfig(ROBOTS, Zenoh(listen=listen, tls=Tls(str(keys.folder)), users=ROLES)), folder)
+    return Net(RouterConfig(Zenoh(listen=listen, tls=Tls(str(keys.folder)), users=ROLES), ROBOTS), folder)
 
 
 @pytest.fixture
@@ -188,6 +189,27 @@ def test_a_robot_is_there_before_its_router_and_after_it_is_gone(net: Net) -> No
                 assert until_answered(eva, "trirail/demo/info") == b"demo"
 
 
+def test_routers_make_a_tree_and_each_speaks_for_its_own_robots_alone(net: Net) -> None:
+    own = (f"tls/127.0.0.1:{free_port()}",)
+    tls = Tls(str(user(net.folder, "north")))
+    north = Net(RouterConfig(Zenoh(own, (net.locator,), "hub", tls=tls, users=ROLES), ROBOTS), net.folder, "north")
+    top = RouterConfig(net.config.zenoh, routers={"north": ("demo",)})
+    with (
+        router.routing(top), router.routing(north.config), Robot(north, "demo") as demo, Robot(north, "other") as other,
+        net.session("max") as above, net.session("eva") as eva, north.session("max") as below,
+    ):  # fmt: skip
+        assert until_answered(above, "trirail/demo/info") == b"demo"
+        assert answers(above, "trirail/demo/cmd/max/reset") == [b"demo"]
+        assert not answers(eva, "trirail/demo/cmd/eva/reset")
+        assert {msgspec.json.decode(role)["role"] for role in answers(above, "trirail/demo/role/max")} == {"maintainer"}
+        assert until_answered(below, "trirail/other/info") == b"other"
+        assert not answers(above, "trirail/other/info")  # for the top, north does not speak for this one
+        summaries = listening(eva, "trirail/*/summary")
+        for _ in range(5):
+            other.session.put("trirail/other/summary", b"x")
+        assert heard(summaries, partial(demo.session.put, "trirail/demo/summary", b"x")) == "trirail/demo/summary"
+
+
 def test_the_state_is_thinned_for_each_robot_by_itself(net: Net) -> None:
     config = msgspec.structs.replace(net.config, state_hz=0.01)
     with router.routing(config), Robot(net, "demo") as demo, Robot(net, "other") as other, net.session("eva") as eva:
@@ -234,6 +256,7 @@ def test_zenohd_is_given_the_same(net: Net) -> None:
             'robots = ["ann"]\n[zenoh]\nlisten = ["tls/0.0.0.0:7447"]\n[zenoh.tls]\n[zenoh.users]\nann = "viewer"',
             "names",
         ),
+        ('robots = ["a"]\n[routers]\nnorth = ["b", "a"]\n[zenoh]', "a stands twice"),
         ("robots = [", "Invalid"),
     ],
 )

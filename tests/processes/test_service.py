@@ -532,15 +532,16 @@ def test_goals_wait_blend_and_are_cancelled(service: Service) -> None:
 
 def test_a_view_is_drawn_from_what_the_service_publishes(shared: tuple[Service, Robot, zenoh.Session]) -> None:
     service, robot, _ = shared
-    with RemoteView(robot.info(), service.locator) as view:
+    with RemoteView([robot.info()], service.locator) as view:
+        (drawn,) = view.robots
         host = socket.create_connection(("127.0.0.1", urlsplit(view.url).port or 0), timeout=5.0)
         host.close()
-        began = view._streams.t
+        began = drawn.streams.t
         goal = robot.move_to(x=0.01, y=0.0, phi=0.0)
         assert goal.wait(timeout=10.0).outcome == "done"
-        until(robot, lambda _: view._streams.t > began + 0.2)
-    assert (view._lost, view._relay.skipped) == (0, 0)
-    assert view._bus_load == pytest.approx(0.75, abs=0.001)
+        until(robot, lambda _: drawn.streams.t > began + 0.2)
+    assert (drawn.lost, view.relay.skipped) == (0, 0)
+    assert drawn._bus_load == pytest.approx(0.75, abs=0.001)
     assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
     refused = trirail("view", "--web", locator=service.locator)
     assert refused.returncode == 1

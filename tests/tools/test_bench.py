@@ -71,6 +71,29 @@ def test_what_one_users_flood_costs_another_is_measured() -> None:
 
 
 @pytest.mark.slow
+def test_a_fleet_is_measured_behind_a_router_that_comes_and_goes() -> None:
+    told = measured("fleet")
+    assert told["robots"] == 6
+    watched = {what: rate["robots_watched"] for what, rate in told["rates"].items()}
+    assert watched == {"nobody watches": 0, "fleet": 6, "state of one": 1, "state of all": 6, "records of one": 1}
+    received = {what: rate["received_per_s"] for what, rate in told["rates"].items()}
+    assert received["nobody watches"] < received["fleet"] < received["state of one"] < received["state of all"]
+    for what in ("fault_seen_s", "stop_direct_ms", "stop_routed_ms"):
+        assert is_spread(told[what], told["quantiles"])
+    assert told["router_back_s"] > 0.0
+    assert told["killed_seen_s"] > 0.0
+
+
+@pytest.mark.slow
+def test_lateness_is_measured_with_scrapes_and_without() -> None:
+    told = measured("scrape")
+    assert told["scrapes"] > 0
+    assert set(told["lateness_us"]) == {"quiet", "scraped", "quiet again"}
+    for values in told["lateness_us"].values():
+        assert is_spread(values, told["quantiles"])
+
+
+@pytest.mark.slow
 def test_settling_is_measured() -> None:
     told = measured("settle")
     assert told["outcomes"] == {"done": 3}

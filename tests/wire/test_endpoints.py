@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ipaddress
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.wire.endpoints import ReachableBy, reach
+from trirail.wire.endpoints import ReachableBy, endpoint_of, is_local, reach, socket_file
 
 ENDS = ("", "#iface=eth0", "?rel=1", "?rel=1#so_sndbuf=65000")
 
@@ -43,8 +44,29 @@ def test_an_address_is_for_this_machine_if_it_is_the_loopbacks(
         ("vsock/-1:7447", ReachableBy.NETWORK),
         ("", ReachableBy.NETWORK),
         ("unixsock-stream//run/trirail/zenoh", ReachableBy.FILE),
+        ("unixpipe/trirail", ReachableBy.MACHINE),
         ("tls/0.0.0.0:7447", ReachableBy.CERTIFICATE),
     ],
 )
 def test_who_reaches_it(endpoint: str, by: ReachableBy) -> None:
     assert reach(endpoint) is by
+
+
+@given(st.ip_addresses(), st.integers(1, 65535))
+def test_an_address_and_a_port_are_an_endpoint(
+    address: ipaddress.IPv4Address | ipaddress.IPv6Address, port: int
+) -> None:
+    host = f"[{address}]" if address.version == 6 else str(address)
+    assert endpoint_of(str(address), port) == f"tcp/{host}:{port}"
+
+
+def test_what_stays_on_this_machine_is_local() -> None:
+    local = ["unixsock-stream//run/trirail/zenoh", "unixpipe/trirail", "tcp/localhost:7447", "tls/[::1]:7447"]
+    assert all(map(is_local, local))
+    assert not any(map(is_local, ["tcp/192.0.2.1:7447", "tls/0.0.0.0:7447", "udp/robot.example.org:7447", ""]))
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_only_a_unix_socket_has_a_file(end: str) -> None:
+    assert socket_file(f"unixsock-stream//run/trirail/zenoh{end}") == Path("/run/trirail/zenoh")
+    assert socket_file(f"tcp/127.0.0.1:7447{end}") is None

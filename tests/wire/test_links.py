@@ -23,6 +23,7 @@ def port(path: Path) -> Iterator[Port]:
 
 
 def test_packets_stay_whole_and_in_order(port: Port, path: Path) -> None:
+    assert not port.accept()
     link = links.connect(path)
     assert not port.connected
     assert port.accept()
@@ -67,6 +68,14 @@ def test_a_lost_peer_is_told_once_and_can_come_back(port: Port, path: Path) -> N
     again.close()
     assert not port.send(b"x")  # a peer that is lost in sending is lost too
     assert port.take_lost()
+
+
+def test_a_peer_is_awaited_until_it_comes(port: Port, path: Path) -> None:
+    assert not port.await_peer(0.0)
+    link = links.connect(path)
+    assert port.await_peer(1e6)
+    assert port.connected
+    link.close()
 
 
 def test_the_peer_sees_the_end(port: Port, path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from msgspec import structs
 from trirail.errors import RefusalCode
 from trirail.wire import packets
 from trirail.wire.messages import Event, PoseGoal
@@ -21,7 +23,8 @@ from trirail.wire.packets import (
     Status,
     Welcome,
 )
-from trirail.wire.records import DTYPE, FIELDS, HEAD, SIZE, unpack
+from trirail.wire.records import DTYPE, FIELDS, HEAD, PARTS, SIZE, last_cycle, unpack
+from trirail.wire.sizes import MAX_PACKET
 from trirail.wire.vocabulary import Command
 
 
@@ -55,6 +58,56 @@ def test_answers(answer: Answer) -> None:
     packet = packets.message(answer)
     assert packet[0] == Kind.MESSAGE
     assert packets.decode_answer(packet[1:]) == answer
+
+
+def an_event(text: str) -> Event:
+    return Event(1, 0.5, 500, 1.0, "goal", "info", text, id="g" * 64, outcome="done")
+
+
+def test_an_event_is_told_whole_up_to_the_size_of_a_packet() -> None:
+    """And what does not fit is cut, in each of its words: nobody is told less than to whom it belongs."""
+    room = MAX_PACKET - len(packets.message(Happened(an_event("x" * 60_000)))) + 60_000
+    whole = an_event("x" * room)
+    packet = packets.told(whole)
+    assert len(packet) == MAX_PACKET
+    assert packets.decode_answer(packet[1:]) == Happened(whole)
+    cut = packets.decode_answer(packets.told(an_event("x" * (room + 1)))[1:])
+    assert isinstance(cut, Happened)
+    assert cut.event.message == f"{'x' * 1000}… ({room + 1} characters)"
+    assert structs.replace(cut.event, message="") == an_event("")
+
+
+def test_whatever_is_long_in_an_event_is_cut() -> None:
+    long = "x" * MAX_PACKET
+    event = Event(1, 0.5, 500, 1.0, "goal", "info", long, id=long, reason=long, goal=long, user=long)
+    packet = packets.told(event)
+    assert len(packet) <= MAX_PACKET
+    told = packets.decode_answer(packet[1:])
+    assert isinstance(told, Happened)
+    for said in (told.event.message, told.event.id, told.event.reason, told.event.goal, told.event.user):
+        assert said is not None
+        assert said.startswith("x" * 100)
+
+
+SCALARS = {"cycle", "deadline_ns", "lateness_ns", "overruns", "mode", "homing", "settled", "progress", "remaining"}
+
+
+def test_a_record_has_one_number_for_the_robot_three_for_its_sliders_or_pose_and_one_for_each_timed_part() -> None:
+    """As clients in other languages read it, and recordings have it: little-endian, whole, in steps of eight bytes."""
+    shapes = {name: DTYPE[name].shape for name, _, _ in FIELDS}
+    assert DTYPE.names == tuple(shapes)
+    assert {name for name, shape in shapes.items() if shape == ()} == SCALARS
+    assert shapes.pop("parts_ns") == (len(PARTS),)
+    assert all(shape == (3,) for name, shape in shapes.items() if name not in SCALARS)
+    assert all(DTYPE.fields[name][1] % DTYPE[name].alignment == 0 for name in shapes)  # type: ignore[index]
+    assert SIZE % 8 == 0
+
+
+def test_records_are_read_one_after_the_other() -> None:
+    rows = np.zeros(3, DTYPE)
+    rows["cycle"] = 1, 2, 2**40
+    assert last_cycle(rows.tobytes()) == 2**40
+    assert unpack(rows.tobytes())["cycle"].tolist() == [1, 2, 2**40]
 
 
 def test_a_record_begins_with_what_the_loop_writes() -> None:

@@ -11,7 +11,7 @@ from trirail.processes.state import StateMaker
 from trirail.wire.packets import Status
 from trirail.wire.records import DTYPE
 from trirail.wire.sizes import MAX_NAME
-from trirail.wire.state import SUMMARY_BYTES, State, Summary, summary_of
+from trirail.wire.state import SUMMARY_BYTES, RobotSummary, State, summary_of
 
 
 def state(goal: str | None, fault: str | None, missed: int) -> State:
@@ -32,7 +32,7 @@ def test_a_summary_is_short_and_says_what_is_so(goal: str | None, fault: str | N
     made = summary_of(state(goal, fault, missed), age, "10.20.30.dev4+gabcdef012")
     encoded = msgspec.json.encode(made)
     assert len(encoded) < SUMMARY_BYTES
-    assert msgspec.json.decode(encoded, type=Summary) == made
+    assert msgspec.json.decode(encoded, type=RobotSummary) == made
     assert (made.mode, made.missed) == ("disabled", missed)
     for said, whole in ((made.fault, fault), (made.goal, goal)):
         assert (said is None) == (whole is None)

@@ -109,7 +109,7 @@ def _run(
     clock.step()
     drives.sync()
     control.start(drives.read())
-    control.cycles = int(records["cycle"][0]) - 1
+    control.modes.cycle = int(records["cycle"][0]) - 1
     waiting = deque(given)
     made = np.zeros((len(records), 2, 3))
     modes = np.zeros(len(records), np.uint8)

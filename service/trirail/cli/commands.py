@@ -28,7 +28,7 @@ from trirail.cli import (
     workspace_command,
 )
 from trirail.cli.completion import Shell, script
-from trirail.cli.options import HERE, Flag, Service
+from trirail.cli.options import ALL_HERE, Flag, Services
 from trirail.errors import TrirailError
 from trirail.wire.vocabulary import Command
 
@@ -119,9 +119,11 @@ def view(
     *,
     web: Annotated[bool, Flag] = False,
     records: Annotated[bool, Flag] = False,
-    service: Service = HERE,
+    services: Services = ALL_HERE,
 ) -> int:
     """Open the Rerun viewer on the robot as it moves, or on a recording, until it is closed or Ctrl-C.
+
+    Several robots, --robot a --robot b, are side by side: those behind one router.
 
     Parameters
     ----------
@@ -130,15 +132,15 @@ def view(
     web
         Show it in a browser on this machine, instead of in a window of its own.
     records
-        Draw it here, from the records that the service publishes; so it is done anyway where --connect names
-        another machine.
+        Draw it here, from the records that the service publishes; so it is done anyway for several robots, and
+        where --connect names another machine.
     """
     from trirail.cli import view as viewer
 
     def say(content: dict[str, str], words: str) -> None:
-        robot_commands.show(service, content, words)
+        robot_commands.show(services, content, words)
 
-    return viewer.run(file, service.robot, service.connect, service.tls, web=web, records=records, say=say)
+    return viewer.run(file, services.robot, services.connect, services.tls, web=web, records=records, say=say)
 
 
 app.command(router_command.router)

@@ -13,15 +13,20 @@ from cyclopts import App
 
 from trirail.cli import terminal
 from trirail.cli.options import Flag
-from trirail.config import SIM, load
 from trirail.errors import ConfigError
-
-FOLDER = SIM.parent
-"""Where the shipped configurations are: in the installed package, or in a checkout."""
 
 app = App(name="config", help="List the shipped configurations, copy one to start from, show what a file comes to.")
 
+BASE = "sim.toml"
+"""The shipped configuration with which others are compared."""
 _Tables = dict[str, Any]
+
+
+def _folder() -> Path:
+    """Where the shipped configurations are: in the installed package, or in a checkout."""
+    from trirail.config import SIM
+
+    return SIM.parent
 
 
 @app.default
@@ -35,12 +40,12 @@ def shipped(*, json: Annotated[bool, Flag] = False) -> int:
     """
     files = shipped_files()
     if json:
-        terminal.json({"folder": str(FOLDER), "files": files})
+        terminal.json({"folder": str(_folder()), "files": files})
         return 0
     width = max(map(len, files))
     for name, purpose in files.items():
         terminal.say(f"{name:{width}}  {purpose}")
-    terminal.say(f"in {FOLDER}; one to start from: trirail config copy sim.toml my.toml")
+    terminal.say(f"in {_folder()}; one to start from: trirail config copy sim.toml my.toml")
     return 0
 
 
@@ -88,9 +93,10 @@ def show(config: Path | None = None, /, *, json: Annotated[bool, Flag] = False) 
     json
         Print one JSON object instead of words.
     """
-    effective, simulated = (_tables(path) for path in (config or SIM, SIM))
+    base = _folder() / BASE
+    effective, simulated = (_tables(path) for path in (config or base, base))
     different = {
-        key: {"value": value, SIM.name: other} for key, value, other in _paired(effective, simulated) if value != other
+        key: {"value": value, BASE: other} for key, value, other in _paired(effective, simulated) if value != other
     }
     if json:
         terminal.json({"config": effective, "differences": different})
@@ -110,9 +116,9 @@ def toml(tables: _Tables, other: _Tables, path: str = "") -> Iterator[str]:
     for key, value in plain.items():
         was = other.get(key)
         if value is not None:
-            yield f"{key} = {_literal(value)}" + ("" if value == was else f"  # {SIM.name}: {_said(was)}")
+            yield f"{key} = {_literal(value)}" + ("" if value == was else f"  # {BASE}: {_said(was)}")
         elif was is not None:
-            yield f"# no {key}; {SIM.name}: {_said(was)}"
+            yield f"# no {key}; {BASE}: {_said(was)}"
     for key, value in inner.items():
         name, was = f"{path}.{key}" if path else key, other.get(key)
         if isinstance(value, dict):
@@ -131,13 +137,13 @@ def shipped_files() -> dict[str, str]:
 
 
 def _shipped() -> list[Path]:
-    files = [path for suffix in ("toml", "service", "yml", "json") for path in FOLDER.glob(f"*.{suffix}")]
-    return sorted(files) + sorted(FOLDER.glob("drives/*.toml"))
+    files = [path for suffix in ("toml", "service", "yml", "json") for path in _folder().glob(f"*.{suffix}")]
+    return sorted(files) + sorted(_folder().glob("drives/*.toml"))
 
 
 def _name(path: Path) -> str:
     """Return how a file is called: from the folder of shipped ones on."""
-    return path.relative_to(FOLDER).as_posix()
+    return path.relative_to(_folder()).as_posix()
 
 
 def _purpose(path: Path) -> str:
@@ -157,6 +163,8 @@ def _find(name: str) -> Path:
 
 def _tables(path: Path) -> _Tables:
     """Return a file's configuration as tables, arrays as lists."""
+    from trirail.config import load  # numba, with the kinematics
+
     config = load(path)
     if config.correction.map is not None:  # what is in that file stays there
         config = msgspec.structs.replace(config, correction=msgspec.structs.replace(config.correction, as_built=None))

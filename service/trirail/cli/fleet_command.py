@@ -51,25 +51,25 @@ def _described(member: Member, now: float) -> dict[str, object]:
 
 def table(members: Sequence[Member], now: float) -> Table:
     """Draw the robots, a line each."""
-    from trirail.client.fleet import Need
+    from trirail.client.fleet import Attention
 
     drawn = Table("robot", "mode", "needs", "goal", "lateness p99.9", "missed", "version", box=None, pad_edge=False)
     for member in members:
         said, need = member.summary, member.need(now)
         needs = {
-            Need.SILENT: f"[bold red]silent for {member.age(now):.0f} s[/]",
-            Need.FAULT: f"[bold red]{terminal.plain(said.fault or 'reset')}[/]",
-            Need.NOTHING: "",
+            Attention.SILENT: f"[bold red]silent for {member.age(now):.0f} s[/]",
+            Attention.FAULT: f"[bold red]{terminal.plain(said.fault or 'reset')}[/]",
+            Attention.NOTHING: "",
         }[need]
         mode = f"[{terminal.COLOURS.get(said.mode, 'white')}]{terminal.plain(said.mode)}[/]"
         drawn.add_row(
             terminal.plain(member.robot),
-            "[dim]unknown[/]" if need is Need.SILENT else mode,
+            "[dim]unknown[/]" if need is Attention.SILENT else mode,
             needs,
             terminal.plain(said.goal or ""),
             f"{said.lateness:.0f} µs",
             str(said.missed),
             terminal.plain(said.version),
         )
-    drawn.caption = f"{len(members)} robots, {sum(m.need(now) is not Need.NOTHING for m in members)} need somebody"
+    drawn.caption = f"{len(members)} robots, {sum(m.need(now) is not Attention.NOTHING for m in members)} need somebody"
     return drawn

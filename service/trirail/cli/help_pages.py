@@ -71,6 +71,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
             "trirail view --web",
             "trirail view session.rrd",
             "trirail view --connect tcp/192.168.1.7:7447",
+            "trirail view --robot left --robot right",
         ),
     },
     "Recordings": {

@@ -6,6 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import msgspec
 from rich.live import Live
@@ -15,10 +16,12 @@ from trirail_drivers.interface import NAMES, MissingProtection
 from trirail.cli import units
 from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain
 from trirail.client.client import Jog, Robot
-from trirail.config import Limits
 from trirail.errors import ServiceError
 from trirail.wire.state import GoalState, Info, State
 from trirail.wire.vocabulary import Mode
+
+if TYPE_CHECKING:
+    from trirail.config import Limits
 
 NEAR = 0.05
 """A position is near a limit in the last such share of its range, a rate in that below its limit."""
@@ -62,6 +65,8 @@ def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True)
 
 def limits_of(info: Info) -> Limits:
     """Return the limits of a robot from what its service tells of it. Raises ServiceError where they are none."""
+    from trirail.config import Limits  # numba, with the kinematics
+
     try:
         return msgspec.convert(info.limits, Limits)
     except msgspec.ValidationError as error:

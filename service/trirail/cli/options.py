@@ -69,11 +69,9 @@ def _robot(context: CompletionContext) -> Robot:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Service:
-    """Which service to talk to."""
+class Address:
+    """Where services are, and how to print."""
 
-    robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT", completer=robots)] = "demo"
-    "Name of the robot, as in its configuration."
     connect: Annotated[str, Parameter(env_var="TRIRAIL_CONNECT")] = DEFAULT_LOCATOR
     "Zenoh locator of the service or of a router."
     tls: Annotated[Path | None, Parameter(env_var="TRIRAIL_TLS")] = None
@@ -82,7 +80,25 @@ class Service:
     "Print one JSON object instead of words."
 
 
-HERE = Service()
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Service(Address):
+    """Which service to talk to."""
+
+    robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT", completer=robots)] = "demo"
+    "Name of the robot, as in its configuration."
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Services(Address):
+    """Which services to talk to, all at one address."""
+
+    robot: Annotated[tuple[str, ...], Parameter(env_var="TRIRAIL_ROBOT", completer=robots, negative="")] = ("demo",)
+    "Name of the robot, as in its configuration; again for another one."
+
+
+HERE, ALL_HERE = Service(), Services()
 
 
 @Parameter(name="*")

@@ -1,20 +1,22 @@
-"""A live view drawn on this machine, from the records, events and state that a service publishes through Zenoh."""
+"""A live view drawn on this machine, from the records, events and state that services publish through Zenoh."""
 
 from __future__ import annotations
 
 import queue
 import threading
 import time
+from collections.abc import Sequence
 from types import TracebackType
 
+import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.samples import SampleReader
 from trirail.errors import ServiceError
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.shown_robot import ShownRobot
-from trirail.telemetry.sinks import free_port, live_relay, live_server
-from trirail.telemetry.streams import LIVE_HZ, Shortfall, Streams
+from trirail.telemetry.sinks import Relay, free_port, live_relay, live_server
+from trirail.telemetry.streams import LIVE_HZ, Shortfall, Streams, open_together
 from trirail.wire import zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import Event
@@ -29,35 +31,33 @@ MISSING = "missing so far: {} cycles on the way here, {} batches in this view (v
 
 
 class RemoteView:
-    """Draws for viewers on this machine while it is open. Raises ServiceError where no records come.
+    """Draws robots for viewers on this machine while it is open: one alone, or several side by side.
 
-    The wall clock is this machine's at the first record, so it is late by the way through the network.
+    Raises ServiceError where no records come of one of them.
     """
 
-    def __init__(self, info: Info, connect: str, credentials: Credentials | None = None) -> None:
-        self._queue: queue.SimpleQueue[Event | State | bytes | None] = queue.SimpleQueue()
-        self._lost = 0
-        self._cycle: int | None = None
-        self._bus_load: float | None = None
+    def __init__(self, robots: Sequence[Info], connect: str, credentials: Credentials | None = None) -> None:
         self._session = zenoh_session.open_client(connect, credentials)
-        self._reader = SampleReader()
+        self.robots: list[RemoteRobot] = []
+        """Those that are drawn, in the order of `robots`."""
         try:
-            self._subscribe(info.robot)
-            first = self._first(info)
-            offset_ns = time.time_ns() - int(unpack(first)[-1]["deadline_ns"])
-            self._streams = Streams(ShownRobot.told(info), f"{info.robot} from {connect}", offset_ns)
+            for info in robots:
+                root = f"/{info.robot}" if len(robots) > 1 else ""
+                self.robots.append(RemoteRobot(info, self._session, f"{info.robot} from {connect}", root))
             server = live_server(free_port(), HISTORY_MB)
         except BaseException:
             self._session.close()  # type: ignore[no-untyped-call]
             raise
         self.url = server.uri
         """Where viewers on this machine connect."""
-        self._relay = live_relay(self._streams.open(server))
-        self._streams.attach(self._relay, LIVE_HZ)
-        self._missing = Shortfall(self._streams, MISSING, lambda: (self._lost, self._relay.skipped))
-        self._records(first)
-        self._thread = threading.Thread(target=self._run, name="records", daemon=True)
-        self._thread.start()
+        if len(self.robots) == 1:
+            stream = self.robots[0].streams.open(server)
+        else:
+            names = ", ".join(info.robot for info in robots)
+            stream = open_together([robot.streams for robot in self.robots], f"{names} from {connect}", server)
+        self.relay = live_relay(stream)
+        for robot in self.robots:
+            robot.draw(self.relay)
 
     def __enter__(self) -> RemoteView:
         return self
@@ -67,9 +67,42 @@ class RemoteView:
     ) -> None:
         """Draw no more."""
         self._session.close()  # type: ignore[no-untyped-call]
+        for robot in self.robots:
+            robot.end()
+        self.relay.close()
+
+
+class RemoteRobot:
+    """What comes of one robot, and its drawing. Raises ServiceError where no records come.
+
+    The wall clock is this machine's at the first record, so it is late by the way through the network.
+    """
+
+    def __init__(self, info: Info, session: zenoh.Session, name: str, root: str) -> None:
+        self._queue: queue.SimpleQueue[Event | State | bytes | None] = queue.SimpleQueue()
+        self.lost = 0
+        """Cycles that were lost on the way here."""
+        self._cycle: int | None = None
+        self._bus_load: float | None = None
+        self._session = session
+        self._reader = SampleReader()
+        self._subscribe(info.robot)
+        self._first_records = self._first(info)
+        offset_ns = time.time_ns() - int(unpack(self._first_records)[-1]["deadline_ns"])
+        self.streams = Streams(ShownRobot.told(info), name, offset_ns, root)
+        self._thread = threading.Thread(target=self._run, name=f"records of {info.robot}", daemon=True)
+
+    def draw(self, relay: Relay) -> None:
+        """Draw from now on, in a thread."""
+        self.streams.attach(relay, LIVE_HZ)
+        self._missing = Shortfall(self.streams, MISSING, lambda: (self.lost, relay.skipped))
+        self._records(self._first_records)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Draw what has come, and no more."""
         self._queue.put(None)
         self._thread.join()
-        self._relay.close()
 
     def _subscribe(self, robot: str) -> None:
         heard, declare = self._reader, self._session.declare_subscriber
@@ -109,22 +142,22 @@ class RemoteView:
             if isinstance(item, bytes):
                 self._records(item)
             elif isinstance(item, Event):
-                self._streams.event(item)
+                self.streams.event(item)
             else:
                 self._state(item)
 
     def _records(self, batch: bytes) -> None:
         cycles = unpack(batch)["cycle"]
         if self._cycle is not None and cycles[0] > self._cycle:
-            self._lost += int(cycles[0]) - self._cycle - 1
+            self.lost += int(cycles[0]) - self._cycle - 1
         self._cycle = int(cycles[-1])
-        self._streams.records(batch)
+        self.streams.records(batch)
         self._missing.check()
-        self._streams.save()  # those of the past come in one go: each alone would be a batch to skip
+        self.streams.save()  # those of the past come in one go: each alone would be a batch to skip
 
     def _state(self, state: State) -> None:
         goal, target = (state.goal.id, state.goal.target) if state.goal else (None, None)
-        self._streams.stands(Standing(goal, target, state.override, "; ".join(state.faults) or None))
+        self.streams.stands(Standing(goal, target, state.override, "; ".join(state.faults) or None))
         if state.loop.bus_load != self._bus_load:
             self._bus_load = state.loop.bus_load
-            self._streams.bus_load(state.loop.bus_load)
+            self.streams.bus_load(state.loop.bus_load)

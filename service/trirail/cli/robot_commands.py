@@ -12,7 +12,7 @@ import msgspec
 from cyclopts import CycloptsError, Parameter
 
 from trirail.cli import live, terminal, units
-from trirail.cli.options import HERE, Flag, Service, axes, frames, taught_poses, tools
+from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
 from trirail.cli.options import poses as poses_of_robot
 from trirail.wire.text import is_name
 from trirail.wire.vocabulary import Command
@@ -392,7 +392,7 @@ def _follow(service: Service, robot: Robot, goal: GoalHandle, wait: bool, title:
     return 0 if result.outcome == "done" else 1
 
 
-def show(service: Service, content: object, words: str) -> None:
+def show(service: Address, content: object, words: str) -> None:
     """Print what a command comes to: words, or with --json its content."""
     if service.json:
         terminal.json(content)

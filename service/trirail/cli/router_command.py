@@ -27,6 +27,6 @@ def router(config: Path, /, *, print_config: Annotated[bool, Flag] = False) -> i
 
         terminal.json(nested(routers.settings(settings)))
         return 0
-    terminal.say(f"routing  {', '.join(settings.zenoh.listen)}  between users and {len(settings.robots)} robots")
+    terminal.say(f"routing  {', '.join(settings.zenoh.listen)}  between users and {len(settings.all_robots)} robots")
     routers.run(settings)
     return 0

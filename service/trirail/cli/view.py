@@ -1,4 +1,4 @@
-"""`trirail view`: Rerun's viewer, or a browser, on a service's live view, on its records from afar, or on a file."""
+"""`trirail view`: Rerun's viewer, or a browser, on a service's live view, on records from afar, or on a file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote, urlsplit
 
@@ -30,7 +30,7 @@ START_WITHIN = 20.0
 
 def run(
     file: Path | None,
-    robot: str,
+    robots: Sequence[str],
     connect: str,
     tls: Path | None,
     *,
@@ -50,7 +50,7 @@ def run(
             "browser, and from a machine with a display trirail view --connect tcp/<this machine>:7447 shows it there"
         )
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with _source(file, robot, connect, tls, records) as source, contextlib.suppress(KeyboardInterrupt):
+    with _source(file, robots, connect, tls, records) as source, contextlib.suppress(KeyboardInterrupt):
         if web:
             _browse(source, say)
         else:
@@ -66,19 +66,22 @@ def has_display() -> bool:
 
 
 @contextlib.contextmanager
-def _source(file: Path | None, robot: str, connect: str, tls: Path | None, records: bool) -> Iterator[str]:
+def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | None, records: bool) -> Iterator[str]:
     """Yield the file, or the address of the live view: the service's own, or one that is drawn here from records."""
     if file is not None:
         yield str(file)
         return
-    with Robot(robot, connect, tls=tls) as service:
-        info = service.info()
-    if records or not is_local(connect):
+    infos = []
+    for robot in dict.fromkeys(robots):
+        with Robot(robot, connect, tls=tls) as service:
+            infos.append(service.info())
+    if records or len(infos) > 1 or not is_local(connect):
         from trirail.cli.remote_view import RemoteView
 
-        with RemoteView(info, connect, credentials_for(robot, connect, tls)) as drawn:
+        with RemoteView(infos, connect, credentials_for(robots[0], connect, tls)) as drawn:
             yield drawn.url
         return
+    (info,) = infos
     if not info.live:
         raise ServiceError(
             "the service has no live view (telemetry.live_port = 0): "

@@ -14,7 +14,7 @@ import zenoh
 from trirail.errors import RefusedError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.credentials import credentials_for
-from trirail.wire.state import Summary
+from trirail.wire.state import RobotSummary
 from trirail.wire.vocabulary import Mode
 
 SILENT: Final = 3.0
@@ -22,7 +22,7 @@ SILENT: Final = 3.0
 once a second. Liveliness tokens outlive an unclean death, so they are not asked."""
 
 
-class Need(IntEnum):
+class Attention(IntEnum):
     """How much a robot needs somebody, the most first."""
 
     SILENT = 0
@@ -34,7 +34,7 @@ class Member(NamedTuple):
     """A robot of the fleet."""
 
     robot: str
-    summary: Summary
+    summary: RobotSummary
     heard: float
     """When that came, by the monotonic clock here [s]."""
 
@@ -42,11 +42,11 @@ class Member(NamedTuple):
         """How old what is known of it is: since its loop has said something [s]."""
         return now - self.heard + self.summary.age
 
-    def need(self, now: float) -> Need:
+    def need(self, now: float) -> Attention:
         """Whether it needs somebody."""
         if self.age(now) > SILENT:
-            return Need.SILENT
-        return Need.FAULT if self.summary.mode == Mode.FAULT else Need.NOTHING
+            return Attention.SILENT
+        return Attention.FAULT if self.summary.mode == Mode.FAULT else Attention.NOTHING
 
 
 class Fleet:
@@ -81,7 +81,7 @@ class Fleet:
     def _take(self, sample: zenoh.Sample) -> None:
         _, robot, *_ = str(sample.key_expr).split("/")
         try:
-            summary = boundary.decode(sample.payload.to_bytes(), Summary, "not a summary", str(sample.encoding))
+            summary = boundary.decode(sample.payload.to_bytes(), RobotSummary, "not a summary", str(sample.encoding))
         except RefusedError:  # nobody but the robot should publish there; what is no summary is not heard
             return
         with self._lock:

@@ -6,21 +6,21 @@ and `write` the setpoints behind the last gate. What is to be said of it waits a
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Literal
 
 from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
 
 from trirail.config import Config, corrected_geometry
-from trirail.control.completion import still_powered, verdict
+from trirail.control.commands import Commands
 from trirail.control.feedback import Measured
 from trirail.control.goal_queue import GoalQueue
-from trirail.control.lease import LeaseArbiter, LeaseChange
+from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger
-from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeState, Refusal, step
+from trirail.control.modes import ModeEvent, ModeState
 from trirail.control.plan_requests import PlannerPort, PlanRequests
 from trirail.control.setpoints import Setpoints
+from trirail.control.transitions import Transitions
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.frames import NamedFrames
 from trirail.motion.limits import EDGE, Bounds
@@ -39,33 +39,10 @@ from trirail.wire.packets import (
 )
 from trirail.wire.planning import PlanAnswer
 from trirail.wire.records import Part
-from trirail.wire.vocabulary import Command, FaultCause, Mode
+from trirail.wire.vocabulary import FaultCause, Mode
 
 Given = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
 """What the control is given in a cycle, and when, by the monotonic clock [ns]."""
-
-SETTLE = 0.1
-"""How long the drives may take to leave their fault state after a reset [s]."""
-
-_OUTCOMES: dict[ModeEvent, Outcome] = {
-    ModeEvent.STANDSTILL: "done",
-    ModeEvent.ARRIVED: "done",
-    ModeEvent.FAULT: "faulted",
-}
-"""How a goal ends on an event after which it is not under way; else it is stopped."""
-_GO_ON = (
-    ModeEvent.GOAL,
-    ModeEvent.STANDSTILL,
-    ModeEvent.ARRIVED,
-    ModeEvent.POWERED,
-    # Homing moves the sliders: what was sent before would not begin from where it was meant to.
-    *(
-        ModeEvent[name.name]
-        for name in Command
-        if not name.stops and name.name in ModeEvent.__members__ and name is not Command.HOME
-    ),
-)
-"""Events that leave alone what has been sent but not begun."""
 
 
 class Control:
@@ -90,15 +67,30 @@ class Control:
             legs, config.period, step_length, self._following_error_limit, config.limits.in_position, taken
         )
         self.setpoints = Setpoints(legs, Bounds(config.limits, config.period, EDGE), self.measured, step_length)
-        self._can_home = any(drive.homing is not None for drive in config.drives.each)
+        self.modes = Transitions(
+            drives, self._schedule, self._planner, self.ledger, self.goal_queue, self.measured, self.setpoints
+        )
+        self._commands = Commands(
+            *(config, self.modes, self.lease, self.ledger),
+            *(self.goal_queue, self._planner, self.measured, self.setpoints),
+        )
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
-        self._settle_cycles = max(3, round(SETTLE / config.period))
-
-        self.cycles = 0
-        self.state: ModeState = DISABLED
-        self.fault: str | None = None
-        self._entered = 0
         self._run: Run | None = None
+
+    @property
+    def cycles(self) -> int:
+        """How many cycles have been run."""
+        return self.modes.cycle
+
+    @property
+    def state(self) -> ModeState:
+        """The mode, and what is to come once the robot stands."""
+        return self.modes.state
+
+    @property
+    def fault(self) -> str | None:
+        """The first reason of the fault; None where there is none."""
+        return self.modes.fault
 
     def cycle(self, feedback: Feedback, given: Iterable[Given], mark: Callable[[Part], None] = lambda _: None) -> None:
         """Run one cycle: what the drives said at its SYNC, and what else is given in it; then motion and setpoints.
@@ -111,7 +103,7 @@ class Control:
             for what, now_ns in given:
                 match what:
                     case Disturbance():
-                        self.happen(ModeEvent[what.event], what.reason)
+                        self.modes.happen(ModeEvent[what.event], what.reason)
                     case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged():
                         self.handle(what, now_ns)
                     case PlannerLost():
@@ -123,7 +115,7 @@ class Control:
             mark(Part.MOTION)
             self.solve()
         except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
-            self.trip(f"internal error, please report it: {error!r}", FaultCause.INTERNAL)
+            self.modes.trip(f"internal error, please report it: {error!r}", FaultCause.INTERNAL)
         mark(Part.KINEMATICS)
         self.write()
         mark(Part.WRITE)
@@ -140,7 +132,7 @@ class Control:
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
-        self.cycles += 1
+        self.modes.cycle += 1
         before = self.measured.feedback
         behind = self.measured.take(feedback, self._stands)
         self._tell_warnings(feedback)
@@ -150,13 +142,13 @@ class Control:
             if mode is Mode.FAULT and feedback.fault != before.fault:
                 # The first one stays, but this came of it.
                 self.ledger.tell("fault", "error", message, fault=FaultDetail(cause, drive, code))
-            self.trip(message, cause, drive, code)
+            self.modes.trip(message, cause, drive, code)
         elif mode is Mode.ENABLING:
             self._power_up()
         elif mode in (Mode.HOMING, Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
             if behind:
                 error = self.measured.following_error[behind - 1]
-                self.trip(
+                self.modes.trip(
                     f"slider {NAMES[behind - 1]}: following error {error * 1e3:.3f} mm is beyond its limit "
                     f"{self._following_error_limit * 1e3:g} mm",
                     FaultCause.FOLLOWING_ERROR,
@@ -165,7 +157,7 @@ class Control:
             elif not feedback.homing:
                 self._homing_over()
         self._judge_arrival()
-        self.ledger.settle(self._verdict, self.state.mode)
+        self._commands.settle()
 
     def _tell_warnings(self, feedback: Feedback) -> None:
         """Tell what people should know of the drives: they say it in one feedback only, some in the first."""
@@ -178,7 +170,7 @@ class Control:
             if isinstance(request, GoalRequest):
                 self.goal_queue.take(request, now_ns, self.cycles)
             elif isinstance(request, CommandRequest):
-                self._take_command(request)
+                self._commands.take(request)
             elif isinstance(request, PoseChanged):
                 self.ledger.tell("pose", "info", request.message, user=request.user)
             else:
@@ -186,24 +178,15 @@ class Control:
         except RefusedError as refusal:
             self.ledger.refuse(request, refusal)
 
-    def happen(self, event: ModeEvent, reason: str) -> None:
-        """Let something happen that nobody asked for: the gateway is lost, ticks are late, the service ends."""
-        decided = step(self.state, event)
-        if not isinstance(decided, Refusal) and decided.state != self.state:
-            self.ledger.tell("service", "warning", reason)
-            self._go(event, reason)
-        self._withdraw(event, reason)
-
     def advance(self) -> None:
         """End a lease or a jog that nobody renews, begin what is planned, and go on to the motion of this cycle."""
-        if (over := self.lease.silent(self.cycles)) is not None:
-            self._change_lease(over)
+        self._commands.end_silent_lease()
         released = self.ledger.release(self.cycles) if self.state.mode is Mode.MOVING else None
         if released is not None:
-            self._go(ModeEvent.NOT_RENEWED, f"goal {released.id} of {released.user} is not renewed")
+            self.modes.go(ModeEvent.NOT_RENEWED, f"goal {released.id} of {released.user} is not renewed")
         beginning = self.goal_queue.think(self.cycles, self._admit, self._place)
         if beginning is not None:
-            self._go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
+            self.modes.go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
         self._run = self._schedule.begin_cycle()
 
     def solve(self) -> None:
@@ -231,7 +214,7 @@ class Control:
         refused = self.setpoints.refusal(found)
         schedule = self._schedule
         if refused:
-            self.trip(refused, FaultCause.LIMIT)
+            self.modes.trip(refused, FaultCause.LIMIT)
         elif self.state.mode in (Mode.MOVING, Mode.STOPPING) and schedule.runs[0].stands:
             self._stand(schedule.runs[0])
 
@@ -262,22 +245,11 @@ class Control:
         x, y, phi = last.destination(self.commanded.pose)
         return (x, y, phi)
 
-    def trip(self, reason: str, cause: str, drive: str = "", code: int = 0) -> None:
-        """Stop all three drives in this cycle and latch the reason; cause, drive and code as of a FaultDetail."""
-        if self.state.mode is Mode.FAULT:
-            return
-        self.fault = reason
-        self.ledger.tell("fault", "error", reason, fault=FaultDetail(cause, drive, code))
-        self._go(ModeEvent.FAULT, reason)
-        self._withdraw(ModeEvent.FAULT, reason)
-
     # ------------------------------------------------------------------ requests
 
     def _admit(self) -> bool:
         """Whether the robot is moving to a goal; RefusedError where it takes none."""
-        decided = step(self.state, ModeEvent.GOAL)
-        if isinstance(decided, Refusal):
-            raise RefusedError(decided.code, self._because(decided))
+        self.modes.check(ModeEvent.GOAL)
         if not self.measured.homed:
             raise RefusedError(RefusalCode.NOT_HOMED, "it is not known where the sliders are: send home first")
         return self.state.mode is Mode.MOVING
@@ -291,127 +263,7 @@ class Control:
             return self.commanded.pose
         return last.end(self.commanded.pose)
 
-    def _withdraw(self, event: ModeEvent, reason: str) -> None:
-        """End what has been sent but not begun, where the robot is to stand: after the goals before it."""
-        if event not in _GO_ON:
-            self.goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason)
-
-    def _take_command(self, request: CommandRequest) -> None:
-        if request.name in (Command.ACQUIRE, Command.RELEASE):
-            self._take_lease(request)
-            return
-        if not request.name.everybodys:
-            self.lease.check(request.user)
-        if request.name is Command.OVERRIDE:
-            self._take_override(request)
-            return
-        event = ModeEvent[request.name.name]
-        if event is ModeEvent.HOME and not self._can_home:
-            raise RefusedError(RefusalCode.NOTHING_TO_HOME, "absolute encoders: there is nothing to home")
-        if request.goal is not None and self.goal_queue.stop_alone(request.goal, f"{request.name} by {request.user}"):
-            self.ledger.undertake(request, self.cycles)
-            return
-        decided = step(self.state, event)
-        if isinstance(decided, Refusal):
-            raise RefusedError(decided.code, self._because(decided))
-        if event is ModeEvent.PAUSE and self.ledger.goal is not None and self.ledger.goal.renewed is not None:
-            event = ModeEvent.STOP  # nobody would be at the key, nor where the target was, when it is resumed
-        if decided.action is Action.POWER_UP:
-            self.setpoints.check_rest()
-            if self.measured.homed:
-                self.setpoints.check_start()
-        if decided.action is Action.CLEAR and self.measured.powered:
-            raise RefusedError(RefusalCode.STOPPING, still_powered(self.measured, self.fault))
-        reason = f"{request.name} by {request.user}"
-        if event is ModeEvent.QUICK_STOP:
-            self.trip(reason, FaultCause.QUICK_STOP)
-        else:
-            self._go(event, reason)
-            self._withdraw(event, reason)
-        self.ledger.undertake(request, self.cycles)
-
-    def _take_override(self, request: CommandRequest) -> None:
-        """Let this motion and those to come run at another rate."""
-        self._planner.override = request.value if request.value is not None else 1.0
-        if self.state.mode is Mode.MOVING:
-            self._planner.run_at(self.override)
-        self.ledger.tell("service", "info", f"override {self.override:.0%} by {request.user}", user=request.user)
-        self.ledger.undertake(request, self.cycles)
-
-    def _take_lease(self, request: CommandRequest) -> None:
-        """Let a user have the lease, keep it, or give it back."""
-        if request.name is Command.ACQUIRE:
-            change = self.lease.acquire(request, self.cycles)
-        else:
-            change = self.lease.release(request)
-        if change is not None:
-            self._change_lease(change)
-        self.ledger.undertake(request, self.cycles)
-
-    def _change_lease(self, change: LeaseChange) -> None:
-        """Tell who holds the lease from now on; what others have under way stops, and does not begin any more."""
-        user = self.lease.user
-        self.ledger.tell("lease", change.level, change.message, user=user)
-        if user is None or not self.ledger.is_all_of(user):
-            self._go(ModeEvent.STOP, change.message)
-            self._withdraw(ModeEvent.STOP, change.message)
-
-    def _because(self, refusal: Refusal) -> str:
-        return f"{refusal.message} (fault: {self.fault})" if self.fault else refusal.message
-
-    def _verdict(self, name: Command, since: int) -> str | None:
-        """Say what has become of a command that came in a cycle: trirail.control.completion.verdict."""
-        settled = self.cycles - since >= self._settle_cycles
-        return verdict(name, self.state.mode, self.fault, self.measured, settled=settled)
-
     # ------------------------------------------------------------------ from state to state
-
-    def _go(self, event: ModeEvent, reason: str, goal: GoalRequest | None = None) -> None:  # noqa: PLR0912  one branch an action
-        """Step the modes and carry out the action; `goal` is the one that begins."""
-        decided = step(self.state, event)
-        if isinstance(decided, Refusal):
-            return
-        match decided.action:
-            case Action.POWER_UP:
-                self._drives.enable()
-            case Action.POWER_DOWN:
-                self._drives.disable()
-            case Action.QUICK_STOP:
-                self._drives.quick_stop()
-            case Action.CLEAR:
-                self._drives.reset()
-                self.fault = None
-            case Action.BRAKE if decided.state.paused:
-                self._planner.run_at(0.0)
-            case Action.BRAKE:
-                self._brake()
-            case Action.RESUME:
-                self._planner.run_at(self.override)
-            case Action.HOME:
-                self._drives.home()
-            case Action.STOP_HOMING:
-                self._drives.stop_homing()
-        before, self.state = self.state, decided.state
-        if self.state.mode is not before.mode:
-            self._entered = self.cycles
-        if goal is not None or not self.state.has_goal:
-            self.measured.settling.leave()
-        if not self.state.has_goal:
-            outcome = _OUTCOMES.get(event, "stopped")
-            arrived = "released" if before.released else "arrived"
-            self.ledger.end(outcome, arrived if outcome == "done" else reason)
-        if self.state.mode is not before.mode:
-            begun = goal.id if goal is not None else None
-            self.ledger.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode, goal=begun)
-        if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
-            self._schedule.take(deque())
-            self.setpoints.tell_progress(0.0, 0.0)
-            self._planner.leave_rate()
-
-    def _brake(self) -> None:
-        """Stop on the path of the motion under way; what was to follow it does not."""
-        self._schedule.stop_on_path()
-        self._planner.run_at(0.0)
 
     @property
     def _stands(self) -> bool:
@@ -425,11 +277,11 @@ class Control:
         """
         goal, settling = self.ledger.goal, self.measured.settling
         if not run.arrived:
-            self._go(ModeEvent.STANDSTILL, "standstill")
+            self.modes.go(ModeEvent.STANDSTILL, "standstill")
         elif self.state.mode is Mode.MOVING and goal is not None and goal.renewed is TrackGoal:
             return  # it waits for its target to move on, for as long as it is renewed
         elif goal is None or not goal.settles:
-            self._go(ModeEvent.ARRIVED, "standstill")
+            self.modes.go(ModeEvent.ARRIVED, "standstill")
         elif not settling.under_way:
             settling.begin(self.cycles)
 
@@ -441,23 +293,25 @@ class Control:
             return
         outcome: Outcome = "done" if settled.settle is not None else "unsettled"
         self.ledger.end(outcome, settling.said(settled), settled=settled)
-        self._go(ModeEvent.ARRIVED, "standstill")
+        self.modes.go(ModeEvent.ARRIVED, "standstill")
 
     def _power_up(self) -> None:
         """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""
         if all(state is PowerState.OPERATION_ENABLED for state in self.measured.feedback.state):
             if not self.measured.homed:
-                self._go(ModeEvent.POWERED, "all drives are enabled; where the sliders are is not known: send home")
+                self.modes.go(
+                    ModeEvent.POWERED, "all drives are enabled; where the sliders are is not known: send home"
+                )
             elif self._rest_at_setpoints():
-                self._go(ModeEvent.POWERED, "all drives are enabled")
-        elif self.cycles - self._entered > self._enable_cycles:
+                self.modes.go(ModeEvent.POWERED, "all drives are enabled")
+        elif self.cycles - self.modes.entered > self._enable_cycles:
             waiting = [
                 f"drive {name} is {state}"
                 for name, state in zip(NAMES, self.measured.feedback.state, strict=True)
                 if state is not PowerState.OPERATION_ENABLED
             ]
             seconds = self._enable_cycles * self._period
-            self.trip(
+            self.modes.trip(
                 f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected", FaultCause.ENABLE
             )
 
@@ -469,21 +323,21 @@ class Control:
             try:
                 self.setpoints.check_start()
             except RefusedError as refusal:
-                self.trip(f"all drives are homed, but {refusal}", FaultCause.PLACE)
+                self.modes.trip(f"all drives are homed, but {refusal}", FaultCause.PLACE)
                 return
             if not self._rest_at_setpoints():
                 return
         if self.state.mode is Mode.STOPPING:
-            self._go(ModeEvent.STANDSTILL, "standstill")
+            self.modes.go(ModeEvent.STANDSTILL, "standstill")
         else:
-            self._go(ModeEvent.HOMED, "all drives are homed")
+            self.modes.go(ModeEvent.HOMED, "all drives are homed")
 
     def _rest_at_setpoints(self) -> bool:
         """Command the pose that belongs to the setpoints, at rest; trip where there is none."""
         a, b, c = self.setpoints.rows[0]
         pose = self.measured.pose_of((a, b, c))
         if pose is None:
-            self.trip("the measured sliders belong to no pose", FaultCause.PLACE)
+            self.modes.trip("the measured sliders belong to no pose", FaultCause.PLACE)
             return False
         self._schedule.commanded = rest(pose)
         return True
@@ -491,5 +345,5 @@ class Control:
     def _follow_measured(self) -> None:
         """Command the pose that is measured, and the sliders to where they are."""
         held = self.state.mode not in (Mode.DISABLED, Mode.FAULT)
-        stopped_now = self.state.mode is Mode.FAULT and self._entered == self.cycles
+        stopped_now = self.state.mode is Mode.FAULT and self.modes.entered == self.cycles
         self.setpoints.follow(self._schedule, held=held, stopped_now=stopped_now)

@@ -8,7 +8,7 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_a
 
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import Event
-from trirail.wire.state import State, Summary
+from trirail.wire.state import RobotSummary, State
 
 EVENTS_KEPT = 1000
 """So many events a client hears that asks for the past."""
@@ -46,7 +46,7 @@ class Publications:
         """Publish the newest state."""
         self._state.put(msgspec.json.encode(state))
 
-    def summary(self, summary: Summary) -> None:
+    def summary(self, summary: RobotSummary) -> None:
         """Publish the newest summary."""
         self._summary.put(msgspec.json.encode(summary))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,12 +27,24 @@ from trirail.wire.messages import RoleReply
 class RouterConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """A router's configuration file."""
 
-    robots: Annotated[tuple[UserName, ...], Meta(min_length=1, max_length=10_000)]
-    """The robots that may dial it, each by the common name of its certificate, which is its name in every key."""
     zenoh: Zenoh
     """As in a robot's: where it listens, certificates, and the users of all its robots; `connect` is another router."""
+    robots: Annotated[tuple[UserName, ...], Meta(max_length=10_000)] = ()
+    """The robots that may dial it, each by the common name of its certificate, which is its name in every key."""
+    routers: Annotated[dict[UserName, tuple[UserName, ...]], Meta(max_length=1000)] = {}
+    """Routers that may dial it, by the common names of their certificates, each with the robots behind it."""
     state_hz: Annotated[float, Meta(gt=0.0, le=200.0)] = 5.0
     """So often a second a user is sent each robot's state at most."""
+
+    @property
+    def behind(self) -> dict[str, tuple[str, ...]]:
+        """Who may dial it, each with the robots that it speaks for: a robot for itself."""
+        return {robot: (robot,) for robot in self.robots} | self.routers
+
+    @property
+    def all_robots(self) -> list[str]:
+        """Every robot, behind it or behind another router."""
+        return [robot for robots in self.behind.values() for robot in robots]
 
 
 def load(path: Path) -> RouterConfig:
@@ -46,19 +59,22 @@ def load(path: Path) -> RouterConfig:
     if config.zenoh.tls is not None:
         tls = msgspec.structs.replace(config.zenoh.tls, directory=str(path.parent / config.zenoh.tls.directory))
         config = msgspec.structs.replace(config, zenoh=msgspec.structs.replace(config.zenoh, tls=tls))
-    if both := set(config.robots) & set(config.zenoh.users):
-        raise ConfigError(f"{path}: robots: {', '.join(sorted(both))} is a user as well: names must differ")
+    if not config.all_robots:
+        raise ConfigError(f"{path}: robots, routers: name one robot at least")
+    named = Counter([*config.all_robots, *config.routers, *config.zenoh.users])
+    if twice := [name for name, times in named.items() if times > 1]:
+        raise ConfigError(f"{path}: robots, routers, zenoh.users: {', '.join(twice)} stands twice: names must differ")
     return config
 
 
 def settings(config: RouterConfig) -> dict[str, Any]:
     """Return the settings of Zenoh's router. Raises ServiceError for certificates that are no good."""
-    thinned = {zenoh_session.key(robot, "state"): config.state_hz for robot in config.robots}
+    thinned = {zenoh_session.key(robot, "state"): config.state_hz for robot in config.all_robots}
     listen, connect = config.zenoh.listen, config.zenoh.connect
     if config.zenoh.tls is None:
         return zenoh_session.router(listen, None, None, connect, thinned)
     folder = Path(config.zenoh.tls.directory)
-    rules = router_access_control(config.robots, with_role(config.zenoh.users, folder))
+    rules = router_access_control(config.behind, with_role(config.zenoh.users, folder), config.zenoh.router)
     return zenoh_session.router(listen, Credentials.read(folder), rules, connect, thinned)
 
 

@@ -1,12 +1,15 @@
-"""How the viewer is laid out: the robot large with mode and events below it, beside it the curves."""
+"""How the viewer is laid out: the robot large with mode and events below it, beside it the curves; or several."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from trirail.telemetry import curves, readout
+from trirail.telemetry import curves, journal, readout
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.workspace.mechanism import Points
 
@@ -16,15 +19,24 @@ MARGIN = 0.09
 """Room around the robot, as a share of its size."""
 
 
-def layout(robot: ShownRobot, bounds: Points) -> rrb.Blueprint:
-    """Return the layout for a robot that lies within `bounds`, (2, 2): lowest and highest x and y [m]."""
+class Shown(NamedTuple):
+    """A robot in a view."""
+
+    robot: ShownRobot
+    bounds: Points
+    """Where it lies, (2, 2): lowest and highest x and y [m]."""
+    root: str = ""
+    """The entity below which all of it is; "" for the root of all."""
+
+
+def layout(shown: Shown) -> rrb.Blueprint:
+    """Return the layout for one robot."""
     window = rrb.TimeAxis(view_range=_last(WINDOW))
-    error_mm = robot.limits.slider.following_error * 1e3
     sliders = rrb.Vertical(
         _plot("Slider position λ  [mm]", curves.POSITION, window, legend=True),
         _plot("Slider velocity  [mm/s]", curves.VELOCITY, window),
         _plot("Slider acceleration  [m/s²]", curves.ACCELERATION, window),
-        _plot(f"Following error  [µm], limit ±{error_mm:g} mm", curves.ERROR, window),
+        _error(shown, window),
     )
     platform = rrb.Vertical(
         _plot("Centre x, y  [mm]", curves.CENTRE, window, legend=True),
@@ -33,39 +45,68 @@ def layout(robot: ShownRobot, bounds: Points) -> rrb.Blueprint:
         _plot("Loop timing  [µs]", curves.TIMING, window, legend=True),
         row_shares=[18, 19, 25, 20],
     )
-    events = rrb.TextLogView(
-        name="Events",
-        origin="/events",
-        columns=rrb.TextLogColumns(
-            timeline_columns=[rrb.encodings.TimelineColumn("t", visible=False)],
-            text_log_columns=["LogLevel", "Body"],
-        ),
-    )
-    left = rrb.Vertical(
-        _robot(robot, bounds),
-        rrb.TextDocumentView(name="Now", origin=readout.PATH),
-        rrb.StateTimelineView(name="Mode", origin="/mode", time_view=window),
-        events,
-        row_shares=[53, 23, 11, 21],
-    )
+    left = rrb.Vertical(*_situation(shown, window, "t"), row_shares=[53, 23, 11, 21])
+    return _whole(rrb.Horizontal(left, sliders, platform, column_shares=[8, 6, 6]), "t")
+
+
+def side_by_side(several: Sequence[Shown]) -> rrb.Blueprint:
+    """Return the layout for several robots, a column each, by the wall clock: each loop has a `t` of its own."""
+    window = rrb.TimeAxis(view_range=_last(WINDOW))
+    columns = [
+        rrb.Vertical(
+            *_situation(shown, window, "wall"),
+            _plot("Slider position λ  [mm]", f"{shown.root}{curves.POSITION}", window, legend=True),
+            _error(shown, window),
+            row_shares=[46, 24, 9, 17, 16, 16],
+            name=shown.robot.name,
+        )
+        for shown in several
+    ]
+    return _whole(rrb.Horizontal(*columns), "wall")
+
+
+def _whole(views: rrb.Horizontal, timeline: str) -> rrb.Blueprint:
     return rrb.Blueprint(
-        rrb.Horizontal(left, sliders, platform, column_shares=[8, 6, 6]),
-        rrb.TimePanel(state="collapsed", timeline="t", play_state="Following"),
+        views,
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="Following"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
 
 
-def _robot(robot: ShownRobot, bounds: Points) -> rrb.Spatial2DView:
-    low, high = bounds + MARGIN * np.ptp(bounds) * np.array([[-1.0], [1.0]])
-    trace = rrb.VisibleTimeRanges(timeline="t", range=_last(WINDOW))
-    return rrb.Spatial2DView(
-        name=f"{robot.name}: 3-PRP planar robot",
-        origin="/",
-        contents="/robot/**",
-        visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
-        overrides={"/robot/trace": [rr.LineStrips2D.from_fields(), trace]},
+def _situation(shown: Shown, window: rrb.TimeAxis, timeline: str) -> list[rrb.View]:
+    """Return the robot, its numbers, its mode and its events."""
+    events = rrb.TextLogView(
+        name="Events",
+        origin=f"{shown.root}{journal.EVENTS}",
+        columns=rrb.TextLogColumns(
+            timeline_columns=[rrb.encodings.TimelineColumn(timeline, visible=False)],
+            text_log_columns=["LogLevel", "Body"],
+        ),
     )
+    return [
+        _robot(shown, timeline),
+        rrb.TextDocumentView(name="Now", origin=f"{shown.root}{readout.PATH}"),
+        rrb.StateTimelineView(name="Mode", origin=f"{shown.root}/mode", time_view=window),
+        events,
+    ]
+
+
+def _robot(shown: Shown, timeline: str) -> rrb.Spatial2DView:
+    low, high = shown.bounds + MARGIN * np.ptp(shown.bounds) * np.array([[-1.0], [1.0]])
+    trace = rrb.VisibleTimeRanges(timeline=timeline, range=_last(WINDOW))
+    return rrb.Spatial2DView(
+        name=f"{shown.robot.name}: 3-PRP planar robot",
+        origin=shown.root or "/",
+        contents=f"{shown.root}/robot/**",
+        visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
+        overrides={f"{shown.root}/robot/trace": [rr.LineStrips2D.from_fields(), trace]},
+    )
+
+
+def _error(shown: Shown, window: rrb.TimeAxis) -> rrb.TimeSeriesView:
+    error_mm = shown.robot.limits.slider.following_error * 1e3
+    return _plot(f"Following error  [µm], limit ±{error_mm:g} mm", f"{shown.root}{curves.ERROR}", window)
 
 
 def _plot(name: str, origin: str, window: rrb.TimeAxis, *, legend: bool = False) -> rrb.TimeSeriesView:

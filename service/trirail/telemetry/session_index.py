@@ -10,13 +10,14 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from msgspec import Struct
 
-from trirail.telemetry import contents
-from trirail.telemetry.contents import Contents
 from trirail.telemetry.retention import IN_USE
+
+if TYPE_CHECKING:
+    from trirail.telemetry.contents import Contents
 
 FILE: Final = "sessions.sqlite3"
 VERSION: Final = 1
@@ -101,7 +102,7 @@ class SessionIndex:
         """Throw all of it away."""
         self._path.unlink(missing_ok=True)
 
-    def update(self, read: Callable[[Path], Contents] = contents.of_file, now: float | None = None) -> Iterator[Path]:
+    def update(self, read: Callable[[Path], Contents] | None = None, now: float | None = None) -> Iterator[Path]:
         """Make it agree with the folder: yield each file that it lacks, then read it; leave out those being written."""
         known: set[str] = set()
         self._do(lambda index: known.update(name for (name,) in index.execute("SELECT name FROM recording")))
@@ -116,7 +117,7 @@ class SessionIndex:
                 continue
             if not being_written:
                 yield there[name]
-                self.put([read(there[name])])
+                self.put([(read or _read)(there[name])])
 
     def find(self, wanted: Wanted = Wanted()) -> list[RecordedSession]:  # noqa: B008 - a value, and never changed
         """Return the sessions that are wanted, in the order in which they began."""
@@ -155,6 +156,12 @@ class SessionIndex:
             index.execute("PRAGMA foreign_keys = ON")
             index.execute("BEGIN")
             yield index
+
+
+def _read(path: Path) -> Contents:
+    from trirail.telemetry.contents import of_file  # Rerun, which is most of what to start takes
+
+    return of_file(path)
 
 
 def _enter(index: sqlite3.Connection, row: Contents) -> None:

@@ -1,9 +1,9 @@
-"""What the loop says, made into what sinks are given: drawings in batches, the goal, lines of the log."""
+"""What loops say, made into what sinks are given: drawings in batches, the goal, lines of the log."""
 
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from trirail.telemetry import blueprint, journal
+from trirail.telemetry.blueprint import Shown
 from trirail.telemetry.columns import SECOND
 from trirail.telemetry.journal import EVENTS, Entry
 from trirail.telemetry.readout import Standing
@@ -37,14 +38,18 @@ class Sink(Protocol):
 
 
 class Streams:
-    """One recording, with its drawing and its layout, and the sinks that it goes to."""
+    """One robot's recording, with its drawing and its layout, and the sinks that it goes to.
 
-    def __init__(self, robot: ShownRobot, name: str, wall_offset_ns: int) -> None:
+    With a `root`, an entity, all of it is below that: others may be in the same recording.
+    """
+
+    def __init__(self, robot: ShownRobot, name: str, wall_offset_ns: int, root: str = "") -> None:
         self.scene = Scene(robot, wall_offset_ns)
+        self.shown = Shown(robot, self.scene.bounds, root)
+        """What a layout is made of."""
         self._name = name
         self._rate_hz = robot.rate_hz
         self._wall_offset_ns = wall_offset_ns
-        self._layout = blueprint.layout(robot, self.scene.bounds)
         self._recording = str(uuid.uuid4())
         self._streams: list[rr.RecordingStream] = []
         self._waiting: list[Chunk] = []
@@ -58,12 +63,16 @@ class Streams:
     def open(self, sink: rr.FileSink | rr.GrpcServerSink) -> rr.RecordingStream:
         """Return a stream of this recording to a sink of Rerun's, with what stands still and the layout in it."""
         stream = rr.RecordingStream(APPLICATION, recording_id=self._recording)
-        stream.set_sinks(sink, default_blueprint=self._layout)
+        stream.set_sinks(sink, default_blueprint=blueprint.layout(self.shown))
         stream.send_recording_name(self._name)
-        for path, archetype in self.scene.still():
-            stream.log(path, archetype, static=True)
-        self._streams.append(stream)
+        self.join(stream)
         return stream
+
+    def join(self, stream: rr.RecordingStream) -> None:
+        """Give a stream what stands still, now and when it changes."""
+        for path, archetype in self.scene.still():
+            stream.log(f"{self.shown.root}{path}", archetype, static=True)
+        self._streams.append(stream)
 
     def attach(self, sink: Sink, drawing_hz: int) -> None:
         """Give a sink everything that is said from now on, and so many batches of drawings a second.
@@ -99,7 +108,7 @@ class Streams:
         """Take the load of the bus, 1 for a full one."""
         for path, archetype in self.scene.bus_load(share):
             for stream in self._streams:
-                stream.log(path, archetype, static=True)
+                stream.log(f"{self.shown.root}{path}", archetype, static=True)
 
     def event(self, event: Event) -> None:
         """Take an event."""
@@ -124,7 +133,7 @@ class Streams:
 
     def save(self) -> None:
         """Pass on what was said: together, for a batch costs about the same with one line or ten."""
-        chunks = self._waiting + journal.chunks(self._entries)
+        chunks = self._placed(self._waiting + journal.chunks(self._entries))
         self._waiting, self._entries = [], []
         if chunks:
             for sink in self._paces:
@@ -142,10 +151,24 @@ class Streams:
         return newest
 
     def _draw(self, hz: int, records: NDArray[np.void]) -> None:
-        chunks = self.scene.drawn(records, self._standing)
+        chunks = self._placed(self.scene.drawn(records, self._standing))
         for sink, pace in self._paces.items():
             if pace == hz:
                 sink.send(chunks)
+
+    def _placed(self, chunks: list[Chunk]) -> list[Chunk]:
+        root = self.shown.root
+        return [chunk.with_entity_path(f"{root}{chunk.entity_path}") for chunk in chunks] if root else chunks
+
+
+def open_together(several: Sequence[Streams], name: str, sink: rr.FileSink | rr.GrpcServerSink) -> rr.RecordingStream:
+    """Return a stream to a sink of Rerun's, in which several robots are side by side, each below its root."""
+    stream = rr.RecordingStream(APPLICATION, recording_id=str(uuid.uuid4()))
+    stream.set_sinks(sink, default_blueprint=blueprint.side_by_side([streams.shown for streams in several]))
+    stream.send_recording_name(name)
+    for streams in several:
+        streams.join(stream)
+    return stream
 
 
 class Shortfall:

@@ -77,18 +77,24 @@ def access_control(robot: str, users: Mapping[str, Role], router: str | None = N
     }
 
 
-def router_access_control(robots: Sequence[str], users: Mapping[str, Role]) -> dict[str, Any]:
-    """Return section access_control for a router between these robots and users.
+def router_access_control(
+    behind: Mapping[str, Sequence[str]], users: Mapping[str, Role], router: str | None = None
+) -> dict[str, Any]:
+    """Return section access_control for a router between robots and users.
 
-    Its users may with every robot what they may with one; a robot may what it lets its router do, the other way round,
-    and that with its own keys only. Nobody's role is a robot's to tell: the router knows it.
+    Its users may with every robot what they may with one. `behind` has who dials it: a robot with itself, or another
+    router with the robots behind that. Either may what robots let their router do, the other way round, and that with
+    keys of these robots only. Nobody's role is a robot's to tell: the router knows it. `router` is one that it dials
+    itself, as a robot does.
     """
-    section = access_control("*", users)
-    for robot in robots:
-        mirrored = [_mirrored(robot, rule) for rule in (*_of_every_user(robot), *_of_router(robot))]
-        section["rules"] += mirrored
-        section["policies"].append(_policy(robot, mirrored))
-        section["subjects"].append(_subject(robot))
+    section = access_control("*", users, router)
+    for name, robots in behind.items():
+        through: list[_Rule] = []
+        for robot in robots:
+            through += [_mirrored(f"{name}: {robot}", rule) for rule in (*_of_every_user(robot), *_of_router(robot))]
+        section["rules"] += through
+        section["policies"].append(_policy(name, through))
+        section["subjects"].append(_subject(name))
     return section
 
 
@@ -103,10 +109,10 @@ def _of_router(robot: str) -> Iterator[_Rule]:
     yield from _of_user(robot, "*", Role.MAINTAINER)
 
 
-def _mirrored(robot: str, rule: _Rule) -> _Rule:
+def _mirrored(name: str, rule: _Rule) -> _Rule:
     """A rule of a robot's, as its other side has it: what may leave here comes in there."""
     (flow,) = rule["flows"]
-    return rule | {"id": f"{robot}: {rule['id']}", "flows": ["egress" if flow == "ingress" else "ingress"]}
+    return rule | {"id": f"{name}: {rule['id']}", "flows": ["egress" if flow == "ingress" else "ingress"]}
 
 
 def _of_every_user(robot: str) -> Iterator[_Rule]:

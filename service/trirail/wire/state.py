@@ -154,7 +154,7 @@ SUMMARY_TEXT = 80
 """What a text of a summary takes at most, as JSON [bytes]; longer ones end in …."""
 
 
-class Summary(Struct, frozen=True):
+class RobotSummary(Struct, frozen=True):
     """What a fleet reads of a robot, published once a second."""
 
     mode: str
@@ -173,12 +173,12 @@ class Summary(Struct, frozen=True):
     """Of the service's software."""
 
 
-def summary_of(state: State, age: float, version: str) -> Summary:
+def summary_of(state: State, age: float, version: str) -> RobotSummary:
     """Make the summary of a state that is so old [s]."""
     fault = _shortened("; ".join(state.faults)) if state.faults else None
     goal = _shortened(state.goal.id) if state.goal else None
     loop = state.loop
-    return Summary(state.mode, fault, goal, loop.lateness_us.p999, loop.overruns, round(age, 2), version)
+    return RobotSummary(state.mode, fault, goal, loop.lateness_us.p999, loop.overruns, round(age, 2), version)
 
 
 def _shortened(text: str) -> str:
