@@ -1,7 +1,9 @@
 """Identifies the geometry of a robot as built from measured poses, and writes its [geometry] section.
 
 python tools/calibrate.py poses.csv --config robot.toml --output geometry.toml
+python tools/calibrate.py poses.csv --config robot.toml --map --output as_built.toml
 
+With --map it leaves the geometry as it is, and writes the map of what the robot still does beside it, for [correction].
 The file has the columns x, y, phi, A, B, C: where an outside instrument saw the platform, and what the sliders
 read there, in metres and radians. kinematics.calibration has the mathematics. The report goes to standard error.
 Needs trirail[analysis].
@@ -11,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import datetime
 import io
 import math
 import sys
@@ -19,8 +22,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from trirail import config
-from trirail.errors import TrirailError
+from trirail import as_built, config
+from trirail.errors import ConfigError, TrirailError
+from trirail.kinematics import correction_fit
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.calibration import PARAMETERS, Calibration, CalibrationError, identify
 from trirail.kinematics.geometry import LEGS, Geometry, singular_angles
@@ -120,6 +124,9 @@ def calibrate(options: argparse.Namespace) -> None:
         poses, sliders, lines = read(options.poses, degrees=options.deg)
     except CalibrationError as error:
         raise CalibrationError(f"{options.poses}: {error}") from error
+    if options.map:
+        write(map_text(options, start, poses, sliders), options.output)
+        return
     try:
         found = identify(start, poses, sliders, position_noise=options.position_noise, angle_noise=options.angle_noise)
     except CalibrationError as error:
@@ -127,13 +134,50 @@ def calibrate(options: argparse.Namespace) -> None:
             raise
         raise CalibrationError(f"{options.poses}: line {lines[error.row]}: {error}") from error
     print(describe(found, lines), file=sys.stderr)
-    if options.output is None:
-        print(section(found.geometry), end="")
+    write(section(found.geometry), options.output)
+
+
+def map_text(options: argparse.Namespace, robot: Geometry, poses: Array, sliders: Array) -> str:
+    """Fit the map, report, and return its file. Raises CalibrationError, also where the service would refuse it."""
+    limits = config.load(options.config).limits
+    try:
+        found = correction_fit.fit(robot, poses, sliders, config.room(limits), options.cells)
+        made = as_built.AsBuilt(
+            made=datetime.datetime.now(datetime.UTC).date().isoformat(),
+            geometry=as_built.geometry_of(robot),
+            low=found.correction.low,
+            high=found.correction.high,
+            nodes=found.correction.nodes.tolist(),
+        )
+        text = as_built.written(made)
+        config.check_as_built(as_built.parse(text), robot, limits)
+    except (CalibrationError, ConfigError) as error:
+        raise CalibrationError(f"{options.poses}: {error}") from error
+    print(describe_map(found), file=sys.stderr)
+    return text
+
+
+def describe_map(found: correction_fit.Fit) -> str:
+    """Return the report on a map for people."""
+    cells = math.prod(found.correction.cells)
+    said = [f"{len(found.before)} poses; {found.empty} of {cells} cells have none, and what is there comes from beside"]
+    said += ["", f"{'pose error: rms, greatest':<28}{'measured':>18}{'left':>18}{'left if not measured':>24}"]
+    for k, (name, unit, scale) in enumerate(COORDINATES):
+        columns = [np.abs(each[:, k]) * scale for each in (found.before, found.residuals, found.foretold)]
+        told = [f"{math.sqrt(np.mean(each**2)):.2f}, {each.max():.2f}" for each in columns]
+        said.append(f"{f'{name} [{unit}]':<28}{told[0]:>18}{told[1]:>18}{told[2]:>24}")
+    return "\n".join(said)
+
+
+def write(text: str, output: Path | None) -> None:
+    """Write to a file, or to standard output."""
+    if output is None:
+        print(text, end="")
         return
     try:
-        options.output.write_text(section(found.geometry), encoding="utf-8")
+        output.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise CalibrationError(f"cannot write {options.output}: {error.strerror}") from error
+        raise CalibrationError(f"cannot write {output}: {error.strerror}") from error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -142,6 +186,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("poses", type=Path, help=f"CSV file with the columns {', '.join(COLUMNS)} [m, rad]")
     parser.add_argument("--config", type=Path, default=config.SIM, help="its geometry is where to start (%(default)s)")
     parser.add_argument("--output", type=Path, metavar="FILE", help="where to write the section; else standard output")
+    parser.add_argument("--map", action="store_true", help="write the map of what the robot does beside its geometry")
+    parser.add_argument(
+        "--cells",
+        type=int,
+        nargs=3,
+        default=(4, 4, 8),
+        choices=range(1, 9),
+        metavar="N",
+        help="of the map, 1 to 8",
+    )
     parser.add_argument("--deg", action="store_true", help="phi is in degrees")
     parser.add_argument("--position-noise", type=float, default=20e-6, metavar="M", help="of x and y [m] (%(default)s)")
     parser.add_argument("--angle-noise", type=float, default=1e-4, metavar="RAD", help="of phi [rad] (%(default)s)")

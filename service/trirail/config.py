@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import ipaddress
 import itertools
@@ -21,8 +22,10 @@ from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Driv
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES
 
+from trirail import as_built
+from trirail.as_built import AsBuilt
 from trirail.errors import ConfigError
-from trirail.kinematics.geometry import Geometry, Leg, gains, singular_angles, travels
+from trirail.kinematics.geometry import Geometry, Leg, Room, gains, singular_angles, travels
 from trirail.wire.endpoints import ReachableBy, endpoint_of, is_local, reach
 from trirail.wire.vocabulary import LeasePolicy, Role
 
@@ -160,6 +163,20 @@ class FramesTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Frames by name: x, y [m] of the origin and the angle [rad], in the base frame."""
 
 
+Play = Annotated[float, Meta(ge=0.0, le=0.001)]
+"""[m]."""
+
+
+class CorrectionTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [correction]: what the robot as built differs from [geometry] by; where it is absent, nothing."""
+
+    map: Name | None = None
+    """File of as-built errors, from `tools/calibrate.py --map`, relative to the configuration file."""
+    backlash: tuple[Play, Play, Play] = (0.0, 0.0, 0.0)
+    """Play between drive and slider, A, B, C [m]: taken up wherever a slider turns back."""
+    as_built: AsBuilt | None = None
+
+
 class LoopTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [loop]."""
 
@@ -252,6 +269,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     watchdogs: Watchdogs
     motion: MotionTable = MotionTable()
     frames: FramesTable = FramesTable()
+    correction: CorrectionTable = CorrectionTable()
     control: ControlTable = ControlTable()
     poses: dict[PoseName, tuple[Coordinate, Coordinate, Angle]] = {}
     """Poses by name: x, y [m] of the platform's centre and phi [rad], in the base frame. The others that goals may name
@@ -270,13 +288,22 @@ def load(path: Path) -> Config:
     except FileError as error:
         raise ConfigError(f"{error}; `trirail config copy sim` gives one to start from") from error
     try:
-        return _beside(path, parse(text))
+        config = _beside(path, _parsed(text))
+        _check(config)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
+    return config
 
 
 def parse(text: str) -> Config:
     """Read a configuration from TOML. Raises ConfigError."""
+    config = _parsed(text)
+    _check(config)
+    return config
+
+
+def _parsed(text: str) -> Config:
+    """Read a configuration whose values are each possible by itself."""
     try:
         raw = tomllib.loads(text)
         leaves = list(_leaves(raw))
@@ -288,15 +315,13 @@ def parse(text: str) -> Config:
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{key} = {value}: it must be a finite number")
     try:
-        config = msgspec.convert(raw, Config)
+        return msgspec.convert(raw, Config)
     except msgspec.ValidationError as error:
         raise ConfigError(_explain(str(error), raw)) from error
-    _check(config)
-    return config
 
 
 def _beside(path: Path, config: Config) -> Config:
-    """The configuration with EDS files and certificates where they lie: relative to the configuration file."""
+    """The configuration with what lies relative to its file: EDS files, certificates, and what is in the map's file."""
     drives = config.drives
     for name, drive in zip(NAMES, drives.each, strict=True):
         if drive.eds is not None:
@@ -306,7 +331,15 @@ def _beside(path: Path, config: Config) -> Config:
     if zenoh.tls is not None:
         tls = msgspec.structs.replace(zenoh.tls, directory=str(path.parent / zenoh.tls.directory))
         zenoh = msgspec.structs.replace(zenoh, tls=tls)
-    return msgspec.structs.replace(config, drives=drives, zenoh=zenoh)
+    correction = config.correction
+    if correction.map is not None and correction.as_built is None:
+        file = path.parent / correction.map
+        try:
+            read = as_built.read(file)
+        except ConfigError as error:
+            raise ConfigError(f"correction.map: {error}") from error
+        correction = msgspec.structs.replace(correction, map=str(file), as_built=read)
+    return msgspec.structs.replace(config, drives=drives, zenoh=zenoh, correction=correction)
 
 
 def metrics_url(config: Config) -> str:
@@ -329,6 +362,24 @@ def geometry(table: GeometryTable) -> Geometry:
         return Geometry(legs=(first, second, third))
     except ValueError as error:
         raise ConfigError(f"geometry: {error}") from error
+
+
+def corrected_geometry(config: Config) -> Geometry:
+    """Build the robot's geometry with the correction, where it has one. Raises ConfigError."""
+    robot, found = geometry(config.geometry), config.correction.as_built
+    return dataclasses.replace(robot, correction=as_built.correction(found)) if found is not None else robot
+
+
+def room(limits: Limits) -> Room:
+    """Return where the robot may be."""
+    low, high = np.transpose([limits.platform.x, limits.platform.y, limits.platform.phi]).tolist()
+    return Room(low, high, limits.slider.position, limits.slider.passive)
+
+
+def check_as_built(found: AsBuilt, robot: Geometry, limits: Limits) -> None:
+    """Refuse a map that is not this robot's, or that could break a limit anywhere. Raises ConfigError."""
+    rates = [(each.velocity, each.acceleration, each.jerk) for each in (limits.platform, limits.slider)]
+    as_built.check(found, robot, room(limits), *rates)
 
 
 def _leaves(value: object, key: str = "") -> Iterator[tuple[str, object]]:
@@ -436,9 +487,14 @@ def _check(config: Config) -> None:
     for key, (low, high) in ranges.items():
         if low >= high:
             raise ConfigError(f"{key} = [{low:g}, {high:g}]: the lower limit must be below the upper one")
-    (low, high), margin = platform.phi, config.limits.singularity_margin
+    _check_correction(config, robot)
+    corrected = corrected_geometry(config)
+    off = corrected.correction
+    x, y, phi = np.zeros(3) if off is None else off.bound  # the legs are told places that far beyond
+    (low, high), margin = (platform.phi[0] - phi, platform.phi[1] + phi), config.limits.singularity_margin
     # On a robot as built the singular angles move with the centre: linearly in x and y, so the corners bound them.
-    centres = [(0.0, 0.0), *itertools.product(platform.x, platform.y)]
+    beside = [(low - more, high + more) for (low, high), more in ((platform.x, x), (platform.y, y))]
+    centres = [(0.0, 0.0), *itertools.product(*beside)]
     for angle in {angle for centre in centres for angle in singular_angles(robot, centre)}:
         if low - margin < angle < high + margin:
             raise ConfigError(
@@ -456,7 +512,7 @@ def _check(config: Config) -> None:
     for name in config.frames.work:
         if name in (BASE, PLATFORM):
             raise ConfigError(f"frames.work.{name}: every robot has a frame of that name; give this one another")
-    _check_poses(config, robot)
+    _check_poses(config, corrected)
     nodes = [config.drives.master_node, *(drive.node for drive in config.drives.each)]
     if len(set(nodes)) < len(nodes):
         raise ConfigError(
@@ -482,6 +538,19 @@ def _check(config: Config) -> None:
         checks.check(config.drives, required)
     except DriveError as error:
         raise ConfigError(str(error)) from error
+
+
+def _check_correction(config: Config, robot: Geometry) -> None:
+    """Refuse a map that is not this robot's, or that the limits have no room for."""
+    told = config.correction
+    if told.as_built is None:
+        if told.map is not None:
+            raise ConfigError(f"correction.map = {told.map!r}: a file, which only a configuration in a file can name")
+        return
+    try:
+        check_as_built(told.as_built, robot, config.limits)
+    except ConfigError as error:
+        raise ConfigError(f"correction.map: {told.map or 'as_built'}: {error}") from error
 
 
 def _check_poses(config: Config, robot: Geometry) -> None:

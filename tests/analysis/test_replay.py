@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 from trirail.analysis.replay import again
 from trirail.analysis.summary import summary
+from trirail.as_built import AsBuilt, geometry_of, written
 from trirail.client import own_service
 from trirail.client.client import Robot
-from trirail.config import Config, load
+from trirail.config import SIM, Config, geometry, load
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import Recording, join, read
@@ -114,6 +115,32 @@ def test_it_comes_out_the_same_to_the_last_bit(recording: Recording, config: Con
     assert compared.lacking == 0
     assert (compared.differing, compared.first) == (0, None)
     assert compared.position == (0.0, 0.0, 0.0)
+
+
+def test_a_corrected_session_comes_out_the_same_without_the_maps_file(tmp_path: Path) -> None:
+    """The recording holds the map; what takes up backlash comes of what the sliders were told before."""
+    made = geometry_of(geometry(load(SIM).geometry))
+    nodes = np.random.default_rng(8).uniform(-2e-5, 2e-5, (5, 5, 5, 3)).tolist()
+    low, high = (-0.15, -0.15, -1.2), (0.15, 0.15, 0.85)
+    (tmp_path / "as_built.toml").write_text(written(AsBuilt("today", made, low, high, nodes)), encoding="utf-8")
+    file, locator = own_service.private(tmp_path)
+    told = '\n[correction]\nmap = "as_built.toml"\nbacklash = [5e-5, 5e-5, 5e-5]\n'
+    file.write_text(file.read_text(encoding="utf-8") + told, encoding="utf-8")
+    with own_service.service(file, tmp_path / "session.rrd") as service, Robot("demo", locator, user="ann") as robot:
+        assert robot.info().correction is not None
+        robot.enable()
+        for x in (0.03, -0.02, 0.01):
+            assert robot.move_to(x=x, y=-x, phi=x).wait(20.0).outcome == "done"
+        assert robot.state().pose == pytest.approx((0.01, -0.01, 0.01), abs=1e-4)
+        assert own_service.end(service) == 0
+    (tmp_path / "as_built.toml").unlink()
+    recording = read(tmp_path / "session.rrd")
+    assert np.abs(recording.records["backlash"]).max() == pytest.approx(2.5e-5)
+    config = provenance.configuration(recording.texts)
+    assert config is not None
+    compared = again(recording, config, simulated=False)
+    assert (compared.lacking, compared.differing, compared.plans_differing) == (0, 0, 0)
+    assert compared.plans >= 3
 
 
 def test_what_was_planned_is_planned_the_same_again(recording: Recording, config: Config) -> None:

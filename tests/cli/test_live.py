@@ -14,7 +14,8 @@ from rich.console import Console
 from trirail.cli import live
 from trirail.cli.units import ANGLE, LENGTH, VELOCITY, quantity
 from trirail.config import SIM, load
-from trirail.wire.state import Commanded, FrameCounts, GoalState, LoopState, Percentiles, Sliders, State
+from trirail.processes.info import info
+from trirail.wire.state import Commanded, CorrectionTold, FrameCounts, GoalState, LoopState, Percentiles, Sliders, State
 
 LIMITS = load(SIM).limits
 NONE = Percentiles(0.0, 0.0, 0.0, 0.0)
@@ -106,3 +107,14 @@ def test_a_position_beyond_its_limit_is_always_said(at: float) -> None:
     said = [words for words in live.near_limits(a_state(sliders=sliders), LIMITS) if words.startswith("slider A")]
     near = min(abs(at - low), abs(high - at)) <= 0.05 * (high - low)
     assert bool(said) == (near or not low <= at <= high)
+
+
+def test_a_correction_that_is_on_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    plain = info(load(SIM))
+    live.show(a_state(), plain)
+    assert "corrected" not in capsys.readouterr().out
+    told = CorrectionTold("map.toml", "2026-05-01", (5e-5, 4e-5, 1e-4), (5e-5, 0.0, 1e-5))
+    live.show(a_state(), msgspec.structs.replace(plain, correction=told))
+    words = " ".join(capsys.readouterr().out.split())
+    assert "corrected map.toml, measured 2026-05-01: up to 50.0 µm in x, 40.0 µm in y, 0.100 mrad; " in words
+    assert "backlash of A 50.0 µm, B 0.0 µm, C 10.0 µm" in words

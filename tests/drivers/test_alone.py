@@ -160,6 +160,18 @@ def test_an_encoder_counts_what_it_holds_on_to(rig: Rig, line: str, counted: flo
     assert rig.bus.faults.carriages.read() == pytest.approx((0.0, 0.01, 0.0))
 
 
+def test_a_slider_with_play_stays_behind_where_its_drive_turns_back(rig: Rig) -> None:
+    rig.bus.faults.add("all play 0.0001")
+    rig.drives.enable()
+    rig.cycles(300)
+    for speed, way, slider in ((0.005, 0.001, 0.00095), (-0.005, -0.001, 0.00005), (0.005, 0.0001, 0.00005)):
+        before = rig.feedback.position[1]
+        rig.cycles(round(way / speed * 1000), (speed,) * 3)
+        rig.cycles(100)
+        assert rig.feedback.position[1] - before == pytest.approx(way, abs=1e-6)
+        assert rig.bus.faults.carriages.read() == pytest.approx((slider,) * 3, abs=3e-6)
+
+
 ways_of_drives = st.lists(st.tuples(st.integers(0, 2), st.floats(-1e6, 1e6)), max_size=20)
 
 

@@ -15,7 +15,7 @@ class Carriages:
         self._servos = tuple(servos)
         self._scales = tuple(counts_per_metre)
         self._moves = [(index, 1.0) for index in range(len(self._servos))]
-        self._seen = [servo.travelled for servo in self._servos]
+        self._seen = [servo.driven for servo in self._servos]
         self._places = [0.0] * len(self._servos)
 
     def couple(self, index: int, slider: int, ratio: float) -> None:
@@ -28,8 +28,8 @@ class Carriages:
         for index, (servo, scale, (slider, ratio)) in enumerate(
             zip(self._servos, self._scales, self._moves, strict=True)
         ):
-            self._places[slider] += ratio * (servo.travelled - self._seen[index]) / scale
-            self._seen[index] = servo.travelled
+            self._places[slider] += ratio * (servo.driven - self._seen[index]) / scale
+            self._seen[index] = servo.driven
         return tuple(self._places)
 
     def push(self, slider: int, by: float) -> None:

@@ -35,6 +35,7 @@ faults of its mechanics and wiring, as a rule beside the rail shows them:
   swapped DRIVE     it moves that drive's slider          loose          its encoder does not turn with it
   slips SHARE       its encoder misses that share of the way while the slider's position rises
   against           its encoder counts against its motor: with power it runs away
+  play METRES       between drive and slider: backlash
 faults of the bus (no DRIVE):
   bus-off           the master's controller leaves the bus        error-passive   ... is about to
   babble ID         a node sends this identifier without pause; what has a higher one does not get through
@@ -107,7 +108,7 @@ def _decimal(word: str) -> float:
     return value
 
 
-def _time(word: str) -> float:
+def _not_negative(word: str) -> float:
     value = _decimal(word)
     if value < 0.0:
         raise ValueError
@@ -156,7 +157,7 @@ _OF_FRAMES: Final = {
     "drop": _Kind(),
     "duplicate": _Kind(),
     "corrupt": _Kind(),
-    "delay": _Kind("seconds", _time, "0.002"),
+    "delay": _Kind("seconds", _not_negative, "0.002"),
     "dlc": _Kind("a length from 0 to 8", _between(0, 8, 10), "3"),
 }
 _CODE: Final = _Kind("an error code, four hexadecimal digits", _between(1, 0xFFFF, 16), "4310", momentary=True)
@@ -166,7 +167,7 @@ _OF_DRIVES: Final = {
     "fault": _CODE,
     "reboot": _Kind(momentary=True),
     "stuck": _Kind(),
-    "lag": _Kind("seconds", _time, "0.05"),
+    "lag": _Kind("seconds", _not_negative, "0.05"),
     "runaway": _Kind("a speed in m/s", _decimal, "0.2"),
     "reversed": _Kind(),
     "scale": _Kind("a ratio above 0", _ratio, "0.5"),
@@ -174,6 +175,7 @@ _OF_DRIVES: Final = {
     "loose": _Kind(),
     "slips": _Kind("a share from 0 to 1", _share, "0.3"),
     "against": _Kind(),
+    "play": _Kind("metres", _not_negative, "0.00005"),
 }
 _OF_BUS: Final = {
     "bus-off": _Kind(),
@@ -212,7 +214,7 @@ def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
     while words.next_is("at", "when", "with"):
         match words.left.pop(0):
             case "at":
-                delay = words.value("at", "seconds", "at 2.5 A silent", _time)
+                delay = words.value("at", "seconds", "at 2.5 A silent", _not_negative)
             case "with":
                 chance = words.value("with", "a chance above 0, at most 1", "with 0.01 A drop tpdo2", _chance)
             case "when":
@@ -275,7 +277,7 @@ def _lasting(words: _Words, name: str, momentary: bool) -> tuple[float, int | No
         return (0.0 if momentary else math.inf), None
     words.left.pop(0)
     example = "for 0.5, or for 3 frames" if name in _OF_FRAMES else "for 0.5"
-    value = words.value("for", "seconds", example, _time)
+    value = words.value("for", "seconds", example, _not_negative)
     if not words.left:
         return value, None
     if name not in _OF_FRAMES or words.left not in (["frames"], ["frame"]) or value != round(value) or value < 1:

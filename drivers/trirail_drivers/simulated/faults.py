@@ -274,6 +274,7 @@ class Faults:
             if "stuck" in fault:
                 drive.servo.forced_velocity = 0.0
             drive.servo.encoder = self._encoder(fault, scale)
+            drive.servo.play = fault["play"].value * scale if "play" in fault else 0.0
             slider = round(fault["swapped"].value) if "swapped" in fault else index
             ratio = fault["scale"].value if "scale" in fault else 1.0
             self.carriages.couple(index, slider, -ratio if "reversed" in fault else ratio)

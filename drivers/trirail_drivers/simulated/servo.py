@@ -50,6 +50,10 @@ class Servo:
         """A defect: which shares of its travel the encoder counts, forwards and backwards; (0, 0) where it is loose."""
         self.travelled = 0.0
         """How far the motor has turned since power-on, whatever the encoder says [counts]."""
+        self.play = 0.0
+        """A defect: how far the motor turns before the slider goes along, where it turns back [counts]."""
+        self.driven = 0.0
+        """How far the slider has gone since power-on: as the motor, but for the play [counts]."""
         self.lag: float | None = None
         """A defect: how long it is behind its setpoint [s]; feed-forward does not help then."""
         self._feed_forward = 0.0
@@ -178,4 +182,6 @@ class Servo:
         """Turn the motor `by` so much [counts]; the encoder counts what it counts of it."""
         forwards, backwards = self.encoder
         self.travelled += by
+        half = abs(self.play) / 2.0
+        self.driven = max(self.travelled - half, min(self.driven, self.travelled + half))
         self.position += by * (forwards if by > 0.0 else backwards)

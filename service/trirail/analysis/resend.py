@@ -108,7 +108,8 @@ class _Heard:
 
 
 def _check_start(recording: Recording, robot: Robot) -> None:
-    stood, stands = recording.records["position"][0], np.array(robot.state().sliders.position)
+    first, stands = recording.records[0], np.array(robot.state().sliders.position)
+    stood = first["position"] - first["backlash"]
     if np.abs(stood - stands).max() > NEAR:
         began, now = (", ".join(f"{value * 1e3:.1f}" for value in place) for place in (stood, stands))
         raise ServiceError(f"the session began with the sliders at {began} mm, they are at {now} mm: go there first")

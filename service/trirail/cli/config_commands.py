@@ -165,7 +165,10 @@ def _tables(path: Path) -> _Tables:
     """Return a file's configuration as tables, arrays as lists."""
     from trirail.config import load  # numba, with the kinematics
 
-    tables: _Tables = json_text.loads(msgspec.json.encode(load(path)))
+    config = load(path)
+    if config.correction.map is not None:  # what is in that file stays there
+        config = msgspec.structs.replace(config, correction=msgspec.structs.replace(config.correction, as_built=None))
+    tables: _Tables = json_text.loads(msgspec.json.encode(config))
     return tables
 
 

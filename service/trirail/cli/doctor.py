@@ -11,6 +11,8 @@ from trirail_drivers.bus.load import HIGH
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
+from trirail import as_built
+from trirail.cli import units
 from trirail.config import Config
 from trirail.processes.clock import Tick
 from trirail.processes.guard import Guard
@@ -83,6 +85,7 @@ def examine(config: Config, machine: Machine) -> list[Check]:
         isolation(machine.cpu, machine.isolated, simulated=simulated),
         *can_interface(config, machine),
         *protections(config),
+        *corrected(config),
         load(config),
         *network(config, machine),
         *metrics(config),
@@ -142,6 +145,13 @@ def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
     elsewhere = f"loop.cpu = {isolated[0]} is isolated; name it" if isolated else "none is isolated"
     remedy = f"boot with isolcpus={cpu} nohz_full={cpu} and set loop.cpu = {cpu}"
     return Check("processor", "warning", f"{cpu}, shared; {elsewhere}", "" if isolated else remedy)
+
+
+def corrected(config: Config) -> list[Check]:
+    """What as-built errors are corrected by: nobody should have to guess that it is on."""
+    section = config.correction
+    told = as_built.told(section.map, section.as_built, section.backlash)
+    return [] if told is None else [Check("correction", "ok", units.correction(told))]
 
 
 def can_interface(config: Config, machine: Machine) -> list[Check]:

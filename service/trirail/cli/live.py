@@ -29,8 +29,11 @@ _ALONG = (("x", "mm", "mm/s", 3), ("y", "mm", "mm/s", 3), ("φ", "°", "°/s", 4
 
 
 def show(state: State, info: Info) -> None:
-    """Print a state, with what drives do without."""
-    out.print(table(state, info.robot, limits_of(info)))
+    """Print a state, with what as-built errors are corrected by, and what drives do without."""
+    grid = table(state, info.robot, limits_of(info))
+    if info.correction is not None:
+        grid.add_row("corrected", plain(units.correction(info.correction)))
+    out.print(grid)
     _missing(info.missing_protections)
 
 

@@ -110,10 +110,10 @@ def fk(a: units.Length, b: units.Length, c: units.Length, /, *, offline: Offline
 
 def robot_of(offline: Offline) -> tuple[Config, Geometry]:
     """Load the configuration that is asked for; return it and its robot. Raises ConfigError."""
-    from trirail.config import SIM, geometry, load
+    from trirail.config import SIM, corrected_geometry, load
 
     config = load(offline.config or SIM)
-    return config, geometry(config.geometry)
+    return config, corrected_geometry(config)
 
 
 def _check_reach(config: Config, robot: Geometry, pose: Array) -> None:

@@ -329,8 +329,8 @@ def status(*, service: Service = HERE) -> int:
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         state, info = robot.state(), robot.info()
     if service.json:
-        missing = msgspec.to_builtins(info.missing_protections)
-        terminal.json(msgspec.to_builtins(state) | {"missing_protections": missing})
+        fixed = {"missing_protections": info.missing_protections, "correction": info.correction}
+        terminal.json(msgspec.to_builtins(state) | msgspec.to_builtins(fixed))
     else:
         live.show(state, info)
     return 0

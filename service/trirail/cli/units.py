@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final, NamedTuple
 
 from cyclopts import Parameter, Token
 
+from trirail.wire.state import CorrectionTold
 from trirail.wire.text import NAME_RULE, is_name, quoted
 
 _DEGREE: Final = Decimal("0.0174532925199432957692369076848861271344")
@@ -122,6 +123,19 @@ def pose(values: Sequence[float], width: int = 0) -> str:
     """Write a pose, [m, m, rad], on a line, its numbers in columns of a `width`."""
     x, y, phi = values
     return f"x {written(x, 'mm', 3, width)}   y {written(y, 'mm', 3, width)}   φ {written(phi, '°', 4, width)}"
+
+
+def correction(told: CorrectionTold) -> str:
+    """Write what as-built errors are corrected by on a line."""
+    words = []
+    if told.file:
+        x, y, phi = told.greatest
+        most = f"{written(x, 'µm', 1)} in x, {written(y, 'µm', 1)} in y, {written(phi, 'mrad', 3)}"
+        words.append(f"{told.file}, measured {told.made}: up to {most}")
+    if any(told.backlash):
+        a, b, c = (written(width, "µm", 1) for width in told.backlash)
+        words.append(f"backlash of A {a}, B {b}, C {c}")
+    return "; ".join(words)
 
 
 def numbers(words: Sequence[str]) -> list[str]:

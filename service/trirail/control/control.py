@@ -11,7 +11,7 @@ from typing import Literal
 
 from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
 
-from trirail.config import Config, geometry
+from trirail.config import Config, corrected_geometry
 from trirail.control.commands import Commands
 from trirail.control.feedback import Measured
 from trirail.control.goal_queue import GoalQueue
@@ -26,6 +26,7 @@ from trirail.motion.frames import NamedFrames
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
+from trirail.motion.take_up import take_up
 from trirail.wire.messages import FaultDetail, Outcome, TrackGoal
 from trirail.wire.packets import (
     CommandRequest,
@@ -48,7 +49,7 @@ class Control:
     """Modes, motion, kinematics and limits of one robot over one set of drives."""
 
     def __init__(self, config: Config, drives: DriveGroup, planner: PlannerPort) -> None:
-        robot = geometry(config.geometry)
+        robot = corrected_geometry(config)
         self._drives = drives
         self._period = config.period
         self._schedule = Schedule(rest(STILL), config.period)
@@ -61,8 +62,9 @@ class Control:
         )
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
         self._following_error_limit = config.limits.slider.following_error
+        taken = take_up(config.correction.backlash, config.limits.slider)
         self.measured = Measured(
-            legs, config.period, step_length, self._following_error_limit, config.limits.in_position
+            legs, config.period, step_length, self._following_error_limit, config.limits.in_position, taken
         )
         self.setpoints = Setpoints(legs, Bounds(config.limits, config.period, EDGE), self.measured, step_length)
         self.modes = Transitions(

@@ -8,8 +8,9 @@ goes. Between the two calls of a cycle the control decides what changes modes.
 Arrays: `legs` is Geometry.packed(), `bounds` Bounds.packed, `feedback` (2,) of FEEDBACK, the newest and the one before,
 `written` (5, 3) the setpoints of the cycles before, the newest last [m], `motion` (2, 3, 3) the platform's rows pose,
 velocity, acceleration as they are commanded, in this cycle and in the one before, `sliders` (2, 6, 3) the rows
-lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 as they are set, and as they are tried, `found` (2,) what the gate
-has found, and `record` (1,) of trirail.wire.records.DTYPE.
+lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 as they are set, and as they are tried, `kept` (2,) of BACKLASH,
+likewise, `found` (2,) what the gate has found, and `record` (1,) of trirail.wire.records.DTYPE. Places of sliders that
+are set or measured have the offset in them by which backlash is taken up.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from numba import b1, f8, from_dtype, i8, typeof, void
 from numpy.typing import NDArray
 from trirail_drivers.interface import PowerState
 
+from trirail.control.backlash import BACKLASH, add_offset, due_offset, keep_offset, let_go, taking_up
 from trirail.control.in_position import MONITOR, monitor
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.closure import forward_into, inverse_motion
@@ -57,17 +59,18 @@ SAID = struct.Struct("<3d3q10B")
 
 _LEGS = typeof(Geometry.symmetric().packed())  # type: ignore[no-untyped-call]
 _BOUNDS, _FEEDBACK, _RECORD = from_dtype(BOUNDS)[::1], from_dtype(FEEDBACK)[::1], from_dtype(DTYPE)[::1]
-_MONITOR = from_dtype(MONITOR)[::1]
+_MONITOR, _BACKLASH = from_dtype(MONITOR)[::1], from_dtype(BACKLASH)[::1]
 _MOTION, _SLIDERS = f8[:, :, ::1], f8[:, :, ::1]
 _KNOTS, _PIECES = f8[::1], f8[:, :, ::1]
 _ENABLED = int(PowerState.OPERATION_ENABLED)
 
 
-@compiled(i8(_LEGS, _FEEDBACK, f8[:, ::1], f8, f8, f8, b1, b1[::1], f8[:, ::1], _MONITOR, _RECORD))
+@compiled(i8(_LEGS, _FEEDBACK, f8[:, ::1], _BACKLASH, f8, f8, f8, b1, b1[::1], f8[:, ::1], _MONITOR, _RECORD))
 def observe(
     legs: Array,
     feedback: NDArray[np.void],
     written: Array,
+    kept: NDArray[np.void],
     period: float,
     fastest: float,
     limit: float,
@@ -80,20 +83,23 @@ def observe(
     """Work out pose, velocities and following errors from feedback[0], and keep it as feedback[1].
 
     `fastest` [m/s] is the velocity above which a slider `jumps`: then the pose stays what it was, as it does where
-    the sliders belong to none; `room` (2, 3) is to seek it in. While the commanded motion `stands`, it is
-    `monitored` whether the robot is in position. Returns 0, or 1 + i if the following error of slider i is the first
-    that is beyond `limit` [m].
+    the sliders belong to none; `room` (2, 3) is to seek it in. While the commanded motion `stands`, and no backlash is
+    being taken up, it is `monitored` whether the robot is in position. Returns 0, or 1 + i if the following error of
+    slider i is the first that is beyond `limit` [m].
     """
     now, before, told = feedback[0], feedback[1], record[0]
     written[:-1] = written[1:]
     written[-1] = told.commanded_position
+    keep_offset(kept)
     beyond, jumping = 0, False
     for i in range(3):
         cycles = 1 + before.age[i] - now.age[i]
         if cycles > 0:  # else there is no newer position
             told.velocity[i] = (now.position[i] - before.position[i]) / (cycles * period)
         # A drive reaches at a SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
-        due = written[len(written) - 2 - min(now.age[i], OLDEST), i]
+        age = min(now.age[i], OLDEST)
+        due = written[len(written) - 2 - age, i]
+        told.backlash[i] = due_offset(kept, age, i)
         told.following_error[i] = due - now.position[i] if now.follows[i] else 0.0
         if beyond == 0 and not abs(told.following_error[i]) <= limit:
             beyond = 1 + i
@@ -101,12 +107,12 @@ def observe(
         jumping |= jumps[i]
         told.position[i], told.age[i] = now.position[i], min(now.age[i], OLDEST_RECORDED)
         told.drive_state[i], told.follows[i], told.homed[i] = now.drive_state[i], now.follows[i], now.homed[i]
-        room[0, i], room[1, i] = now.position[i], told.pose[i]
+        room[0, i], room[1, i] = now.position[i] - told.backlash[i], told.pose[i]
     told.homing = now.homing
     known = not jumping and forward_into(legs, room[0], room[1], room[1]) == 0
     if known:
         told.pose[:] = room[1]
-    monitor(record, known, stands, monitored)
+    monitor(record, known and not taking_up(kept), stands, monitored)
     feedback[1] = feedback[0]
     return beyond
 
@@ -127,7 +133,14 @@ def _tell(motion: Array, sliders: Array, progress: float, remaining: float, reco
 
 
 @compiled()
-def _solve(legs: Array, bounds: NDArray[np.void], motion: Array, sliders: Array, found: Array) -> int:
+def _solve(
+    legs: Array,
+    bounds: NDArray[np.void],
+    motion: Array,
+    sliders: Array,
+    kept: NDArray[np.void],
+    found: Array,
+) -> int:
     """Solve the sliders for the platform's motion; leave them as they are where the last gate refuses it.
 
     Returns 0, 1 + i where leg i is singular or a number is not finite, or 3 + a code of trirail.motion.limits.gate.
@@ -135,17 +148,18 @@ def _solve(legs: Array, bounds: NDArray[np.void], motion: Array, sliders: Array,
     singular = inverse_motion(legs, motion[0], sliders[1])
     if singular:
         return singular
+    add_offset(kept, sliders[1])
     code = gate(bounds, sliders[1], sliders[0], motion[0], motion[1], found)
     if code:
         return 3 + code
-    sliders[0] = sliders[1]
+    sliders[0], kept[0] = sliders[1], kept[1]
     return 0
 
 
 @compiled(
     i8(
         *(_LEGS, _BOUNDS, _KNOTS, _PIECES, b1, f8[:, ::1], _KNOTS, _PIECES),
-        *(f8, f8, f8, f8, f8, _MOTION, _SLIDERS, f8[::1], _RECORD),
+        *(f8, f8, f8, f8, f8, _MOTION, _SLIDERS, _BACKLASH, f8[::1], _RECORD),
     )
 )
 def command(
@@ -164,6 +178,7 @@ def command(
     arrival: float,
     motion: Array,
     sliders: Array,
+    kept: NDArray[np.void],
     found: Array,
     record: NDArray[np.void],
 ) -> int:
@@ -178,7 +193,7 @@ def command(
     motion[1] = motion[0]
     if platform_at(legs, knots, pieces, in_sliders, tools, law, motion[1, 0], motion[0]) != 0:
         motion[0] = math.nan
-    refused = _solve(legs, bounds, motion, sliders, found)
+    refused = _solve(legs, bounds, motion, sliders, kept, found)
     progress = max(0.0, min(1.0, (s - begun) / (end - begun))) if end > begun else 1.0
     remaining = max(0.0, arrival - time if target != 0.0 else end - s)
     _tell(motion, sliders, progress, remaining, record)
@@ -187,13 +202,19 @@ def command(
     return PASSED * passed + STANDS * stands + 4 * refused
 
 
-@compiled(i8(_LEGS, _BOUNDS, _MOTION, _SLIDERS, f8[::1], _RECORD))
+@compiled(i8(_LEGS, _BOUNDS, _MOTION, _SLIDERS, _BACKLASH, f8[::1], _RECORD))
 def hold(
-    legs: Array, bounds: NDArray[np.void], motion: Array, sliders: Array, found: Array, record: NDArray[np.void]
+    legs: Array,
+    bounds: NDArray[np.void],
+    motion: Array,
+    sliders: Array,
+    kept: NDArray[np.void],
+    found: Array,
+    record: NDArray[np.void],
 ) -> int:
     """Solve the sliders for a platform that stays as it is; returns as `command`."""
     motion[1] = motion[0]
-    refused = _solve(legs, bounds, motion, sliders, found)
+    refused = _solve(legs, bounds, motion, sliders, kept, found)
     _tell(motion, sliders, 0.0, 0.0, record)
     return 4 * refused
 
@@ -206,7 +227,7 @@ def refusal(code: int) -> int:
     return code >> 2
 
 
-@compiled(void(_LEGS, _FEEDBACK, b1[::1], b1, b1, f8, _MOTION, _SLIDERS, _RECORD))
+@compiled(void(_LEGS, _FEEDBACK, b1[::1], b1, b1, f8, _MOTION, _SLIDERS, _BACKLASH, _RECORD))
 def follow(
     legs: Array,
     feedback: NDArray[np.void],
@@ -216,6 +237,7 @@ def follow(
     step: float,
     motion: Array,
     sliders: Array,
+    kept: NDArray[np.void],
     record: NDArray[np.void],
 ) -> None:
     """Command the pose that is measured, at rest, and lead each slider to where it is, by a `step` [m] at most.
@@ -223,6 +245,7 @@ def follow(
     A position that jumps is not followed, nor one that an enabled drive holds where `held`, nor any where all drives
     were `stopped_now`. A drive that moves by itself gets its own position at once.
     """
+    let_go(kept)
     now, told = feedback[0], record[0]
     motion[0] = 0.0
     motion[0, 0] = told.pose

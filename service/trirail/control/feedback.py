@@ -7,10 +7,12 @@ from trirail_drivers.interface import Feedback, PowerState, Triple
 
 from trirail.config import InPosition
 from trirail.control import cycle
+from trirail.control.backlash import backlash
 from trirail.control.in_position import Settling
 from trirail.kinematics.algebra import Array
 from trirail.kinematics.robot import forward_into
 from trirail.motion.runs import STILL
+from trirail.motion.take_up import NO_BACKLASH, TakeUp
 from trirail.wire.records import DTYPE
 
 WINDOWS = InPosition()
@@ -22,11 +24,17 @@ class Measured:
     """The newest feedback, beside the setpoints that it answers; all of it in the cycle's record.
 
     `step` [m] is how far a slider can go in a cycle, `limit` [m] what following errors are held against, `windows` what
-    residuals are held against where the robot is to stand.
+    residuals are held against where the robot is to stand, `taken` how the sliders' backlash is taken up.
     """
 
     def __init__(
-        self, legs: Array, period: float, step: float, limit: float = np.inf, windows: InPosition = WINDOWS
+        self,
+        legs: Array,
+        period: float,
+        step: float,
+        limit: float = np.inf,
+        windows: InPosition = WINDOWS,
+        taken: TakeUp = NO_BACKLASH,
     ) -> None:
         self.feedback = Feedback(STILL, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
         self.record = np.zeros(1, DTYPE)
@@ -37,6 +45,8 @@ class Measured:
         """Which sliders were measured where none can be so soon: what they say is not followed."""
         self.settling = Settling(windows, period)
         """Whether the robot is in position."""
+        self.backlash = backlash(taken, period)
+        """What of the setpoints takes up backlash, (2,) of trirail.control.backlash.BACKLASH."""
         self._legs = legs
         self._period = period
         self._fastest = 2.0 * step / period  # the age may be one off, and makes a step a double one
@@ -92,6 +102,7 @@ class Measured:
             self._legs,
             self.numbers,
             self._written,
+            self.backlash,
             self._period,
             self._fastest,
             self._limit,
@@ -103,8 +114,9 @@ class Measured:
         )
 
     def pose_of(self, sliders: Triple) -> Triple | None:
-        """Return the pose to which sliders belong, the one nearest to the newest; None if they belong to none."""
+        """Return the pose to which setpoints belong, the one nearest to the newest; None if they belong to none."""
         self._room[:] = sliders, self.pose
+        self._room[0] -= self.backlash[0]["offset"]
         if forward_into(self._legs, self._room[0], self._room[1], self._room[1]):
             return None
         x, y, phi = self._room[1].tolist()

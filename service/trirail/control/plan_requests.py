@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from trirail_drivers.interface import Triple
 
-from trirail.config import Config, geometry
+from trirail.config import Config, corrected_geometry
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
@@ -24,6 +24,7 @@ from trirail.motion.planning import revision
 from trirail.motion.rate_change import RateChange
 from trirail.motion.runs import STILL, MotionState, Run, nominal, rest
 from trirail.motion.schedule import Schedule
+from trirail.motion.take_up import planned_limits
 from trirail.motion.time_scaling import SHARES, TimeScaling
 from trirail.wire.messages import PlannedGoal, TrackGoal
 from trirail.wire.planning import Extended, NotPlanned, PlanAnswer, Planned, PlanRequest
@@ -68,7 +69,8 @@ class PlanRequests:
     def __init__(self, config: Config, port: PlannerPort, schedule: Schedule) -> None:
         self.override = 1.0
         """The rate at which motions are to run."""
-        robot, limits, self._period = geometry(config.geometry), config.limits, config.period
+        robot, self._period = corrected_geometry(config), config.period
+        limits = planned_limits(config.limits, config.correction.backlash)
         checker = Checker(robot, limits, Bounds(limits, self._period), self._period)
         self._scaling = TimeScaling(robot, limits.platform, checker, self._period)
         self._legs = robot.packed()

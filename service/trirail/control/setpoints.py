@@ -52,12 +52,13 @@ class Setpoints:
         """
         legs, bounds, found = self._legs, self._bounds.packed, self._bounds.found
         motion, sliders, record = schedule.motion, self._sliders, self._measured.record
+        kept = self._measured.backlash
         if run is None:
-            return cycle.hold(legs, bounds, motion, sliders, found, record)
+            return cycle.hold(legs, bounds, motion, sliders, kept, found, record)
         path, law, (begun, end, arrival) = run.path, run.law, run.course
         return cycle.command(
             *(legs, bounds, *path, law.knots, law.pieces, run.time, run.target),
-            *(begun, end, arrival, motion, sliders, found, record),
+            *(begun, end, arrival, motion, sliders, kept, found, record),
         )
 
     def refusal(self, code: int) -> str | None:
@@ -79,7 +80,7 @@ class Setpoints:
         cycle: then no setpoint is sent.
         """
         measured = self._measured
-        arrays = schedule.motion, self._sliders, measured.record
+        arrays = schedule.motion, self._sliders, measured.backlash, measured.record
         cycle.follow(self._legs, measured.numbers, measured.jumping, held, stopped_now, self._step, *arrays)
 
     def tell_progress(self, progress: float, remaining: float) -> None:
@@ -106,6 +107,7 @@ class Setpoints:
             raise RefusedError(
                 RefusalCode.SINGULAR, "the measured sliders belong to no pose: move them by hand, then enable"
             )
+        self._tried[0] += self._measured.backlash[0]["offset"]
         violation = self._bounds.pose(pose) or self._bounds.setpoint(self._tried)
         if violation:
             raise RefusedError(

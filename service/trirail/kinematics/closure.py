@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from trirail.kinematics.algebra import Array, Matrix, Vector, add, cross, dot, scale, subtract
+from trirail.kinematics.algebra import Array, Matrix, Vector, add, cross, dot, scale, subtract, times
 from trirail.kinematics.compiled import compiled
+from trirail.kinematics.correction import corrected_motion, is_corrected, real_motion
 from trirail.kinematics.geometry import PARALLEL
 from trirail.kinematics.recursion import BASE, ZERO, joint_motion, link, platform_centre
 
@@ -29,6 +30,7 @@ __all__ = [
 
 ROUNDING = 1e-15  # part of the squares whose difference is (det J2)² that their rounding can make up
 LOOPS_OPEN, J2_SINGULAR = 4, 5  # codes of forward_into; 1 to 3 are the legs'
+UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 LEGS_TYPE = "Array(f8, 3, 'C', readonly=True)"  # numba's name for what Geometry.packed() returns
 
@@ -81,11 +83,15 @@ def _move(leg: Array, pose: Vector, velocity: Vector, acceleration: Vector) -> M
 @compiled()
 def inverse_motion(legs: Array, motion: Array, out: Array) -> int:
     """Do inverse_into, from compiled code."""
-    pose = motion[0, 0], motion[0, 1], motion[0, 2]
-    velocity = motion[1, 0], motion[1, 1], motion[1, 2]
-    acceleration = motion[2, 0], motion[2, 1], motion[2, 2]
+    told = (
+        (motion[0, 0], motion[0, 1], motion[0, 2]),
+        (motion[1, 0], motion[1, 1], motion[1, 2]),
+        (motion[2, 0], motion[2, 1], motion[2, 2]),
+    )
+    if is_corrected(legs):
+        told = corrected_motion(legs, told)
     for i in range(3):
-        leg = _move(legs[i], pose, velocity, acceleration)
+        leg = _move(legs[i], told[0], told[1], told[2])
         out[0, i], out[1, i], out[2, i] = leg.closed.lambda_10, leg.rates[0], leg.accelerations[0]
         out[3, i], out[4, i], out[5, i] = leg.closed.lambda_32, leg.rates[2], leg.accelerations[2]
         if not leg.regular:
@@ -124,10 +130,18 @@ def _beta(closed: ClosedLeg) -> Vector:
 def jacobians_batch(legs: Array, poses: Array, j1: Array, j2: Array) -> int:
     """Write the diagonals of J1 and all of J2, (17), (N, 3, 3), for poses (N, 3); codes of inverse_batch."""
     for k in range(len(poses)):
+        pose, by_pose = (poses[k, 0], poses[k, 1], poses[k, 2]), UNIT
+        if is_corrected(legs):  # the rows of by_pose are the derivatives of what the legs are told by x, y and phi
+            by_pose = (
+                corrected_motion(legs, (pose, UNIT[0], ZERO))[1],
+                corrected_motion(legs, (pose, UNIT[1], ZERO))[1],
+                corrected_motion(legs, (pose, UNIT[2], ZERO))[1],
+            )
+            pose = corrected_motion(legs, (pose, ZERO, ZERO))[0]
         for i in range(3):
-            closed = _close(legs[i], (poses[k, 0], poses[k, 1], poses[k, 2]))
+            closed = _close(legs[i], pose)
             j1[k, i, i] = closed.delta
-            j2[k, i, 0], j2[k, i, 1], j2[k, i, 2] = _beta(closed)
+            j2[k, i, 0], j2[k, i, 1], j2[k, i, 2] = times(by_pose, _beta(closed))
             if not (abs(closed.delta) > PARALLEL and math.isfinite(j2[k, i, 2])):
                 return 3 * k + 1 + i
     return 0
@@ -185,6 +199,7 @@ def loop_equation(legs: Array, sliders: Array) -> Vector:
 
 @compiled()
 def _forward(legs: Array, sliders: Array | Vector, near: Array, pose: Array) -> int:
+    """Write the pose of the legs as configured, without a correction."""
     for i in range(3):
         if not math.isfinite(sliders[i]):
             return 1 + i
@@ -217,6 +232,14 @@ def _forward(legs: Array, sliders: Array | Vector, near: Array, pose: Array) -> 
     return code
 
 
+@compiled()
+def _forward_real(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
+    code = _forward(legs, sliders, near, pose)
+    if code == 0 and is_corrected(legs):
+        pose[0], pose[1], pose[2] = real_motion(legs, ((pose[0], pose[1], pose[2]), ZERO, ZERO))[0]
+    return code
+
+
 @compiled(f"i8({LEGS_TYPE}, f8[::1], f8[::1], f8[::1])")
 def forward_into(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
     """Write the pose at which the sliders stand as given; raises and allocates nothing.
@@ -225,14 +248,14 @@ def forward_into(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
     itself. Returns 0; 1 + i if slider i is not finite or the edge of leg i is parallel to its rail; 4 if no
     pose closes the loops; 5 if J2 is singular, or `near` is. Then `pose` means nothing.
     """
-    return _forward(legs, sliders, near, pose)
+    return _forward_real(legs, sliders, near, pose)
 
 
 @compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, ::1], f8[:, ::1])")
 def forward_batch(legs: Array, sliders: Array, near: Array, poses: Array) -> int:
     """Do forward_into for arrays (N, 3); the codes of row k begin after 5 k."""
     for k in range(len(sliders)):
-        code = _forward(legs, sliders[k], near[k], poses[k])
+        code = _forward_real(legs, sliders[k], near[k], poses[k])
         if code != 0:
             return 5 * k + code
     return 0
@@ -269,5 +292,10 @@ def forward_motion(legs: Array, sliders: Matrix, near: Array, motion: Array) -> 
         if not leg.regular:
             return 1 + i
         motion[2, i] = leg.closed.delta * (sliders[2][i] - leg.accelerations[0])
-    motion[2, 0], motion[2, 1], motion[2, 2] = _solve(j2, (motion[2, 0], motion[2, 1], motion[2, 2]))
+    acceleration = _solve(j2, (motion[2, 0], motion[2, 1], motion[2, 2]))
+    motion[2, 0], motion[2, 1], motion[2, 2] = acceleration
+    if is_corrected(legs):
+        real = real_motion(legs, (pose, velocity, acceleration))
+        for i in range(3):
+            motion[i, 0], motion[i, 1], motion[i, 2] = real[i]
     return 0

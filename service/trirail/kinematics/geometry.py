@@ -9,15 +9,19 @@ R(phi), each leg closes the loop (9), (11):
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from trirail.errors import KinematicsError
 from trirail.kinematics.algebra import Array
+from trirail.kinematics.correction import Correction
 from trirail.kinematics.recursion import Joint, serial_leg
 
-__all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "gains", "singular_angles"]
+__all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "Room", "gains", "singular_angles", "travels"]
 
 LEGS = ("A", "B", "C")
 PARALLEL = 1e-9  # |sin| of the angle between an edge and its rail up to which the leg counts as singular
@@ -55,14 +59,20 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Three legs A, B, C. KinematicsError if a number is not finite or the pose (0, 0, 0) is singular."""
+    """Three legs A, B, C, and what the robot differs from them by, if that is known.
+
+    KinematicsError if a number is not finite or the pose (0, 0, 0) is singular.
+    """
 
     legs: tuple[Leg, Leg, Leg]
+    correction: Correction | None = None
     _packed: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         _check(self)
         packed = np.stack([leg.packed() for leg in self.legs])
+        if self.correction is not None:
+            packed = np.concatenate([packed, self.correction.packed().reshape(-1, *packed.shape[1:])])
         packed.setflags(write=False)
         object.__setattr__(self, "_packed", packed)
 
@@ -91,6 +101,8 @@ class Geometry:
         """Return the three legs as compiled code takes them: float64, shape (3, 4, 13), read-only.
 
         Axes: leg; its three joints and the platform's centre; the columns described in trirail.kinematics.recursion.
+        Where there is a correction it follows, in as many more rows of the first axis as it takes: one array, since
+        each further one would cost every call a microsecond.
         """
         return self._packed
 
@@ -113,21 +125,42 @@ def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)
     return tuple(sorted(_wrapped(phi) for phi in found))
 
 
-def travels(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
-    """Return lambda_10 and lambda_32 of the legs at a pose x, y [m], phi [rad]: (2, 3) [m], by (11).
+class Room(NamedTuple):
+    """Where a robot may be: the least and the greatest of x, y [m] and phi [rad], of lambda_10 and of lambda_32 [m]."""
+
+    low: Sequence[float]
+    high: Sequence[float]
+    position: tuple[float, float]
+    passive: tuple[float, float]
+
+    def holds(self, travelled: Array, spare: float = 0.0) -> NDArray[np.bool]:
+        """Whether sliders and passive joints (2, ..., 3) are within their travel, or `spare` beyond it [m]: (...)."""
+        low, high = np.array([self.position, self.passive]).T.reshape(2, 2, *[1] * (travelled.ndim - 1))
+        within: NDArray[np.bool] = ((travelled >= low - spare) & (travelled <= high + spare)).all(axis=(0, -1))
+        return within
+
+
+def travels(geometry: Geometry, poses: ArrayLike) -> Array:
+    """Return lambda_10 and lambda_32 of the legs at poses (..., 3) of x, y [m], phi [rad]: (2, ..., 3) [m], by (11).
 
     For who looks at a few poses and has no use for the compiled trirail.kinematics.robot.inverse. Not finite where an
     edge is parallel to its rail.
     """
-    x, y, phi = pose
-    found = np.empty((2, 3))
+    told = np.array(poses, dtype=np.float64)
+    if geometry.correction is not None:
+        told += geometry.correction.at(told.reshape(-1, 3)).reshape(told.shape)
+    x, y, phi = np.moveaxis(told, -1, 0)
+    cos, sin = np.cos(phi), np.sin(phi)
+    found = np.empty((2, *told.shape))
     for i, leg in enumerate(geometry.legs):
-        along, across = _theta(phi + leg.edge_angle)[:2, :2]  # the edge
-        rail = _theta(leg.rail_angle)[0, :2]
-        way = np.array([x, y]) + _theta(phi)[:2, :2].T @ leg.edge_point - leg.anchor
-        with np.errstate(divide="ignore"):
-            pin = (across @ way) / (across @ rail)
-        found[:, i] = pin - leg.home, along @ (way - pin * rail)
+        (u, v), (anchor_x, anchor_y) = leg.edge_point, leg.anchor
+        way_x, way_y = x + cos * u - sin * v - anchor_x, y + sin * u + cos * v - anchor_y
+        edge_x, edge_y = np.cos(phi + leg.edge_angle), np.sin(phi + leg.edge_angle)
+        rail_x, rail_y = math.cos(leg.rail_angle), math.sin(leg.rail_angle)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pin = (edge_x * way_y - edge_y * way_x) / (edge_x * rail_y - edge_y * rail_x)
+            found[0, ..., i] = pin - leg.home
+            found[1, ..., i] = edge_x * (way_x - pin * rail_x) + edge_y * (way_y - pin * rail_y)
     return found
 
 

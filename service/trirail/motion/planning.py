@@ -12,12 +12,13 @@ from collections import deque
 
 import msgspec
 
-from trirail.config import Config, geometry
+from trirail.config import Config, corrected_geometry
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.goals import Extension, Goals, PlannedMotion
 from trirail.motion.packing import pack_path, pack_run, unpack_run
 from trirail.motion.runs import MotionState
 from trirail.motion.schedule import Schedule
+from trirail.motion.take_up import planned_limits
 from trirail.wire.messages import PoseGoal, SlidersGoal, TrackGoal
 from trirail.wire.planning import Extended, NotPlanned, PackedRun, PlanAnswer, Planned, PlanRequest
 
@@ -25,18 +26,19 @@ from trirail.wire.planning import Extended, NotPlanned, PackedRun, PlanAnswer, P
 def revision(config: Config) -> int:
     """Return a number that stands for all of a configuration on which plans depend."""
     limits = config.limits.platform, config.limits.slider, config.limits.singularity_margin
-    return zlib.crc32(msgspec.json.encode((config.geometry, limits, config.loop.rate_hz)))
+    correction = config.correction.as_built, config.correction.backlash
+    return zlib.crc32(msgspec.json.encode((config.geometry, correction, limits, config.loop.rate_hz)))
 
 
 class MotionPlanner:
     """Plans the motions of one robot."""
 
     def __init__(self, config: Config) -> None:
-        robot = geometry(config.geometry)
+        robot = corrected_geometry(config)
         self._legs = robot.packed()
         self._period = config.period
         self._revision = revision(config)
-        self._goals = Goals(robot, config.limits, config.period)
+        self._goals = Goals(robot, planned_limits(config.limits, config.correction.backlash), config.period)
 
     def plan(self, request: PlanRequest) -> PlanAnswer:
         """Return the motion to a goal, or why there is none. Whatever goes wrong is an answer."""

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 from trirail_drivers.interface import NAMES
 
+from trirail import as_built
 from trirail.config import Config, geometry
 from trirail.telemetry.provenance import software, versions
 from trirail.wire.state import Info
@@ -32,4 +33,5 @@ def info(config: Config) -> Info:
         lease=config.control.lease,
         homes=tuple(name for name, drive in zip(NAMES, config.drives.each, strict=True) if drive.homing is not None),
         versions=versions(),
+        correction=as_built.told(config.correction.map, config.correction.as_built, config.correction.backlash),
     )

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from trirail.config import Config, geometry
+from trirail.config import Config, corrected_geometry
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.kinematics.geometry import travels
 from trirail.processes.inbox import Incoming
@@ -60,7 +60,7 @@ class Poses:
         wake: Callable[[], None],
     ) -> None:
         self._robot = config.robot.name
-        self._geometry = geometry(config.geometry)
+        self._geometry = corrected_geometry(config)
         self._configured = config.poses
         self._file = PoseFile(state_directory(config.robot.name))
         self._taught = self._file.read()
@@ -170,7 +170,7 @@ class Poses:
             raise RefusedError(RefusalCode.NOT_HOMED, "it is not known where the sliders are: send home first")
         x, y, phi = record["pose"].tolist()
         there = travels(self._geometry, (x, y, phi))[0]
-        if not np.abs(there - record["position"]).max() <= BELONGS:
+        if not np.abs(there - record["position"] + record["backlash"]).max() <= BELONGS:
             raise RefusedError(RefusalCode.SINGULAR, "the sliders are where they belong to no pose: move them")
         return x, y, phi
 

@@ -78,6 +78,7 @@ class StateMaker:
         lateness, cycle = self._statistics
         goal = self._status.goal
         a, b, c = self._status.counts
+        offset = row["backlash"]  # in what the drives are told and tell, not where the sliders are
         return State(
             seq=int(row["cycle"]),
             t=round(int(row["cycle"]) * self._period, 9),
@@ -89,12 +90,12 @@ class StateMaker:
                 pose=_triple(row["commanded_pose"]),
                 pose_velocity=_triple(row["commanded_pose_velocity"]),
                 pose_acceleration=_triple(row["commanded_pose_acceleration"]),
-                position=_triple(row["commanded_position"]),
+                position=_triple(row["commanded_position"] - offset),
                 velocity=_triple(row["commanded_velocity"]),
                 acceleration=_triple(row["commanded_acceleration"]),
             ),
             sliders=Sliders(
-                position=_triple(row["position"]),
+                position=_triple(row["position"] - offset),
                 velocity=_triple(row["velocity"]),
                 following_error=_triple(row["following_error"]),
                 following_error_max=_triple(self._error_max),

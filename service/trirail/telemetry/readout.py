@@ -37,8 +37,9 @@ def markdown(record: np.void, standing: Standing) -> str:
         head += f"   goal **{standing.goal.translate(_SPECIAL)}**: {share:.0%}, {left:.1f} s left"
     wrong = [f"**{standing.fault.translate(_SPECIAL)}**"] if standing.fault else []
     target = ["–"] * 3 if standing.target is None else _pose(standing.target)
+    place = record["position"] - record["backlash"]
     rows = [
-        ("measured", *_pose(record["pose"]), "λ [mm]", *(f"{value * 1e3:.3f}" for value in record["position"])),
+        ("measured", *_pose(record["pose"]), "λ [mm]", *(f"{value * 1e3:.3f}" for value in place)),
         ("commanded", *_pose(record["commanded_pose"]), "v [mm/s]", *(f"{v * 1e3:.1f}" for v in record["velocity"])),
         ("goal", *target, "error [µm]", *(f"{value * 1e6:.0f}" for value in record["following_error"])),
     ]

@@ -47,9 +47,10 @@ FIELDS: tuple[tuple[str, str, int], ...] = (
     ("commanded_pose", "d", 3),
     ("commanded_pose_velocity", "d", 3),
     ("commanded_pose_acceleration", "d", 3),
-    ("position", "d", 3),  # measured sliders: lambda_10 of A, B, C [m]
+    ("position", "d", 3),  # measured sliders: lambda_10 of A, B, C, and what takes up their backlash [m]
+    ("backlash", "d", 3),  # that alone: position less this is lambda_10 [m]
     ("velocity", "d", 3),  # measured sliders [m/s]
-    ("commanded_position", "d", 3),  # setpoints written in this cycle [m]
+    ("commanded_position", "d", 3),  # setpoints written in this cycle, with what takes up backlash [m]
     ("commanded_velocity", "d", 3),  # v_10 [m/s]
     ("commanded_acceleration", "d", 3),  # gamma_10 [m/s²]
     ("passive_position", "d", 3),  # commanded lambda_32 [m]

@@ -23,11 +23,11 @@ class Commanded(Struct, frozen=True):
     pose_acceleration: Triple
     """[m/s², m/s², rad/s²]."""
     position: Triple
-    """lambda_10 of the sliders A, B, C [m]."""
+    """lambda_10 of the sliders A, B, C [m], without what takes up backlash."""
     velocity: Triple
-    """[m/s]."""
+    """Of the drives, with what takes up backlash [m/s]."""
     acceleration: Triple
-    """[m/s²]."""
+    """Of the drives, with what takes up backlash [m/s²]."""
 
 
 class FrameCounts(Struct, frozen=True):
@@ -47,7 +47,7 @@ class Sliders(Struct, frozen=True):
     """What the drives say, of A, B, C."""
 
     position: Triple
-    """[m]."""
+    """lambda_10 [m]: what the drives say, without what takes up backlash."""
     velocity: Triple
     """[m/s]."""
     following_error: Triple
@@ -121,7 +121,8 @@ class State(Struct, frozen=True):
     mode: str
     """A trirail.wire.vocabulary.Mode."""
     pose: Triple
-    """Measured: x, y [m] and phi [rad] in the base frame, by the forward kinematics of the measured sliders."""
+    """Measured: x, y [m] and phi [rad] in the base frame, by the forward kinematics of the measured sliders,
+    with [correction] where there is one."""
     velocity: Triple
     """Measured, as a difference over a batch of records [m/s, m/s, rad/s]."""
     acceleration: Triple
@@ -188,6 +189,19 @@ def _shortened(text: str) -> str:
     return f"{text}…"
 
 
+class CorrectionTold(Struct, frozen=True):
+    """What the robot's as-built errors are corrected by."""
+
+    file: str
+    """The map's; "" for none."""
+    made: str
+    """When the robot was measured for it; "" for none."""
+    greatest: Triple
+    """The greatest correction in x, y [m] and phi [rad]."""
+    backlash: Triple
+    """Of the sliders A, B, C, as it is taken up [m]."""
+
+
 class Info(Struct, frozen=True):
     """What a client needs to know the robot: answered on …/info."""
 
@@ -217,6 +231,8 @@ class Info(Struct, frozen=True):
     """Of Python and the libraries that matter, by name."""
     missing_protections: tuple[MissingProtection, ...] = ()
     """What the drives do without; none where they have all."""
+    correction: CorrectionTold | None = None
+    """Of as-built errors; None where the robot is taken for its geometry."""
 
 
 class NamedPose(Struct, frozen=True):

@@ -1,0 +1,103 @@
+"""A map from measured poses: what it finds again, what it foretells, and which data it refuses in one line."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import calibrate
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from trirail.kinematics.correction import Correction
+from trirail.kinematics.correction_fit import FEWEST, fit
+from trirail.kinematics.geometry import Geometry, Room
+from trirail.kinematics.robot import inverse
+
+Array = NDArray[np.float64]
+
+PLAIN = Geometry.symmetric(0.3)
+ROOM = Room((-0.15, -0.15, -1.2), (0.15, 0.15, 0.85), (-0.17, 0.34), (-0.17, 0.34))
+
+
+def reached(number: int, seed: int) -> Array:
+    """Poses all over what the sliders' travel allows."""
+    poses = np.random.default_rng(seed).uniform(ROOM.low, ROOM.high, (20 * number, 3))
+    joints = inverse(PLAIN, poses)
+    places = np.hstack([joints.position, joints.passive_position])
+    found: Array = poses[((places >= -0.17) & (places <= 0.34)).all(axis=1)][:number]
+    assert len(found) == number
+    return found
+
+
+def robot(seed: int, size: float = 5e-5) -> Geometry:
+    """A robot that differs from the plain one by a map of a single cell."""
+    nodes = np.random.default_rng(seed).uniform(-size, size, (4, 4, 4, 3))
+    return Geometry(PLAIN.legs, Correction(ROOM.low, ROOM.high, nodes))
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 1000))
+def test_a_smooth_error_is_found_again_and_foretold(seed: int) -> None:
+    built, poses, others = robot(seed), reached(250, seed), reached(50, seed + 1)
+    found = fit(PLAIN, poses, inverse(built, poses).position, ROOM, (3, 3, 3))
+    assert np.abs(found.residuals).max() < 1e-6
+    assert np.abs(found.before).max() > 1e-5
+    told = inverse(Geometry(PLAIN.legs, found.correction), others).position
+    assert np.abs(told - inverse(built, others).position).max() < 3e-6
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=10)
+def test_what_it_foretells_is_no_less_than_what_it_leaves(seed: int) -> None:
+    """With noise that no map can know, it says so."""
+    poses, random = reached(150, seed), np.random.default_rng(seed)
+    sliders = inverse(robot(seed), poses).position
+    found = fit(PLAIN, poses + random.normal(0.0, 1e-5, poses.shape), sliders, ROOM, (4, 4, 4))
+    assert (found.foretold.std(axis=0) >= 0.9e-5).all()
+    assert (found.foretold.std(axis=0) >= found.residuals.std(axis=0)).all()
+
+
+def table(path: Path, poses: Array, sliders: Array) -> Path:
+    rows = [",".join(map(repr, row)) for row in np.hstack([poses, sliders]).tolist()]
+    path.write_text("\n".join(["x,y,phi,A,B,C", *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def complaint(path: Path, poses: Array, sliders: Array, capsys: pytest.CaptureFixture[str]) -> str:
+    assert calibrate.main([str(table(path, poses, sliders)), "--map"]) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    (line,) = said.err.splitlines()
+    assert line.startswith(f"calibrate: {path}: ")
+    return line
+
+
+def test_what_makes_no_map_is_said_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, poses = tmp_path / "poses.csv", reached(120, 1)
+    sliders = inverse(robot(1), poses).position
+
+    def said(poses: Array, sliders: Array) -> str:
+        return complaint(path, poses, sliders, capsys)
+
+    assert f"{FEWEST - 1} poses are too few for a map" in said(poses[: FEWEST - 1], sliders[: FEWEST - 1])
+    inside = np.abs(poses[:, 0]) < 0.08
+    assert re.search(
+        r"x was measured from -0\.0\d+ to 0\.0\d+, and the robot goes from", said(poses[inside], sliders[inside])
+    )
+    assert "out of the geometry's reach" in said(poses, sliders * 10.0)
+    wild = np.random.default_rng(2).normal(0.0, 3e-3, poses.shape)
+    assert re.search("too steep near x|expected float", said(poses + wild * [1.0, 1.0, 5.0], sliders))
+
+
+def test_the_report_says_what_to_expect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    poses = reached(120, 1)
+    path = table(tmp_path / "poses.csv", poses, inverse(robot(1), poses).position)
+    assert calibrate.main([str(path), "--map", "--cells", "2", "2", "2", "--output", str(tmp_path / "map.toml")]) == 0
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "120 poses; " in said.err
+    assert "left if not measured" in said.err
+    assert "calibrate.py --map" in (tmp_path / "map.toml").read_text(encoding="utf-8")
