@@ -170,7 +170,8 @@ def _adds(errors: Correction, robot: Geometry, room: Room, rates: Array) -> tupl
     told = travels(dataclasses.replace(robot, correction=errors), places)
 
     def slopes(of: Array) -> Array:
-        return np.stack(np.gradient(of, *axes, axis=(-4, -3, -2)))
+        each: Array = np.array(np.gradient(of, *axes, axis=(-4, -3, -2)))
+        return each
 
     first = slopes(told[0] - travels(robot, places)[0])
     second = slopes(first)

@@ -19,7 +19,8 @@ from trirail.kinematics.robot import inverse
 Array = NDArray[np.float64]
 
 PLAIN = Geometry.symmetric(0.3)
-ROOM = Room((-0.15, -0.15, -1.2), (0.15, 0.15, 0.85), (-0.17, 0.34), (-0.17, 0.34))
+LOW, HIGH = (-0.15, -0.15, -1.2), (0.15, 0.15, 0.85)
+ROOM = Room(LOW, HIGH, (-0.17, 0.34), (-0.17, 0.34))
 
 
 def reached(number: int, seed: int) -> Array:
@@ -35,7 +36,7 @@ def reached(number: int, seed: int) -> Array:
 def robot(seed: int, size: float = 5e-5) -> Geometry:
     """A robot that differs from the plain one by a map of a single cell."""
     nodes = np.random.default_rng(seed).uniform(-size, size, (4, 4, 4, 3))
-    return Geometry(PLAIN.legs, Correction(ROOM.low, ROOM.high, nodes))
+    return Geometry(PLAIN.legs, Correction(LOW, HIGH, nodes))
 
 
 @settings(max_examples=10)
