@@ -134,7 +134,9 @@ def real_motion(legs: Array, told: Matrix) -> Matrix:
     return motion
 
 
-def splines(poses: Array, low: Sequence[float], high: Sequence[float], cells: Sequence[int]) -> tuple[Array, NDArray[np.int64]]:
+def splines(
+    poses: Array, low: Sequence[float], high: Sequence[float], cells: Sequence[int]
+) -> tuple[Array, NDArray[np.int64]]:
     """Return the value of every spline at poses (N, 3), (N, nodes), and the poses' cells, (N, 3).
 
     For who looks at a few poses, or at many once.
