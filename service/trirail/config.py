@@ -378,8 +378,9 @@ def room(limits: Limits) -> Room:
 
 def check_as_built(found: AsBuilt, robot: Geometry, limits: Limits) -> None:
     """Refuse a map that is not this robot's, or that could break a limit anywhere. Raises ConfigError."""
-    rates = [(each.velocity, each.acceleration, each.jerk) for each in (limits.platform, limits.slider)]
-    as_built.check(found, robot, room(limits), *rates)
+    platform, slider = limits.platform, limits.slider
+    rates = platform.velocity, platform.acceleration, platform.jerk
+    as_built.check(found, robot, room(limits), rates, (slider.velocity, slider.acceleration, slider.jerk))
 
 
 def _leaves(value: object, key: str = "") -> Iterator[tuple[str, object]]:

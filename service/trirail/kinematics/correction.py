@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from trirail.errors import KinematicsError
 from trirail.kinematics.algebra import Array, Matrix, Vector, add, scale, subtract
@@ -133,7 +134,9 @@ def real_motion(legs: Array, told: Matrix) -> Matrix:
     return motion
 
 
-def splines(poses: Array, low: Sequence[float], high: Sequence[float], cells: Sequence[int]) -> tuple[Array, Array]:
+def splines(
+    poses: Array, low: Sequence[float], high: Sequence[float], cells: Sequence[int]
+) -> tuple[Array, NDArray[np.int64]]:
     """Return the value of every spline at poses (N, 3), (N, nodes), and the poses' cells, (N, 3).
 
     For who looks at a few poses, or at many once.

@@ -153,8 +153,9 @@ def _nodes(rows: Array, by_geometry: Array, wanted: Array, scale: Array, penalty
     """Return the nodes, (nodes, 3): those of a geometry's errors, and those of what these leave."""
     each = np.tensordot(rows, by_geometry, 1) / scale[:, None]
     parameters, *_ = np.linalg.lstsq(each.reshape(wanted.size, -1), (wanted / scale).ravel(), rcond=None)
-    nodes: Array = by_geometry @ parameters
-    return nodes + _solve(rows, wanted - rows @ nodes, penalty)
+    nodes: Array = by_geometry @ parameters.astype(np.float64)
+    nodes += _solve(rows, wanted - rows @ nodes, penalty)
+    return nodes
 
 
 def _triple(values: Sequence[float]) -> tuple[float, float, float]:
