@@ -149,7 +149,7 @@ def corrected(robot_file: Path) -> Config:
 def goals(number: int, seed: int = 9) -> list[tuple[float, float, float]]:
     random = np.random.default_rng(seed)
     found = [tuple(random.uniform((-0.14, -0.14, -0.9), (0.14, 0.14, 0.8)).tolist()) for _ in range(3 * number)]
-    return list(reachable(found))[:number]  # type: ignore[arg-type]
+    return list(reachable(found))[:number]
 
 
 def errors(config: Config, number: int) -> list[float]:

@@ -135,7 +135,7 @@ def _curvature(shape: Sequence[int]) -> Array:
 def _solve(rows: Array, wanted: Array, penalty: Array) -> Array:
     """Return the nodes, (nodes, 3)."""
     try:
-        found: Array = np.linalg.solve(rows.T @ rows + penalty, rows.T @ wanted)
+        found: Array = np.linalg.solve(rows.T @ rows + penalty, rows.T @ wanted).astype(np.float64)
     except np.linalg.LinAlgError as error:
         raise CalibrationError("the poses tell too little for a map: vary x, y and phi independently") from error
     return found
