@@ -8,6 +8,7 @@ import math
 import re
 import sys
 from collections.abc import Callable
+from decimal import Decimal
 
 import pytest
 from hypothesis import assume, given
@@ -66,6 +67,18 @@ def test_a_unit_and_the_bare_number_are_the_same_number(number: object) -> None:
 
 def test_an_inch_is_exact() -> None:
     assert quantity("-0.2in", LENGTH) == -0.00508
+
+
+@given(st.decimals("0.001", 1, places=4))
+def test_a_share_is_a_number_or_a_percentage(value: Decimal) -> None:
+    assert units.share(str(value)) == float(value)
+    assert units.share(f"{100 * value}%") == pytest.approx(float(value), rel=1e-15)
+
+
+@given(st.decimals(allow_nan=False, allow_infinity=False).filter(lambda value: not Decimal("0.001") <= value <= 1))
+def test_a_share_is_from_a_thousandth_to_one(value: Decimal) -> None:
+    with pytest.raises(ValueError, match=r"0\.001 to 1, or 0\.1% to 100%"):
+        units.share(str(value))
 
 
 def is_quantity(word: str) -> bool:
