@@ -133,7 +133,7 @@ def test_an_answer_that_would_be_another_now_is_noticed_and_used_all_the_same(
     )
     assert isinstance(what.given, Planned)
     requests = list(recording.requests)
-    answer = msgspec.structs.replace(what.given, duration=what.given.duration + 1.0)
+    answer = msgspec.structs.replace(what.given, duration=(what.given.duration or 0.0) + 1.0)
     requests[number] = msgspec.structs.replace(what, given=answer)
     compared = again(recording._replace(requests=tuple(requests)), config, simulated=False)
     assert (compared.plans_differing, compared.differing) == (1, 0)

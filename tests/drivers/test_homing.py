@@ -381,6 +381,16 @@ def test_the_held_setpoint_is_taken_up_before_setpoints_are_followed(rig: Rig) -
     assert held[since - 5] != held[since - 4]
 
 
+def test_after_a_stop_no_other_drive_is_begun(rig: Rig) -> None:
+    rig.enable()
+    begin(rig, 100)
+    assert modes(rig) == [6, 8, 8]
+    rig.order("stop")
+    while rig.mode is not Mode.HOLDING:
+        rig.cycle()
+        assert modes(rig)[1:] == [8, 8]
+
+
 def test_a_stop_when_the_last_drive_is_home_comes_too_late(rig: Rig) -> None:
     rig.enable()
     begin(rig)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from trirail.config import geometry
 from trirail.errors import RefusedError
 from trirail.kinematics.robot import forward, inverse
-from trirail.motion.feasibility import Checker
+from trirail.motion.feasibility import PLANNED, Checker
 from trirail.motion.limits import Bounds
 from trirail.motion.paths import Path, value
 from trirail.motion.planner import Kinodynamic, Plan, Planner
@@ -185,6 +185,16 @@ def test_sooner_on_weak_sliders() -> None:
     ways = [[tuple(rnd.uniform(*bounds) for bounds in box) for _ in range(2)] for _ in range(30)]
     pairs = [to_pose(WEAK, way[0], way[1]) for way in ways]
     assert statistics.median(pair.plan.path.duration / pair.uniform.path.duration for pair in pairs) < 0.93
+
+
+@pytest.mark.parametrize("end", [(0.05, -0.02, 0.3), (-0.04, 0.05, -0.3)])
+@pytest.mark.parametrize("sliders", [WEAK, (0.05, 3.0, 50.0), (0.3, 0.5, 50.0)])
+def test_a_way_comes_close_to_the_limit_that_is_nearest(sliders: Triple, end: Triple) -> None:
+    """To half a percent of what plans make use of: else the whole way could be made sooner."""
+    plan, uniform = to_pose(sliders, (0.0, 0.0, 0.0), end)
+    assert plan.path.duration < uniform.path.duration
+    of_sliders, _ = greatest(plan.path)
+    assert (of_sliders / sliders).max() > 0.995 * PLANNED[0]
 
 
 def test_what_fits_stays_ruckigs() -> None:

@@ -19,11 +19,13 @@ from trirail.processes.inbox import Incoming
 from trirail.processes.refusals import REFUSALS_PER_SECOND
 from trirail.processes.requests import AHEAD, AHEAD_OF_ALL, UNDER_WAY
 from trirail.wire import boundary, packets, zenoh_session
+from trirail.wire.links import Closed
 from trirail.wire.messages import Event
 from trirail.wire.packets import (
     Accepted,
     CommandRequest,
     Confirmed,
+    Farewell,
     GoalRequest,
     Happened,
     RefusedRequest,
@@ -294,3 +296,34 @@ def test_info_tells_what_the_drives_do_without(rig: Rig, monkeypatch: pytest.Mon
     (info,) = said
     assert isinstance(info, Info)
     assert info.missing_protections == missing
+
+
+class EndedLoop(FakeLink):
+    """A loop that has said something and ended: it takes nothing any more."""
+
+    def __init__(self, *said: bytes) -> None:
+        super().__init__()
+        self._said = list(said)
+
+    def send(self, packet: bytes) -> bool:
+        raise Closed
+
+    def receive(self) -> bytes:
+        if not self._said:
+            raise Closed
+        return self._said.pop(0)
+
+    def fileno(self) -> int:
+        return 0
+
+
+def test_what_the_loop_said_before_it_ended_is_heard_though_it_takes_nothing_any_more(tmp_path: Path) -> None:
+    """Else a loop that ended as it should would be told to have died."""
+    accepted, ended = (packets.message(said) for said in (Accepted(1, "g", 1.0, 1.0, False, False), Farewell()))
+    unreadable = bytes([packets.Kind.MESSAGE]) + b"\xc1"
+    told: list[Event] = []
+    with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
+        link = EndedLoop(accepted, unreadable, accepted, ended)
+        gateway = Gateway(CONFIG, link, lambda: None, opened, Guard(CONFIG), told.append)  # type: ignore[arg-type]
+        gateway.serve(lambda: None)
+    assert told == []

@@ -174,3 +174,13 @@ for number in range({FUNCTIONS}):
     assert told[0] == f"the first start compiles the mathematics, {FUNCTIONS} functions; once, a minute or two"
     assert told[1:4] == [f"compiling: {-(-FUNCTIONS * part // 4)} of {FUNCTIONS} functions" for part in (1, 2, 3)]
     assert told[4:6] == [f"compiling: {FUNCTIONS} of {FUNCTIONS} functions", "up"]
+
+
+def test_the_terminals_interrupt_reaches_no_child_not_even_one_that_is_still_importing(
+    told: list[str], tmp_path: Path
+) -> None:
+    """Ctrl-C goes to all of the terminal's processes: the supervisor alone acts on it."""
+    interrupted = "import signal; os.kill(os.getpid(), signal.SIGINT); ready(); "
+    turning = "beat_until(lambda: begun('gateway-1') and begun('recorder-1')); heartbeats.of('loop').rest()"
+    run(told, tmp_path, loop_1=interrupted + turning, gateway_1=interrupted + "freeze()", recorder_1=RECORDING)
+    assert told[0] == "up"

@@ -234,6 +234,24 @@ def test_events_and_requests_of_another_version_are_refused(tmp_path: Path, log:
         read(path)
 
 
+@pytest.mark.parametrize(
+    ("log", "lacks"), [("events", journal.WORDS), ("events", journal.LEVEL), ("requests", journal.JSON)]
+)
+def test_events_and_requests_that_lack_a_column_are_refused_by_its_name(tmp_path: Path, log: str, lacks: Any) -> None:
+    path, sent = tmp_path / "a.rrd", made.records(0.1)
+    stream = rr.RecordingStream("trirail")
+    stream.save(path)
+    stream.send_chunks(chunks(Timelines(1000, 0).of(sent), [Column(RECORD, FIELDS, structs(sent))]))
+    kinds = [kind for kind in (journal.TEXT, journal.LEVEL, journal.WORDS, journal.JSON) if kind is not lacks]
+    said = [Column(f"/{log}", kind, pa.array([["?"]])) for kind in kinds]
+    stream.send_chunks(chunks(Timelines(1000, 0).of(sent[:1]), said))
+    stream.disconnect()
+    with pytest.raises(
+        ServiceError, match=rf"a\.rrd: written by another version: its {log} have no {lacks.component}$"
+    ):
+        read(path)
+
+
 def test_a_file_that_grows_while_it_is_read_is_read_up_to_a_whole_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

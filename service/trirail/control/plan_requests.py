@@ -218,7 +218,12 @@ class PlanRequests:
         if run.target != min(self.override, self._greatest_rate):
             self.run_at(self.override)
         return AcceptedPlan(
-            planned.duration, planned.slowed, planned.stops_first, queued=False, bound=planned.bound, lag=planned.lag
+            planned.duration if planned.duration is not None else math.inf,
+            planned.slowed,
+            planned.stops_first,
+            queued=False,
+            bound=planned.bound,
+            lag=planned.lag,
         )
 
     def _stopping(self, under_way: Run, planned: Planned) -> Run:

@@ -6,6 +6,7 @@ limits, which have a revision. So it may be asked in a process of its own, in th
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections import deque
 
@@ -54,7 +55,7 @@ class MotionPlanner:
             version,
             decided.first,
             pack_run(decided.run),
-            decided.duration,
+            decided.duration if math.isfinite(decided.duration) else None,
             decided.slowed,
             decided.stops_first,
             pack_path(decided.stop) if decided.stop is not None else None,

@@ -30,9 +30,14 @@ class ChildProcess:
         self._hung_for = 0.0
         self.pipe, write = os.pipe()
         arguments = [name, str(runtime), str(write), str(beats), *map(str, sockets)]
-        self.process = subprocess.Popen(
-            python("-m", CHILD, *arguments), stdin=subprocess.PIPE, pass_fds=[write, beats, *sockets]
-        )
+        # The terminal sends it to all, and the supervisor alone acts on it: also while the child is still importing.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            self.process = subprocess.Popen(
+                python("-m", CHILD, *arguments), stdin=subprocess.PIPE, pass_fds=[write, beats, *sockets]
+            )
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         os.close(write)
         os.set_blocking(self.pipe, False)
         if self.process.stdin is not None:

@@ -120,6 +120,7 @@ class Gateway:
                 self._summarize()
                 self._refusals.tell_of_overruns()
         except Closed:
+            self._hear_the_rest(ready)
             self._tell_of_its_end()
         finally:
             with contextlib.suppress(Closed):
@@ -256,6 +257,14 @@ class Gateway:
         self._log(event)
         if self._meter is not None:
             self._meter.event(event)
+
+    def _hear_the_rest(self, ready: Callable[[], None]) -> None:
+        """Hear what the loop said before it ended: that may be its farewell."""
+        with contextlib.suppress(Closed):
+            while (packet := self._link.receive()) is not None:
+                self._last_words.heard()
+                with contextlib.suppress(Closed):  # it takes nothing any more
+                    self._hear(packet, ready)
 
     def _tell_of_its_end(self) -> None:
         """The loop has gone: where it has died, tell everyone in its place."""

@@ -12,6 +12,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -86,7 +87,8 @@ def main() -> int:
 
     def ready(content: object) -> None:
         # The descriptor stays open: its end is how the supervisor learns of this process's end.
-        os.write(int(descriptor), msgspec.json.encode(content) + b"\n")
+        with suppress(BrokenPipeError):  # a supervisor that was killed: the loop ends by itself, and the others with it
+            os.write(int(descriptor), msgspec.json.encode(content) + b"\n")
 
     def log(event: Event) -> None:
         if select.select([], [int(descriptor)], [], LOG_WITHIN)[1]:
@@ -96,7 +98,8 @@ def main() -> int:
         line = msgspec.json.encode({MEASURED: content}) + b"\n"
         # No more than a pipe takes at once: nobody waits for a supervisor here, and in a second it comes again.
         if len(line) <= select.PIPE_BUF and select.select([], [int(descriptor)], [], 0.0)[1]:
-            os.write(int(descriptor), line)
+            with suppress(BrokenPipeError):
+                os.write(int(descriptor), line)
 
     tell_of_compiling(lambda function: ready({COMPILING: function}))
 

@@ -213,7 +213,7 @@ def _events(chunks: list[Chunk], path: Path) -> list[Line]:
     for batch in (chunk.to_record_batch() for chunk in chunks):
         t = batch.column("t").to_numpy().astype(np.int64) / SECOND
         wall = batch.column("wall").to_numpy()
-        levels, texts = (batch.column(name).flatten().to_pylist() for name in (_LEVEL, WORDS.component))
+        levels, texts = (_texts(batch, name, path, "events") for name in (_LEVEL, WORDS.component))
         spoken = batch.column(JSON.component).to_pylist() if JSON.component in batch.schema.names else [None] * len(t)
         events = [_decoded(content[0], Event, path, "events") if content else None for content in spoken]
         lines += map(Line, t.tolist(), wall, levels, texts, events)
@@ -221,9 +221,16 @@ def _events(chunks: list[Chunk], path: Path) -> list[Line]:
 
 
 def _requests(chunks: list[Chunk], path: Path) -> tuple[ControlInput, ...]:
-    rows = [text for chunk in chunks for text in chunk.to_record_batch().column(JSON.component).flatten().to_pylist()]
+    rows = [row for chunk in chunks for row in _texts(chunk.to_record_batch(), JSON.component, path, "requests")]
     found = (_decoded(row, ControlInput, path, "requests") for row in rows)
     return tuple(sorted(found, key=lambda given: given.seq))
+
+
+def _texts(batch: pa.RecordBatch, component: str, path: Path, what: str) -> list[str]:
+    if component not in batch.schema.names:
+        raise ServiceError(f"{path}: written by another version: its {what} have no {component}")
+    texts: list[str] = batch.column(component).flatten().to_pylist()
+    return texts
 
 
 def _decoded(row: str, kind: type[T], path: Path, what: str) -> T:

@@ -67,8 +67,8 @@ class Planned(Struct, frozen=True, tag=True):
     first: int | None
     """The cycle in whose commanded state it begins; None where the robot stands, and it may begin at any time."""
     run: PackedRun
-    duration: float
-    """From when it begins to its end [s]; infinite at override zero."""
+    duration: float | None
+    """From when it begins to its end [s]; None at override zero: recorded as JSON, which knows no infinity."""
     slowed: float
     """How many times slower than was asked for, for the limits' sake."""
     stops_first: bool = False
