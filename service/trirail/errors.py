@@ -67,7 +67,7 @@ class RefusalCode(StrEnum):
     WILDCARD = "wildcard", "a key for more than one robot or user", "name one of each"
     BAD_NAME = (
         "bad_name",
-        "a robot, user or pose with other than letters, digits, - and _, or a new pose that reads as a quantity: 5mm",
+        "a name with other than letters, digits, - and _, or a new pose's that reads as a quantity: 5mm",
         "use another name",
     )
     UNKNOWN_COMMAND = "unknown_command", "no such command", "send one of those that the message names"
