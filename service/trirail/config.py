@@ -26,7 +26,8 @@ from trirail import as_built
 from trirail.as_built import AsBuilt
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry, Leg, Room, gains, singular_angles, travels
-from trirail.wire.endpoints import ReachableBy, endpoint_of, is_local, reach
+from trirail.wire.endpoints import ReachableBy, endpoint_of, fault_of, is_local, reach, same_port, tcp_address
+from trirail.wire.text import QUANTITY_RULE, is_quantity
 from trirail.wire.vocabulary import LeasePolicy, Role
 
 _PACKAGED = Path(__file__).parent / "configs"
@@ -505,6 +506,7 @@ def _check(config: Config) -> None:
             )
     check_reach(config.zenoh)
     _check_metrics(config)
+    _check_ports(config)
     settling = config.limits.in_position
     if settling.timeout <= settling.dwell:
         raise ConfigError(
@@ -558,6 +560,8 @@ def _check_poses(config: Config, robot: Geometry) -> None:
     """Refuse named poses at which the robot cannot be."""
     platform, slider = config.limits.platform, config.limits.slider
     for name, pose in config.poses.items():
+        if is_quantity(name):
+            raise ConfigError(f"poses.{name}: {name} {QUANTITY_RULE}")
         places = [
             (key, at, key, getattr(platform, key), "platform") for key, at in zip(("x", "y", "phi"), pose, strict=True)
         ]
@@ -594,6 +598,20 @@ def _check_metrics(config: Config) -> None:
         )
 
 
+def _check_ports(config: Config) -> None:
+    """Refuse a port that two would listen on."""
+    telemetry = config.telemetry
+    addresses = [(f"zenoh.listen[{index}]", tcp_address(at)) for index, at in enumerate(config.zenoh.listen)]
+    addresses += [
+        ("telemetry.live_port", ("127.0.0.1", telemetry.live_port)),
+        ("telemetry.metrics_port", (telemetry.metrics_address, telemetry.metrics_port)),
+    ]
+    listening = [(key, address) for key, address in addresses if address is not None and address[1]]
+    for (key, address), (other, taken) in itertools.combinations(listening, 2):
+        if same_port(address, taken):
+            raise ConfigError(f"{other}: port {taken[1]} is that of {key} too: give each a port of its own")
+
+
 def check_reach(zenoh: Zenoh) -> None:
     """Refuse a door that is open by accident, and certificates or users that would not be looked at."""
     if zenoh.tls is not None and zenoh.connect and zenoh.router is None:
@@ -608,6 +626,8 @@ def check_reach(zenoh: Zenoh) -> None:
     named += [(f"connect[{index}]", endpoint) for index, endpoint in enumerate(zenoh.connect)]
     for name, endpoint in named:
         key, by = f"zenoh.{name} = {endpoint!r}", reach(endpoint)
+        if fault := fault_of(endpoint):
+            raise ConfigError(f"{key}: {fault}")
         if zenoh.tls is not None and by is not ReachableBy.CERTIFICATE:
             raise ConfigError(f"{key}: with [zenoh.tls] every endpoint is tls/ADDRESS:PORT, or it would go round it")
         if zenoh.tls is not None and "#" in endpoint:

@@ -59,9 +59,17 @@ class RefusalCode(StrEnum):
     )
     TOO_LARGE = "too_large", "more bytes than are read", "send a smaller message"
     UNKNOWN_ENCODING = "unknown_encoding", "neither JSON nor msgpack", "name the encoding, or none for JSON"
-    UNKNOWN_KEY = "unknown_key", "no such key below the robot's name", "use a key of the table"
+    UNKNOWN_KEY = (
+        "unknown_key",
+        "not a key of the table; Zenoh delivers none such, so a query on one ends without any reply",
+        "use a key of the table",
+    )
     WILDCARD = "wildcard", "a key for more than one robot or user", "name one of each"
-    BAD_NAME = "bad_name", "a robot or user with other than letters, digits, - and _", "use another name"
+    BAD_NAME = (
+        "bad_name",
+        "a name with other than letters, digits, - and _, or a new pose's that reads as a quantity: 5mm",
+        "use another name",
+    )
     UNKNOWN_COMMAND = "unknown_command", "no such command", "send one of those that the message names"
     DUPLICATE_ID = "duplicate_id", "the goal's id has been used", "give every goal an id of its own, or none"
     UNKNOWN_FRAME = "unknown_frame", "no tool or frame of that name in [frames]", "use one of those that info tells"

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 import pytest
 from cyclopts import App
-from trirail.cli import commands, help_pages, terminal, units, view
+from trirail.cli import commands, help_pages, live, terminal, units, view
 from trirail.client import client, connection
 from trirail.client.goal import Result
 from trirail.config import SIM, load
@@ -110,6 +110,76 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
         found = json.loads(out)
         assert found["ok"] is False
         assert said in found["message"]
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "said"),
+    [
+        ("goto ../../etc", 1, "pose '../../etc' cannot be in a key: letters, digits, - and _, at most 64 are taken"),
+        ("goto a/b", 1, "letters, digits, - and _"),
+        ("goto 5mm", 2, "goto takes X, Y and PHI, or the NAME of a pose"),
+        ("teach 5mm", 1, "pose '5mm' reads as a number or a quantity"),
+        ("teach 10", 1, "pose '10' reads as a number or a quantity"),
+        ("goto 0 0 0 --speed 50", 2, "--speed: '50' is no share of the limits: 0.001 to 1, or 0.1% to 100%"),
+        ("move 0 0 0 --speed 0", 2, "--speed: '0' is no share of the limits"),
+        ("sliders 0 0 0 --speed x", 2, "--speed: 'x' is no share of the limits"),
+        ("sessions --since yesterday", 2, "'yesterday' is no day or time such as 2026-01-31 or 2026-01-31T12:00:00"),
+        (f"goto 0 0 0 --connect {NOBODY}", 1, "start one with: trirail run, or name its address"),
+    ],
+)
+def test_what_is_typed_wrongly_is_told_with_what_would_be_right(line: str, code: int, said: str, run: Run) -> None:
+    assert run(*line.split())[:2] == (code, "")
+    assert said in run(*line.split())[2]
+
+
+class Slow:
+    """A robot that takes what it is sent, and so many times slower."""
+
+    def __init__(self, slowed: float) -> None:
+        self.id, self.name, self.duration, self.error = "g-1", "demo", 1.0, None
+        self.reply, self.result = GoalReply("g-1", 1.0, slowed), Result("g-1", "done", "goal g-1 done")
+        self.move = self.move_to = self.move_to_named = self.move_sliders = self.follow = self.jog = lambda *_, **__: (
+            self
+        )
+
+    def __enter__(self) -> Slow:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def states(self, timeout: float) -> Iterator[SimpleNamespace]:
+        yield SimpleNamespace(goal=None)
+
+    def info(self) -> SimpleNamespace:
+        return SimpleNamespace(limits=msgspec.to_builtins(load(SIM).limits))
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("jog 10 0 0", "slowed 40 times: 10 m/s is beyond the platform's limit 0.25 m/s"),
+        ("jog 1mm/s -10 0", "slowed 40 times: 10 m/s is beyond the platform's limit 0.25 m/s"),
+        ("jog 0.01 0 0", "slowed 40 times: it would be beyond the limits"),
+        ("goto 0 0 0 --wait", "slowed 40 times"),
+        ("goto pick --wait", "slowed 40 times"),
+        ("move 0 0 0 --wait", "slowed 40 times"),
+        ("sliders 0 0 0 --wait", "slowed 40 times"),
+    ],
+)
+def test_what_is_slowed_is_said_beside_its_end_and_with_json_a_field(
+    line: str, said: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "table", lambda *_: "")
+    monkeypatch.setattr(client, "Robot", lambda *_, **__: Slow(40.0))
+    code, out, err = run(*line.split())
+    assert (code, err.count("\n")) == (0, 1)
+    assert said in err
+    assert "goal g-1 done" in out
+    code, out, err = run(*line.split(), "--json")
+    assert (code, err, json.loads(out)["slowed"]) == (0, "", 40.0)
+    monkeypatch.setattr(client, "Robot", lambda *_, **__: Slow(1.0))
+    assert run(*line.split())[2] == ""
 
 
 WRONG = ["report", "replay", "goto", "goto 1 2", "nothing", "watch extra", "status --wat", "config wat"]

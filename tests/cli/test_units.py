@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
 import sys
 from collections.abc import Callable
+from decimal import Decimal
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from trirail.cli import commands, units
 from trirail.cli.units import ANGLE, DIMENSIONS, LENGTH, Dimension, quantity, written
+from trirail.wire import text
 
 Run = Callable[..., tuple[int, str, str]]
 a_unit = st.sampled_from([(dimension, unit) for dimension in DIMENSIONS for unit in dimension.units])
@@ -64,6 +67,38 @@ def test_a_unit_and_the_bare_number_are_the_same_number(number: object) -> None:
 
 def test_an_inch_is_exact() -> None:
     assert quantity("-0.2in", LENGTH) == -0.00508
+
+
+@given(st.decimals("0.001", 1, places=4))
+def test_a_share_is_a_number_or_a_percentage(value: Decimal) -> None:
+    assert units.share(str(value)) == float(value)
+    assert units.share(f"{100 * value}%") == pytest.approx(float(value), rel=1e-15)
+
+
+@given(st.decimals(allow_nan=False, allow_infinity=False).filter(lambda value: not Decimal("0.001") <= value <= 1))
+def test_a_share_is_from_a_thousandth_to_one(value: Decimal) -> None:
+    with pytest.raises(ValueError, match=r"0\.001 to 1, or 0\.1% to 100%"):
+        units.share(str(value))
+
+
+def is_quantity(word: str) -> bool:
+    """Whether a word of the command line is a quantity of any kind."""
+    for dimension in DIMENSIONS:
+        with contextlib.suppress(ValueError):
+            quantity(word, dimension)
+            return True
+    return False
+
+
+@given(
+    st.from_regex(r"[A-Za-z0-9_-]{1,6}", fullmatch=True)
+    | st.tuples(st.integers(-99, 99).map(str), st.sampled_from(["", "e3", "E-3"]), a_unit).map(
+        lambda parts: parts[0] + parts[1] + parts[2][1]
+    )
+)
+def test_a_name_is_no_pose_where_the_command_line_reads_a_quantity(word: str) -> None:
+    assume(text.is_name(word))
+    assert text.is_quantity(word) is is_quantity(word)
 
 
 @given(st.text(), st.sampled_from(DIMENSIONS))

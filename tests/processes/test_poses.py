@@ -194,6 +194,8 @@ def test_where_it_is_not_known_to_stand_it_cannot_be_taught(make: Make) -> None:
         ("forget", "park", b"", RefusalCode.CONFIGURED_POSE),
         ("forget", "pick", b"", RefusalCode.UNKNOWN_POSE),
         ("teach", "a b", b"", RefusalCode.BAD_NAME),
+        ("teach", "5mm", b"", RefusalCode.BAD_NAME),
+        ("teach", "-10", b"", RefusalCode.BAD_NAME),
         ("teach", "p" * 65, b"", RefusalCode.BAD_NAME),
         ("teach", "\x1b[2J", b"", RefusalCode.BAD_NAME),
         ("teach", "", b"", RefusalCode.BAD_NAME),

@@ -145,6 +145,7 @@ def test_what_the_recorder_enters_is_what_its_files_hold(tmp_path: Path) -> None
         (["--since", "2026-03-01"], []),
         (["--fault", "EMCY"], ["one", "two"]),
         (["--fault", "0x8700"], ["one", "two"]),
+        (["--fault", "8700"], ["one", "two"]),
         (["--fault", "0x8611"], []),
         (["--user", "eva"], ["one", "two"]),
         (["--user", "max"], []),

@@ -36,6 +36,12 @@ def test_a_key_whose_user_no_name_can_be_is_refused(user: str) -> None:
     assert refused(lambda: boundary.names(f"{PREFIX}/{user}", PREFIX, ("user",))) is RefusalCode.BAD_NAME
 
 
+@pytest.mark.parametrize("name", ["5mm", "10", "a b", "../../etc"])
+def test_a_pose_is_not_taught_by_what_is_no_name_or_a_quantity(name: str) -> None:
+    assert refused(lambda: boundary.check_new_pose(name)) is RefusalCode.BAD_NAME
+    assert boundary.check_new_pose("p5mm") == "p5mm"
+
+
 def test_a_message_is_decoded_up_to_its_size_and_not_a_byte_beyond() -> None:
     goal = b'{"kind":"pose","x":0.1,"y":0,"phi":0}'
     assert boundary.decode(goal.ljust(MAX_MESSAGE), Goal, "not a goal") == PoseGoal(0.1, 0.0, 0.0)

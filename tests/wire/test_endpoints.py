@@ -8,7 +8,16 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.wire.endpoints import ReachableBy, endpoint_of, is_local, reach, socket_file
+from trirail.wire.endpoints import (
+    ReachableBy,
+    endpoint_of,
+    fault_of,
+    is_local,
+    reach,
+    same_port,
+    socket_file,
+    tcp_address,
+)
 
 ENDS = ("", "#iface=eth0", "?rel=1", "?rel=1#so_sndbuf=65000")
 
@@ -70,3 +79,49 @@ def test_what_stays_on_this_machine_is_local() -> None:
 def test_only_a_unix_socket_has_a_file(end: str) -> None:
     assert socket_file(f"unixsock-stream//run/trirail/zenoh{end}") == Path("/run/trirail/zenoh")
     assert socket_file(f"tcp/127.0.0.1:7447{end}") is None
+
+
+HOSTS = st.ip_addresses().map(lambda at: f"[{at}]" if at.version == 6 else str(at)) | st.sampled_from(
+    ["localhost", "a.b"]
+)
+
+
+@given(HOSTS, st.integers(1, 65535), st.sampled_from(("tcp", "tls", "udp", "quic", "ws")), st.sampled_from(ENDS))
+def test_what_an_endpoint_lacks_is_said(host: str, port: int, protocol: str, end: str) -> None:
+    assert fault_of(f"{protocol}/{host}:{port}{end}") == ""
+    assert fault_of(f"{host}:{port}{end}").startswith("the protocol is missing")
+    assert fault_of(f"/{host}:{port}{end}").startswith("the protocol is missing")
+    assert fault_of(f"{protocol}/{host}{end}").startswith("the port is missing")
+    assert fault_of(f"{protocol}/:{port}{end}").startswith("the host is missing")
+    assert fault_of(f"{protocol}/{end}").startswith("the address is missing")
+    for wrong in ("", "0", str(port + 65535), f"-{port}", "x", "\u0665"):
+        assert fault_of(f"{protocol}/{host}:{wrong}{end}").startswith("its port must be 1 to 65535")
+    assert tcp_address(f"{protocol}/{host}:{port}{end}") == (
+        None if protocol in ("udp", "quic") else (host.strip("[]"), port)
+    )
+
+
+def test_an_ipv6_address_is_in_brackets_and_a_file_needs_no_port() -> None:
+    for bare in ("tcp/::1", "tcp/::1:7447"):
+        assert "[::1]:7447" in fault_of(bare)
+    assert fault_of("unixsock-stream//run/trirail/zenoh") == ""
+    assert fault_of("unixsock-stream/").startswith("the address is missing")
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("127.0.0.1", "127.0.0.1", True),
+        ("127.0.0.1", "localhost", True),
+        ("127.0.0.1", "0.0.0.0", True),
+        ("127.0.0.1", "::", True),
+        ("0.0.0.0", "::", True),
+        ("127.0.0.1", "::1", False),
+        ("0.0.0.0", "::1", False),
+        ("127.0.0.1", "192.0.2.7", False),
+        ("robot", "robot", True),
+    ],
+)
+def test_a_port_can_be_listened_on_once_an_address(one: str, other: str, same: bool) -> None:
+    assert same_port((one, 7447), (other, 7447)) is same_port((other, 7447), (one, 7447)) is same
+    assert not same_port((one, 7447), (other, 7448))

@@ -14,13 +14,16 @@ from cyclopts import CycloptsError, Parameter
 from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
 from trirail.cli.options import poses as poses_of_robot
-from trirail.wire.text import is_name
+from trirail.wire.boundary import check_name, check_new_pose
 from trirail.wire.vocabulary import Command
 
 if TYPE_CHECKING:
     from trirail.client.client import GoalHandle, Robot
 
 Tool = Annotated[units.ToolPoint, Parameter(completer=tools)]
+
+
+NO_END = "the jog has no known end"
 
 
 def goto(
@@ -30,7 +33,7 @@ def goto(
     /,
     *,
     wait: Annotated[bool, Flag] = False,
-    speed: float = 1.0,
+    speed: units.Share = 1.0,
     blend: units.Length | None = None,
     tool: Tool | None = None,
     frame: Annotated[str, Parameter(completer=frames)] = "base",
@@ -50,7 +53,7 @@ def goto(
     wait
         Show the progress; exit 0 only when the robot has arrived.
     speed
-        Fraction of full speed, up to 1.
+        Share of the limits, 0.001 to 1, or 5%.
     blend
         The next goto waits for this one, and begins that near to its end [m], instead of preempting it.
     tool
@@ -64,10 +67,11 @@ def goto(
     from trirail.client.client import Robot
 
     if y is None or phi is None:
-        if y is not None or not is_name(x) or tool is not None or frame != "base":
+        if y is not None or units.is_length(x) or tool is not None or frame != "base":
             raise CycloptsError(
                 msg="goto takes X, Y and PHI, or the NAME of a pose, that knows no --tool and no --frame"
             )
+        check_name(x, "pose")
         with Robot(service.robot, service.connect, tls=service.tls) as robot:
             return _follow(service, robot, robot.move_to_named(x, speed=speed, blend=blend), wait, x)
     try:
@@ -86,7 +90,7 @@ def move(
     /,
     *,
     wait: Annotated[bool, Flag] = False,
-    speed: float = 1.0,
+    speed: units.Share = 1.0,
     tool: Tool | None = None,
     frame: Annotated[str, Parameter(completer=axes)] = "base",
     measured: Annotated[bool, Flag] = False,
@@ -106,7 +110,7 @@ def move(
     wait
         Show the progress; exit 0 only when the robot has arrived.
     speed
-        Fraction of full speed, up to 1.
+        Share of the limits, 0.001 to 1, or 5%.
     tool
         The point of the platform that moves so far, and about which it turns: U V in the platform's own frame [m], or
         its name in [frames.tool].
@@ -133,7 +137,7 @@ def sliders(
     /,
     *,
     wait: Annotated[bool, Flag] = False,
-    speed: float = 1.0,
+    speed: units.Share = 1.0,
     service: Service = HERE,
 ) -> int:
     """Move the sliders to positions; also the way out of a pose that goto refuses.
@@ -149,7 +153,7 @@ def sliders(
     wait
         Show the progress; exit 0 only when the robot has arrived.
     speed
-        Fraction of full speed, up to 1.
+        Share of the limits, 0.001 to 1, or 5%.
     """
     from trirail.client.client import Robot
 
@@ -199,13 +203,17 @@ def jog(
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         try:
             with robot.jog(x=vx, y=vy, phi=w) as jogging:
+                taken = jogging.reply
+                if not service.json and (words := live.slowed_jog(robot, taken, (vx, vy, w))):
+                    terminal.complain(words)
                 live.jogging(robot, jogging, seconds, show=not service.json)
         except KeyboardInterrupt:
             pass
         if jogging.error is not None:
             raise jogging.error
         result = jogging.result
-    show(service, result._asdict() if result else {}, result.message if result else "the jog has no known end")
+    slowed = {"slowed": taken.slowed} if taken else {}
+    show(service, (result._asdict() if result else {}) | slowed, result.message if result else NO_END)
     return 0 if result and result.outcome == "done" else 1
 
 
@@ -243,10 +251,11 @@ def teach(name: str, /, *, service: Service = HERE) -> int:
     Parameters
     ----------
     name
-        Letters, digits, - and _; a pose that was taught by that name before is replaced.
+        Letters, digits, - and _, but no number or quantity; a pose that was taught by that name before is replaced.
     """
     from trirail.client.client import Robot
 
+    check_new_pose(name)
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         pose = robot.teach(name)
     show(service, msgspec.to_builtins(pose), f"{name}: {units.pose((pose.x, pose.y, pose.phi))}")
@@ -387,8 +396,10 @@ def _follow(service: Service, robot: Robot, goal: GoalHandle, wait: bool, title:
         words = f"goal {goal.id}: {goal.expected}{terminal.notes(goal.reply)}"
         show(service, msgspec.to_builtins(goal.reply), words)
         return 0
+    if not service.json and (words := terminal.slowed(goal.reply)):
+        terminal.complain(words)
     result = terminal.follow(robot, goal, title, show=not service.json)
-    show(service, result._asdict(), result.message)
+    show(service, result._asdict() | {"slowed": goal.reply.slowed}, result.message)
     return 0 if result.outcome == "done" else 1
 
 

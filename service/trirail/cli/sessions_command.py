@@ -5,12 +5,13 @@ from __future__ import annotations
 import sqlite3
 import sys
 import time
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 from rich.table import Table
 
 from trirail.cli import terminal
@@ -18,7 +19,7 @@ from trirail.cli.options import Flag
 from trirail.errors import ServiceError
 from trirail.telemetry import palette
 from trirail.wire.messages import Outcome
-from trirail.wire.text import wall_clock
+from trirail.wire.text import quoted, wall_clock
 
 if TYPE_CHECKING:
     from trirail.telemetry.session_index import RecordedSession, SessionIndex
@@ -27,13 +28,26 @@ FOLDER = Path("recordings")
 """Where a service records that was started in this folder."""
 
 
+def _moment(_: Any, tokens: Sequence[Token]) -> datetime:
+    try:
+        return datetime.fromisoformat(tokens[0].value)
+    except ValueError as error:
+        raise ValueError(
+            f"{quoted(tokens[0].value)!r} is no day or time such as 2026-01-31 or 2026-01-31T12:00:00"
+        ) from error
+
+
+Moment = Annotated[datetime, Parameter(converter=_moment, n_tokens=1)]
+"""A day, or a time of one, as the clock on the wall shows it."""
+
+
 def sessions(
     folder: Path = FOLDER,
     /,
     *,
     robot: Annotated[str | None, Parameter(env_var="TRIRAIL_ROBOT")] = None,
-    since: datetime | None = None,
-    until: datetime | None = None,
+    since: Moment | None = None,
+    until: Moment | None = None,
     fault: str | None = None,
     user: str | None = None,
     outcome: Outcome | None = None,

@@ -101,11 +101,18 @@ def _reach(config: Config) -> list[str]:
     return options
 
 
+SLOWED = 1.001
+"""A goal that is slowed by less is as asked."""
+
+
+def slowed(reply: GoalReply, why: str = "it would be beyond the limits") -> str:
+    """Say how much slower an accepted goal is than was asked for; nothing where it is not."""
+    return f"slowed {reply.slowed:.4g} times: {why}" if reply.slowed > SLOWED else ""
+
+
 def notes(reply: GoalReply) -> str:
     """Say what is out of the ordinary with an accepted goal; nothing where all is as asked."""
-    said = []
-    if reply.slowed > 1.001:
-        said.append(f"slowed {reply.slowed:.2f} times, to stay within the limits")
+    said = [words] if (words := slowed(reply)) else []
     if reply.stops_first:
         said.append("stops on the old path first")
     if reply.queued:

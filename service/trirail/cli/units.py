@@ -21,6 +21,8 @@ _DEGREE: Final = Decimal("0.0174532925199432957692369076848861271344")
 """π / 180, to more digits than a float has."""
 _WRITTEN: Final = re.compile(r"\s*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(.*?)\s*")
 _NEGATIVE: Final = re.compile(r"-[0-9.]")
+LOWEST_SHARE: Final = 1e-3
+"""Least `speed` of a goal."""
 TOOL: Final = "--tool"
 """The option that takes a point of the platform, or its name."""
 
@@ -164,6 +166,19 @@ def is_length(word: str) -> bool:
     return True
 
 
+def share(text: str) -> float:
+    """Return a share of full speed, from a number or a percentage. Raises ValueError with what would be right."""
+    try:
+        value = quantity(text, PERCENTAGE) / (100.0 if text.strip().endswith("%") else 1.0)
+    except ValueError:
+        value = math.nan
+    if not LOWEST_SHARE <= value <= 1.0:
+        raise ValueError(
+            f"{quoted(text.strip())!r} is no share of the limits: {LOWEST_SHARE} to 1, or {LOWEST_SHARE:.1%} to 100%"
+        )
+    return value
+
+
 def radians(text: str, deg: bool, dimension: Dimension = ANGLE) -> float:
     """Return what an angle, or its rate, is in radians; a bare number is one of degrees where `deg` says so."""
     return quantity(text, dimension, next(iter(dimension.units)).replace("rad", "deg") if deg else None)
@@ -223,6 +238,8 @@ Time = Annotated[float, _one(lambda text: quantity(text, TIME))]
 """Likewise [s]."""
 Percentage = Annotated[float, _one(lambda text: quantity(text, PERCENTAGE))]
 """Likewise [%]."""
+Share = Annotated[float, _one(share)]
+"""A share of full speed."""
 ToolPoint = Annotated[tuple[float, float] | str, _one(_tool)]
 """A point of the platform in its own frame [m], or the name of one in [frames.tool]."""
 Angle = Annotated[str, _one(_angle)]

@@ -196,7 +196,7 @@ class AsyncRobot:
 
     async def teach(self, name: str) -> NamedPose:
         """Keep where the robot is measured to stand as the pose of a name, as Robot.teach does."""
-        return await self._connection.ask(("teach", self.user, boundary.check_name(name, "pose")), NamedPose)
+        return await self._connection.ask(("teach", self.user, boundary.check_new_pose(name)), NamedPose)
 
     async def forget(self, name: str) -> NamedPose:
         """Remove a taught pose, as Robot.forget does."""

@@ -11,7 +11,7 @@ import msgspec
 
 from trirail.client.goal import STANDS_WITHIN, AcceptedGoal, Result
 from trirail.errors import RefusalCode, RefusedError, TrirailError
-from trirail.wire.messages import Goal, Stop, VelocityGoal
+from trirail.wire.messages import Goal, GoalReply, Stop, VelocityGoal
 from trirail.wire.vocabulary import Command
 
 
@@ -67,6 +67,11 @@ class AsyncJog:
         self._renewing: asyncio.Task[None] | None = None
         self.error: Exception | None = None
         """Why it could not be renewed any more."""
+
+    @property
+    def reply(self) -> GoalReply | None:
+        """What the service last said of it, None before it was taken: how much it is `slowed`, for one."""
+        return self._goal.reply if self._goal else None
 
     @property
     def result(self) -> Result | None:

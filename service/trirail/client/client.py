@@ -359,7 +359,7 @@ class Robot:
         The service keeps it for good: when this returns it is on its disk. A taught pose of that name is replaced.
         Raises RefusedError where the robot moves, is in fault or has not been homed, and for names of [poses].
         """
-        return self._connection.ask(("teach", self.user, boundary.check_name(name, "pose")), NamedPose)
+        return self._connection.ask(("teach", self.user, boundary.check_new_pose(name)), NamedPose)
 
     def forget(self, name: str) -> NamedPose:
         """Remove a taught pose; return what it was. Raises RefusedError where none of that name was taught."""

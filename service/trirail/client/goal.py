@@ -124,6 +124,11 @@ class Jog:
         """Why it could not be renewed any more."""
 
     @property
+    def reply(self) -> GoalReply | None:
+        """What the service last said of it, None before it was taken: how much it is `slowed`, for one."""
+        return self._goal.reply if self._goal else None
+
+    @property
     def result(self) -> Result | None:
         """How it ended, None while it has not."""
         return self._goal.result if self._goal else None

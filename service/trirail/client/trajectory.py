@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -13,11 +15,20 @@ from trirail.wire.messages import TrajectoryPoint
 from trirail.wire.text import quoted
 
 COLUMNS = ("t", "x", "y", "phi")
+FEWEST = 2
+"""Points of a trajectory: the first is where the robot stands."""
 VELOCITY, ACCELERATION = ("vx", "vy", "w"), ("ax", "ay", "e")
 
 
 def read(path: Path) -> list[TrajectoryPoint]:
     """Read the points of a trajectory. Raises TrirailError with file, line and what would be right."""
+    points = _points(path)
+    if len(points) < FEWEST:
+        raise TrirailError(f"{path}: {'one point' if points else 'no points'}: a trajectory has {FEWEST} at least")
+    return points
+
+
+def _points(path: Path) -> list[TrajectoryPoint]:
     text = files.text(path)
     if path.suffix == ".json":
         try:
@@ -33,18 +44,21 @@ def read(path: Path) -> list[TrajectoryPoint]:
 
 
 def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
-    rows = csv.DictReader(text.splitlines())
-    names = [name.strip() for name in rows.fieldnames or ()]
+    rows = csv.reader(text.splitlines())
+    names = [name.strip() for name in next(rows, ())]
     allowed = {*COLUMNS, *VELOCITY, *ACCELERATION}
-    if not set(COLUMNS) <= set(names) <= allowed:
+    whole = all(not set(group) & set(names) or set(group) <= set(names) for group in (VELOCITY, ACCELERATION))
+    if not set(COLUMNS) <= set(names) <= allowed or len(set(names)) < len(names) or not whole:
         raise TrirailError(
             f"{path}: line 1: columns {quoted(', '.join(names)) or 'none'}; wanted {', '.join(COLUMNS)}, "
-            f"and if known {', '.join((*VELOCITY, *ACCELERATION))}"
+            f"and if known {', '.join(VELOCITY)} and {', '.join(ACCELERATION)}, each once"
         )
     points = []
     for row in rows:
+        if not row:
+            continue
+        values = _numbers(f"{path}: line {rows.line_num}", names, row)
         try:
-            values = {name.strip(): float(value) for name, value in row.items()}
             points.append(
                 TrajectoryPoint(
                     **{name: values[name] for name in COLUMNS},
@@ -52,9 +66,27 @@ def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
                     acceleration=_triple(values, ACCELERATION),
                 )
             )
-        except (TypeError, ValueError, AttributeError) as error:
+        except ValueError as error:
             raise TrirailError(f"{path}: line {rows.line_num}: {quoted(str(error))}") from error
     return points
+
+
+def _numbers(where: str, names: Sequence[str], row: Sequence[str]) -> dict[str, float]:
+    """Return the numbers of a row by their columns. Raises TrirailError."""
+    if len(row) != len(names):
+        raise TrirailError(f"{where}: {len(row)} of {len(names)} columns")
+    values = {}
+    for name, cell in zip(names, row, strict=True):
+        try:
+            values[name] = float(cell)
+        except ValueError:
+            values[name] = math.nan
+        if not math.isfinite(values[name]):
+            raise TrirailError(
+                f"{where}, column {name}: {quoted(cell.strip())!r} is no number; "
+                "a CSV has bare metres, radians and seconds"
+            )
+    return values
 
 
 def _triple(values: dict[str, float], names: tuple[str, str, str]) -> tuple[float, float, float] | None:

@@ -104,6 +104,7 @@ class Poses:
             self._check_known(name)
             self._write(_Change(incoming, user, name, None))
             return
+        boundary.check_new_pose(name)
         if name in self._configured:
             raise RefusedError(
                 RefusalCode.CONFIGURED_POSE, f"{name} is in [poses]: teach another name, or change it there"
@@ -154,6 +155,7 @@ class Poses:
     def _check_known(self, name: str) -> None:
         if name in self._taught:
             return
+        boundary.check_new_pose(name)
         if name in self._configured:
             raise RefusedError(RefusalCode.CONFIGURED_POSE, f"{name} is in [poses]: remove it there")
         there_are = ", ".join(sorted(self._taught)) or "none"

@@ -15,7 +15,7 @@ from trirail_drivers.interface import PowerState
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.records import SIZE, unpack
 from trirail.wire.sizes import MAX_MESSAGE
-from trirail.wire.text import NAME_RULE, is_name, printable, quoted
+from trirail.wire.text import NAME_RULE, QUANTITY_RULE, is_name, is_quantity, printable, quoted
 from trirail.wire.vocabulary import MODES
 
 JSON, MSGPACK, BINARY = "application/json", "application/msgpack", "application/octet-stream"
@@ -51,6 +51,14 @@ def check_name(name: str, whose: str) -> str:
     """Return what may name a robot or user. Raises RefusedError."""
     if not is_name(name):
         raise RefusedError(RefusalCode.BAD_NAME, f"{whose} {quoted(name)!r} cannot be in a key: {NAME_RULE} are taken")
+    return name
+
+
+def check_new_pose(name: str) -> str:
+    """Return what may name a pose that is taught: a name that goto takes for no quantity. Raises RefusedError."""
+    check_name(name, "pose")
+    if is_quantity(name):
+        raise RefusedError(RefusalCode.BAD_NAME, f"pose {name!r} {QUANTITY_RULE}")
     return name
 
 

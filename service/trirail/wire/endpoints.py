@@ -1,10 +1,15 @@
-"""Who reaches a Zenoh endpoint: this machine's users, those whom a socket's file lets, or a whole network."""
+"""What an endpoint of Zenoh lacks, and who reaches it: a machine's users, those of a socket's file, a whole network."""
 
 from __future__ import annotations
 
 import ipaddress
 from enum import StrEnum
 from pathlib import Path
+
+LIKE = "an endpoint is protocol/address, as tcp/127.0.0.1:7447"
+_WITH_PORT = frozenset({"tcp", "tls", "udp", "quic", "ws"})
+_LAST_PORT = 65535
+_Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class ReachableBy(StrEnum):
@@ -14,6 +19,50 @@ class ReachableBy(StrEnum):
     MACHINE = "every user of this machine"
     CERTIFICATE = "who has a role, by his certificate,"
     NETWORK = "everybody in the network"
+
+
+def fault_of(endpoint: str) -> str:
+    """Return what an endpoint lacks, and what one looks like, in words; "" where it lacks nothing."""
+    protocol, address = _parts(endpoint)
+    if "/" not in endpoint or not protocol:
+        return f"the protocol is missing: {LIKE}"
+    if not address:
+        return f"the address is missing: {LIKE}"
+    if protocol not in _WITH_PORT:
+        return ""
+    host, colon, port = address.rpartition(":")
+    if address.endswith("]") or not colon:
+        return f"the port is missing: {LIKE}"
+    if not host:
+        return f"the host is missing: {LIKE}"
+    if ":" in host and not (host.startswith("[") and host.endswith("]")):
+        return f"an IPv6 address is in brackets, and the port behind them, as {protocol}/[::1]:7447"
+    if not (port.isascii() and port.isdigit() and len(port) <= len(str(_LAST_PORT)) and 1 <= int(port) <= _LAST_PORT):
+        return f"its port must be 1 to {_LAST_PORT}: {LIKE}"
+    return ""
+
+
+def tcp_address(endpoint: str) -> tuple[str, int] | None:
+    """Return host and port of an endpoint that has them and takes a port of TCP, None of any other."""
+    protocol, address = _parts(endpoint)
+    host, _, port = address.rpartition(":")
+    return (host.strip("[]"), int(port)) if protocol in {"tcp", "tls", "ws"} else None
+
+
+def same_port(one: tuple[str, int], other: tuple[str, int]) -> bool:
+    """Whether two hosts and ports cannot be listened on at once; of host names only those that are equal."""
+    if one[1] != other[1]:
+        return False
+    try:
+        first, second = (ipaddress.ip_address("127.0.0.1" if host == "localhost" else host) for host, _ in (one, other))
+    except ValueError:
+        return one[0] == other[0]
+    return first == second or _covers(first, second) or _covers(second, first)
+
+
+def _covers(every: _Address, other: _Address) -> bool:
+    """Whether one address stands for all of a machine's, the other among them; that of IPv6 also for those of IPv4."""
+    return every.is_unspecified and every.version >= other.version
 
 
 def reach(endpoint: str) -> ReachableBy:

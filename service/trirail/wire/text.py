@@ -12,14 +12,22 @@ from trirail.wire.sizes import MAX_NAME, MAX_TEXT
 _HIDDEN = frozenset({"Cc", "Cf", "Cs", "Co", "Zl", "Zp"})
 """Unicode's categories of what steers a terminal, reorders or ends a line, or cannot be seen."""
 _NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{MAX_NAME}}}")
+_QUANTITY = re.compile(r"-?[0-9]+([eE]-?[0-9]+)?(m|cm|mm|um|nm|in|rad|mrad|urad|deg|s|ms|us|min)?")
+"""What is a name by its characters and, on the command line, a number or one with a unit."""
 
 NAME_RULE = f"letters, digits, - and _, at most {MAX_NAME}"
+QUANTITY_RULE = "reads as a number or a quantity: a pose is told from one by its name, as p5mm"
 ID_RULE = f"at most {MAX_NAME} characters, none of them for control or formatting"
 
 
 def is_name(text: str) -> bool:
     """Whether it may name a robot or a user in a key."""
     return _NAME.fullmatch(text) is not None
+
+
+def is_quantity(name: str) -> bool:
+    """Whether a name reads as a number, or as one with a unit: 10, 5mm."""
+    return _QUANTITY.fullmatch(name) is not None
 
 
 def is_id(text: str) -> bool:

@@ -139,7 +139,7 @@ def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.S
             **_tls(credentials),
         },
         f"no service at {locator}, or none that takes more clients",
-        "start one with: trirail run configs/sim.toml, or name its address with --connect",
+        "start one with: trirail run, or name its address with --connect",
     )
 
 

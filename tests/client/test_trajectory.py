@@ -1,0 +1,71 @@
+"""Trajectories from files: read as written, or refused with file, line, column and what would be right."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.client.trajectory import read
+from trirail.errors import TrirailError
+from trirail.wire.messages import TrajectoryPoint
+
+HEAD = ("t", "x", "y", "phi", "vx", "vy", "w")
+NUMBER = st.floats(-100.0, 100.0)
+ROWS = st.lists(st.tuples(*(NUMBER,) * len(HEAD)), min_size=2, max_size=5)
+
+
+def csv_of(rows: list[list[str]], head: tuple[str, ...] = HEAD) -> str:
+    return "\n".join(",".join(row) for row in (head, *rows)) + "\n"
+
+
+def read_text(text: str, name: str = "path.csv") -> list[TrajectoryPoint]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_text(text)
+        return read(path)
+
+
+@given(ROWS)
+def test_what_is_written_is_read(rows: list[tuple[float, ...]]) -> None:
+    points = read_text(csv_of([[repr(value) for value in row] for row in rows]))
+    assert [(each.t, each.x, each.y, each.phi, *(each.velocity or ())) for each in points] == rows
+
+
+@given(ROWS, st.data())
+def test_a_row_that_is_too_short_or_too_long_is_named(rows: list[tuple[float, ...]], data: st.DataObject) -> None:
+    cells = [[repr(value) for value in row] for row in rows]
+    line = data.draw(st.integers(0, len(rows) - 1))
+    count = data.draw(st.integers(1, 9).filter(lambda count: count != len(HEAD)))
+    cells[line] = (cells[line] * 2)[:count]
+    with pytest.raises(TrirailError, match=rf"path\.csv: line {line + 2}: {count} of 7 columns$"):
+        read_text(csv_of(cells))
+
+
+@given(ROWS, st.data(), st.sampled_from(["mm", "deg", "s", " m"]))
+def test_a_cell_that_is_no_number_is_named(rows: list[tuple[float, ...]], data: st.DataObject, unit: str) -> None:
+    cells = [[repr(value) for value in row] for row in rows]
+    line, column = data.draw(st.integers(0, len(rows) - 1)), data.draw(st.integers(0, len(HEAD) - 1))
+    wrong = cells[line][column] = data.draw(st.sampled_from(["10" + unit, "x", "nan", "inf", ""]))
+    with pytest.raises(TrirailError) as refused:
+        read_text(csv_of(cells))
+    where = f"path.csv: line {line + 2}, column {HEAD[column]}: {wrong!r} is no number"
+    assert f"{where}; a CSV has bare metres, radians and seconds" in str(refused.value)
+
+
+@pytest.mark.parametrize("rows", [0, 1])
+def test_a_trajectory_of_fewer_than_two_points_is_told_by_its_file(rows: int) -> None:
+    said = rf"path\.(csv|json): {('no points', 'one point')[rows]}: a trajectory has 2 at least"
+    with pytest.raises(TrirailError, match=said):
+        read_text(csv_of([["0"] * len(HEAD)] * rows))
+    with pytest.raises(TrirailError, match=said):
+        read_text(json.dumps([{"t": 0.0, "x": 0.0, "y": 0.0, "phi": 0.0}] * rows), "path.json")
+
+
+@pytest.mark.parametrize("head", ["t,x,y", "t,x,y,phi,vx", "t,x,y,phi,vx,vy,w,ax", "t,t,x,y,phi", "t,x,y,phi,z", ""])
+def test_columns_are_those_that_there_are_each_once_and_by_threes(head: str) -> None:
+    with pytest.raises(TrirailError, match=r"line 1: columns .*; wanted t, x, y, phi, and if known vx, vy, w and"):
+        read_text(head + "\n")
