@@ -22,7 +22,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from trirail import as_built, config
+from trirail import config
+from trirail.config import as_built
 from trirail.errors import ConfigError, TrirailError
 from trirail.kinematics import correction_fit
 from trirail.kinematics.algebra import Array

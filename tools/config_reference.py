@@ -42,9 +42,9 @@ trirail doctor robot.toml                   # this machine, its rights, the CAN 
 ```
 
 How to bring a real robot up with one: [drivers/README.md](../drivers/README.md).
-A key is added in `service/trirail/config.py` or, for bus and drives, in `drivers/trirail_drivers/config.py`, with a
-docstring that gives meaning and unit. What follows is made from there by `tools/config_reference.py`; a test holds
-the two together.
+A key is added in `service/trirail/config/tables.py` or, for bus and drives, in `drivers/trirail_drivers/config.py`,
+with a docstring that gives meaning and unit. What follows is made from there by `tools/config_reference.py`; a test
+holds the two together.
 """
 
 

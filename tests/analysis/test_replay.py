@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from trirail.analysis.replay import again
 from trirail.analysis.summary import summary
-from trirail.as_built import AsBuilt, geometry_of, written
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.config import SIM, Config, geometry, load
+from trirail.config.as_built import AsBuilt, geometry_of, written
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import Recording, join, read

@@ -193,7 +193,7 @@ def test_a_correction_of_nothing_changes_no_bit() -> None:
     """Setpoints of a whole session, with a map of zeros and without [correction]."""
     zeros = np.zeros((5, 5, 5, 3)).tolist()
     low, high = (-0.15, -0.15, -1.2), (0.15, 0.15, 0.85)
-    from trirail.as_built import AsBuilt, geometry_of
+    from trirail.config.as_built import AsBuilt, geometry_of
 
     nothing = AsBuilt(made="today", geometry=geometry_of(PLAIN), low=low, high=high, nodes=zeros)
     told = msgspec.structs.replace(QUICK.correction, as_built=nothing)

@@ -11,9 +11,8 @@ from trirail_drivers.bus.load import HIGH
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
-from trirail import as_built
 from trirail.cli import units
-from trirail.config import Config
+from trirail.config import Config, as_built
 from trirail.processes.clock import Tick
 from trirail.processes.guard import Guard
 from trirail.wire.endpoints import ReachableBy, endpoint_of, reach

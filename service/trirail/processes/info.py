@@ -8,8 +8,7 @@ from typing import Any
 import msgspec
 from trirail_drivers.interface import NAMES
 
-from trirail import as_built
-from trirail.config import Config, geometry
+from trirail.config import Config, as_built, geometry
 from trirail.telemetry.provenance import software, versions
 from trirail.wire.state import Info
 

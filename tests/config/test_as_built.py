@@ -13,10 +13,9 @@ import pytest
 from conftest import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail import as_built
-from trirail.as_built import AsBuilt, geometry_of, parse, written
 from trirail.cli import doctor
-from trirail.config import SIM, Config, corrected_geometry, geometry, load
+from trirail.config import SIM, Config, as_built, corrected_geometry, geometry, load
+from trirail.config.as_built import AsBuilt, geometry_of, parse, written
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import PLANNED
