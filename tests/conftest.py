@@ -18,6 +18,7 @@ import can
 import msgspec
 import numpy as np
 import pytest
+import trirail
 from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
@@ -295,7 +296,7 @@ def _peak(cycle: Callable[[], None], cycles: int) -> int:
 def _allocated_here() -> tracemalloc.Snapshot:
     """Return what is held that code of the package has allocated, called from here."""
     found = tracemalloc.take_snapshot()
-    for one in ("*/trirail/*", __file__):
+    for one in (f"{os.path.dirname(trirail.__file__)}/*", __file__):
         found = found.filter_traces([tracemalloc.Filter(True, one, all_frames=True)])
     return found
 

@@ -57,7 +57,7 @@ def test_what_it_foretells_is_no_less_than_what_it_leaves(seed: int) -> None:
     poses, random = reached(150, seed), np.random.default_rng(seed)
     sliders = inverse(robot(seed), poses).position
     found = fit(PLAIN, poses + random.normal(0.0, 1e-5, poses.shape), sliders, ROOM, (4, 4, 4))
-    assert (found.foretold.std(axis=0) >= 0.9e-5).all()
+    assert (found.foretold.std(axis=0) >= 0.8e-5).all()  # of 150 poses, the noise of 1e-5 itself spreads by 6 %
     assert (found.foretold.std(axis=0) >= found.residuals.std(axis=0)).all()
 
 
