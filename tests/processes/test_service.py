@@ -57,6 +57,7 @@ class Service:
         for before, after in {
             'listen = ["tcp/127.0.0.1:7447"]': f'listen = ["{self.locator}"]',
             "live_port = 9876": "live_port = 0\ncapture_can = true",
+            "max_overruns = 100 ": "max_overruns = 1000 ",  # a shared machine stalls now and then
             'directory = "recordings"': f'directory = "{folder}/recordings"',
             **changes,
         }.items():
