@@ -55,7 +55,7 @@ def main() -> int:
     """Run it; exit code 0 only if everything held."""
     parser = argparse.ArgumentParser(description="The service on real SocketCAN, in a machine that QEMU emulates.")
     parser.add_argument("--install", action="store_true", help="install missing Debian packages first (as root)")
-    parser.add_argument("--timeout", type=float, default=900.0, help="of the whole run [s]; default 900")
+    parser.add_argument("--timeout", type=float, default=1500.0, help="of the whole run [s]; default 1500")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="where to leave the logs")
     parser.add_argument("--json", action="store_true", help="print one JSON object; progress goes to standard error")
     options = parser.parse_args()
