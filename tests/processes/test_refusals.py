@@ -1,0 +1,58 @@
+"""What is refused: the asker is answered always, everyone is told, so many times a second and user."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from trirail.errors import RefusalCode, RefusedError
+from trirail.processes import refusals
+from trirail.processes.inbox import Incoming
+from trirail.processes.refusals import REFUSALS_OF_ALL, REFUSALS_PER_SECOND, Refusals
+from trirail.wire import packets
+from trirail.wire.messages import ErrorReply
+
+
+class Listener:
+    """Stands for the loop and for the askers, and for the clock."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        self.told: list[Any] = []
+        self.answers: list[Any] = []
+        link: Any = SimpleNamespace(send=lambda packet: self.told.append(packets.decode_request(packet[1:])))
+        replies: Any = SimpleNamespace(send=lambda _, content: self.answers.append(content))
+        monkeypatch.setattr(refusals, "time", SimpleNamespace(monotonic=lambda: self.now))
+        self.refusals = Refusals(link, replies)
+
+    def refuse(self, user: str) -> None:
+        message = Incoming("goal", f"trirail/demo/goal/{user}", 0, b"", "", None)
+        self.refusals.refuse(message, RefusedError(RefusalCode.BUSY, "send fewer"))
+
+
+@pytest.fixture
+def listener(monkeypatch: pytest.MonkeyPatch) -> Listener:
+    return Listener(monkeypatch)
+
+
+def test_each_refusal_is_answered_and_a_user_s_are_told_so_many_times_a_second(listener: Listener) -> None:
+    for _ in range(3 * REFUSALS_PER_SECOND):
+        listener.refuse("ann")
+    listener.refuse("bob")
+    assert listener.answers == [ErrorReply(RefusalCode.BUSY, "send fewer")] * (3 * REFUSALS_PER_SECOND + 1)
+    assert [said.user for said in listener.told] == ["ann"] * REFUSALS_PER_SECOND + ["bob"]
+    assert {said.message for said in listener.told} == {"send fewer"}
+    listener.now += 0.99
+    listener.refuse("ann")
+    assert len(listener.told) == REFUSALS_PER_SECOND + 1
+    listener.now += 0.02
+    listener.refuse("ann")
+    assert len(listener.told) == REFUSALS_PER_SECOND + 2
+
+
+def test_of_all_users_together_so_many_are_told_a_second(listener: Listener) -> None:
+    for number in range(2 * REFUSALS_OF_ALL):
+        listener.refuse(f"user{number}")
+    assert len(listener.told) == REFUSALS_OF_ALL
+    assert len(listener.answers) == 2 * REFUSALS_OF_ALL
