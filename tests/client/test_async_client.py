@@ -76,10 +76,6 @@ class Silent:
         keep = zenoh.handlers.Callback(self.asked.put, indirect=False)
         self._declared = session.declare_queryable("trirail/demo/**", keep)
 
-    def key(self) -> str:
-        with self.asked.get(timeout=WITHIN) as query:
-            return str(query.key_expr).removeprefix("trirail/demo/")
-
     def answer(self, message: msgspec.Struct) -> str:
         with self.asked.get(timeout=WITHIN) as query:
             payload = msgspec.json.encode(message)
@@ -121,13 +117,18 @@ def run(locator: str, work: Work) -> None:
     asyncio.run(main())
 
 
-async def cancelled(awaitable: Awaitable[object], begun: Callable[[], object]) -> None:
-    """Cancel a task once it has begun, and wait for its end."""
-    task = asyncio.ensure_future(awaitable)
-    await asyncio.to_thread(begun)
+async def cancel(task: asyncio.Future[object]) -> None:
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
+
+
+async def cancel_when_asked(awaitable: Awaitable[object], silent: Silent) -> str:
+    """Cancel a call whose query has come; return its key. The query stays open: its end would be an answer too."""
+    task = asyncio.ensure_future(awaitable)
+    with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as query:
+        await cancel(task)
+        return str(query.key_expr).removeprefix("trirail/demo/")
 
 
 def test_a_hundred_calls_at_once_take_no_thread(silent: Silent, locator: str) -> None:
@@ -158,7 +159,7 @@ def test_a_call_that_is_cancelled_leaves_nothing(silent: Silent, locator: str, k
     keys: list[str] = []
 
     async def work(robot: AsyncRobot) -> None:
-        await cancelled(CALLS[key](robot), lambda: keys.append(silent.key()))
+        keys.append(await cancel_when_asked(CALLS[key](robot), silent))
 
     run(locator, work)
     assert keys == [key]
@@ -169,7 +170,7 @@ def test_a_goal_whose_sending_is_cancelled_is_stopped_if_it_was_taken(silent: Si
     keys: list[str] = []
 
     async def work(robot: AsyncRobot) -> None:
-        await cancelled(robot.move_to(x=0.0, y=0.0, phi=0.0, id="g"), lambda: keys.append(silent.key()))
+        keys.append(await cancel_when_asked(robot.move_to(x=0.0, y=0.0, phi=0.0, id="g"), silent))
         with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as query:
             assert query.payload is not None
             keys.append(f"{query.key_expr} {query.payload.to_string()}")
@@ -207,7 +208,9 @@ def test_a_goal_is_waited_for_and_cancelling_the_wait_does_not_stop_it(silent: S
         assert (goal.duration, goal.result) == (1.0, None)
         with pytest.raises(TimeoutError, match=r"goal g has not ended within 0\.01 s"):
             await goal.wait(0.01)
-        await cancelled(goal.wait(), lambda: None)
+        forgotten = asyncio.ensure_future(goal.wait())
+        await asyncio.sleep(0)
+        await cancel(forgotten)
         waiting = [asyncio.ensure_future(goal.wait(WITHIN)) for _ in range(3)]
         await asyncio.to_thread(silent.publish, "event", end)
         assert {(await each).outcome for each in waiting} == {"done"}
@@ -251,7 +254,9 @@ def test_a_subscription_ends_with_who_iterates(silent: Silent, locator: str) -> 
 
         for states in (robot.states, robot.events):
             await iterate(states(timeout=0.01))
-            await cancelled(iterate(states()), lambda: None)
+            iterating = asyncio.ensure_future(iterate(states()))
+            await asyncio.sleep(0.01)
+            await cancel(iterating)
             with pytest.raises(TimeoutError):
                 await asyncio.wait_for(anext(states()), 0.01)
         with pytest.raises(ServiceError, match="no robot"):
