@@ -103,8 +103,8 @@ def recorder(*, seconds: float = 60.0, json: bool = False) -> None:
 
 
 @app.command
-def scrape(*, seconds: float = 65.0, json: bool = False) -> None:
-    """Lateness with a scrape of the metrics each second, and without, by turns in one run of three times as long."""
+def scrape(*, seconds: float = 120.0, json: bool = False) -> None:
+    """Lateness with a scrape of the metrics each second: of all cycles, and without those around the scrapes."""
     import bench_scrape
 
     bench_scrape.main(seconds, json)

@@ -117,7 +117,7 @@ def run(locator: str, work: Work) -> None:
     asyncio.run(main())
 
 
-async def cancel(task: asyncio.Future[object]) -> None:
+async def cancel(task: asyncio.Future[Any]) -> None:
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task

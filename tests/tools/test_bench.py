@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import bench_aims
+import bench_scrape
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -85,12 +87,18 @@ def test_a_fleet_is_measured_behind_a_router_that_comes_and_goes() -> None:
 
 
 @pytest.mark.slow
-def test_lateness_is_measured_with_scrapes_and_without() -> None:
+def test_lateness_is_measured_with_the_cycles_of_scrapes_and_without() -> None:
     told = measured("scrape")
     assert told["scrapes"] > 0
-    assert set(told["lateness_us"]) == {"quiet", "scraped", "quiet again"}
-    for values in told["lateness_us"].values():
+    assert 0 < told["cycles_of_scrapes"] < told["cycles"]
+    for values in (*told["lateness_us"].values(), told["lateness_of_scrapes_us"]):
         assert is_spread(values, told["quantiles"])
+
+
+def test_cycles_are_of_a_scrape_from_its_beginning_to_its_end() -> None:
+    spans = np.array([[1.0, 1.1], [2.0, 2.1]])
+    times = np.array([0.9, 1.0, 1.05, 1.1, 1.11, 1.99, 2.1, 2.2])
+    assert bench_scrape.within(times, spans).tolist() == [False, True, True, True, False, False, True, False]
 
 
 @pytest.mark.slow
