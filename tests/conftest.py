@@ -23,8 +23,8 @@ from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
 from trirail.control.control import Control, Given
-from trirail.control.ledger import Notice
 from trirail.control.local_planner import LocalPlanner
+from trirail.control.notices import Notice
 from trirail.motion.paths import FOR_EVER, Path, constant
 from trirail.motion.runs import MotionState
 from trirail.wire.messages import Goal, PoseGoal

@@ -40,6 +40,12 @@ def top_level(*packages: ModuleType) -> Iterator[ast.stmt]:
         ("from trirail import read", {"numpy", "rerun"}),
         ("from trirail.cli import commands", {"numpy", "zenoh", "rich", "cyclopts"}),
         ("from trirail.telemetry.session_index import SessionIndex", set()),
+        ("from trirail.config import SIM, load; load(SIM)", {"numpy", "can", "canopen"}),
+        ("from trirail.processes import supervisor", {"numpy"}),
+        ("from trirail.processes import gateway", {"numpy", "zenoh"}),
+        ("from trirail.processes import planner", {"numpy", "numba", "ruckig"}),
+        ("from trirail.processes import loop", {"numpy", "numba", "ruckig", "can", "canopen"}),
+        ("from trirail.processes import recording", {"numpy", "numba", "rerun", "can"}),
     ],
 )
 def test_each_name_loads_what_it_needs_and_no_more(statement: str, loaded: set[str]) -> None:

@@ -8,7 +8,7 @@ import timeit
 from collections.abc import Callable
 
 import numpy as np
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.closure import inverse_batch
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import forward_into, inverse, inverse_into, warm_up

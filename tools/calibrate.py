@@ -26,7 +26,7 @@ from trirail import config
 from trirail.config import as_built
 from trirail.errors import ConfigError, TrirailError
 from trirail.kinematics import correction_fit
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.calibration import PARAMETERS, Calibration, CalibrationError, identify
 from trirail.kinematics.geometry import LEGS, Geometry, singular_angles
 from trirail_drivers import files

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from trirail.errors import ServiceError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse
 

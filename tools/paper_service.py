@@ -19,7 +19,7 @@ from trirail.client import own_service
 from trirail.client.client import GoalHandle, Robot
 from trirail.config import SIM, load
 from trirail.errors import RefusedError, ServiceError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.telemetry.reading import Recording, read
 from trirail.wire.messages import TrajectoryPoint
 from trirail.wire.vocabulary import MODES, Mode

@@ -19,8 +19,8 @@ import pytest
 from conftest import CONFIG
 from trirail.config import geometry
 from trirail.control.control import Control, Given
-from trirail.control.ledger import Notice
 from trirail.control.local_planner import LocalPlanner
+from trirail.control.notices import Notice
 from trirail.errors import KinematicsError
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import Config, geometry
 from trirail.control.in_position import Settling, monitor
-from trirail.control.ledger import Notice
 from trirail.control.modes import ModeEvent
+from trirail.control.notices import Notice
 from trirail.kinematics.robot import inverse
 from trirail.wire.messages import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, Confirmed

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.control.ledger import REMEMBERED_IDS, Ledger
+from trirail.control.ledger import Ledger
+from trirail.control.notices import REMEMBERED_IDS
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.messages import PoseGoal, VelocityGoal

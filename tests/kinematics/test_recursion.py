@@ -10,7 +10,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from trirail.kinematics.recursion import Joint, follow, joint_motion, platform_centre, platform_motion, serial_leg
+from trirail.kinematics.joints import Joint, serial_leg
+from trirail.kinematics.recursion import follow, joint_motion, platform_centre, platform_motion
 
 Array = NDArray[np.float64]
 Kind = Literal["prismatic", "revolute"]

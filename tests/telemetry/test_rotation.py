@@ -21,7 +21,7 @@ from trirail.processes.loop import BATCHES_PER_SECOND
 from trirail.processes.recording import GATHER
 from trirail.telemetry import blackbox, provenance, retention
 from trirail.telemetry.blackbox import AFTER, BEFORE, BlackBox
-from trirail.telemetry.columns import SOFTWARE
+from trirail.telemetry.provenance import SOFTWARE
 from trirail.telemetry.reading import Recording, join, read
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder

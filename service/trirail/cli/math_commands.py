@@ -11,7 +11,7 @@ from trirail.errors import KinematicsError
 
 if TYPE_CHECKING:
     from trirail.config import Config
-    from trirail.kinematics.algebra import Array
+    from trirail.kinematics.arrays import Array
     from trirail.kinematics.geometry import Geometry
     from trirail.motion.limits import Violation
 

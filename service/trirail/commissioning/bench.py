@@ -12,7 +12,7 @@ from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, T
 
 from trirail.commissioning.moves import SlowMove
 from trirail.config import Config
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 
 FOLLOWING: Final = 0.0003
 """How far a powered slider may be from its setpoint before everything is stopped [m]: at 5 mm/s a drive without

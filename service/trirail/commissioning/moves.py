@@ -9,7 +9,7 @@ import numpy as np
 from ruckig import InputParameter, Ruckig, Trajectory
 
 from trirail.config import Config, SliderLimits, geometry
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.limits import beyond
 from trirail.motion.ruckig_call import solved

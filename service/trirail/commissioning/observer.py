@@ -11,7 +11,7 @@ from trirail_drivers.simulated import Carriages
 from trirail.commissioning.bench import FOLLOWING
 from trirail.commissioning.moves import DISTANCE
 from trirail.commissioning.person import Person, Question, choose, number
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 
 SEEN = 0.00005
 """How far a simulated slider must have gone for somebody to see it [m]."""

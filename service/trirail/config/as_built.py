@@ -22,7 +22,7 @@ from trirail_drivers.errors import FileError
 from trirail_drivers.interface import Triple
 
 from trirail.errors import ConfigError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.correction import STEEPEST, Correction
 from trirail.kinematics.geometry import LEGS, Geometry, Room, travels
 from trirail.wire.state import CorrectionTold

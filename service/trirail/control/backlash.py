@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.motion.take_up import TakeUp
 

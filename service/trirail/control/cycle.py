@@ -25,7 +25,7 @@ from trirail_drivers.interface import PowerState
 
 from trirail.control.backlash import BACKLASH, add_offset, due_offset, keep_offset, let_go, taking_up
 from trirail.control.in_position import MONITOR, monitor
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.closure import forward_into, inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import Geometry

@@ -9,7 +9,7 @@ from trirail.config import InPosition
 from trirail.control import cycle
 from trirail.control.backlash import backlash
 from trirail.control.in_position import Settling
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.robot import forward_into
 from trirail.motion.runs import STILL
 from trirail.motion.take_up import NO_BACKLASH, TakeUp

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 from trirail_drivers.interface import Triple
 
 from trirail.control.in_position import Settled
+from trirail.control.notices import REMEMBERED_IDS, Notice
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.messages import (
@@ -19,7 +20,6 @@ from trirail.wire.messages import (
     Outcome,
     PoseGoal,
     RenewedGoal,
-    Residual,
     TrackGoal,
     TrajectoryGoal,
     VelocityGoal,
@@ -39,34 +39,12 @@ from trirail.wire.vocabulary import Command
 
 Withdrawal = Literal["stopped", "faulted"]
 """How a goal ends that has been sent but did not begin: the outcome in its event, and the code of its refusal."""
-REMEMBERED_IDS = 10_000
-"""Goals whose ids may not be used again; older ones are forgotten."""
-
-
 _LEVELS: dict[Outcome, Level] = {
     "faulted": "error",
     "rejected": "warning",
     "expired": "warning",
     "unsettled": "warning",
 }
-
-
-class Notice(NamedTuple):
-    """Something to tell everyone, in the order in which it happened."""
-
-    kind: str
-    level: Level
-    message: str
-    mode: str | None = None
-    id: str | None = None
-    outcome: Outcome | None = None
-    reason: str | None = None
-    goal: str | None = None
-    user: str | None = None
-    settle: float | None = None
-    residual: Residual | None = None
-    overshoot: Triple | None = None
-    fault: FaultDetail | None = None
 
 
 class ActiveGoal(NamedTuple):

@@ -10,7 +10,7 @@ from trirail_drivers.interface import NAMES, Triple
 from trirail.control import cycle
 from trirail.control.feedback import Measured
 from trirail.errors import RefusalCode, RefusedError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.limits import Bounds
 from trirail.motion.runs import Run

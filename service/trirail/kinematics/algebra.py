@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
+from trirail.kinematics.arrays import Matrix, Vector
 from trirail.kinematics.compiled import compiled
 
 __all__ = [
-    "Array",
-    "Matrix",
-    "Vector",
     "add",
     "cross",
     "dot",
@@ -25,10 +19,6 @@ __all__ = [
     "transposed_times",
     "turned",
 ]
-
-Array: TypeAlias = NDArray[np.float64]
-Vector: TypeAlias = tuple[float, float, float]
-Matrix: TypeAlias = tuple[Vector, Vector, Vector]  # three rows
 
 
 @compiled()

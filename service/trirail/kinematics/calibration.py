@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
 from trirail.errors import KinematicsError, TrirailError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import LEGS, Geometry, Leg
 from trirail.kinematics.robot import forward, inverse, jacobians
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from trirail.kinematics.algebra import Array, Matrix, Vector, add, cross, dot, scale, subtract, times
+from trirail.kinematics.algebra import add, cross, dot, scale, subtract, times
+from trirail.kinematics.arrays import Array, Matrix, Vector
 from trirail.kinematics.compiled import compiled
-from trirail.kinematics.correction import corrected_motion, is_corrected, real_motion
+from trirail.kinematics.corrected import corrected_motion, is_corrected, real_motion
 from trirail.kinematics.geometry import PARALLEL
 from trirail.kinematics.recursion import BASE, ZERO, joint_motion, link, platform_centre
 

@@ -23,8 +23,10 @@ ROOMS = ("kinematics", "motion", "control")
 
 def _sources() -> bytes:
     package = Path(__file__).parents[1]
-    sources = [file.read_bytes() for room in ROOMS for file in sorted((package / room).glob("*.py"))]
-    return b"".join(source for source in sources if b"compiled" in source)
+    files = [file for room in ROOMS for file in sorted((package / room).glob("*.py"))]
+    sources = [(file.parent.name, file.read_bytes()) for file in files]
+    # Constants come from any file of the kinematics; elsewhere from those that have compiled functions themselves.
+    return b"".join(source for room, source in sources if room == ROOMS[0] or b"compiled" in source)
 
 
 FINGERPRINT = hashlib.sha256(_sources()).hexdigest()

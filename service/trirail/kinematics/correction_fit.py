@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trirail.errors import KinematicsError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.calibration import CalibrationError, pose_derivatives
 from trirail.kinematics.correction import DEGREE, Correction, splines
 from trirail.kinematics.geometry import Geometry, Room, travels

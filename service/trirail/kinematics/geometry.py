@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trirail.errors import KinematicsError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.correction import Correction
-from trirail.kinematics.recursion import Joint, serial_leg
+from trirail.kinematics.joints import Joint, serial_leg
 
 __all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "Room", "gains", "singular_angles", "travels"]
 

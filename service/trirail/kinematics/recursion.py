@@ -7,7 +7,7 @@ components from T_{k-1} to T_k, its transpose takes them back. Motion is in the 
 lie in it, revolute axes are normal to it. The last link is the platform or fixed to it; r_n^G leads from A_n
 to its centre G.
 
-A leg is a float64 array of shape (n + 1, 13), made by `serial_leg`, with a row for each joint and one for G:
+A leg is a float64 array of shape (n + 1, 13), made by `joints.serial_leg`, with a row for each joint and one for G:
 
     column  0        1 for a revolute joint, 0 for a prismatic one
     columns 1 to 3   the constant part of r_{k,k-1}, in T_{k-1} [m]; in the last row r_n^G, in T_n
@@ -19,16 +19,9 @@ What is singular or not finite comes out as an infinity or NaN; whoever closes a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
-
-import numpy as np
-from numpy.typing import ArrayLike
+from typing import NamedTuple
 
 from trirail.kinematics.algebra import (
-    Array,
-    Matrix,
-    Vector,
     add,
     cross,
     dot,
@@ -40,12 +33,12 @@ from trirail.kinematics.algebra import (
     transposed_times,
     turned,
 )
+from trirail.kinematics.arrays import Array, Matrix, Vector
 from trirail.kinematics.compiled import compiled
 
 __all__ = [
     "AT_REST",
     "BASE",
-    "Joint",
     "Link",
     "LinkMotion",
     "follow",
@@ -54,16 +47,7 @@ __all__ = [
     "link_motion",
     "platform_centre",
     "platform_motion",
-    "serial_leg",
 ]
-
-
-class Joint(NamedTuple):
-    """A joint of a leg: its kind and the constant parts of q_{k,k-1} (3, 3) and of r_{k,k-1} (3,) [m]."""
-
-    kind: Literal["prismatic", "revolute"]
-    constant: ArrayLike
-    offset: ArrayLike = (0.0, 0.0, 0.0)
 
 
 class Link(NamedTuple):
@@ -90,25 +74,6 @@ U3: Vector = (0.0, 0.0, 1.0)
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), U3)
 BASE = Link(False, IDENTITY, ZERO, IDENTITY, ZERO)
 AT_REST = LinkMotion(ZERO, ZERO, ZERO, ZERO)
-
-
-def serial_leg(joints: Sequence[Joint], tip: ArrayLike) -> Array:
-    """Return the leg (n + 1, 13) of n joints with r_n^G = tip [m]; ValueError if it leaves the plane."""
-    leg = np.zeros((len(joints) + 1, 13))
-    q_k0 = np.eye(3)  # with all variables at zero; they do not change which axes are normal to the plane
-    for k, (kind, constant, offset) in enumerate(joints):
-        leg[k, 0] = kind == "revolute"
-        leg[k, 1:4] = offset
-        leg[k, 4:13] = np.ravel(constant)
-        q = leg[k, 4:13].reshape(3, 3)
-        if not np.allclose(q @ q.T, np.eye(3), atol=1e-12):
-            raise ValueError(f"joint {k + 1}: its constant matrix is not orthogonal")
-        out_of_plane = leg[k, 1:4] @ q_k0[:, 2]
-        q_k0 = q @ q_k0
-        if abs(abs(q_k0[2, 2]) - leg[k, 0]) > 1e-12 or abs(out_of_plane) > 1e-12:
-            raise ValueError(f"joint {k + 1}: with this axis and offset a {kind} joint leaves the plane")
-    leg[-1, 1:4] = tip
-    return leg
 
 
 @compiled()

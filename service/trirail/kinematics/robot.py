@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trirail.errors import KinematicsError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.closure import (
     J2_SINGULAR,
     LOOPS_OPEN,

@@ -11,7 +11,7 @@ import numpy as np
 
 from trirail.config import Limits
 from trirail.errors import RefusalCode, RefusedError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.limits import COORDINATES, Bounds, Violation

@@ -10,7 +10,7 @@ from numba import f8, from_dtype, i8
 from numpy.typing import ArrayLike, NDArray
 
 from trirail.config import Limits
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import LEGS
 from trirail.motion.paths import ROUNDING

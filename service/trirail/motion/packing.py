@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.motion.paths import Path, sound
 from trirail.motion.runs import Run, Seam
 from trirail.wire.planning import PackedPath, PackedRun

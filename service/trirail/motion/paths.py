@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail.kinematics.algebra import Array, Vector
+from trirail.kinematics.arrays import Array, Vector
 from trirail.kinematics.closure import LEGS_TYPE, forward_motion
 from trirail.kinematics.compiled import compiled
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.motion.paths import Path
 
 

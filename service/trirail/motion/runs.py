@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from ruckig import Trajectory
 
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.motion.paths import CENTRE, FOR_EVER, Path, advance, constant, path_motion, reached, transfer, value
 
 STILL = (0.0, 0.0, 0.0)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.closure import LEGS_TYPE, forward_motion, inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.recursion import ZERO

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 
 __all__ = ["FIXED", "minimise_time", "spline_states", "too_fast"]

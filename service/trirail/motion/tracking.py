@@ -15,7 +15,7 @@ import numpy as np
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
 from trirail.errors import RefusedError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.motion.feasibility import Checker, Look
 from trirail.motion.limits import Bounds
 from trirail.motion.paths import Path, constant

@@ -8,7 +8,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
-from trirail.kinematics.compiled import FUNCTIONS, tell_of_compiling
 from trirail.processes.systemd import notify
 
 QUARTERS = 4
@@ -25,6 +24,8 @@ class Progress:
 
     def begin(self, name: str) -> None:
         """Take in that a function is being compiled; `patience` seconds may pass until the next one [s]."""
+        from trirail.kinematics.compiled import FUNCTIONS  # with numba, which a start without compiling goes without
+
         before = len(self._begun)
         self._begun.add(name)
         now = len(self._begun)
@@ -38,6 +39,8 @@ class Progress:
 
 def main() -> int:
     """Compile what is not kept yet."""
+    from trirail.kinematics.compiled import tell_of_compiling
+
     tell_of_compiling(Progress(lambda words: print(f"trirail: {words}", flush=True), 0.0).begin)  # noqa: T201
     from trirail.control import cycle  # noqa: F401 - importing compiles
     from trirail.motion import planner  # noqa: F401

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from trirail.control.ledger import REMEMBERED_IDS, Notice
+from trirail.control.notices import REMEMBERED_IDS, Notice
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.packets import Answer, ControlInput, Farewell, GoalRequest, Happened, Status
 from trirail.wire.vocabulary import FaultCause, Mode

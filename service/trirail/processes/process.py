@@ -19,7 +19,6 @@ import msgspec
 
 from trirail.config import Config
 from trirail.errors import TrirailError
-from trirail.kinematics.compiled import tell_of_compiling
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.realtime import die_with_parent
 from trirail.wire import links
@@ -56,7 +55,11 @@ def _main(
 ) -> int:
     order = msgspec.json.decode(sys.stdin.buffer.read(), type=Order)
     config = order.config
-    # Each process imports what it needs and no more: the loop must not load Zenoh or Rerun.
+    # Each process imports what it needs and no more: the loop must not load Zenoh or Rerun, the gateway no mathematics.
+    if name != "gateway":
+        from trirail.kinematics.compiled import tell_of_compiling
+
+        tell_of_compiling(lambda function: ready({COMPILING: function}))
     if name == "loop":
         from trirail.processes import loop
 
@@ -100,8 +103,6 @@ def main() -> int:
         if len(line) <= select.PIPE_BUF and select.select([], [int(descriptor)], [], 0.0)[1]:
             with suppress(BrokenPipeError):
                 os.write(int(descriptor), line)
-
-    tell_of_compiling(lambda function: ready({COMPILING: function}))
 
     hearts, numbers = Heartbeats(int(beats)), [int(number) for number in sockets]
     try:

@@ -14,8 +14,6 @@ from rerun.chunk import Chunk
 SECOND = 1_000_000_000  # [ns]
 RECORD, FIELDS = "/record", rr.ComponentDescriptor("fields")
 """Where every cycle's record stands in a recording, whole: entity path and component."""
-CONFIGURATION, SOFTWARE = "/configuration", "/software"
-"""Where a recording has what made it, as text documents."""
 
 
 class Column(NamedTuple):

@@ -14,8 +14,9 @@ import msgspec
 import trirail_drivers
 
 from trirail.config import Config, parse
-from trirail.telemetry.columns import CONFIGURATION, SOFTWARE
 
+CONFIGURATION, SOFTWARE = "/configuration", "/software"
+"""Where a recording has what made it, as text documents: entity paths."""
 LIBRARIES = ("eclipse-zenoh", "ruckig", "rerun-sdk", "python-can", "canopen", "numpy", "numba")
 _PACKAGES = (Path(__file__).parents[1], Path(trirail_drivers.__path__[0]))
 

@@ -29,8 +29,9 @@ from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
 from trirail.errors import EmptyRecordingError, ServiceError
-from trirail.telemetry.columns import FIELDS, RECORD, SECOND, SOFTWARE, structs
+from trirail.telemetry.columns import FIELDS, RECORD, SECOND, structs
 from trirail.telemetry.journal import EVENTS, JSON, REQUESTS, WORDS
+from trirail.telemetry.provenance import SOFTWARE
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
 from trirail.config import Limits
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
 from trirail.workspace.mechanism import Mechanism
 from trirail.workspace.singularity import conditioning, range_of_j1

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from trirail.config import Limits, Range
 from trirail.errors import KinematicsError
-from trirail.kinematics.algebra import Array
+from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Violation
