@@ -5,6 +5,10 @@ Speed is a ratio within one run, for the machines that this runs on are not alik
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
+
 from cyclopts import App
 
 app = App(help="Speed, as ratios within one run: the machines this runs on are not alike.")
@@ -119,4 +123,5 @@ def everything(*, brief: bool = False, json: bool = False) -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(os.EX_TEMPFAIL))  # so that its services end with it
     app()

@@ -27,12 +27,14 @@ from trirail.wire.packets import (
     Refused,
     Remark,
     Status,
+    Unrecorded,
     Welcome,
     decode_answer,
     message,
 )
 from trirail.wire.planning import MAX_PLANNING, Planned, decode_plan_request, encode
 from trirail.wire.records import unpack
+from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.interface import DriveGroup
 
@@ -42,6 +44,7 @@ class Shell:
 
     def __init__(self, rig: Rig, folder: Path) -> None:
         self.rig = rig
+        self.folder = folder
         names = ("gateway", "recorder", "planner")
         self.ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))
         self.gateway: PacketLink = links.connect(folder / "gateway")
@@ -290,6 +293,31 @@ def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
     assert told[1][1].startswith("the recorder said something unreadable")
     assert len(told) == 2
     assert shell.loop.control.state.mode is Mode.HOLDING
+
+
+def test_that_nothing_is_recorded_stands_in_the_status_while_it_is_so(shell: Shell) -> None:
+    def standing() -> list[str]:
+        shell.cycles(60)
+        said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
+        return [answer.unrecorded for answer in said if isinstance(answer, Status)]
+
+    shell.enabled()
+    shell.recorder.send(message(Remark("info", "recording to x.rrd")))
+    assert set(standing()) == {""}
+    shell.recorder.send(message(Unrecorded("nothing is recorded: /rec is full")))
+    assert standing() == ["nothing is recorded: /rec is full"]
+    shell.recorder.send(message(Unrecorded("")))
+    assert standing() == [""]
+    shell.recorder.send(message(Unrecorded("\x1b[2J" + "x" * 60_000)))
+    (told,) = standing()
+    assert len(told) <= MAX_TEXT
+    assert "\x1b" not in told
+    shell.recorder.close()
+    assert standing() == ["the recorder has gone: nothing is recorded until it is back"]
+    shell.recorder = links.connect(shell.folder / "recorder")
+    shell.cycles(60)
+    shell.recorder.send(message(Remark("info", "recording to y.rrd")))
+    assert standing()[-1] == ""
 
 
 def test_whatever_the_fault_says_the_gateway_and_the_recorder_can_read_it(shell: Shell) -> None:

@@ -675,6 +675,7 @@ def test_a_recording_that_suffers_is_told_to_everyone(service: Service) -> None:
         resource.prlimit(recorder, resource.RLIMIT_FSIZE, (50_000, 50_000))  # more than the log has, less than a second
         told = (event for event in robot.events(history=True, timeout=10.0) if event.level == "warning")
         assert "takes no more" in next(told).message
+        until(robot, lambda state: any("nothing is recorded" in warning for warning in state.warnings))
         assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)
     service.end()
     assert "trirail: recorder: missing so far" in service.log.read_text()

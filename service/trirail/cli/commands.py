@@ -61,6 +61,9 @@ def run(
     settings = load(config or SIM)
     form = log or settings.telemetry.log
     lines = Log(form)
+    can = settings.can
+    drives = f"drives on {can.interface} {can.channel}".strip() if can.interface != "simulated" else "simulated drives"
+    lines.say(f"starting robot {settings.robot.name}: {drives}, {settings.loop.rate_hz} Hz")
 
     def up(ready: dict[str, dict[str, Any]]) -> None:
         if form == "json":

@@ -75,7 +75,7 @@ class Address:
     connect: Annotated[str, Parameter(env_var="TRIRAIL_CONNECT")] = DEFAULT_LOCATOR
     "Zenoh locator of the service or of a router."
     tls: Annotated[Path | None, Parameter(env_var="TRIRAIL_TLS")] = None
-    "Folder with ca.pem, cert.pem and key.pem, for a locator tls/HOST:PORT; ~/.config/trirail/<robot> if absent."
+    "Folder with ca.pem, cert.pem and key.pem, for a locator tls/HOST:PORT; ~/.config/trirail/ROBOT if absent."
     json: Annotated[bool, Flag] = False
     "Print one JSON object instead of words."
 

@@ -33,10 +33,11 @@ from trirail.wire.packets import (
     Farewell,
     GivenInput,
     Kind,
+    Remark,
     Request,
     Status,
     Welcome,
-    decode_remark,
+    decode_recorder,
     decode_request,
     message,
     told,
@@ -122,6 +123,7 @@ class Loop:
         self._marked_ns = 0
         self._parts_ns = [0] * len(Part)
         self._recorded = False
+        self._unrecorded = ""
 
     def run(self, ticker: Ticker) -> None:
         """Run cycles until told to end and the robot stands without power."""
@@ -257,18 +259,23 @@ class Loop:
         packet = self._recorder.receive()
         if self._recorder.take_lost() and self._recorded:
             self._recorded = False
-            self.control.ledger.tell(
-                "service", "warning", "the recorder has gone: nothing is recorded until it is back"
-            )
+            self._unrecorded = "the recorder has gone: nothing is recorded until it is back"
+            self.control.ledger.tell("service", "warning", self._unrecorded)
+            self._publish_status()
         if packet is None:
             return
-        self._recorded = True
+        if not self._recorded:
+            self._recorded, self._unrecorded = True, ""
         try:
-            remark = decode_remark(memoryview(packet)[1:])
+            said = decode_recorder(memoryview(packet)[1:])
         except msgspec.DecodeError as error:  # the recorder must not be able to stop the robot
             self.control.ledger.tell("service", "warning", f"the recorder said something unreadable: {error}")
+            return
+        if isinstance(said, Remark):
+            self.control.ledger.tell("service", said.level, said.message)
         else:
-            self.control.ledger.tell("service", remark.level, remark.message)
+            self._unrecorded = quoted(said.why) if said.why else ""
+        self._publish_status()
 
     def _accept_peers(self) -> None:
         """Take new peers."""
@@ -305,7 +312,7 @@ class Loop:
         goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
         fault, lag = quoted(control.fault) if control.fault else None, goal.lag if goal else None
         said = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user, lag
-        status = message(Status(*said))
+        status = message(Status(*said, self._unrecorded))
         if status != self._status:
             self._status = status
             self._gateway.send(status)

@@ -24,7 +24,19 @@ from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.session_index import SessionIndex
 from trirail.wire.links import Closed, PacketLink
 from trirail.wire.messages import Level
-from trirail.wire.packets import Answer, ControlInput, Happened, Kind, Remark, Status, Welcome, decode_answer, message
+from trirail.wire.packets import (
+    Answer,
+    ControlInput,
+    Happened,
+    Kind,
+    RecorderSaid,
+    Remark,
+    Status,
+    Unrecorded,
+    Welcome,
+    decode_answer,
+    message,
+)
 from trirail.wire.records import last_cycle
 
 GATHER = 0.14
@@ -44,6 +56,7 @@ class Intake:
         self._link = link
         self._ready = ready
         self._cycle = 0
+        self._told_unrecorded = False
         self._last_words = LastWords(config.period)
         path = Path(record) if record else None
         directory = Path(config.telemetry.directory)
@@ -68,6 +81,15 @@ class Intake:
             self.recorder.frames(content)
         else:
             self._hear(decode_answer(content))
+
+    def save(self) -> None:
+        """Write what has been taken; tell everyone where that fails, and once it does no more."""
+        self.recorder.save()
+        trouble = self.recorder.trouble  # whose words change with every byte of the disk
+        if bool(trouble) != self._told_unrecorded and self._send(
+            Unrecorded(trouble and f"nothing is recorded: {trouble}")
+        ):
+            self._told_unrecorded = bool(trouble)
 
     def loop_gone(self) -> None:
         """The loop has gone: where it has died, keep what it can no longer say."""
@@ -107,8 +129,13 @@ class Intake:
 
     def _tell(self, level: Level, words: str) -> None:
         """Have the loop tell everyone."""
-        with contextlib.suppress(Closed):  # then nobody is left to be told
-            self._link.send(message(Remark(level, words)))
+        self._send(Remark(level, words))
+
+    def _send(self, said: RecorderSaid) -> bool:
+        """Send it to the loop; False where that takes no more now, or has gone and nobody is left to be told."""
+        with contextlib.suppress(Closed):
+            return self._link.send(message(said))
+        return False
 
 
 def main(
@@ -140,7 +167,7 @@ def main(
             while (packet := link.receive()) is not None:
                 intake.take(packet)
                 heart.beat()
-            intake.recorder.save()
+            intake.save()
             if config.telemetry.metrics_port and time.monotonic() >= told + TOLD_EVERY:
                 told = time.monotonic()
                 measured(RecorderMeasured(*intake.recorder.missing))

@@ -109,7 +109,7 @@ class StateMaker:
             override=self._status.override,
             lease=self._status.lease,
             faults=(self._status.fault,) if self._status.fault else (),
-            warnings=warnings,
+            warnings=(*warnings, self._status.unrecorded) if self._status.unrecorded else warnings,
             loop=LoopState(
                 rate_hz=self._rate_hz,
                 cycles=int(row["cycle"]),

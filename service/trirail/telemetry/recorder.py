@@ -123,6 +123,11 @@ class Recorder:
         return self._files.cause or frames
 
     @property
+    def trouble(self) -> str:
+        """Why what is taken now gets into no file; empty while it does."""
+        return self._files.trouble
+
+    @property
     def skipped(self) -> int:
         """Batches that the live view was too slow for."""
         return self._live.skipped if self._live else 0

@@ -145,6 +145,8 @@ class Status(Struct, frozen=True, tag=True):
     """The user who holds the lease."""
     lag: float | None = None
     """Of a track, as in trirail.wire.messages.GoalReply, when it was last renewed."""
+    unrecorded: str = ""
+    """Why nothing is recorded now; empty while it is."""
 
 
 class Disturbance(Struct, frozen=True, tag="Mishap"):  # as recordings have it
@@ -193,15 +195,22 @@ class Remark(Struct, frozen=True, tag=True):
     message: str
 
 
+class Unrecorded(Struct, frozen=True, tag=True):
+    """Recorder to loop: why what it takes is in no file, sent when that changes; empty while it is."""
+
+    why: str
+
+
+RecorderSaid = Remark | Unrecorded
 Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Status | ControlInput
 
 encode = msgpack.Encoder().encode
 decode_request = msgpack.Decoder(Request).decode
 decode_answer = msgpack.Decoder(Answer).decode
-decode_remark = msgpack.Decoder(Remark).decode
+decode_recorder = msgpack.Decoder(RecorderSaid).decode
 
 
-def message(content: Request | Answer | Remark) -> bytes:
+def message(content: Request | Answer | RecorderSaid) -> bytes:
     """Pack a message."""
     return bytes((Kind.MESSAGE,)) + encode(content)
 

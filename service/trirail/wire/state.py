@@ -142,8 +142,8 @@ class State(Struct, frozen=True):
     loop: LoopState
     """How well the loop keeps its time."""
     warnings: tuple[str, ...] = ()
-    """What people should know of how the service is run, one line each: that it is open to a network, or that its
-    certificate expires soon."""
+    """What people should know of how the service is run, one line each: that it is open to a network, that its
+    certificate expires soon, or that nothing is recorded and why."""
     lease: str | None = None
     """The user who holds the lease: his goals and commands alone move the robot; None where nobody does."""
 
