@@ -47,6 +47,7 @@ def robot(service: Service) -> Iterator[Robot]:
         assert robot.move_to(x=-0.1, y=0.0, phi=0.0).wait(20.0).outcome == "done"
         yield robot
         robot.override(100.0)
+        until(robot, lambda state: state.mode not in ("moving", "stopping"))
 
 
 def moving(robot: Robot) -> None:

@@ -93,7 +93,7 @@ def test_a_gateway_that_is_lost_neither_keeps_a_lease_nor_frees_it_in_silence(
             assert lease.wait(20.0)
             assert lease.lost is not None
         with again(service) as ann:
-            assert until(ann, lambda state: state.mode == "holding").lease is None
+            until(ann, lambda state: state.mode == "holding" and state.lease is None)
             assert told(ann) == [
                 ("lease acquired by ann", "ann"),
                 ("lease of ann is over: no sign of life for 1 s", None),
