@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from trirail.config import Limits
 from trirail.kinematics.geometry import Geometry, singular_angles
 from trirail.workspace.mechanism import Points
+from trirail.workspace.workspace import permitted
 
 ANGLE = math.radians(0.5)
 """Workspace outlines are those of multiples of this φ [rad]."""
@@ -61,7 +62,5 @@ def _least(phi: NDArray[np.float64], singular: NDArray[np.float64]) -> NDArray[n
 
 
 def _outline(geometry: Geometry, limits: Limits, step: int) -> Points:
-    from trirail.workspace.workspace import permitted  # with the compiled mathematics: a recorder begins without
-
     polygon = permitted(geometry, limits, step * ANGLE)
     return np.concatenate([polygon, polygon[:1]])
