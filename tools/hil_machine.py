@@ -119,7 +119,9 @@ grep -q well {folder}/{COMPILED}
 cp -r {CACHE} /dev/shm/numba
 set +e
 {sys.executable} tools/hil_guest.py {folder}
-{sys.executable} -m pytest --noconftest -m vcan -rA --tb=short {" ".join(TESTS)} 2>&1 | tee {folder}/vcan.log
+export PYTEST_DISABLE_PLUGIN_AUTOLOAD=1  # hypothesis alone takes a quarter of a minute to be loaded
+options='-p pytest_timeout --noconftest -m vcan -rA --tb=short'
+{sys.executable} -m pytest $options {" ".join(TESTS)} 2>&1 | tee {folder}/vcan.log
 echo ${{PIPESTATUS[0]}} > {folder}/vcan.code
 {sys.executable} tools/bench.py frames --cycles 300 --json > {folder}/price.json
 """
