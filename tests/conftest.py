@@ -27,7 +27,7 @@ from trirail.control.local_planner import LocalPlanner
 from trirail.control.notices import Notice
 from trirail.motion.paths import FOR_EVER, Path, constant
 from trirail.motion.runs import MotionState
-from trirail.wire.messages import Goal, PoseGoal
+from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.cia402 import frames

@@ -16,7 +16,7 @@ from trirail.errors import RefusedError
 from trirail.motion.goals import Goals
 from trirail.motion.runs import rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import PlannedGoal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
+from trirail.wire.goals import PlannedGoal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
 
 GOALS = 1500
 AIM = 5000.0

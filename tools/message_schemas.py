@@ -15,13 +15,13 @@ from typing import Any, get_args
 import docstrings
 import msgspec
 from trirail.errors import RefusalCode
-from trirail.wire import messages, state
+from trirail.wire import goals, messages, state
 
 FOLDER = Path(messages.__file__).parent / "schemas"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 MESSAGES: dict[str, tuple[Any, str]] = {
-    "goal": (messages.Goal, "What is sent to goal/<user>: a goal of one of the kinds."),
+    "goal": (goals.Goal, "What is sent to goal/<user>: a goal of one of the kinds."),
     "goal-reply": (messages.GoalReply, "The reply to a goal that is accepted."),
     **{
         f"command-{name}": (kind, f"The content{', if any,' * (type(None) in get_args(kind))} of cmd/<user>/{name}.")
@@ -55,7 +55,7 @@ def schemas() -> dict[str, str]:
                     {"const": code, "description": f"{code.meaning}; {code.remedy}"} for code in RefusalCode
                 ]
                 continue
-            told = getattr(messages, struct, None) or getattr(state, struct)
+            told = next(getattr(module, struct) for module in (goals, messages, state) if hasattr(module, struct))
             on_the_wire = {field.name: field.encode_name for field in msgspec.structs.fields(told)}
             for field, text in docstrings.fields(told).items():
                 definition["properties"][on_the_wire[field]]["description"] = text

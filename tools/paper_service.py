@@ -21,7 +21,7 @@ from trirail.config import SIM, load
 from trirail.errors import RefusedError, ServiceError
 from trirail.kinematics.arrays import Array
 from trirail.telemetry.reading import Recording, read
-from trirail.wire.messages import TrajectoryPoint
+from trirail.wire.goals import TrajectoryPoint
 from trirail.wire.vocabulary import MODES, Mode
 
 SPACING = 0.02

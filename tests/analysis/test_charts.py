@@ -15,7 +15,8 @@ from trirail.cli import recording_commands, terminal
 from trirail.config import SIM, load
 from trirail.telemetry import palette
 from trirail.telemetry.recorder import Recorder
-from trirail.wire.messages import Event, Outcome, SlidersGoal
+from trirail.wire.goals import SlidersGoal
+from trirail.wire.messages import Event, Outcome
 from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.vocabulary import MODES, Mode
 

@@ -9,7 +9,7 @@ import pytest
 from processes.test_loop import Shell, shell
 from trirail.analysis.replay import again
 from trirail.telemetry.reading import Recording
-from trirail.wire.messages import PoseGoal
+from trirail.wire.goals import PoseGoal
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Kind, decode_answer, message
 from trirail.wire.records import unpack
 from trirail.wire.vocabulary import MODES, Command, Mode

@@ -23,7 +23,7 @@ from trirail.config.as_built import AsBuilt, geometry_of, written
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import Recording, join, read
-from trirail.wire.messages import VelocityGoal
+from trirail.wire.goals import VelocityGoal
 from trirail.wire.packets import CommandRequest, Disturbance, DrivesFault, GoalRequest
 from trirail.wire.planning import Extended, NotPlanned, Planned
 

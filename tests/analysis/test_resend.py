@@ -17,7 +17,8 @@ from trirail.analysis.resend import _beginnings, _Heard, _send
 from trirail.analysis.summary import _goals
 from trirail.client.client import GoalHandle, Result, Robot
 from trirail.telemetry.reading import Line, Recording
-from trirail.wire.messages import Event, PoseGoal
+from trirail.wire.goals import PoseGoal
+from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Request
 from trirail.wire.vocabulary import Command
 

@@ -10,7 +10,7 @@ import pytest
 from trirail.client import own_service
 from trirail.client.async_client import AsyncRobot
 from trirail.errors import RefusedError
-from trirail.wire.messages import TrajectoryPoint
+from trirail.wire.goals import TrajectoryPoint
 from trirail.wire.records import unpack
 from trirail.wire.state import State
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.client.trajectory import read
 from trirail.errors import TrirailError
-from trirail.wire.messages import TrajectoryPoint
+from trirail.wire.goals import TrajectoryPoint
 
 HEAD = ("t", "x", "y", "phi", "vx", "vy", "w")
 NUMBER = st.floats(-100.0, 100.0)

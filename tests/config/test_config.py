@@ -16,7 +16,7 @@ from msgspec.structs import fields
 from trirail.config import SIM, Config, load, metrics_url, parse
 from trirail.errors import ConfigError
 from trirail.telemetry import provenance
-from trirail.wire.messages import PoseGoal
+from trirail.wire.goals import PoseGoal
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.errors import LONGEST, BusError, DriveError
 

@@ -24,7 +24,7 @@ from trirail.control.notices import Notice
 from trirail.errors import KinematicsError
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState
-from trirail.wire.messages import Goal, PoseGoal, SlidersGoal
+from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.interface import DriveFault, Feedback, MissingProtection, PowerState, Triple

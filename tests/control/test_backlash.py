@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from trirail.config import Config
 from trirail.control.backlash import TURNS, add_offset, backlash, taking_up
 from trirail.motion.take_up import NO_BACKLASH, SHARE, planned_limits, take_up
-from trirail.wire.messages import SlidersGoal
+from trirail.wire.goals import SlidersGoal
 from trirail.wire.vocabulary import Mode
 
 Array = NDArray[np.float64]

@@ -17,7 +17,8 @@ from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState, rest
-from trirail.wire.messages import FaultDetail, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.goals import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.messages import FaultDetail
 from trirail.wire.packets import Accepted, Answer, Confirmed, GoalRequest, Refused
 from trirail.wire.vocabulary import FaultCause, Mode
 from trirail_drivers.cia402 import frames

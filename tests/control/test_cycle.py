@@ -21,7 +21,7 @@ from trirail.motion.limits import Bounds
 from trirail.motion.paths import FOR_EVER, Path
 from trirail.motion.runs import Run, Seam, rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import PoseGoal, SlidersGoal
+from trirail.wire.goals import PoseGoal, SlidersGoal
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.interface import DriveGroup, Feedback, PowerState
 

@@ -16,7 +16,7 @@ from trirail.control.in_position import Settling, monitor
 from trirail.control.modes import ModeEvent
 from trirail.control.notices import Notice
 from trirail.kinematics.robot import inverse
-from trirail.wire.messages import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.goals import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, Confirmed
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import Mode

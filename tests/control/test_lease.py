@@ -13,7 +13,7 @@ from conftest import CONFIG, Rig
 from trirail.config import ControlTable
 from trirail.control.lease import REMEMBERED_IDS, LeaseArbiter
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.messages import Goal, PoseGoal, VelocityGoal
+from trirail.wire.goals import Goal, PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused, Request
 from trirail.wire.vocabulary import Command, LeasePolicy, Mode
 

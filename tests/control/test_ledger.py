@@ -12,7 +12,7 @@ from trirail.control.ledger import Ledger
 from trirail.control.notices import REMEMBERED_IDS
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.messages import PoseGoal, VelocityGoal
+from trirail.wire.goals import PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest
 from trirail.wire.vocabulary import Command
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from trirail.config import Config, FramesTable
 from trirail.errors import RefusedError
 from trirail.motion.frames import NamedFrames
-from trirail.wire.messages import Goal, MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
+from trirail.wire.goals import Goal, MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode
 

@@ -20,7 +20,7 @@ from trirail.motion.paths import Path
 from trirail.motion.planning import MotionPlanner, revision
 from trirail.motion.runs import nominal
 from trirail.motion.time_scaling import TimeScaling
-from trirail.wire.messages import Goal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, GoalRequest, PlannerLost, Refused
 from trirail.wire.planning import (
     MAX_PLANNING,

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.config import Config
 from trirail.control.modes import ModeEvent
-from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
+from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
 from trirail.wire.vocabulary import Command, Mode
 

@@ -16,7 +16,7 @@ from control.test_stop import PROMPT, braking, confirmed_after
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from trirail.wire.messages import TrackGoal, VelocityGoal
+from trirail.wire.goals import TrackGoal, VelocityGoal
 from trirail.wire.packets import Accepted, GoalRequest, Refused
 from trirail.wire.vocabulary import Mode
 

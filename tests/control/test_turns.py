@@ -5,7 +5,7 @@ from __future__ import annotations
 from conftest import Rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from trirail.wire.messages import PoseGoal
+from trirail.wire.goals import PoseGoal
 from trirail.wire.packets import Accepted, GoalRequest, Refused
 
 

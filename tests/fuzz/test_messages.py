@@ -21,9 +21,10 @@ from trirail.processes.gateway import Gateway
 from trirail.processes.guard import Guard
 from trirail.processes.inbox import Incoming, Kind
 from trirail.wire import boundary, links, packets, text, zenoh_session
+from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal
+from trirail.wire.goals import TrajectoryPoint as Point
 from trirail.wire.links import Port, TooLarge
-from trirail.wire.messages import CommandReply, Event, Goal, Override, PoseGoal, Stop, TrajectoryGoal
-from trirail.wire.messages import TrajectoryPoint as Point
+from trirail.wire.messages import CommandReply, Event, Override, Stop
 from trirail.wire.packets import Accepted, GoalRequest, Happened, RefusedRequest
 from trirail.wire.records import DTYPE, SIZE
 from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_PACKET, MAX_POINTS

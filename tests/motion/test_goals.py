@@ -17,7 +17,7 @@ from trirail.motion.limits import Bounds
 from trirail.motion.planner import Planner
 from trirail.motion.runs import rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import PoseGoal, VelocityGoal
+from trirail.wire.goals import PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted
 
 

@@ -16,7 +16,7 @@ from trirail.control.feedback import Measured
 from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Bounds, Violation, gate, told_apart
 from trirail.motion.runs import MotionState, rest
-from trirail.wire.messages import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.interface import Feedback, PowerState

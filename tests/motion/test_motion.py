@@ -22,7 +22,7 @@ from trirail.motion.goals import Goals, PlannedMotion
 from trirail.motion.planner import TOO_FAST_IN_MOTION
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import (
+from trirail.wire.goals import (
     Goal,
     OwnLimits,
     PlannedGoal,

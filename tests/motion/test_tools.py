@@ -20,7 +20,7 @@ from trirail.motion.packing import pack_path, unpack_path
 from trirail.motion.paths import Path, path_motion
 from trirail.motion.runs import MotionState, of_centre, of_tool, rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import OwnLimits, PoseGoal
+from trirail.wire.goals import OwnLimits, PoseGoal
 from trirail.wire.packets import Accepted
 
 Tool = tuple[float, float]

@@ -7,7 +7,7 @@ from conftest import CONFIG, Rig
 from control.test_control import PERIOD, assert_within_limits, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from trirail.wire.messages import PoseGoal, TrajectoryGoal, TrajectoryPoint
+from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode
 

@@ -17,7 +17,8 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse
 from trirail.processes.info import info
-from trirail.wire.messages import CommandReply, Event, Goal, VelocityGoal
+from trirail.wire.goals import Goal, VelocityGoal
+from trirail.wire.messages import CommandReply, Event
 from trirail.wire.state import (
     Commanded,
     FrameCounts,

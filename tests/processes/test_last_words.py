@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.processes.last_words import LastWords
-from trirail.wire.messages import Event, PoseGoal
+from trirail.wire.goals import PoseGoal
+from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput, Farewell, GoalRequest, Happened, Status
 
 

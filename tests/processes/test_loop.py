@@ -13,8 +13,8 @@ from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop, Ports
 from trirail.wire import links
+from trirail.wire.goals import PoseGoal
 from trirail.wire.links import Closed, PacketLink, Port
-from trirail.wire.messages import PoseGoal
 from trirail.wire.packets import (
     CommandRequest,
     Confirmed,

@@ -22,7 +22,8 @@ from processes.test_service import Service, trirail, until
 from trirail.client.client import Robot
 from trirail.errors import RefusedError
 from trirail.wire import boundary
-from trirail.wire.messages import Event, TrajectoryGoal, TrajectoryPoint
+from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
+from trirail.wire.messages import Event
 from trirail.wire.sizes import MAX_MESSAGE, MAX_POINTS, MAX_TRANSPORT
 from trirail.wire.zenoh_session import open_client
 

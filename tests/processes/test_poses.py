@@ -23,7 +23,8 @@ from trirail.processes.inbox import Incoming, Kind
 from trirail.processes.pose_file import PoseFile, state_directory
 from trirail.processes.poses import MOST, UNDER_WAY, Poses
 from trirail.telemetry.provenance import toml
-from trirail.wire.messages import ErrorReply, NamedGoal, OwnLimits, PoseGoal
+from trirail.wire.goals import NamedGoal, OwnLimits, PoseGoal
+from trirail.wire.messages import ErrorReply
 from trirail.wire.packets import PoseChanged, Refused
 from trirail.wire.records import DTYPE
 from trirail.wire.state import NamedPose

@@ -33,7 +33,8 @@ from trirail.errors import RefusedError, ServiceError
 from trirail.processes.interpreter import child, python
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import read
-from trirail.wire.messages import Event, GoalReply, OwnLimits
+from trirail.wire.goals import OwnLimits
+from trirail.wire.messages import Event, GoalReply
 from trirail.wire.state import State
 from trirail.wire.vocabulary import MODES, Mode
 from trirail.wire.zenoh_session import open_client

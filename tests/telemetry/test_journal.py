@@ -6,7 +6,8 @@ import msgspec
 import pytest
 from trirail.telemetry import journal
 from trirail.telemetry.journal import EVENTS, REQUESTS, Entry
-from trirail.wire.messages import Event, Level, PoseGoal
+from trirail.wire.goals import PoseGoal
+from trirail.wire.messages import Event, Level
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
 from trirail.wire.vocabulary import Command
 

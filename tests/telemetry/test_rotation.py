@@ -25,7 +25,8 @@ from trirail.telemetry.provenance import SOFTWARE
 from trirail.telemetry.reading import Recording, join, read
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
-from trirail.wire.messages import Event, PoseGoal
+from trirail.wire.goals import PoseGoal
+from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.vocabulary import Mode
 from trirail_drivers import interface

@@ -24,7 +24,8 @@ from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.contents import Contents, FaultEntry, of_file
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.session_index import FILE, RecordedSession, SessionIndex, Wanted
-from trirail.wire.messages import Event, FaultDetail, PoseGoal
+from trirail.wire.goals import PoseGoal
+from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
 from trirail.wire.vocabulary import Command
 

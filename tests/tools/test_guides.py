@@ -17,7 +17,7 @@ from trirail.cli.commands import app
 from trirail.cli.units import numbers
 from trirail.config import Config
 from trirail.errors import TrirailError
-from trirail.wire.messages import Goal
+from trirail.wire.goals import Goal
 
 ROOT = Path(__file__).parents[2]
 GUIDES = sorted(

@@ -18,7 +18,8 @@ from trirail.client import own_service
 from trirail.config import SIM, load
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry.reading import Line, Recording
-from trirail.wire.messages import Event, TrajectoryGoal
+from trirail.wire.goals import TrajectoryGoal
+from trirail.wire.messages import Event
 from trirail.wire.packets import Accepted
 from trirail.wire.records import DTYPE
 from trirail.wire.sizes import MAX_MESSAGE

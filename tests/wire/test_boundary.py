@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
-from trirail.wire.messages import Goal, PoseGoal
+from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.records import DTYPE
 from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME
 from trirail.wire.vocabulary import MODES

@@ -7,12 +7,10 @@ from typing import Any
 
 import msgspec
 import pytest
-from trirail.wire.messages import (
+from trirail.wire.goals import (
     SHORTEST_PIECE,
-    AcquireLease,
     MoveGoal,
     NamedGoal,
-    Override,
     OwnLimits,
     PoseGoal,
     SlidersGoal,
@@ -21,6 +19,7 @@ from trirail.wire.messages import (
     TrajectoryPoint,
     VelocityGoal,
 )
+from trirail.wire.messages import AcquireLease, Override
 
 POINTS = (TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(1.0, 0.01, 0.0, 0.0))
 GOOD: dict[type[Any], dict[str, Any]] = {

@@ -7,7 +7,8 @@ import pytest
 from msgspec import structs
 from trirail.errors import RefusalCode
 from trirail.wire import packets
-from trirail.wire.messages import Event, PoseGoal
+from trirail.wire.goals import PoseGoal
+from trirail.wire.messages import Event
 from trirail.wire.packets import (
     Accepted,
     Answer,

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator, ValidationError
 from trirail.client import own_service
 from trirail.errors import RefusalCode
-from trirail.wire import messages, zenoh_session
+from trirail.wire import goals, messages, zenoh_session
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -56,8 +56,9 @@ def test_every_message_has_a_schema() -> None:
     """A type that is added to the messages is described, in a file of its own or within one."""
     structs = {
         name
-        for name, kind in vars(messages).items()
-        if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and kind.__module__ == messages.__name__
+        for module in (goals, messages)
+        for name, kind in vars(module).items()
+        if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and kind.__module__ == module.__name__
     }
     described = {name for file in message_schemas.MESSAGES for name in schema(file)["$defs"]}
     assert structs - described == set()
@@ -88,7 +89,7 @@ def test_the_schema_of_an_error_reply_tells_what_each_code_means() -> None:
 )
 def test_the_service_takes_no_goal_that_the_schema_refuses(goal: dict[str, Any]) -> None:
     try:
-        msgspec.json.decode(json.dumps(goal), type=messages.Goal)
+        msgspec.json.decode(json.dumps(goal), type=goals.Goal)
     except msgspec.ValidationError:
         return
     assert valid("goal", goal)

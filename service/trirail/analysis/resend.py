@@ -22,7 +22,8 @@ from trirail_drivers.interface import Triple
 from trirail.client.client import GoalHandle, Robot
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry.reading import Recording
-from trirail.wire.messages import Event, Goal, Override, Stop, TrackGoal
+from trirail.wire.goals import Goal, TrackGoal
+from trirail.wire.messages import Event, Override, Stop
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.records import unpack
 from trirail.wire.vocabulary import MODES, Command, Mode

@@ -28,7 +28,8 @@ from trirail.client.goal import GoalHandle
 from trirail.client.track import Taker
 from trirail.errors import RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.messages import AcquireLease, CommandReply, Event, Goal, GoalReply, Stop
+from trirail.wire.goals import Goal
+from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, Stop
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.vocabulary import Command
 

@@ -11,7 +11,8 @@ import msgspec
 
 from trirail.client.goal import STANDS_WITHIN, AcceptedGoal, Result
 from trirail.errors import RefusalCode, RefusedError, TrirailError
-from trirail.wire.messages import Goal, GoalReply, Stop, VelocityGoal
+from trirail.wire.goals import Goal, VelocityGoal
+from trirail.wire.messages import GoalReply, Stop
 from trirail.wire.vocabulary import Command
 
 

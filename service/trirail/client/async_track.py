@@ -11,7 +11,7 @@ from trirail.client.async_goal import AsyncGoalHandle
 from trirail.client.goal import STANDS_WITHIN
 from trirail.client.track import FollowedTarget, Taker
 from trirail.errors import RefusedError
-from trirail.wire.messages import Goal
+from trirail.wire.goals import Goal
 
 
 class AsyncTrack(FollowedTarget[AsyncGoalHandle]):

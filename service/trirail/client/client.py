@@ -26,15 +26,10 @@ from trirail.client.track import Taker, Track
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.credentials import Credentials, credentials_for
-from trirail.wire.messages import (
-    AcquireLease,
-    CommandReply,
-    Event,
+from trirail.wire.goals import (
     Goal,
-    GoalReply,
     MoveGoal,
     NamedGoal,
-    Override,
     OwnLimits,
     PoseGoal,
     SlidersGoal,
@@ -42,6 +37,7 @@ from trirail.wire.messages import (
     TrajectoryGoal,
     TrajectoryPoint,
 )
+from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, Override
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.text import quoted
@@ -261,7 +257,7 @@ class Robot:
         return Track(self.send, post, id or uuid.uuid4().hex[:12], timeout)
 
     def send(self, make: Callable[[str], Goal], id: str | None = None) -> GoalHandle:  # noqa: A002
-        """Send the goal that `make` makes for an id, a trirail.wire.messages.Goal; return once it is accepted."""
+        """Send the goal that `make` makes for an id, a trirail.wire.goals.Goal; return once it is accepted."""
         goal_id = id or uuid.uuid4().hex[:12]
         message = message_of(make, goal_id)
         goal = GoalHandle(goal_id, self.command)

@@ -10,7 +10,8 @@ from typing import NamedTuple, Self
 import msgspec
 
 from trirail.errors import RefusalCode, RefusedError, TrirailError
-from trirail.wire.messages import Goal, GoalReply, Residual, Stop, VelocityGoal
+from trirail.wire.goals import Goal, VelocityGoal
+from trirail.wire.messages import GoalReply, Residual, Stop
 from trirail.wire.vocabulary import Command
 
 STANDS_WITHIN = 10.0

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from trirail.client.goal import GoalHandle
 from trirail.errors import RefusalCode, RefusedError, TrirailError
-from trirail.wire.messages import Goal, VelocityGoal
+from trirail.wire.goals import Goal, VelocityGoal
 
 TIMEOUT = 0.2
 """Real time after which the service brakes a jog that is not renewed [s]."""

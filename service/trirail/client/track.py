@@ -10,7 +10,8 @@ from typing import Generic, Self, TypeVar
 
 from trirail.client.goal import STANDS_WITHIN, AcceptedGoal, GoalHandle, Result
 from trirail.errors import RefusalCode, RefusedError, TrirailError
-from trirail.wire.messages import Goal, GoalReply, TrackGoal
+from trirail.wire.goals import Goal, TrackGoal
+from trirail.wire.messages import GoalReply
 
 Handle = TypeVar("Handle", bound=AcceptedGoal)
 Taker = Callable[[GoalReply | TrirailError], None]

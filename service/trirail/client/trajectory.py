@@ -11,7 +11,7 @@ import msgspec
 from trirail_drivers import files
 
 from trirail.errors import TrirailError
-from trirail.wire.messages import TrajectoryPoint
+from trirail.wire.goals import TrajectoryPoint
 from trirail.wire.text import quoted
 
 COLUMNS = ("t", "x", "y", "phi")

@@ -27,7 +27,8 @@ from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import take_up
-from trirail.wire.messages import FaultDetail, Outcome, TrackGoal
+from trirail.wire.goals import TrackGoal
+from trirail.wire.messages import FaultDetail, Outcome
 from trirail.wire.packets import (
     CommandRequest,
     Disturbance,

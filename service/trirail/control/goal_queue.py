@@ -15,7 +15,8 @@ from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.frames import NamedFrames, Place
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import Outcome, PlannedGoal, PoseGoal, RenewedGoal, TrackGoal, VelocityGoal
+from trirail.wire.goals import PlannedGoal, PoseGoal, RenewedGoal, TrackGoal, VelocityGoal
+from trirail.wire.messages import Outcome
 from trirail.wire.packets import GoalRequest
 
 FURTHEST = 0.5

@@ -13,17 +13,8 @@ from trirail.control.in_position import Settled
 from trirail.control.notices import REMEMBERED_IDS, Notice
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.messages import (
-    FaultDetail,
-    Level,
-    MoveGoal,
-    Outcome,
-    PoseGoal,
-    RenewedGoal,
-    TrackGoal,
-    TrajectoryGoal,
-    VelocityGoal,
-)
+from trirail.wire.goals import MoveGoal, PoseGoal, RenewedGoal, TrackGoal, TrajectoryGoal, VelocityGoal
+from trirail.wire.messages import FaultDetail, Level, Outcome
 from trirail.wire.packets import (
     Accepted,
     Answer,

@@ -26,7 +26,7 @@ from trirail.motion.runs import STILL, MotionState, Run, nominal, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import planned_limits
 from trirail.motion.time_scaling import SHARES, TimeScaling
-from trirail.wire.messages import PlannedGoal, TrackGoal
+from trirail.wire.goals import PlannedGoal, TrackGoal
 from trirail.wire.planning import Extended, NotPlanned, PlanAnswer, Planned, PlanRequest
 
 LEADS = (0.003, 0.012, 0.048)

@@ -13,7 +13,7 @@ from trirail.config import BASE, PLATFORM, FramesTable
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.planner import NO_TOOL
 from trirail.motion.runs import of_tool, rest
-from trirail.wire.messages import (
+from trirail.wire.goals import (
     Goal,
     MoveGoal,
     NamedGoal,

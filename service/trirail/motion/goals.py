@@ -17,7 +17,7 @@ from trirail.motion.runs import MotionState, Run, nominal, rest, stretched
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import TimeScaling
 from trirail.motion.tracking import Tracker
-from trirail.wire.messages import PlannedGoal, PoseGoal, SlidersGoal, TrackGoal, TrajectoryGoal, VelocityGoal
+from trirail.wire.goals import PlannedGoal, PoseGoal, SlidersGoal, TrackGoal, TrajectoryGoal, VelocityGoal
 
 SLOWEST = 0.05
 """Where the time along a path runs slower than this, a new goal is planned from a standstill."""

@@ -19,7 +19,7 @@ from trirail.motion.packing import pack_path, pack_run, unpack_run
 from trirail.motion.runs import MotionState
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import planned_limits
-from trirail.wire.messages import PoseGoal, SlidersGoal, TrackGoal
+from trirail.wire.goals import PoseGoal, SlidersGoal, TrackGoal
 from trirail.wire.planning import Extended, NotPlanned, PackedRun, PlanAnswer, Planned, PlanRequest
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from trirail.wire.messages import Coordinates
+from trirail.wire.goals import Coordinates
 from trirail.wire.vocabulary import Command
 
 

@@ -28,18 +28,9 @@ from trirail.processes.replies import Replies
 from trirail.processes.requests import Requests
 from trirail.processes.state import StateMaker
 from trirail.wire import boundary, zenoh_session
+from trirail.wire.goals import Goal
 from trirail.wire.links import Closed, PacketLink
-from trirail.wire.messages import (
-    CONTENT,
-    CommandReply,
-    ErrorReply,
-    Event,
-    Goal,
-    GoalReply,
-    NoContent,
-    RoleReply,
-    Stop,
-)
+from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Event, GoalReply, NoContent, RoleReply, Stop
 from trirail.wire.packets import (
     Accepted,
     Answer,

@@ -13,7 +13,7 @@ from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
 from trirail.errors import ServiceError
-from trirail.wire.messages import Coordinates, PoseName
+from trirail.wire.goals import Coordinates, PoseName
 
 NAME = "poses.json"
 

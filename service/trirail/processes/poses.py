@@ -21,7 +21,8 @@ from trirail.kinematics.geometry import travels
 from trirail.processes.inbox import Incoming
 from trirail.processes.pose_file import PoseFile, state_directory
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.messages import Coordinates, ErrorReply, Goal, NamedGoal, NoContent, PoseGoal
+from trirail.wire.goals import Coordinates, Goal, NamedGoal, PoseGoal
+from trirail.wire.messages import ErrorReply, NoContent
 from trirail.wire.packets import PoseChanged
 from trirail.wire.state import NamedPose, NamedPoses
 from trirail.wire.vocabulary import MODES, Mode

@@ -17,8 +17,9 @@ from trirail.processes.guard import Guard
 from trirail.processes.inbox import Incoming
 from trirail.processes.last_words import LastWords
 from trirail.processes.replies import Replies
+from trirail.wire.goals import Goal, TrackGoal
 from trirail.wire.links import PacketLink
-from trirail.wire.messages import AcquireLease, ErrorReply, Goal, Override, ReleaseLease, Stop, TrackGoal
+from trirail.wire.messages import AcquireLease, ErrorReply, Override, ReleaseLease, Stop
 from trirail.wire.packets import CommandRequest, GoalRequest, message
 from trirail.wire.vocabulary import Command
 

@@ -8,7 +8,8 @@ from msgspec import Struct, msgpack, structs
 from trirail_drivers.interface import Counts, MissingProtection, Triple
 
 from trirail.errors import RefusalCode
-from trirail.wire.messages import Event, Goal, Level
+from trirail.wire.goals import Goal
+from trirail.wire.messages import Event, Level
 from trirail.wire.planning import PlanAnswer
 from trirail.wire.sizes import MAX_PACKET
 from trirail.wire.vocabulary import Command

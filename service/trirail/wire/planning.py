@@ -10,7 +10,7 @@ from msgspec import Struct, msgpack
 from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.messages import PlannedGoal
+from trirail.wire.goals import PlannedGoal
 
 
 class PackedPath(Struct, frozen=True, array_like=True):
