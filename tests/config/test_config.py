@@ -352,6 +352,16 @@ def run_a_little(config: Config) -> str:
         ),
         ("counts_per_metre = 1e7", "counts_per_metre = 1e12", "drives.A.counts_per_metre = 1e+12"),
         (
+            "counts_per_metre = 1e7",
+            'counts_per_metre = 1e7\nvelocity_unit = "0.001 counts/s"',
+            'drives.A.velocity_unit = "0.001 counts/s": limits.slider.velocity = 1 is 1e+10 of it, and twice that',
+        ),
+        (
+            "counts_per_metre = 1e7",
+            'counts_per_metre = 1e7\nvelocity_unit = "1e400 counts/s"',
+            'drives.A.velocity_unit = "1e400 counts/s" is no unit of velocities; wanted one as',
+        ),
+        (
             "feed_forward_gain = 0.95",
             "feed_forward_gain = 9e18",
             "can.simulated.feed_forward_gain = 9e+18: expected float <= 2.0",

@@ -193,3 +193,26 @@ def test_a_move_after_a_stop_or_in_a_jog_counts_from_where_the_robot_is(rig: Rig
     here = rig.control.commanded.pose[0]
     landed = arrive(rig, "m2", MoveGoal(0.01, 0.0, 0.0))[0]
     assert here + 0.01 - 1e-12 <= landed <= here + 0.01 + 0.02 * 5 * PERIOD
+
+
+@pytest.mark.parametrize("how", ["pause", "override"])
+def test_a_move_while_a_goal_waits_half_way_is_refused_unless_it_is_from_where_the_robot_is(how: str) -> None:
+    """It would count from the end of the goal that waits: who asks for 5 mm would get all that was left, too."""
+    rig = Rig(NAMED)
+    rig.enable()
+    rig.goal("g1", 0.1, 0.0, 0.0)
+    rig.cycles(300)
+    if how == "pause":
+        rig.command("pause")
+    else:
+        rig.command("override", 0.0)
+    rig.cycles(1000)
+    stood = rig.control.commanded.pose[0]
+    assert 0.0 < stood < 0.1
+    answer = refusal(rig.send("m1", MoveGoal(0.005, 0.0, 0.0)))
+    assert (answer.code, "send stop first" in answer.message) == ("moving", True)
+    assert rig.control.commanded.pose[0] == stood
+    if how == "pause":
+        arrive(rig, "m2", MoveGoal(0.005, 0.0, 0.0, origin="measured"))
+        assert rig.control.commanded.pose[0] == pytest.approx(stood + 0.005, abs=1e-5)
+    rig.bus.shutdown()

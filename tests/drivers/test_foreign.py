@@ -169,6 +169,11 @@ def test_the_table_of_objects_is_that_of_the_guide() -> None:
             r'6007, .*605E, .*accept_without = \["1006", "6007", "605E"\]',
         ),
         ("technosoft_ipos", {"acceleration_unit": None}, r"its unit of acceleration \(object 60AA\)"),
+        (
+            "technosoft_ipos",
+            {"acceleration_unit": "rpm/s", "revolutions_per_metre": None},
+            r'A.acceleration_unit = "rpm/s" is of revolutions, .* say drives.A.revolutions_per_metre',
+        ),
         ("elmo_gold", {"velocity_unit": "rpm"}, r'A.velocity_unit = "rpm" contradicts the drive: object 6096'),
         (
             "maxon_epos4_compact50_5",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections.abc import Iterator
 from functools import partial
@@ -15,7 +16,7 @@ from certificates import ROLES, user
 from conftest import CONFIG
 from trirail.cli.key_folder import KeyFolder
 from trirail.config import Config, Tls, Zenoh
-from trirail.errors import ConfigError
+from trirail.errors import ConfigError, ServiceError
 from trirail.processes import router
 from trirail.processes.guard import Guard
 from trirail.processes.router import RouterConfig
@@ -266,3 +267,21 @@ def test_a_routers_file_that_is_wrong_is_refused_with_its_name(text: str, said: 
     with pytest.raises(ConfigError, match=said) as refused:
         router.load(path)
     assert str(refused.value).startswith(str(path))
+
+
+@pytest.mark.parametrize("name", [ROBOTS[0], "north"])
+def test_a_robot_or_router_that_is_revoked_is_not_let_in(net: Net, tmp_path: Path, name: str) -> None:
+    """Its certificate may be in anybody's hands: who has it would answer in its name."""
+    keys = KeyFolder(shutil.copytree(net.folder / "keys", tmp_path / "keys"))
+    keys.revoke(name)
+    zenoh_table = Zenoh(listen=(f"tls/127.0.0.1:{free_port()}",), tls=Tls(str(keys.folder)), users=ROLES)
+    config = RouterConfig(zenoh_table, ROBOTS, {"north": ("far",)})
+    with pytest.raises(ServiceError, match=f"{name}: revoked"), router.routing(config):
+        pass
+    without = msgspec.structs.replace(
+        config,
+        robots=tuple(robot for robot in config.robots if robot != name),
+        routers={router: robots for router, robots in config.routers.items() if router != name},
+    )
+    with router.routing(without):
+        pass

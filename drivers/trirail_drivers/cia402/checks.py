@@ -18,9 +18,22 @@ def check(drives: Drives, required: Requirements) -> None:
         check_resolution(name, drive, drives, required, 1.0 / drive.counts_per_metre, _finer)
         _check_counts(name, drive, scale, required)
         units.check(name, drive)
+        _check_velocity(name, drive, required)
         units.Units(scale, scale.counts_per_metre, 1.0).length(name, "following_error", drives.following_error)
     settings.heartbeat_of(drives)
     settings.interpolation_periods(required.period)
+
+
+def _check_velocity(name: str, drive: Drive, required: Requirements) -> None:
+    """Feed-forward in the unit that is configured, where that is known of a metre, is a 32-bit integer too."""
+    key = f"drives.{name}.velocity_unit"
+    unit = units.written(key, drive.velocity_unit, 1) if drive.velocity_unit is not None else None
+    per_metre = unit.per_metre(drive.counts_per_metre, drive.revolutions_per_metre) if unit is not None else None
+    if per_metre is not None and 2.0 * required.velocity * per_metre >= INT32_MAX:
+        raise DriveError(
+            f'{key} = "{drive.velocity_unit}": limits.slider.velocity = {required.velocity:g} is '
+            f"{required.velocity * per_metre:g} of it, and twice that must be below {INT32_MAX}; wanted a coarser unit"
+        )
 
 
 def _finer(widest: float) -> str:

@@ -107,6 +107,11 @@ def _unit(
     if told is None:
         told = _by_factor(remote, index, velocity)
     if told is None:
+        if configured is not None and configured.per_metre(counts, revolutions) is None:
+            raise DriveError(
+                f'drives.{remote.name}.{key} = "{text}" is of revolutions, and nobody says how many a metre takes: '
+                f"say drives.{remote.name}.revolutions_per_metre"
+            )
         return configured
     if configured is not None:
         one, other = (unit.per_metre(counts, revolutions) for unit in (configured, told))

@@ -123,6 +123,8 @@ _WORDS: Final = {
     "µm": (Of.METRES, 1e-6),
 }
 _WRITTEN: Final = re.compile(r"(?:(\d+(?:\.\d+)?(?:e-?\d+)?) +)?(rpm|[a-zµ]+/(?:s|min|h))((?:/(?:s|min|h))?|2)")
+FACTORS: Final = 1e-9, 1e9
+"""What may stand in front of a unit: far beyond what drives have, far from where numbers lose their digits."""
 _SECONDS: Final = {symbol: seconds for seconds, symbol in _TIMES.values()}
 
 
@@ -136,7 +138,7 @@ def written(key: str, text: str, power: int) -> Unit:
         if word in _WORDS and bool(per) == (power == 2) and not (rate == "rpm" and per == "2"):
             of, size = _WORDS[word]
             factor = float(number) if number else 1.0
-            if factor > 0.0:
+            if FACTORS[0] <= factor <= FACTORS[1]:
                 return Unit(of, factor * size / times, text.strip())
     kind, shown = (
         ("velocities", '"counts/s", "0.1 counts/s", "rpm", "rev/s", "deg/s", "rad/s", "mm/s", "m/min"')

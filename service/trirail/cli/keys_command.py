@@ -226,5 +226,8 @@ def revoke(user: str, /, *, folder: Folder = HERE, json: Annotated[bool, Flag] =
     if json:
         terminal.json({"user": user, "revoked": True})
         return 0
-    terminal.say(f"{user} has no role any more, once the service starts again with this {folder / 'revoked.txt'}")
+    terminal.say(f"{user} has no role any more wherever this {folder / 'revoked.txt'} is read")
+    terminal.say(
+        "copy it to the folder of [zenoh.tls] of every robot and router of this authority, and start them again"
+    )
     return 0

@@ -256,9 +256,18 @@ class Control:
         return self.state.mode is Mode.MOVING
 
     def _place(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
-        """Return the pose from which a move begins: where the goals before it lead, or where the robot is."""
+        """Return the pose from which a move begins: where the goals before it lead, or where the robot is.
+
+        RefusedError while a goal waits half-way, paused or at override 0: who looks at the robot means from there.
+        """
         if origin == "measured":
             return self.measured.pose
+        if self.state.paused or (self.override == 0.0 and self._schedule.last is not None):
+            raise RefusedError(
+                RefusalCode.MOVING,
+                "a goal waits half-way, and a move would count from its end: send stop first, or resume it, or move "
+                "from where the robot is measured to be",
+            )
         last, goal = self._schedule.last, self.ledger.goal
         if last is None or goal is None or goal.renewed is not None:
             return self.commanded.pose

@@ -101,8 +101,10 @@ def _response(status: HTTPStatus, body: bytes, suffix: str) -> Response:
 
 def _listen(port: int | None) -> socket.socket:
     """Listen on a port of the loopback: the one that is asked for, or the usual one, or where that is taken any."""
-    with contextlib.suppress(OSError):
-        return socket.create_server((HOST, PORT if port is None else port))
+    wanted = PORT if port is None else port
+    if 0 <= wanted <= 65535:
+        with contextlib.suppress(OSError):
+            return socket.create_server((HOST, wanted))
     if port is not None:
-        raise ServiceError(f"port {port} cannot be listened on: choose another, or none for any that is free")
+        raise ServiceError(f"port {port} cannot be listened on: choose another of 1 to 65535, or 0 for any")
     return socket.create_server((HOST, 0))

@@ -17,10 +17,10 @@ from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
 from trirail.config import UserName, Zenoh, check_reach
-from trirail.errors import ConfigError, RefusedError
+from trirail.errors import ConfigError, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import router_access_control
-from trirail.wire.credentials import Credentials, with_role
+from trirail.wire.credentials import Credentials, revoked, with_role
 from trirail.wire.messages import RoleReply
 
 
@@ -74,6 +74,11 @@ def settings(config: RouterConfig) -> dict[str, Any]:
     if config.zenoh.tls is None:
         return zenoh_session.router(listen, None, None, connect, thinned)
     folder = Path(config.zenoh.tls.directory)
+    if gone := sorted(revoked(folder) & config.behind.keys()):
+        raise ServiceError(
+            f"{', '.join(gone)}: revoked, and who has the certificate would be taken for it: take the name out of "
+            "robots and routers; a robot or router that goes on gets a certificate of another name"
+        )
     rules = router_access_control(config.behind, with_role(config.zenoh.users, folder), config.zenoh.router)
     return zenoh_session.router(listen, Credentials.read(folder), rules, connect, thinned)
 
