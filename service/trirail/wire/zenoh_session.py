@@ -128,6 +128,10 @@ def serving(
 
 def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.Session:
     """Open a client's session to a service or router, with credentials where that asks for them."""
+    refused, otherwise = "", ""
+    if credentials is not None:
+        refused = " or these certificates"
+        otherwise = ", its authority's folder with --tls; where a router is away, name the robot's own address"
     return _open(
         {
             "mode": "client",
@@ -138,8 +142,8 @@ def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.S
             "listen/endpoints": [],
             **_tls(credentials),
         },
-        f"no service at {locator}, or none that takes more clients",
-        "start one with: trirail run, or name its address with --connect",
+        f"no service at {locator}, or none that takes more clients{refused}",
+        f"start one with: trirail run, or name its address with --connect{otherwise}",
     )
 
 
