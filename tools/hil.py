@@ -44,8 +44,8 @@ LOGS = ("service", "drives", "second-service", "second-drives", "foreign")
 """What is shown of a run that failed."""
 NOT_SHOWN = (
     "lateness, jitter and 1 kHz: the processor is emulated, ten to twenty times slower and without a clock of its own",
-    "bit errors, arbitration, a bus that is full, error-passive and bus-off: the emulated cards delay nothing, and lose "
-    "only what comes while the host stalls",
+    "bit errors, arbitration, a bus that is full, error-passive and bus-off: the emulated cards delay nothing, and "
+    "lose only what comes while the host stalls",
     "cable, terminators, bitrates that differ, transceivers, and the drivers of USB adapters: there is no wire",
     "what maker's firmware does beyond its dictionary, motors, brakes, power: every drive is a program",
 )
