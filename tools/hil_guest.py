@@ -20,6 +20,8 @@ from hil_programs import Machine
 LOGS = {"bus.log": "bus.log", "second-bus.log": "second-bus.log", "recordings/*.log": "service-frames.log"}
 """What is brought out of memory: what the host has it by."""
 
+CARDS = ("can0", "can1")
+
 
 def main() -> int:
     """Run both robots; leave logs and result.json."""
@@ -38,6 +40,7 @@ def main() -> int:
     except Exception as error:  # noqa: BLE001 - whatever it is, the host is to tell it
         result["failure"] = f"{type(error).__name__}: {error}"
     finally:
+        result["lost"] = {card: _lost(card) for card in CARDS}
         for pattern, name in LOGS.items():
             for log in memory.glob(pattern):
                 shutil.copy(log, folder / name)
@@ -69,6 +72,11 @@ def _run(machine: Machine, folder: Path, held: Callable[[str, str], None], resul
     hil_second.run(machine, second, load(folder / "second.toml"), held, result)
     here = sorted(_compiled() - prepared)
     held("compiled code", f"{len(prepared)} functions from outside, {len(here)} compiled here: {', '.join(here)}")
+
+
+def _lost(card: str) -> int:
+    """How often a card had no room for a frame that came: linux/if_link.h, rx_over_errors."""
+    return int(Path(f"/sys/class/net/{card}/statistics/rx_over_errors").read_text())
 
 
 def _compiled() -> set[str]:

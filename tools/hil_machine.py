@@ -120,7 +120,7 @@ cp -r {CACHE} /dev/shm/numba
 set +e
 {sys.executable} tools/hil_guest.py {folder}
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD=1  # hypothesis alone takes a quarter of a minute to be loaded
-options='-p pytest_timeout --noconftest -m vcan -rA --tb=short'
+options='-p pytest_timeout -p no:cacheprovider --noconftest -m vcan -rA --tb=short'
 {sys.executable} -m pytest $options {" ".join(TESTS)} 2>&1 | tee {folder}/vcan.log
 echo ${{PIPESTATUS[0]}} > {folder}/vcan.code
 {sys.executable} tools/bench.py frames --cycles 300 --json > {folder}/price.json
