@@ -234,6 +234,11 @@ def test_a_jog_that_is_left_while_it_is_renewed_hears_its_end_and_is_not_stopped
             assert renewal.payload is not None
             name = json.loads(renewal.payload.to_string())["id"]
             renewal.reply(renewal.key_expr, msgspec.json.encode(GoalReply(name, 1.0)))
+        with await asyncio.to_thread(silent.asked.get, timeout=WITHIN) as braking:
+            assert braking.payload is not None
+            sent = json.loads(braking.payload.to_string())
+            assert (sent["id"], sent["x"], sent["y"], sent["phi"]) == (name, 0.0, 0.0, 0.0)
+            braking.reply(braking.key_expr, msgspec.json.encode(GoalReply(name, 1.0)))
         end = Event(7, 0.0, 0, 5.0, "goal", "info", "goal done: not renewed", id=name, outcome="done")
         await asyncio.to_thread(silent.publish, "event", end)
         await leaving

@@ -86,8 +86,9 @@ def test_a_session(locator: str) -> None:
 
 def test_a_jog_lasts_while_its_context_does(locator: str) -> None:
     async def work(robot: AsyncRobot) -> None:
-        async with robot.jog(x=0.02) as jog:
+        async with robot.jog(x=0.02, timeout=3.0) as jog:
             await until(robot, lambda state: state.pose[0] > 0.01)
+        assert (await robot.state()).pose[0] < 0.03  # it brakes where the context is left, not a time-out later
         assert jog.result is not None
         assert jog.result.outcome == "done"
         assert max(map(abs, (await robot.state()).commanded.pose_velocity)) == 0.0

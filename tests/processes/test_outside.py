@@ -144,7 +144,35 @@ def test_the_content_of_commands(shared: tuple[Service, Robot, zenoh.Session]) -
         assert asked(session, key("stop"), payload=content)[0][0] == "ok"
         until(robot, lambda state: state.mode == "holding")
     assert "takes no content" in asked(session, key("pause"), payload=b'{"a":' * 5000)[0][1]
-    assert "stop takes nothing, or" in asked(session, key("stop"), payload=b'{"goal": 5}')[0][1]
+
+
+@pytest.mark.parametrize(
+    ("name", "payload", "encoding", "code"),
+    [
+        ("stop", b'{"goal": 5}', "", "malformed"),
+        ("stop", b'{"a":' * 5000, "", "malformed"),
+        ("stop", b"please", "image/png", "unknown_encoding"),
+        ("stop", b" " * (MAX_MESSAGE + 1), "", "too_large"),
+        ("quick_stop", b"\xff now!", "", "malformed"),
+        ("disable", b"true", "", "malformed"),
+    ],
+)
+def test_a_stop_that_cannot_be_read_stops_the_robot_all_the_same(
+    shared: tuple[Service, Robot, zenoh.Session], name: str, payload: bytes, encoding: str, code: str
+) -> None:
+    _, robot, session = shared
+    robot.override(100)
+    robot.enable()
+    goal = robot.move_to(x=0.05 if robot.state().pose[0] < 0.0 else -0.05, y=0.0, phi=0.0, speed=0.1)
+    until(robot, lambda state: state.mode == "moving")
+    ((found, message),) = asked(session, f"trirail/demo/cmd/eve/{name}", payload=payload, encoding=encoding)
+    assert found == code
+    assert message.endswith(f"; the robot is told to {name} all the same")
+    assert goal.wait(timeout=20.0).outcome in ("stopped", "faulted")
+    until(robot, lambda state: state.mode == {"stop": "holding", "quick_stop": "fault", "disable": "disabled"}[name])
+    if name == "quick_stop":
+        robot.reset()
+    robot.enable()
 
 
 # ---------------------------------------------------------------------- what is documented

@@ -392,8 +392,9 @@ def test_every_kind_of_goal(shared: tuple[Service, Robot, zenoh.Session], tmp_pa
     service, robot, _ = shared
     assert robot.move_sliders(0.01, 0.0, -0.01).wait(timeout=10.0).outcome == "done"
     assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
-    with robot.jog(x=0.02) as jog:
+    with robot.jog(x=0.02, timeout=3.0) as jog:
         until(robot, lambda state: state.pose[0] > 0.015)
+    assert robot.state().pose[0] < 0.04  # it brakes where the context is left, not a time-out later
     assert jog.error is None
     assert jog.result is not None
     assert jog.result.outcome == "done"

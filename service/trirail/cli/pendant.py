@@ -24,7 +24,8 @@ from trirail.cli import gamepad, terminal
 from trirail.cli.gamepad import Gamepad, Pad
 from trirail.cli.keyboard import keys
 from trirail.client.client import Robot
-from trirail.client.held_jog import SPEEDS, USUAL, HeldJog, Velocity
+from trirail.client.goal import Velocity
+from trirail.client.held_jog import SPEEDS, USUAL, HeldJog
 from trirail.config import Limits
 from trirail.errors import ServiceError, TrirailError
 from trirail.wire.state import State

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import uuid
 from collections.abc import Awaitable, Callable
 from typing import Self
 
 import msgspec
 
-from trirail.client.goal import STANDS_WITHIN, AcceptedGoal, Result
+from trirail.client.goal import LETTING_GO, STANDS_WITHIN, AcceptedGoal, Result, Velocity
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, VelocityGoal
 from trirail.wire.messages import GoalReply, Stop
@@ -56,7 +57,7 @@ class AsyncJog:
     def __init__(
         self,
         send: Callable[[Callable[[str], Goal], str], Awaitable[AsyncGoalHandle]],
-        velocity: tuple[float, float, float],
+        velocity: Velocity,
         timeout: float,
     ) -> None:
         self._send_goal = send
@@ -80,7 +81,7 @@ class AsyncJog:
         return self._goal.result if self._goal else None
 
     async def __aenter__(self) -> Self:
-        self._goal = await self._send()
+        self._goal = await self._send(self._velocity, self._timeout)
         self._renewing = asyncio.create_task(self._renew(), name="jog")
         return self
 
@@ -88,7 +89,9 @@ class AsyncJog:
         self._over.set()
         if self._renewing is not None:
             await self._renewing  # a renewal that is on its way is not taken back
-        if self._goal is not None and self.error is None:
+        if self._goal is not None and self._goal.result is None and self.error is None:
+            with contextlib.suppress(TrirailError):  # it has ended, or does by its time-out
+                await self._send((0.0, 0.0, 0.0), LETTING_GO)
             await self._goal.wait(self._timeout + STANDS_WITHIN)
 
     async def _is_over(self, within: float) -> bool:
@@ -98,14 +101,13 @@ class AsyncJog:
         except TimeoutError:
             return False
 
-    async def _send(self) -> AsyncGoalHandle:
-        x, y, phi = self._velocity
-        return await self._send_goal(lambda name: VelocityGoal(x, y, phi, timeout=self._timeout, id=name), self._id)
+    async def _send(self, velocity: Velocity, timeout: float) -> AsyncGoalHandle:
+        return await self._send_goal(lambda name: VelocityGoal(*velocity, timeout=timeout, id=name), self._id)
 
     async def _renew(self) -> None:
         while not await self._is_over(self._timeout / 3.0):
             try:
-                await self._send()
+                await self._send(self._velocity, self._timeout)
             except TrirailError as error:
                 at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
                 self.error = None if at_limit else error  # at a limit it has ended as it should

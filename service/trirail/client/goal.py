@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import uuid
 from collections.abc import Callable
@@ -16,6 +17,11 @@ from trirail.wire.vocabulary import Command
 
 STANDS_WITHIN = 10.0
 """How long the end of a jog may take beyond its own time-out [s]."""
+LETTING_GO = 0.05
+"""The time-out of a jog's last renewal, whose velocity is zero: it brakes at once [s]."""
+
+Velocity = tuple[float, float, float]
+"""Of x, y [m/s] and phi [rad/s], in the base frame."""
 
 
 class Result(NamedTuple):
@@ -101,7 +107,8 @@ class Jog:
 
     It is renewed three times in each time-out, by a thread of its own. A program that hangs or dies renews it no more,
     and the robot brakes: the time-out is real time, at every override. What has run out or was paused is over; begin
-    a new one. `error` tells whether it could not be renewed. Leaving the context waits for the standstill.
+    a new one. `error` tells whether it could not be renewed. Leaving the context brakes at once and waits for the
+    standstill.
 
     `velocity` is that of x, y [m/s] and phi [rad/s] in the base frame, `timeout` in seconds. Entering the context
     raises RefusedError where the service does not take it, leaving it TimeoutError where no end is heard. `send` sends
@@ -111,7 +118,7 @@ class Jog:
     def __init__(
         self,
         send: Callable[[Callable[[str], Goal], str], GoalHandle],
-        velocity: tuple[float, float, float],
+        velocity: Velocity,
         timeout: float,
     ) -> None:
         self._send_goal = send
@@ -135,24 +142,25 @@ class Jog:
         return self._goal.result if self._goal else None
 
     def __enter__(self) -> Self:
-        self._goal = self._send()
+        self._goal = self._send(self._velocity, self._timeout)
         self._renewing.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._renewing.join()
-        if self._goal is not None and self.error is None:
+        if self._goal is not None and self._goal.result is None and self.error is None:
+            with contextlib.suppress(TrirailError):  # it has ended, or does by its time-out
+                self._send((0.0, 0.0, 0.0), LETTING_GO)
             self._goal.wait(self._timeout + STANDS_WITHIN)
 
-    def _send(self) -> GoalHandle:
-        x, y, phi = self._velocity
-        return self._send_goal(lambda name: VelocityGoal(x, y, phi, timeout=self._timeout, id=name), self._id)
+    def _send(self, velocity: Velocity, timeout: float) -> GoalHandle:
+        return self._send_goal(lambda name: VelocityGoal(*velocity, timeout=timeout, id=name), self._id)
 
     def _renew(self) -> None:
         while not self._over.wait(self._timeout / 3.0):
             try:
-                self._send()
+                self._send(self._velocity, self._timeout)
             except TrirailError as error:
                 at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
                 self.error = None if at_limit else error  # at a limit it has ended as it should

@@ -7,22 +7,17 @@ import time
 import uuid
 from collections.abc import Callable
 
-from trirail.client.goal import GoalHandle
+from trirail.client.goal import LETTING_GO, GoalHandle, Velocity
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, VelocityGoal
 
 TIMEOUT = 0.2
 """Real time after which the service brakes a jog that is not renewed [s]."""
-LETTING_GO = 0.05
-"""The same for the last renewal, whose velocity is zero [s]."""
 
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """What an operator chooses from: shares of the platform's velocity limits."""
 USUAL = 3
 """Which of them it is until another is chosen."""
-
-Velocity = tuple[float, float, float]
-"""Of x, y [m/s] and phi [rad/s], in the base frame."""
 
 
 class HeldJog:
@@ -102,9 +97,8 @@ class HeldJog:
                 return  # it has ended, or does by its time-out
 
     def _send(self, velocity: Velocity, timeout: float, goal_id: str | None = None) -> GoalHandle:
-        x, y, phi = velocity
         goal_id = goal_id or (self._goal.id if self._goal is not None else uuid.uuid4().hex[:12])
-        return self._send_goal(lambda name: VelocityGoal(x, y, phi, timeout=timeout, id=name), goal_id)
+        return self._send_goal(lambda name: VelocityGoal(*velocity, timeout=timeout, id=name), goal_id)
 
     def _end(self, why: str) -> None:
         self._goal, self._over = None, True

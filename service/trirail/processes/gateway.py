@@ -134,7 +134,6 @@ class Gateway:
     def _handle(self, incoming: Incoming) -> None:
         """Take a message; whatever is wrong with it is answered, and told to everyone, since a put has no answer."""
         try:
-            boundary.check_size(incoming.size)
             if incoming.kind == "info":
                 self._replies.send(incoming, self._info)
             elif incoming.kind == "role":
@@ -159,7 +158,7 @@ class Gateway:
 
     def _goal(self, incoming: Incoming) -> None:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
-        sent: Goal = boundary.decode(incoming.payload, Goal, "not a goal", incoming.encoding)
+        sent: Goal = incoming.content(Goal, "not a goal")
         self._requests.goal(incoming, user, self._poses.of_name(sent))
 
     def _command(self, incoming: Incoming) -> None:
@@ -169,8 +168,17 @@ class Gateway:
         except ValueError as error:
             problem = f"{quoted(called)}: no such command; there are {', '.join(Command)}"
             raise RefusedError(RefusalCode.UNKNOWN_COMMAND, problem) from error
-        takes = f"{name} takes {name.content}"
-        content = boundary.decode(incoming.payload, CONTENT.get(name, NoContent | None), takes, incoming.encoding)
+        try:
+            content = incoming.content(CONTENT.get(name, NoContent | None), f"{name} takes {name.content}")
+        except RefusedError as refusal:
+            if not (name.stops and name.everybodys):
+                raise
+            # Whoever says stop, however badly, wants it to stop: it is carried out as if it had no content.
+            self._carry_out(incoming._replace(query=None), user, name, None)
+            raise RefusedError(refusal.code, f"{refusal}; the robot is told to {name} all the same") from refusal
+        self._carry_out(incoming, user, name, content)
+
+    def _carry_out(self, incoming: Incoming, user: str, name: Command, content: msgspec.Struct | None) -> None:
         goal = content.goal if isinstance(content, Stop) else None
         reason = f"{name} by {user}"
         if goal is not None and self._requests.backlog.withdraw(goal, reason):  # before the loop has it

@@ -9,13 +9,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import zenoh
 
 from trirail.processes.fair_queue import FairQueue
 from trirail.processes.pace import Pace
-from trirail.wire import zenoh_session
+from trirail.wire import boundary, zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE, MAX_UNREAD
 from trirail.wire.vocabulary import Command
 
@@ -50,6 +50,11 @@ class Incoming(NamedTuple):
     def user(self) -> str:
         """Who is said to have sent it; "" for what names nobody."""
         return self.key.split("/")[3] if self.key.count("/") > 2 else ""
+
+    def content(self, kind: Any, what: str) -> Any:
+        """Return its payload as a message of that kind, a type or union. Raises RefusedError, beginning with `what`."""
+        boundary.check_size(self.size)
+        return boundary.decode(self.payload, kind, what, self.encoding)
 
 
 class Inbox:

@@ -98,7 +98,7 @@ class Poses:
         kind = incoming.kind
         user, name = boundary.names(incoming.key, zenoh_session.key(self._robot, kind), ("user", "pose"))
         boundary.check_name(name, "pose")
-        boundary.decode(incoming.payload, NoContent | None, f"{kind} takes no content", incoming.encoding)
+        incoming.content(NoContent | None, f"{kind} takes no content")
         if self._under_way >= UNDER_WAY:
             raise RefusedError(RefusalCode.BUSY, f"{self._under_way} poses are being taught already: send fewer")
         if kind == "forget":
