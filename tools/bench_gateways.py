@@ -21,8 +21,8 @@ from trirail.config import SIM, Config, Tls, Zenoh, load
 from trirail.processes.gateway import SUMMARY_EVERY
 from trirail.processes.guard import Guard
 from trirail.processes.inbox import Inbox
-from trirail.processes.loop import BATCHES_PER_SECOND
 from trirail.processes.publications import Publications
+from trirail.processes.reports import BATCHES_PER_SECOND
 from trirail.processes.state import StateMaker
 from trirail.telemetry.sinks import free_port
 from trirail.wire.records import DTYPE

@@ -11,7 +11,8 @@ from conftest import Followers, Rig, alone, what_memory_takes
 from trirail.motion.planning import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
-from trirail.processes.loop import BATCHES_PER_SECOND, REQUESTS_A_CYCLE, Loop, Ports
+from trirail.processes.loop import REQUESTS_A_CYCLE, Loop, Ports
+from trirail.processes.reports import BATCHES_PER_SECOND
 from trirail.wire import links
 from trirail.wire.goals import PoseGoal
 from trirail.wire.links import Closed, PacketLink, Port

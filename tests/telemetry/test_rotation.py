@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from trirail.config import SIM, Config, load, parse
 from trirail.processes import loop
-from trirail.processes.loop import BATCHES_PER_SECOND
 from trirail.processes.recording import GATHER
+from trirail.processes.reports import BATCHES_PER_SECOND
 from trirail.telemetry import blackbox, provenance, retention
 from trirail.telemetry.blackbox import AFTER, BEFORE, BlackBox
 from trirail.telemetry.provenance import SOFTWARE

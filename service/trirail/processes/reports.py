@@ -1,0 +1,195 @@
+"""What the loop says to the processes beside it, and what the recorder has to say."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from trirail_drivers.bus.capture import Capture
+from trirail_drivers.interface import DriveGroup
+
+from trirail.config import Config
+from trirail.control.control import Control
+from trirail.processes.clock import Tick
+from trirail.wire.links import Port
+from trirail.wire.messages import Event
+from trirail.wire.packets import ControlInput, GivenInput, Kind, Remark, Status, Welcome, decode_recorder, message, told
+from trirail.wire.records import HEAD, SIZE
+from trirail.wire.text import quoted
+from trirail.wire.vocabulary import MODES
+
+BATCHES_PER_SECOND = 50
+ANSWERS_A_CYCLE = 8
+EVENTS_KEPT = 1000
+"""Events kept for a gateway that comes anew: the one before may have died with some that it had not published."""
+
+
+class Reports:
+    """Passes on what each cycle has made: records in batches, events, answers, and what records do not say.
+
+    Nothing in it waits: what the gateway is too slow for is kept for it, what the recorder is too slow for it lacks.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        control: Control,
+        drives: DriveGroup,
+        gateway: Port,
+        recorder: Port,
+        capture: Capture | None,
+        lacking: tuple[str, ...],
+    ) -> None:
+        self._control = control
+        self._drives = drives
+        self._gateway = gateway
+        self._recorder = recorder
+        self._capture = capture
+        self._period = config.period
+        self._welcome = message(Welcome(lacking, drives.bus_load, time.time(), drives.missing_protections))
+        self._status = message(Status(None, 1.0, None))
+        self._bitrate = config.can.bitrate
+        self._bus_load = 0.0
+        self._bits = drives.traffic
+        self._weighed_at = 0
+        self._events = 0
+        self._kept: deque[bytes] = deque(maxlen=EVENTS_KEPT)
+        self._answers: deque[bytes] = deque()
+        self._told = 0
+        self._inputs = 0
+        self._given: list[ControlInput] = []
+        self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
+        self._made = control.measured.record.view(np.uint8).data
+        """The cycle's record, as the control makes it."""
+        self._batch = memoryview(bytearray(1 + self._batch_size * SIZE))
+        self._batch[0] = Kind.RECORDS
+        self._batched = 0
+        self._recorded = False
+        self._unrecorded = ""
+
+    def note(self, now_ns: int, given: GivenInput) -> None:
+        """Keep what the control is given in this cycle, for the recorder."""
+        self._inputs += 1
+        self._given.append(ControlInput(self._inputs, self._control.cycles, now_ns, given))
+
+    def record(self, tick: Tick, overruns: int, parts_ns: Sequence[int]) -> bool:
+        """Append this cycle's record; return whether the batch is full, and to be flushed."""
+        control = self._control
+        ticks = control.cycles, tick.deadline_ns, tick.lateness_ns, overruns
+        HEAD.pack_into(self._made, 0, *ticks, *parts_ns, MODES.index(control.state.mode))
+        begin = 1 + self._batched * SIZE
+        self._batch[begin : begin + SIZE] = self._made
+        self._batched += 1
+        return self._batched == self._batch_size
+
+    def pass_on(self) -> None:
+        """Pass on what was given to the control, what has happened and what is answered, if anything."""
+        if self._control.ledger.answers or self._control.ledger.notices or self._given:
+            self._publish()
+        if self._answers:
+            self._send_answers()
+
+    def flush(self) -> None:
+        """Send the batch, take new peers, and what was kept for them; listen to the recorder."""
+        if self._batched:
+            batch = self._batch[: 1 + self._batched * SIZE]
+            self._batched = 0
+            self._gateway.send(batch)
+            self._recorder.send(batch)
+        if self._capture is not None and self._recorder.connected:
+            for frames in self._capture.take():
+                self._recorder.send(bytes((Kind.FRAMES,)) + frames)
+        self._measure_bus_load()
+        self._listen()
+        self.accept_peers()
+        self._send_events()
+
+    def accept_peers(self) -> None:
+        """Take new peers."""
+        for port in (self._gateway, self._recorder):
+            if port.accept():
+                port.send(self._welcome)
+                port.send(self._status)
+                if port is self._gateway:
+                    self._told = 0
+
+    def _measure_bus_load(self) -> None:
+        """Once a second, work out how much of the bus is in use, and tell it."""
+        cycles = self._control.cycles - self._weighed_at
+        if cycles * self._period >= 1.0:
+            bits, self._bits = self._drives.traffic - self._bits, self._drives.traffic
+            self._bus_load = round(bits / (cycles * self._period * self._bitrate), 3)
+            self._weighed_at += cycles
+            self._publish_status()
+
+    def _listen(self) -> None:
+        """Tell everyone what the recorder has to say, and if it has gone."""
+        packet = self._recorder.receive()
+        if self._recorder.take_lost() and self._recorded:
+            self._recorded = False
+            self._unrecorded = "the recorder has gone: nothing is recorded until it is back"
+            self._control.ledger.tell("service", "warning", self._unrecorded)
+            self._publish_status()
+        if packet is None:
+            return
+        if not self._recorded:
+            self._recorded, self._unrecorded = True, ""
+        try:
+            said = decode_recorder(memoryview(packet)[1:])
+        except msgspec.DecodeError as error:  # the recorder must not be able to stop the robot
+            self._control.ledger.tell("service", "warning", f"the recorder said something unreadable: {error}")
+            return
+        if isinstance(said, Remark):
+            self._control.ledger.tell("service", said.level, said.message)
+        else:
+            self._unrecorded = quoted(said.why) if said.why else ""
+        self._publish_status()
+
+    def _publish(self) -> None:
+        """Answer requests, number what has happened, and pass on what the control was given."""
+        control, ledger = self._control, self._control.ledger
+        for given in self._given:
+            self._recorder.send(message(given))
+        self._given.clear()
+        for notice in ledger.notices:
+            self._events += 1
+            t = control.cycles * self._period
+            event = Event(self._events, t, control.cycles, time.time(), **notice._asdict())
+            packet = told(event)
+            self._kept.append(packet)
+            self._recorder.send(packet)
+        ledger.notices.clear()
+        self._publish_status()
+        self._send_events()
+        self._answers.extend(map(message, ledger.answers))
+        ledger.answers.clear()
+
+    def _publish_status(self) -> None:
+        """Tell what records do not say, where that has changed."""
+        control, goal = self._control, self._control.ledger.goal
+        goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
+        fault, lag = quoted(control.fault) if control.fault else None, goal.lag if goal else None
+        said = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user, lag
+        status = message(Status(*said, self._unrecorded))
+        if status != self._status:
+            self._status = status
+            self._gateway.send(status)
+            self._recorder.send(status)
+
+    def _send_answers(self) -> None:
+        """Answer some requests; what the gateway is too slow for waits, what it has gone without is nobody's."""
+        if not self._gateway.connected:
+            self._answers.clear()
+        for _ in range(min(len(self._answers), ANSWERS_A_CYCLE)):
+            if not self._gateway.send(self._answers[0]):
+                return
+            self._answers.popleft()
+
+    def _send_events(self) -> None:
+        """Tell the gateway of every event that is kept and that it does not know."""
+        self._told = max(self._told, self._events - len(self._kept))
+        while self._told < self._events and self._gateway.send(self._kept[self._told - self._events]):
+            self._told += 1
