@@ -22,7 +22,8 @@ from trirail.kinematics.robot import forward, inverse
 from trirail.motion.feasibility import PLANNED, Checker
 from trirail.motion.limits import Bounds
 from trirail.motion.paths import Path, value
-from trirail.motion.planner import Kinodynamic, Plan, Planner
+from trirail.motion.planner import Plan, Planner
+from trirail.motion.ruckig_call import Kinodynamic
 from trirail.motion.runs import MotionState, rest
 
 ROBOT = geometry(CONFIG.geometry)

@@ -11,8 +11,7 @@ from trirail_drivers.interface import Triple
 
 from trirail.config import BASE, PLATFORM, FramesTable
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.planner import NO_TOOL
-from trirail.motion.runs import of_tool, rest
+from trirail.motion.runs import NO_TOOL, of_tool, rest
 from trirail.wire.goals import (
     Goal,
     MoveGoal,

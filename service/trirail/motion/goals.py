@@ -11,9 +11,10 @@ from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
 from trirail.motion.paths import HALVINGS, Path, constant
-from trirail.motion.planner import NO_TOOL, TOO_FAST_IN_MOTION, Kinodynamic, Plan, Planner
+from trirail.motion.planner import TOO_FAST_IN_MOTION, Plan, Planner
 from trirail.motion.quintic import Point
-from trirail.motion.runs import MotionState, Run, nominal, rest, stretched
+from trirail.motion.ruckig_call import Kinodynamic
+from trirail.motion.runs import NO_TOOL, MotionState, Run, nominal, rest, stretched
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import TimeScaling
 from trirail.motion.tracking import Tracker

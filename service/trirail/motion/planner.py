@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 
 from trirail.config import PlatformLimits, SliderLimits
 from trirail.errors import RefusalCode, RefusedError
@@ -16,9 +15,9 @@ from trirail.kinematics.robot import inverse_into
 from trirail.motion.feasibility import Checker, excess, fastest
 from trirail.motion.limits import COORDINATES, Bounds, beyond, told_apart
 from trirail.motion.paths import Path, constant
-from trirail.motion.quintic import Point, quintic
-from trirail.motion.ruckig_call import solve_within
-from trirail.motion.runs import STILL, MotionState, from_ruckig, joined, of_centre, of_tool, rest, stretched, tools_of
+from trirail.motion.quintic import Point, check_ends, quintic
+from trirail.motion.ruckig_call import Kinodynamic, Solver
+from trirail.motion.runs import NO_TOOL, STILL, MotionState, joined, of_centre, of_tool, rest, stretched
 from trirail.motion.straight_lines import time_optimal
 
 GENTLEST = 0.1
@@ -35,26 +34,9 @@ FASTEST_OVERRIDE = 2.0
 """At how many times its nominal rate the time along a path may be told to run."""
 A_HAIR_MORE = 1.0 + 1e-6
 """What rounding may lose."""
-START = 1e-4
-"""How far a trajectory may begin from where the robot stands [m, rad]."""
-STANDS = 1e-6
-"""Velocity at the ends of a trajectory that counts as rounding, and is taken for none [m/s, rad/s]."""
-FASTEST = 1e6
-"""A limit for where nothing moves [m/s, m/s², m/s³]."""
-NO_TOOL = (0.0, 0.0)
-"""The platform's centre, as a point of the platform [m]."""
-
 TOO_FAST_IN_MOTION = RefusedError(
     RefusalCode.TOO_FAST, "from its present motion the robot cannot take this path within its sliders' limits"
 )
-
-
-class Kinodynamic(NamedTuple):
-    """Greatest velocity, acceleration and jerk in each coordinate [m/s, rad/s, …]."""
-
-    velocity: Sequence[float]
-    acceleration: Sequence[float]
-    jerk: Sequence[float]
 
 
 class Plan(NamedTuple):
@@ -90,7 +72,7 @@ class Planner:
         self._bounds = bounds
         self._checker = checker
         self._period = period
-        self._ruckig, self._along_a_line = Ruckig(3), Ruckig(1)
+        self._solver = Solver()
         # How far the platform's edges are: what a turn by one radian moves at most.
         self._reach = max(math.hypot(*leg.edge_point) for leg in geometry.legs)
 
@@ -195,7 +177,7 @@ class Planner:
 
         Too fast is refused, or slowed with `stretch`.
         """
-        _check_ends(points, start)
+        check_ends(points, start)
         path = quintic(points, start.pose)
         worst = self._checker.whole(path, start.pose)
         slower = excess(worst)
@@ -214,7 +196,7 @@ class Planner:
 
     def to_velocity(self, start: MotionState, velocity: Sequence[float]) -> Path:
         """Return the quickest way to a velocity within the platform's limits, not looked at. Raises RefusedError."""
-        return self._solve(start, self._platform, velocity=velocity)
+        return self._solver.to_velocity(start, velocity, self._platform)
 
     def nearness(self, pose: Sequence[float], target: Sequence[float]) -> float:
         """Return how far a point of the platform is at most from where it is to be [m]."""
@@ -235,7 +217,7 @@ class Planner:
     ) -> Plan:
         """Plan from `begin`, the platform's motion `start` as that of the sliders or of a tool."""
         if start.at_rest:
-            path = self._solve(begin, limits, in_sliders, tool, target=target)
+            path = self._solver.to_rest(begin, target, limits, in_sliders, tool)
             slower = max(1.0 / speed, excess(self._checker.whole(path, start.pose)))
             if slower * speed > 1.0:
                 quickest = self._quickest(path, limits, path.duration / speed, start.pose)
@@ -247,7 +229,7 @@ class Planner:
         shares = np.full(3, speed)
         for _ in range(TRIES):
             lower = Kinodynamic(*(np.array(limits) * shares[:, None]).tolist())
-            path = self._solve(begin, lower, in_sliders, tool, target=target)
+            path = self._solver.to_rest(begin, target, lower, in_sliders, tool)
             worst = self._checker.whole(path, start.pose)
             if self._checker.bears(worst):
                 return Plan(path, speed / float(shares.min()))
@@ -294,93 +276,3 @@ class Planner:
         end = [value + hold * rate for value, rate in zip(pose, velocity, strict=True)]
         brake = self.to_velocity(MotionState(end, velocity, STILL), STILL)
         return ramp.duration, brake.duration, joined([ramp, Path(np.array([0.0, hold]), held), brake])
-
-    def _solve(
-        self,
-        start: MotionState,
-        limits: Kinodynamic,
-        in_sliders: bool = False,
-        tool: Sequence[float] = NO_TOOL,
-        *,
-        target: Sequence[float] | None = None,
-        velocity: Sequence[float] | None = None,
-    ) -> Path:
-        """Ask Ruckig for the way to rest at a target, or to a velocity."""
-        if target is not None and start.at_rest:
-            return self._straight(start.pose, target, limits, in_sliders, tool)
-        request, trajectory = InputParameter(3), Trajectory(3)
-        request.current_position = list(start.pose)
-        request.current_velocity = list(start.velocity)
-        request.current_acceleration = list(start.acceleration)
-        request.max_velocity = list(limits.velocity)
-        request.max_acceleration = list(limits.acceleration)
-        request.synchronization = Synchronization.Phase
-        if target is not None:
-            request.target_position = list(target)
-        if velocity is not None:
-            request.control_interface = ControlInterface.Velocity
-            request.target_velocity = list(velocity)
-        return self._solved(self._ruckig, request, trajectory, limits.jerk, in_sliders, tool)
-
-    def _straight(
-        self,
-        begin: Sequence[float],
-        target: Sequence[float],
-        limits: Kinodynamic,
-        in_sliders: bool,
-        tool: Sequence[float],
-    ) -> Path:
-        """Return the straight way from rest to rest, in the coordinate that goes farthest; the others share its time.
-
-        Ruckig's phase synchronisation gives up where one coordinate's velocity, acceleration or jerk would have to be
-        lower than it takes alone: three goals in a hundred then left their line.
-        """
-        length = np.subtract(target, begin)
-        farthest = float(np.abs(length).max())
-        shares = length / farthest if farthest else np.zeros(3)
-        with np.errstate(divide="ignore", over="ignore"):  # a coordinate that stays where it is bounds nothing
-            velocity, acceleration, jerk = (np.array(limits) / np.abs(shares)).min(axis=1)
-        request, trajectory = InputParameter(1), Trajectory(1)
-        request.target_position = [farthest]
-        request.max_velocity, request.max_acceleration = [min(velocity, FASTEST)], [min(acceleration, FASTEST)]
-        along = self._solved(self._along_a_line, request, trajectory, [min(jerk, FASTEST)])
-        pieces = along.pieces * shares[:, None]
-        pieces[:, :, 0] += begin
-        return Path(along.knots, pieces, in_sliders, tools_of(tool, len(pieces)))
-
-    def _solved(
-        self,
-        ruckig: Ruckig,
-        request: InputParameter,
-        trajectory: Trajectory,
-        jerk: Sequence[float],
-        in_sliders: bool = False,
-        tool: Sequence[float] = NO_TOOL,
-    ) -> Path:
-        """Return Ruckig's answer as a path; the request lacks its limits of jerk. Raises RefusedError."""
-        solve_within(ruckig, request, trajectory, jerk)
-        return from_ruckig(trajectory, in_sliders, tool)
-
-
-def _check_ends(points: Sequence[Point], start: MotionState) -> None:
-    """Raise RefusedError where points do not begin as the robot stands, or do not end at rest.
-
-    What they begin or end with of an acceleration counts as the jerk over one cycle that it is (Checker.look).
-    """
-    if not start.at_rest:
-        raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it stands")
-    for name, given, stands in zip(COORDINATES, points[0].pose, start.pose, strict=True):
-        if abs(given - stands) > START:
-            text = "the trajectory begins at {} = {}, the robot is at {}: go there first".format(
-                name, *told_apart(given, stands)
-            )
-            raise RefusedError(RefusalCode.WRONG_START, text, value=given, limit=stands)
-    ends = (
-        (RefusalCode.WRONG_START, "begins", "let it begin at rest, as the robot stands", points[0]),
-        (RefusalCode.WRONG_END, "ends", "let it end at rest", points[-1]),
-    )
-    for code, does, remedy, point in ends:
-        for name, unit, value in zip(COORDINATES, ("m/s", "m/s", "rad/s"), point.velocity or STILL, strict=True):
-            if abs(value) > STANDS:
-                text = f"the trajectory {does} with {value:.6g} {unit} in {name}: {remedy}"
-                raise RefusedError(code, text, value=value, limit=0.0)

@@ -7,8 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.arrays import Array
+from trirail.motion.limits import COORDINATES, told_apart
 from trirail.motion.paths import Path
+from trirail.motion.runs import STILL, MotionState
+
+START = 1e-4
+"""How far a trajectory may begin from where the robot stands [m, rad]."""
+STANDS = 1e-6
+"""Velocity at the ends of a trajectory that counts as rounding, and is taken for none [m/s, rad/s]."""
 
 
 class Point(NamedTuple):
@@ -62,3 +70,27 @@ def _filled(given: Sequence[Sequence[float] | None], t: Array, values: Array) ->
         if rate is not None:
             rates[row] = rate
     return rates
+
+
+def check_ends(points: Sequence[Point], start: MotionState) -> None:
+    """Raise RefusedError where points do not begin as the robot stands, or do not end at rest.
+
+    What they begin or end with of an acceleration counts as the jerk over one cycle that it is (Checker.look).
+    """
+    if not start.at_rest:
+        raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it stands")
+    for name, given, stands in zip(COORDINATES, points[0].pose, start.pose, strict=True):
+        if abs(given - stands) > START:
+            text = "the trajectory begins at {} = {}, the robot is at {}: go there first".format(
+                name, *told_apart(given, stands)
+            )
+            raise RefusedError(RefusalCode.WRONG_START, text, value=given, limit=stands)
+    ends = (
+        (RefusalCode.WRONG_START, "begins", "let it begin at rest, as the robot stands", points[0]),
+        (RefusalCode.WRONG_END, "ends", "let it end at rest", points[-1]),
+    )
+    for code, does, remedy, point in ends:
+        for name, unit, value in zip(COORDINATES, ("m/s", "m/s", "rad/s"), point.velocity or STILL, strict=True):
+            if abs(value) > STANDS:
+                text = f"the trajectory {does} with {value:.6g} {unit} in {name}: {remedy}"
+                raise RefusedError(code, text, value=value, limit=0.0)

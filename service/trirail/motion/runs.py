@@ -14,6 +14,8 @@ from trirail.kinematics.arrays import Array
 from trirail.motion.paths import CENTRE, FOR_EVER, Path, advance, constant, path_motion, reached, transfer, value
 
 STILL = (0.0, 0.0, 0.0)
+NO_TOOL = (0.0, 0.0)
+"""The platform's centre, as a point of the platform [m]."""
 SAME_TIME = 1e-9
 """Knots closer than this are one [s]."""
 

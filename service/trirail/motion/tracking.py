@@ -19,9 +19,9 @@ from trirail.kinematics.arrays import Array
 from trirail.motion.feasibility import Checker, Look
 from trirail.motion.limits import Bounds
 from trirail.motion.paths import Path, constant
-from trirail.motion.planner import GENTLEST, ROOM, TOO_FAST_IN_MOTION, Kinodynamic, Plan, Planner
+from trirail.motion.planner import GENTLEST, ROOM, TOO_FAST_IN_MOTION, Plan, Planner
 from trirail.motion.quintic import Point, between
-from trirail.motion.ruckig_call import solve_within
+from trirail.motion.ruckig_call import Kinodynamic, solve_within
 from trirail.motion.runs import STILL, MotionState, cut, from_ruckig, joined, nominal
 
 CATCH_UP = 0.05
