@@ -33,10 +33,10 @@ RIGHT = "[data-axis=x][data-sign='1']"
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    service = Service(tmp_path_factory.mktemp("operated"))
-    service.wait_up()
-    yield service
-    assert service.end() == 0
+    with Service(tmp_path_factory.mktemp("operated")) as service:
+        service.wait_up()
+        yield service
+        assert service.end() == 0
 
 
 @pytest.fixture
@@ -182,22 +182,22 @@ def test_two_tabs_both_work_and_either_stops(service: Service, robot: Robot, bro
 @needs_chromium
 @pytest.mark.timeout(300)
 def test_the_page_comes_back_with_the_service(browser: Page, tmp_path: Path) -> None:
-    first = Service(tmp_path)
-    first.wait_up()
-    with served(first) as (url, _):
-        page = browser.another()
-        page.open(url)
-        page.until("document.querySelector('#mode-name').textContent === 'disabled'")
-        assert first.end() == 0
-        page.until("document.querySelector('#mode-name').textContent === 'no contact'")
-        second = Service(tmp_path)
-        second.wait_up()
-        page.until("document.querySelector('#mode-name').textContent === 'disabled'")
-        page.click("[data-command=enable]")
-        page.until("document.querySelector('#mode-name').textContent === 'holding'")
-        page.until("document.querySelector('#events li').innerText.includes('enabled')")
-        page.close()
-    assert second.end() == 0
+    with Service(tmp_path) as first:
+        first.wait_up()
+        with served(first) as (url, _):
+            page = browser.another()
+            page.open(url)
+            page.until("document.querySelector('#mode-name').textContent === 'disabled'")
+            assert first.end() == 0
+            page.until("document.querySelector('#mode-name').textContent === 'no contact'")
+            with Service(tmp_path) as second:
+                second.wait_up()
+                page.until("document.querySelector('#mode-name').textContent === 'disabled'")
+                page.click("[data-command=enable]")
+                page.until("document.querySelector('#mode-name').textContent === 'holding'")
+                page.until("document.querySelector('#events li').innerText.includes('enabled')")
+                page.close()
+                assert second.end() == 0
 
 
 # ---------------------------------------------------------------------- the pendant

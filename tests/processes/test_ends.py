@@ -170,20 +170,20 @@ def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.soc
 
 
 def test_the_watchdog_is_fed_while_loop_and_gateway_are_alive(told: socket.socket, tmp_path: Path) -> None:
-    service = Service(tmp_path)
-    while told.recv(100) != b"READY=1":
-        pass
-    for _ in range(5):
-        assert told.recv(100) == b"WATCHDOG=1"
-    os.kill(service.child("gateway"), signal.SIGSTOP)
-    service.wait_said("the gateway has died")
-    told.setblocking(False)
-    with contextlib.suppress(BlockingIOError):
-        while told.recv(100):  # what was sent before
+    with Service(tmp_path) as service:
+        while told.recv(100) != b"READY=1":
             pass
-    told.settimeout(UP_WITHIN)
-    assert told.recv(100) == b"WATCHDOG=1"  # it is back
-    assert service.end() == 0
+        for _ in range(5):
+            assert told.recv(100) == b"WATCHDOG=1"
+        os.kill(service.child("gateway"), signal.SIGSTOP)
+        service.wait_said("the gateway has died")
+        told.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while told.recv(100):  # what was sent before
+                pass
+        told.settimeout(UP_WITHIN)
+        assert told.recv(100) == b"WATCHDOG=1"  # it is back
+        assert service.end() == 0
 
 
 def test_nothing_is_imported_from_the_folder_it_is_started_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,7 +192,7 @@ def test_nothing_is_imported_from_the_folder_it_is_started_in(tmp_path: Path, mo
     for name in ("msgspec", "numpy", "zenoh", "rerun", "trirail", "signal"):
         (folder / f"{name}.py").write_text(f"open('{folder}/run', 'a').write('{name}')\nraise SystemExit(9)\n")
     monkeypatch.chdir(folder)
-    service = Service(tmp_path)
-    service.wait_up()
-    assert service.end() == 0
-    assert not (folder / "run").exists()
+    with Service(tmp_path) as service:
+        service.wait_up()
+        assert service.end() == 0
+        assert not (folder / "run").exists()

@@ -25,11 +25,9 @@ pytestmark = pytest.mark.slow
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[Service]:
     """A service that moves for the holder of the lease alone."""
-    started = Service(tmp_path, **{"[telemetry]": '[control]\nlease = "required"\n\n[telemetry]'})
-    started.wait_up()
-    yield started
-    if started.process.poll() is None:
-        started.end()
+    with Service(tmp_path, **{"[telemetry]": '[control]\nlease = "required"\n\n[telemetry]'}) as started:
+        started.wait_up()
+        yield started
 
 
 def held_by(service: Service, user: str) -> subprocess.Popen[str]:

@@ -36,19 +36,19 @@ UNSEEN = ("\x1b[2J", "\x9b31m", "\u202eevil", "a\0b", "forged\ntrirail: line", "
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Service, Robot, zenoh.Session]]:
     """One enabled service, which no test may end; it has the processes afterwards that it had before."""
-    service = Service(tmp_path_factory.mktemp("shared"))
-    service.wait_up()
-    names = ("loop", "gateway", "planner", "recorder")
-    before = [service.child(name) for name in names]
-    with service.robot() as robot, open_client(service.locator) as session:
-        robot.enable()
-        yield service, robot, session
-        assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(10.0).outcome == "done"
-    assert [service.child(name) for name in names] == before, service.log.read_text()
-    assert service.end() == 0
-    log = service.log.read_text()
-    assert "Traceback" not in log
-    assert all(line.isprintable() for line in log.splitlines()), log
+    with Service(tmp_path_factory.mktemp("shared")) as service:
+        service.wait_up()
+        names = ("loop", "gateway", "planner", "recorder")
+        before = [service.child(name) for name in names]
+        with service.robot() as robot, open_client(service.locator) as session:
+            robot.enable()
+            yield service, robot, session
+            assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(10.0).outcome == "done"
+        assert [service.child(name) for name in names] == before, service.log.read_text()
+        assert service.end() == 0
+        log = service.log.read_text()
+        assert "Traceback" not in log
+        assert all(line.isprintable() for line in log.splitlines()), log
 
 
 def asked(session: zenoh.Session, key: str, **what: object) -> list[tuple[str, str]]:

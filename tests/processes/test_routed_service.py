@@ -58,13 +58,10 @@ def hub(tmp_path: Path) -> Iterator[Hub]:
 @pytest.fixture
 def service(hub: Hub, tmp_path: Path) -> Iterator[Service]:
     locator = f"unixsock-stream/{tmp_path}/zenoh"
-    made = Service(tmp_path, **{f'listen = ["{locator}"]': f'listen = ["{locator}"]\nconnect = ["{hub.locator}"]'})
-    try:
+    changes = {f'listen = ["{locator}"]': f'listen = ["{locator}"]\nconnect = ["{hub.locator}"]'}
+    with Service(tmp_path, **changes) as made:
         made.wait_up()
         yield made
-    finally:
-        if made.process.poll() is None:
-            made.end()
 
 
 def seen(fleet: Fleet, condition: Callable[[Member, float], bool], within: float, service: Service) -> None:

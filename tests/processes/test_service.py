@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 from urllib.parse import urlsplit
 
 import edsfiles
@@ -69,6 +69,14 @@ class Service:
         self.log = folder / "service.log"
         with self.log.open("wb") as log:
             self.process = run(path, stdout=log, stderr=subprocess.STDOUT)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:  # whatever has failed: it must not disturb the tests to come
+            self.process.terminate()
+            self.process.wait(END_WITHIN)
 
     def wait_up(self) -> None:
         """Wait until it says that it is up."""
@@ -156,11 +164,9 @@ def controlwords(sent: list[tuple[int, bytes]], node: int) -> list[int]:
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[Service]:
-    started = Service(tmp_path)
-    started.wait_up()
-    yield started
-    if started.process.poll() is None:
-        started.end()
+    with Service(tmp_path) as started:
+        started.wait_up()
+        yield started
 
 
 # ---------------------------------------------------------------------- the way it is meant to be used
@@ -208,22 +214,24 @@ def test_a_session_with_odrives(tmp_path: Path) -> None:
     changes = {'protocol = "cia402"': 'protocol = "odrive"'}
     # The feed-forward of an ODrive reaches the 1 m/s of the configuration with at most 32 turns per metre.
     changes |= {f"node = {n}\ncounts_per_metre = 1e7": f"node = {n}\ncounts_per_metre = 25.0" for n in (1, 2, 3)}
-    service = Service(tmp_path, **changes)
-    service.wait_up()
-    with service.robot() as robot:
-        robot.enable()
-        assert robot.move_to(x=0.02, y=-0.01, phi=0.1).wait(timeout=10.0).outcome == "done"
-        state = until(robot, lambda state: state.mode == "holding")
-        assert state.pose == pytest.approx((0.02, -0.01, 0.1), abs=1e-4)
-        robot.disable()
-        assert robot.state().sliders.status == ("switch on disabled",) * 3
-    assert service.end() == 0
-    sent = service.frames()
-    commands = {0x00, 0x01, 0x03, 0x07, 0x09, 0x0B, 0x0C}
-    assert {identifier for identifier, _ in sent} == {node << 5 | number for node in (1, 2, 3) for number in commands}
-    for node in (1, 2, 3):
-        states = [data[0] for identifier, data in sent if identifier == node << 5 | odrive_frames.SET_AXIS_STATE]
-        assert [state for state, _ in itertools.groupby(states)] == [1, 8, 1]
+    with Service(tmp_path, **changes) as service:
+        service.wait_up()
+        with service.robot() as robot:
+            robot.enable()
+            assert robot.move_to(x=0.02, y=-0.01, phi=0.1).wait(timeout=10.0).outcome == "done"
+            state = until(robot, lambda state: state.mode == "holding")
+            assert state.pose == pytest.approx((0.02, -0.01, 0.1), abs=1e-4)
+            robot.disable()
+            assert robot.state().sliders.status == ("switch on disabled",) * 3
+        assert service.end() == 0
+        sent = service.frames()
+        commands = {0x00, 0x01, 0x03, 0x07, 0x09, 0x0B, 0x0C}
+        assert {identifier for identifier, _ in sent} == {
+            node << 5 | number for node in (1, 2, 3) for number in commands
+        }
+        for node in (1, 2, 3):
+            states = [data[0] for identifier, data in sent if identifier == node << 5 | odrive_frames.SET_AXIS_STATE]
+            assert [state for state, _ in itertools.groupby(states)] == [1, 8, 1]
 
 
 def test_what_a_drive_does_without_stands_in_every_place_where_one_looks(tmp_path: Path) -> None:
@@ -231,19 +239,19 @@ def test_what_a_drive_does_without_stands_in_every_place_where_one_looks(tmp_pat
     eds = tmp_path / "without.eds"
     eds.write_text(edsfiles.eds(edsfiles.rows("elmo_gold"), lacks=[0x1006]))
     lines = f'\neds = "{eds}"\naccept_without = ["1006"]\n'
-    service = Service(tmp_path, **{f"[drives.{name}]\n": f"[drives.{name}]{lines}" for name in "BC"})
-    service.wait_up()
-    words = "its watch on SYNC; without: it goes on without SYNC"
-    said = trirail("doctor", tmp_path / "robot.toml").stdout
-    assert f"drives B, C may lack 1006, {words}" in said
-    assert f"drives B, C: 1006, {words}" in trirail("status", locator=service.locator).stdout
-    missing = json.loads(trirail("status", "--json", locator=service.locator).stdout)["missing_protections"]
-    assert missing == [{"drive": name, "object": "1006", "means": words} for name in "BC"]
-    with service.robot() as robot:
-        told = [event.message for event in robot.events(history=True, timeout=2.0)]
-        assert robot.info().missing_protections == tuple(MissingProtection(**each) for each in missing)
-    assert any("drives B, C: lacks 1006" in message for message in told), told
-    assert service.end() == 0
+    with Service(tmp_path, **{f"[drives.{name}]\n": f"[drives.{name}]{lines}" for name in "BC"}) as service:
+        service.wait_up()
+        words = "its watch on SYNC; without: it goes on without SYNC"
+        said = trirail("doctor", tmp_path / "robot.toml").stdout
+        assert f"drives B, C may lack 1006, {words}" in said
+        assert f"drives B, C: 1006, {words}" in trirail("status", locator=service.locator).stdout
+        missing = json.loads(trirail("status", "--json", locator=service.locator).stdout)["missing_protections"]
+        assert missing == [{"drive": name, "object": "1006", "means": words} for name in "BC"]
+        with service.robot() as robot:
+            told = [event.message for event in robot.events(history=True, timeout=2.0)]
+            assert robot.info().missing_protections == tuple(MissingProtection(**each) for each in missing)
+        assert any("drives B, C: lacks 1006" in message for message in told), told
+        assert service.end() == 0
 
 
 def test_the_commands(service: Service) -> None:
@@ -306,12 +314,12 @@ def test_bad_goals(shared: tuple[Service, Robot, zenoh.Session], payload: bytes,
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Service, Robot, zenoh.Session]]:
     """One enabled service for the tests that ask it for nothing but a no."""
-    service = Service(tmp_path_factory.mktemp("shared"))
-    service.wait_up()
-    with service.robot() as robot, open_client(service.locator) as session:
-        robot.enable()
-        yield service, robot, session
-    assert service.end() == 0
+    with Service(tmp_path_factory.mktemp("shared")) as service:
+        service.wait_up()
+        with service.robot() as robot, open_client(service.locator) as session:
+            robot.enable()
+            yield service, robot, session
+        assert service.end() == 0
 
 
 def test_bad_commands(shared: tuple[Service, Robot, zenoh.Session]) -> None:
@@ -467,7 +475,7 @@ def test_goals_that_wait_at_override_zero_keep_no_command_waiting(service: Servi
 
 def test_done_is_said_when_the_robot_is_measured_to_be_there(tmp_path: Path) -> None:
     """Servos 0.2 s behind: not before, and where that takes too long, what is left to go; a replay judges the same."""
-    lagging = Service(
+    with Service(
         tmp_path,
         **{
             "time_constant = 0.004": "time_constant = 0.2",
@@ -476,41 +484,41 @@ def test_done_is_said_when_the_robot_is_measured_to_be_there(tmp_path: Path) -> 
             "\nfollowing_error = 0.005": "\nfollowing_error = 0.06",
             "timeout = 2.0": "timeout = 0.3",
         },
-    )
-    windows = load(tmp_path / "robot.toml").limits.in_position
-    lagging.wait_up()
-    with lagging.robot() as robot:
-        robot.enable()
-        near = robot.move_to(x=0.0003, y=-0.0002, phi=0.0).wait(timeout=10.0)
-        assert near.outcome == "done"
-        assert near.settle is not None
-        assert near.settle > 0.02
-        assert near.residual is not None
-        assert (np.abs(near.residual.pose) <= windows.pose).all()
-        assert near.overshoot == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
-        until(robot, lambda state: state.settled)
-        far = trirail("goto", 0.006, -0.004, 0.02, "--wait", locator=lagging.locator)
-        assert far.returncode == 1
-        assert "unsettled: not in position 0.3 s after the end of its path; left to go: slider A " in far.stdout
-        said = json.loads(trirail("goto", 0.05, 0.0, 0.0, "--wait", "--json", locator=lagging.locator).stdout)
-        assert (said["outcome"], said["settle"]) == ("unsettled", None)
-        assert max(np.abs(said["residual"]["pose"]) / windows.pose) > 1.0
-        state = robot.state()
-        assert (state.mode, state.faults) == ("holding", ())
-        until(robot, lambda state: state.settled)
-        there = trirail("goto", 0.05, 0.0, 0.0, "--wait", locator=lagging.locator)
-        assert (there.returncode, "done: arrived, settled in 1 ms" in there.stdout) == (0, True)
-    assert lagging.end() == 0
-    (file,) = (tmp_path / "recordings").glob("*.rrd")
-    recording = read(file)
-    (done,) = [line.event for line in recording.events if line.event is not None and line.event.id == near.id]
-    last = int(np.searchsorted(recording.records["cycle"], done.cycle))
-    dwell = recording.records[last + 1 - round(windows.dwell * 1000) : last + 1]
-    assert (np.abs(dwell["pose"] - (0.0003, -0.0002, 0.0)) <= windows.pose).all()
-    report = trirail("report", file)
-    assert "unsettled" in report.stdout
-    assert f"settled in {near.settle * 1e3:g} ms" in report.stdout
-    assert trirail("replay", file).returncode == 0
+    ) as lagging:
+        windows = load(tmp_path / "robot.toml").limits.in_position
+        lagging.wait_up()
+        with lagging.robot() as robot:
+            robot.enable()
+            near = robot.move_to(x=0.0003, y=-0.0002, phi=0.0).wait(timeout=10.0)
+            assert near.outcome == "done"
+            assert near.settle is not None
+            assert near.settle > 0.02
+            assert near.residual is not None
+            assert (np.abs(near.residual.pose) <= windows.pose).all()
+            assert near.overshoot == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+            until(robot, lambda state: state.settled)
+            far = trirail("goto", 0.006, -0.004, 0.02, "--wait", locator=lagging.locator)
+            assert far.returncode == 1
+            assert "unsettled: not in position 0.3 s after the end of its path; left to go: slider A " in far.stdout
+            said = json.loads(trirail("goto", 0.05, 0.0, 0.0, "--wait", "--json", locator=lagging.locator).stdout)
+            assert (said["outcome"], said["settle"]) == ("unsettled", None)
+            assert max(np.abs(said["residual"]["pose"]) / windows.pose) > 1.0
+            state = robot.state()
+            assert (state.mode, state.faults) == ("holding", ())
+            until(robot, lambda state: state.settled)
+            there = trirail("goto", 0.05, 0.0, 0.0, "--wait", locator=lagging.locator)
+            assert (there.returncode, "done: arrived, settled in 1 ms" in there.stdout) == (0, True)
+        assert lagging.end() == 0
+        (file,) = (tmp_path / "recordings").glob("*.rrd")
+        recording = read(file)
+        (done,) = [line.event for line in recording.events if line.event is not None and line.event.id == near.id]
+        last = int(np.searchsorted(recording.records["cycle"], done.cycle))
+        dwell = recording.records[last + 1 - round(windows.dwell * 1000) : last + 1]
+        assert (np.abs(dwell["pose"] - (0.0003, -0.0002, 0.0)) <= windows.pose).all()
+        report = trirail("report", file)
+        assert "unsettled" in report.stdout
+        assert f"settled in {near.settle * 1e3:g} ms" in report.stdout
+        assert trirail("replay", file).returncode == 0
 
 
 def test_goals_wait_blend_and_are_cancelled(service: Service) -> None:
