@@ -135,7 +135,11 @@ class RefusalCode(StrEnum):
     )
     NO_VELOCITY = "no_velocity", "a jog that moves nothing", "give it a velocity"
     AT_LIMIT = "at_limit", "the jog has ended at a limit", "begin a new one, away from it"
-    JOG_OVER = "jog_over", "the jog or track was not renewed in time", "begin a new one"
+    JOG_OVER = (
+        "jog_over",
+        "the jog or track is over: not renewed in time, paused, stopped or refused",
+        "begin a new one",
+    )
     WRONG_TIME = (
         "wrong_time",
         "a track's target of too long ago, or of too far ahead",

@@ -130,7 +130,10 @@ def test_a_jog_is_renewed_by_velocities_of_its_id_alone() -> None:
     assert ended(ledger) == [("j", "stopped", "ann")]
 
 
-@pytest.mark.parametrize("code", sorted(set(RefusalCode) - {RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT}))
+OF_ENDED = {RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT, RefusalCode.JOG_OVER}
+
+
+@pytest.mark.parametrize("code", sorted(set(RefusalCode) - OF_ENDED))
 def test_a_refused_goal_has_ended(code: RefusalCode) -> None:
     outcome = "expired" if code is RefusalCode.EXPIRED else "rejected"
     ledger = Ledger()

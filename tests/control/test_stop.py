@@ -287,6 +287,62 @@ def test_a_jog_that_was_let_go_does_not_come_back(rig: Rig) -> None:
     assert rig.outcomes() == [("j1", "done")]
 
 
+@pytest.mark.parametrize(
+    "goal", [VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), TrackGoal(0.05, 0.0, 0.0)], ids=["jog", "track"]
+)
+@pytest.mark.parametrize(
+    ("end", "said"),
+    [
+        ("silence", "was not renewed in time"),
+        ("pause", "stopped: pause by ann"),
+        ("stop", "stopped: stop by ann"),
+        ("quick_stop", "faulted: quick_stop by ann"),
+        ("disable", "stopped: disable by ann"),
+        ("another", "preempted: preempted by goal g1"),
+    ],
+)
+def test_what_was_renewed_and_is_over_says_how_it_ended(rig: Rig, goal: Goal, end: str, said: str) -> None:
+    """Whatever has ended it, and in every mode: who streams one id looks at the last answer."""
+    rig.enable()
+    rig.send("j1", goal)
+    rig.cycles(50)
+    if end == "another":
+        rig.goal("g1", 0.0, 0.0, 0.0)
+    elif end != "silence":
+        rig.command(end)
+    rig.until(lambda: rig.mode not in (Mode.MOVING, Mode.STOPPING), 1500)
+    for _ in range(2):
+        answer = rig.send("j1", goal)
+        assert isinstance(answer, Refused)
+        assert answer.code == "jog_over"
+        assert said in answer.message
+    assert isinstance(rig.send("j1", PoseGoal(0.0, 0.0, 0.0)), Refused)  # the id stays used for all else
+    assert rig.answers[-1].code == "duplicate_id"
+
+
+@pytest.mark.parametrize(
+    "goal", [VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), TrackGoal(0.05, 0.0, 0.0)], ids=["jog", "track"]
+)
+def test_what_was_renewed_and_refused_goes_on_to_say_why(rig: Rig, goal: Goal) -> None:
+    assert getattr(rig.send("j1", goal), "code", None) == "not_enabled"
+    answer = rig.send("j1", goal)
+    assert isinstance(answer, Refused)
+    assert answer.code == "jog_over"
+    assert "rejected: the robot is disabled: send enable first; begin a new one" in answer.message
+
+
+def test_what_is_refused_in_fault_says_which_and_only_there(rig: Rig) -> None:
+    rig.enable()
+    assert "fault" not in refused(rig.command("resume"))
+    rig.command("quick_stop")
+    assert refused(rig.command("enable")).endswith("(fault: quick_stop by ann)")
+
+
+def refused(answer: object) -> str:
+    assert isinstance(answer, Refused)
+    return answer.message
+
+
 def test_another_goal_may_follow_a_jog_that_brakes(rig: Rig) -> None:
     rig.enable()
     rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.1))

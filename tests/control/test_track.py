@@ -209,7 +209,7 @@ def test_a_target_of_which_nobody_tells_is_over_in_real_time(rig: Rig, override:
     rig.until(rig.holds, round(0.5 / PERIOD))
     assert rig.outcomes() == [("t1", "done")]
     assert "released" in rig.notices[-2].message or "released" in rig.notices[-1].message
-    assert refusal(rig.send("t1", TrackGoal(0.0, 0.0, 0.0))).code == "duplicate_id"
+    assert refusal(rig.send("t1", TrackGoal(0.0, 0.0, 0.0))).code == "jog_over"
     assert_within_limits(rig)
 
 

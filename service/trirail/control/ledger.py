@@ -63,6 +63,26 @@ class ActiveGoal(NamedTuple):
     """Likewise, trirail.wire.messages.GoalReply."""
 
 
+class _Ended(NamedTuple):
+    """How a goal has ended; `renewed` and `bound` as of an ActiveGoal, the latter where a jog has ended at it."""
+
+    user: str
+    renewed: type[RenewedGoal] | None
+    outcome: Outcome
+    reason: str
+    bound: str | None
+
+    def over(self, goal_id: str) -> RefusedError:
+        """Return what is said to one who would renew it."""
+        if self.bound is not None:
+            text = f"jog {goal_id!r} has ended at the limit of {self.bound}: begin a new one, away from it"
+            return RefusedError(RefusalCode.AT_LIMIT, text)
+        if self.outcome == "done":
+            return _not_renewed(goal_id)
+        text = f"goal {goal_id!r} is over, {self.outcome}: {self.reason}; begin a new one"
+        return RefusedError(RefusalCode.JOG_OVER, text)
+
+
 class Ledger:
     """Keeps the goals and the commands under way; what it has to say waits in `answers` and `notices`."""
 
@@ -72,8 +92,7 @@ class Ledger:
         self.answers: list[Answer] = []
         self.notices: list[Notice] = []
         self._commands: dict[Command, deque[tuple[CommandRequest, int]]] = {}
-        self._ended: dict[str, str | None] = {}
-        """Goals that have ended, and the limit at which that was, for a jog."""
+        self._ended: dict[str, _Ended] = {}
         self._refused: tuple[str, RefusalCode] | None = None
         """The track of which something was refused last, and why."""
 
@@ -88,15 +107,13 @@ class Ledger:
         """Raise RefusedError if the id has been used; what renews a goal shares its own."""
         goal_id = request.id
         running = any(goal.id == goal_id for goal in self.goals)
-        if isinstance(request.goal, VelocityGoal) and (bound := self._ended.get(goal_id)):
-            text = f"jog {goal_id!r} has ended at the limit of {bound}: begin a new one, away from it"
-            raise RefusedError(RefusalCode.AT_LIMIT, text)
-        if goal_id in self._ended or (running and not self.renewed_by(request)):
+        ended = self._ended.get(goal_id)
+        if ended is not None and (ended.renewed, ended.user) == (type(request.goal), request.user):
+            raise ended.over(goal_id)
+        if ended is not None or (running and not self.renewed_by(request)):
             raise RefusedError(RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has been used: every goal needs its own")
         if self.goal is not None and self.goal.released and self.renewed_by(request):
-            raise RefusedError(
-                RefusalCode.JOG_OVER, f"goal {goal_id!r} was not renewed in time and is over: begin a new one"
-            )
+            raise _not_renewed(goal_id)
 
     def pass_over(self, request: GoalRequest) -> None:
         """Accept a renewal in whose place a newer one is taken up."""
@@ -135,7 +152,7 @@ class Ledger:
         if not taken.queued and not passes:
             self.end("preempted", f"preempted by goal {request.id}")
         blend = goal.blend if isinstance(goal, PoseGoal | MoveGoal) else None
-        renewed = type(goal) if isinstance(goal, RenewedGoal) else None
+        renewed = _renewed(request)
         settles = goal.settle if isinstance(goal, TrajectoryGoal) else renewed is None
         self.goals.append(ActiveGoal(request.id, request.user, renewed, blend, expires, alive_until, settles=settles))
         if passes:
@@ -156,7 +173,7 @@ class Ledger:
     def pass_on(self) -> None:
         """The first goal is reached, and the one that waited for it has begun."""
         goal = self.goals.popleft()
-        self._ending(goal.id, goal.user, "done", f"passed on the way to goal {self.goals[0].id}")
+        self._ending(goal.id, goal.user, goal.renewed, "done", f"passed on the way to goal {self.goals[0].id}")
 
     def end(self, outcome: Outcome, reason: str, but: int = 0, settled: Settled | None = None) -> None:
         """End the goals, but so many of the first."""
@@ -166,7 +183,7 @@ class Ledger:
             at_limit = outcome == "done" and not goal.released and goal.renewed is VelocityGoal
             bound = goal.bound if at_limit else None
             words = f"at the limit of {bound}" if bound else reason
-            self._ending(goal.id, goal.user, outcome, words, bound, settled)
+            self._ending(goal.id, goal.user, goal.renewed, outcome, words, bound, settled)
         self.goals.extend(kept)
 
     def withdraw(self, request: GoalRequest, outcome: Withdrawal, reason: str) -> None:
@@ -175,7 +192,7 @@ class Ledger:
             Refused(request.ticket, RefusalCode(outcome), f"goal {request.id} {outcome} before it began: {reason}")
         )
         if not self.renewed_by(request):
-            self._ending(request.id, request.user, outcome, reason)
+            self._ending(request.id, request.user, _renewed(request), outcome, reason)
 
     def is_all_of(self, user: str | None) -> bool:
         """Whether the goals and commands under way that need the lease are all a user's."""
@@ -199,14 +216,14 @@ class Ledger:
             before, self._refused = self._refused, (request.id, refusal.code)
             if before == self._refused:
                 return
-        if refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT):
+        if refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT, RefusalCode.JOG_OVER):
             self.tell("refused", "warning", text, user=request.user)
         else:
             outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
             if self.renewed_by(request):
                 self.tell("refused", "warning", text, user=request.user)
             else:
-                self._ending(request.id, request.user, outcome, text)
+                self._ending(request.id, request.user, _renewed(request), outcome, text)
 
     def renewed_by(self, request: GoalRequest) -> bool:
         """Whether it renews the goal that is under way; only its own user can."""
@@ -221,6 +238,7 @@ class Ledger:
         self,
         goal_id: str,
         user: str,
+        renewed: type[RenewedGoal] | None,
         outcome: Outcome,
         reason: str,
         bound: str | None = None,
@@ -229,7 +247,7 @@ class Ledger:
         if goal_id in self._ended:  # by what also withdraws its renewals
             return
         level = _LEVELS.get(outcome, "info")
-        self._ended[goal_id] = bound
+        self._ended[goal_id] = _Ended(user, renewed, outcome, reason, bound)
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]
         words = f"goal {goal_id} {outcome}: {reason}"
@@ -274,3 +292,11 @@ class Ledger:
     ) -> None:
         """Note something that everyone is to know."""
         self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, goal, user, fault=fault))
+
+
+def _renewed(request: GoalRequest) -> type[RenewedGoal] | None:
+    return type(request.goal) if isinstance(request.goal, RenewedGoal) else None
+
+
+def _not_renewed(goal_id: str) -> RefusedError:
+    return RefusedError(RefusalCode.JOG_OVER, f"goal {goal_id!r} was not renewed in time and is over: begin a new one")
