@@ -296,6 +296,18 @@ def test_a_time_too_far_from_now_is_refused(rig: Rig, age: float, when: str) -> 
     assert rig.outcomes() == [("t1", "rejected")]
 
 
+def test_what_has_waited_behind_its_senders_others_is_not_blamed_on_a_clock(rig: Rig) -> None:
+    rig.enable()
+    rig.cycles(2000)
+    came = round((rig.now - 1.2) * 1e9)
+    rig.cycle(GoalRequest(1, "ann", "t1", TrackGoal(0.01, 0.0, 0.0, timeout=1.0), came, age=0.1))
+    assert refusal(rig.answers[-1]).code == "expired"
+    rig.cycle(GoalRequest(2, "ann", "t2", TrackGoal(0.01, 0.0, 0.0, timeout=2.0), came, age=0.1))
+    answer = refusal(rig.answers[-1])
+    assert answer.code == "busy"
+    assert "has waited 1.2" in answer.message
+
+
 def test_what_is_refused_hundreds_of_times_is_told_once(rig: Rig) -> None:
     rig.enable()
     track(rig, sine(), regular(100.0, 0.3))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import time
 import unicodedata
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -194,7 +195,7 @@ def test_the_gateway_takes_any_message(
     served, link = gateway
     served._refusals._told_since = -math.inf
     link.sent.clear()
-    served._handle(Incoming(kind, key, len(payload), payload, encoding, None))
+    served._handle(Incoming(kind, key, len(payload), payload, encoding, None, time.monotonic_ns()))
     for packet in link.sent:
         request = packets.decode_request(packet[1:])
         assert text.is_name(request.user) or request.user == ""

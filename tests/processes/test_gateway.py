@@ -15,7 +15,7 @@ from conftest import CONFIG
 from trirail.processes.backlog import MOST_OF_ONE, PATIENCE
 from trirail.processes.gateway import Gateway
 from trirail.processes.guard import Guard
-from trirail.processes.inbox import Incoming
+from trirail.processes.inbox import Incoming, Kind
 from trirail.processes.refusals import REFUSALS_PER_SECOND
 from trirail.processes.requests import AHEAD, AHEAD_OF_ALL, UNDER_WAY
 from trirail.wire import boundary, packets, zenoh_session
@@ -50,6 +50,7 @@ class FakeLink:
 
 
 Rig = tuple[Gateway, FakeLink]
+EVERYBODYS_STOPS = (Command.STOP, Command.QUICK_STOP, Command.DISABLE)
 
 
 @pytest.fixture
@@ -59,13 +60,28 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         yield Gateway(CONFIG, link, lambda: None, opened, Guard(CONFIG)), link  # type: ignore[arg-type]
 
 
+def came(kind: Kind, key: str, content: bytes, number: int = 0) -> Incoming:
+    return Incoming(kind, key, len(content), content, "", None, time.monotonic_ns(), number)
+
+
 def goal(gateway: Gateway, name: str, user: str = "ann", number: int = 0) -> None:
     content = json.dumps({"kind": "pose", "x": 0, "y": 0, "phi": 0, "id": name}).encode()
-    gateway._handle(Incoming("goal", f"trirail/demo/goal/{user}", len(content), content, "", None, number))
+    gateway._handle(came("goal", f"trirail/demo/goal/{user}", content, number))
+
+
+def test_what_has_waited_is_as_old_as_its_arrival_and_a_targets_age_is_that_of_then(rig: Rig) -> None:
+    gateway, link = rig
+    content = json.dumps({"kind": "track", "x": 0, "y": 0, "phi": 0, "time": time.time() - 2.1}).encode()
+    arrived = time.monotonic_ns() - 2_000_000_000
+    gateway._handle(came("goal", "trirail/demo/goal/ann", content)._replace(arrived_ns=arrived))
+    (sent,) = link.sent
+    assert isinstance(sent, GoalRequest)
+    assert sent.received_ns == arrived
+    assert 0.05 < sent.age < 1.0
 
 
 def command(gateway: Gateway, name: str, content: bytes = b"", user: str = "ann", number: int = 0) -> None:
-    gateway._handle(Incoming("cmd", f"trirail/demo/cmd/{user}/{name}", len(content), content, "", None, number))
+    gateway._handle(came("cmd", f"trirail/demo/cmd/{user}/{name}", content, number))
 
 
 def passed(link: FakeLink) -> list[tuple[str, str | None]]:
@@ -88,7 +104,8 @@ def test_every_command_is_passed_on(rig: Rig, name: Command) -> None:
 def test_what_a_command_does_not_take_is_refused_with_what_it_takes(rig: Rig, name: Command) -> None:
     gateway, link = rig
     command(gateway, name, b'{"odd": 1}')
-    (said,) = link.sent
+    *carried_out, said = link.sent
+    assert [one.name for one in carried_out if isinstance(one, CommandRequest)] == [name] * (name in EVERYBODYS_STOPS)
     assert isinstance(said, RefusedRequest)
     assert said.message.startswith(f"{name} takes {name.content}: ")
 
@@ -292,7 +309,7 @@ def test_info_tells_what_the_drives_do_without(rig: Rig, monkeypatch: pytest.Mon
     monkeypatch.setattr(gateway._replies, "send", lambda _incoming, content: said.append(content))
     missing = (MissingProtection("A", "1006", "its watch on SYNC"), MissingProtection("C", "6007", "its stop"))
     gateway._hear(packets.message(Welcome((), 0.5, 0.0, missing)), lambda: None)
-    gateway._handle(Incoming("info", "trirail/demo/info", 0, b"", "", None))
+    gateway._handle(came("info", "trirail/demo/info", b""))
     (info,) = said
     assert isinstance(info, Info)
     assert info.missing_protections == missing

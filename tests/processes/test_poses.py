@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,7 @@ class Asked:
 
     def ask(self, kind: Kind, name: str, content: bytes = b"") -> None:
         key = f"trirail/demo/{kind}/ann/{name}"
-        self.poses.take(Incoming(kind, key, len(content), content, "", None))
+        self.poses.take(Incoming(kind, key, len(content), content, "", None, time.monotonic_ns()))
 
     def teach(self, name: str, at: np.void | None = None) -> None:
         self.ask("teach", name)

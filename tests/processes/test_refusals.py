@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,7 +28,7 @@ class Listener:
         self.refusals = Refusals(link, replies)
 
     def refuse(self, user: str) -> None:
-        message = Incoming("goal", f"trirail/demo/goal/{user}", 0, b"", "", None)
+        message = Incoming("goal", f"trirail/demo/goal/{user}", 0, b"", "", None, time.monotonic_ns())
         self.refusals.refuse(message, RefusedError(RefusalCode.BUSY, "send fewer"))
 
 

@@ -186,6 +186,12 @@ class GoalQueue:
         if not isinstance(planned, TrackGoal):
             return planned
         ago = (cycle - sent.known_since(self._period)) * self._period
+        if ago > FURTHEST >= abs(sent.request.age):
+            waited = ago - sent.request.age
+            text = (
+                f"what was told of the target has waited {waited:.3f} s behind its sender's others: send fewer a second"
+            )
+            raise RefusedError(RefusalCode.BUSY, text, value=waited)
         if not abs(ago) <= FURTHEST:
             when = f"{ago:.3f} s ago" if ago > 0.0 else f"in {-ago:.3f} s"
             text = (

@@ -43,6 +43,8 @@ class Incoming(NamedTuple):
     encoding: str
     query: zenoh.Query | None
     """None for a put: it has no answer."""
+    arrived_ns: int
+    """When it came, by the monotonic clock: it may have waited since, behind its user's others."""
     number: int = 0
     """Messages are numbered as they come."""
 
@@ -156,7 +158,7 @@ class Inbox:
     ) -> None:
         size = len(payload) if payload is not None else 0
         content = payload.to_bytes() if payload is not None and size <= MAX_MESSAGE else b""
-        incoming = Incoming(kind, key, size, content, encoding, query)
+        incoming = Incoming(kind, key, size, content, encoding, query, time.monotonic_ns())
         user, room = incoming.user, 2 if kind == "cmd" else 1
         stops = kind == "cmd" and size == 0 and key.rpartition("/")[2] in _STOPS
         with self._lock:

@@ -75,8 +75,9 @@ class Requests:
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
         told_of = goal.time if isinstance(goal, TrackGoal) else None
-        age = time.time() - told_of if told_of is not None else 0.0
-        self.backlog.add(incoming, GoalRequest(self._tickets, user, goal_id, goal, time.monotonic_ns(), age=age))
+        waited = (time.monotonic_ns() - incoming.arrived_ns) * 1e-9
+        age = time.time() - waited - told_of if told_of is not None else 0.0
+        self.backlog.add(incoming, GoalRequest(self._tickets, user, goal_id, goal, incoming.arrived_ns, age=age))
         self.send_goals()
 
     def send_goals(self) -> None:
