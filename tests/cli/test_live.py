@@ -84,6 +84,9 @@ def test_a_goal_is_shown_with_its_target_and_how_far_it_is() -> None:
 
 def test_a_paused_goal_and_a_robot_that_has_settled_are_named() -> None:
     assert "holding  paused" in printed(a_state(goal=GoalState("g", 0.5, 1.0, None)))["robot"]
+    assert printed(a_state(goal=GoalState("g", 0.5, 1.0, None)))["goal"] == "g  50%, no expected end while it is paused"
+    slow = a_state(mode="moving", goal=GoalState("g", 0.5, 1.0, None), override=0.0)
+    assert printed(slow)["goal"] == "g  50%, no expected end while the override is 0"
     assert "holding  settled" in printed(a_state())["robot"]
     assert printed(a_state(faults=("drive B: over-current",)))["fault"] == "drive B: over-current"
 

@@ -23,7 +23,7 @@ from trirail.telemetry.readout import Standing
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import free_port, live_relay, live_server
 from trirail.telemetry.streams import Streams
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import MODES, Mode
 
 RECORD = made.records(0.01, mode=Mode.FAULT)[-1]
 
@@ -35,6 +35,10 @@ def test_it_says_mode_goal_pose_sliders_and_what_is_wrong() -> None:
     record["progress"], record["remaining"] = 0.4, 0.71
     said = readout.markdown(record, Standing("g-1", (0.03, 0.0, 0.5), 0.5, "drive B: EMCY 8700"))
     assert "**FAULT**   override 50%   goal **g\\-1**: 40%, 0.7 s left" in said
+    assert "40%, waits half-way" in readout.markdown(record, Standing("g-1", override=0.0))
+    record["mode"] = MODES.index(Mode.HOLDING)
+    assert "40%, waits half-way" in readout.markdown(record, Standing("g-1"))
+    record["mode"] = MODES.index(Mode.FAULT)
     assert "**drive B\\: EMCY 8700**" in said
     assert "| measured | 12.346 | -20.000 | 12.500 | λ [mm] | 1.000 | -2.500 | 100.000 |" in said
     assert "| goal | 30.000 | 0.000 | 28.648 |" in said

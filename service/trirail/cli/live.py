@@ -98,7 +98,7 @@ def table(state: State, robot: str, limits: Limits | None = None) -> Table:
     if state.lease is not None:
         grid.add_row("lease", f"held by {plain(state.lease)}")
     if state.goal:
-        _add_goal(grid, state.goal, state.pose)
+        _add_goal(grid, state, state.goal)
     grid.add_row("measured", units.pose(state.pose, 9))
     grid.add_row("commanded", units.pose(state.commanded.pose, 9))
     _add_sliders(grid, state)
@@ -152,14 +152,14 @@ def _mode(state: State) -> str:
     return f"[{colour}]{plain(state.mode)}[/]{paused}{settled}"
 
 
-def _add_goal(grid: Table, goal: GoalState, pose: Sequence[float]) -> None:
+def _add_goal(grid: Table, state: State, goal: GoalState) -> None:
     if goal.lag is not None:
         grid.add_row("goal", f"{plain(goal.id)}  follows its target, {units.written(goal.lag, 'm', 6)} behind")
     else:
-        grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {left(goal)}")
+        grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {left(state, goal)}")
     if goal.target is not None:
         grid.add_row("  target", units.pose(goal.target, 9))
-        grid.add_row("  to go", units.pose([end - at for end, at in zip(goal.target, pose, strict=True)], 9))
+        grid.add_row("  to go", units.pose([end - at for end, at in zip(goal.target, state.pose, strict=True)], 9))
 
 
 def _add_sliders(grid: Table, state: State) -> None:

@@ -21,8 +21,9 @@ from trirail.client.client import GoalHandle, Result, Robot
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.telemetry import palette
 from trirail.wire.messages import Event, GoalReply
-from trirail.wire.state import GoalState, Percentiles
+from trirail.wire.state import GoalState, Percentiles, State
 from trirail.wire.text import json_printable, printable, wall_clock
+from trirail.wire.vocabulary import Mode
 
 if TYPE_CHECKING:
     from trirail.cli.doctor import Check
@@ -136,7 +137,7 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
                 if goal.result is not None:
                     return goal.result
                 if state.goal is not None and state.goal.id == goal.id:
-                    progress.update(task, completed=state.goal.progress, left=left(state.goal))
+                    progress.update(task, completed=state.goal.progress, left=left(state, state.goal))
             if goal.result is not None:
                 return goal.result
             raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
@@ -160,9 +161,13 @@ def _cancel(goal: GoalHandle) -> None:
         goal.cancel()
 
 
-def left(goal: GoalState) -> str:
-    """Say how long the path of a goal still takes, or that it has ended and the robot settles."""
-    return f"{goal.remaining:.1f} s left" if goal.progress < 1.0 else "settling"
+def left(state: State, goal: GoalState) -> str:
+    """Say how long the path of the goal under way still takes, or that it has ended and the robot settles."""
+    if goal.progress >= 1.0:
+        return "settling"
+    if state.mode == Mode.HOLDING:
+        return "no expected end while it is paused"
+    return f"{goal.remaining:.1f} s left" if state.override else "no expected end while the override is 0"
 
 
 def event(happened: Event) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail.wire.vocabulary import MODES
+from trirail.wire.vocabulary import MODES, Mode
 
 PATH = "/readout"
 _SPECIAL = str.maketrans({letter: f"\\{letter}" for letter in "\\`*_{}[]<>()#+-.!|~$&:"})
@@ -34,7 +34,9 @@ def markdown(record: np.void, standing: Standing) -> str:
     head = f"**{MODES[record['mode']].upper()}**   override {standing.override:.0%}"
     if standing.goal is not None:
         share, left = float(record["progress"]), float(record["remaining"])
-        head += f"   goal **{standing.goal.translate(_SPECIAL)}**: {share:.0%}, {left:.1f} s left"
+        waits = share < 1.0 and (standing.override == 0.0 or MODES[record["mode"]] == Mode.HOLDING)
+        words = "waits half-way" if waits else f"{left:.1f} s left"
+        head += f"   goal **{standing.goal.translate(_SPECIAL)}**: {share:.0%}, {words}"
     wrong = [f"**{standing.fault.translate(_SPECIAL)}**"] if standing.fault else []
     target = ["–"] * 3 if standing.target is None else _pose(standing.target)
     place = record["position"] - record["backlash"]

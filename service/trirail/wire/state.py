@@ -68,7 +68,8 @@ class GoalState(Struct, frozen=True):
     progress: float
     """Share of its path's time that is over, 0 to 1; 1 while it settles."""
     remaining: float
-    """Time to the end of its path [s]; 0 while it settles."""
+    """Time to the end of its path at the present override [s], were it not to wait, paused or at 0: there it is as at
+    100 %. 0 while it settles."""
     target: Triple | None = None
     """The pose that it leads to, of a track that its target was last told to have; None for a jog."""
     lag: float | None = None

@@ -21,8 +21,9 @@ export class Readings {
 
   state({ mode, pose, goal, sliders, faults, override, lease }) {
     const doing = [];
+    const waits = mode === "holding" || override === 0;  // half-way, paused or at override 0
     if (goal?.lag != null) doing.push(`follows a target, ${(goal.lag * 1000).toFixed(1)} mm behind`);
-    else if (goal) doing.push(goal.target ? `${goal.id} ${Math.round(goal.progress * 100)} %, ${goal.remaining.toFixed(1)} s left` : "jog");
+    else if (goal) doing.push(goal.target ? `${goal.id} ${Math.round(goal.progress * 100)} %, ${waits && goal.progress < 1 ? "waits" : `${goal.remaining.toFixed(1)} s left`}` : "jog");
     if (override !== 1) doing.push(`override ${Math.round(override * 100)} %`);
     if (lease) doing.push(`lease: ${lease}`);
     text(byId("mode-name"), mode);
