@@ -29,6 +29,7 @@ from trirail.kinematics import correction_fit
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.calibration import PARAMETERS, Calibration, CalibrationError, identify
 from trirail.kinematics.geometry import LEGS, Geometry, singular_angles
+from trirail.wire.text import number
 from trirail_drivers import files
 
 COLUMNS = ("x", "y", "phi", *LEGS)
@@ -71,12 +72,9 @@ def _numbers(names: Sequence[str], fields: Sequence[str], line: int) -> list[flo
     values = []
     for name in COLUMNS:
         try:
-            value = float(given[name])
+            values.append(number(given[name]))
         except ValueError as error:
-            raise CalibrationError(f"line {line}: {name} is {given[name]!r}: it must be a number") from error
-        if not math.isfinite(value):
-            raise CalibrationError(f"line {line}: {name} is {value}: it must be finite")
-        values.append(value)
+            raise CalibrationError(f"line {line}: {name}: {error}") from error
     return values
 
 

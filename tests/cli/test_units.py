@@ -161,7 +161,7 @@ def test_what_ik_and_fk_print_is_what_they_take(run: Run) -> None:
         ("jog 5mm 0 0", "'5mm' is not a velocity such as 5mm/s"),
         ("jog 0 0 1deg", "'1deg' is not an angular velocity such as 1.5deg/s"),
         ("jog 0 0 0 --seconds x", "'x' is not a time such as 2s"),
-        ("override fast", "'fast' is not a percentage such as 50%"),
+        ("override fast", "'fast' is no override: 0, or 1 to 200 %"),
         ("ik 0 0 0 --velocity 1 2 x", "Invalid value for velocity: 'x' is not an angular velocity"),
         ("workspace --phi 1mm", "'1mm' is not an angle"),
         ("goto -- -0.06 0 0 --speed 0.5", "--speed stands behind --"),

@@ -49,7 +49,9 @@ def test_a_row_that_is_too_short_or_too_long_is_named(rows: list[tuple[float, ..
 def test_a_cell_that_is_no_number_is_named(rows: list[tuple[float, ...]], data: st.DataObject, unit: str) -> None:
     cells = [[repr(value) for value in row] for row in rows]
     line, column = data.draw(st.integers(0, len(rows) - 1)), data.draw(st.integers(0, len(HEAD) - 1))
-    wrong = cells[line][column] = data.draw(st.sampled_from(["10" + unit, "x", "nan", "inf", ""]))
+    wrong = cells[line][column] = data.draw(
+        st.sampled_from(["10" + unit, "x", "nan", "inf", "", "0_5", "\u0661", "1e400", "0x1"])
+    )
     with pytest.raises(TrirailError) as refused:
         read_text(csv_of(cells))
     where = f"path.csv: line {line + 2}, column {HEAD[column]}: {wrong!r} is no number"

@@ -159,15 +159,15 @@ def _goals(recording: Recording, period: float) -> Iterator[GoalSummary]:
         seen.add(request.id)
         end = ends.pop(request.id, None)
         kind = type(request.goal).__name__.removesuffix("Goal").lower()
-        yield GoalSummary(request.id, request.user, kind, *_end(end, what.cycle * period))
+        yield GoalSummary(request.id, request.user, kind, *_end(end, round(what.cycle * period, 6)))
     for name, end in ends.items():
-        yield GoalSummary(name, end.user or "", UNKNOWN, *_end(end, end.t))
+        yield GoalSummary(name, end.user or "", UNKNOWN, *_end(end, round(end.t, 6)))
 
 
 def _end(event: Event | None, given: float) -> tuple[str, float, float | None, str, float | None]:
     if event is None:
         return UNKNOWN, given, None, "its end is not in the recording", None
-    return event.outcome or UNKNOWN, given, event.t, event.reason or event.message, event.settle
+    return event.outcome or UNKNOWN, given, round(event.t, 6), event.reason or event.message, event.settle
 
 
 def _is_fault(line: Line) -> bool:

@@ -34,7 +34,7 @@ def goto(
     *,
     wait: Annotated[bool, Flag] = False,
     speed: units.Share = 1.0,
-    blend: units.Length | None = None,
+    blend: units.Distance | None = None,
     tool: Tool | None = None,
     frame: Annotated[str, Parameter(completer=frames)] = "base",
     deg: Annotated[bool, Flag] = False,
@@ -296,7 +296,7 @@ def poses(*, service: Service = HERE) -> int:
     return 0
 
 
-def override(percent: units.Percentage, /, *, service: Service = HERE) -> int:
+def override(percent: units.Percent, /, *, service: Service = HERE) -> int:
     """Send the one command that takes a number.
 
     Parameters

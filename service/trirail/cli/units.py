@@ -12,14 +12,16 @@ from collections.abc import Callable, Mapping, Sequence
 from decimal import Decimal
 from typing import Annotated, Any, Final, NamedTuple
 
+import msgspec
 from cyclopts import Parameter, Token
 
+from trirail.wire.messages import LOWEST_OVERRIDE, Override
 from trirail.wire.state import CorrectionTold
-from trirail.wire.text import NAME_RULE, is_name, quoted
+from trirail.wire.text import NAME_RULE, NUMBER, is_name, quoted
 
 _DEGREE: Final = Decimal("0.0174532925199432957692369076848861271344")
 """π / 180, to more digits than a float has."""
-_WRITTEN: Final = re.compile(r"\s*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(.*?)\s*")
+_WRITTEN: Final = re.compile(rf"\s*({NUMBER})\s*(.*?)\s*")
 _NEGATIVE: Final = re.compile(r"-[0-9.]")
 LOWEST_SHARE: Final = 1e-3
 """Least `speed` of a goal."""
@@ -179,6 +181,26 @@ def share(text: str) -> float:
     return value
 
 
+def percent(text: str) -> float:
+    """Return an override [%], from a number or a percentage. Raises ValueError with what would be right."""
+    try:
+        value = quantity(text, PERCENTAGE)
+        msgspec.convert({"percent": value}, Override)
+    except (ValueError, msgspec.ValidationError):
+        raise ValueError(f"{quoted(text.strip())!r} is no override: 0, or {LOWEST_OVERRIDE:g} to 200 %") from None
+    return value
+
+
+def positive(text: str, dimension: Dimension) -> float:
+    """Return a quantity that is not negative. Raises ValueError with what would be right."""
+    value = quantity(text, dimension)
+    if value < 0.0:
+        raise ValueError(
+            f"{quoted(text.strip())!r} is negative: {dimension.name} such as {dimension.examples} is taken"
+        )
+    return value
+
+
 def radians(text: str, deg: bool, dimension: Dimension = ANGLE) -> float:
     """Return what an angle, or its rate, is in radians; a bare number is one of degrees where `deg` says so."""
     return quantity(text, dimension, next(iter(dimension.units)).replace("rad", "deg") if deg else None)
@@ -234,10 +256,12 @@ Velocity = Annotated[float, _one(lambda text: quantity(text, VELOCITY))]
 """Likewise [m/s]."""
 AngularVelocity = Annotated[float, _one(lambda text: quantity(text, ANGULAR_VELOCITY))]
 """Likewise [rad/s]."""
-Time = Annotated[float, _one(lambda text: quantity(text, TIME))]
-"""Likewise [s]."""
-Percentage = Annotated[float, _one(lambda text: quantity(text, PERCENTAGE))]
-"""Likewise [%]."""
+Distance = Annotated[float, _one(lambda text: positive(text, LENGTH))]
+"""A length that is not negative [m]."""
+Time = Annotated[float, _one(lambda text: positive(text, TIME))]
+"""A time that is not negative [s]."""
+Percent = Annotated[float, _one(percent)]
+"""An override [%]."""
 Share = Annotated[float, _one(share)]
 """A share of full speed."""
 ToolPoint = Annotated[tuple[float, float] | str, _one(_tool)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from trirail_drivers import files
 
 from trirail.errors import TrirailError
 from trirail.wire.goals import TrajectoryPoint
-from trirail.wire.text import quoted
+from trirail.wire.text import number, quoted
 
 COLUMNS = ("t", "x", "y", "phi")
 FEWEST = 2
@@ -78,14 +77,10 @@ def _numbers(where: str, names: Sequence[str], row: Sequence[str]) -> dict[str, 
     values = {}
     for name, cell in zip(names, row, strict=True):
         try:
-            values[name] = float(cell)
-        except ValueError:
-            values[name] = math.nan
-        if not math.isfinite(values[name]):
-            raise TrirailError(
-                f"{where}, column {name}: {quoted(cell.strip())!r} is no number; "
-                "a CSV has bare metres, radians and seconds"
-            )
+            values[name] = number(cell)
+        except ValueError as error:
+            what = f"{where}, column {name}: {error}; a CSV has bare metres, radians and seconds"
+            raise TrirailError(what) from error
     return values
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import unicodedata
 from datetime import datetime
@@ -15,9 +16,19 @@ _NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{MAX_NAME}}}")
 _QUANTITY = re.compile(r"-?[0-9]+([eE]-?[0-9]+)?(m|cm|mm|um|nm|in|rad|mrad|urad|deg|s|ms|us|min)?")
 """What is a name by its characters and, on the command line, a number or one with a unit."""
 
+NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
+"""A number as people write one: no underscores and no digits of other scripts, which Python's float takes."""
+
 NAME_RULE = f"letters, digits, - and _, at most {MAX_NAME}"
 QUANTITY_RULE = "reads as a number or a quantity: a pose is told from one by its name, as p5mm"
 ID_RULE = f"at most {MAX_NAME} characters, none of them for control or formatting"
+
+
+def number(text: str) -> float:
+    """Return what a number says, blanks around it aside. Raises ValueError for what is none, or not finite."""
+    if re.fullmatch(NUMBER, text.strip()) is None or not math.isfinite(value := float(text)):
+        raise ValueError(f"{quoted(text.strip())!r} is no number")
+    return value
 
 
 def is_name(text: str) -> bool:
