@@ -124,7 +124,13 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
         ("move 0 0 0 --speed 0", 2, "--speed: '0' is no share of the limits"),
         ("sliders 0 0 0 --speed x", 2, "--speed: 'x' is no share of the limits"),
         ("sessions --since yesterday", 2, "'yesterday' is no day or time such as 2026-01-31 or 2026-01-31T12:00:00"),
-        (f"goto 0 0 0 --connect {NOBODY}", 1, "start one with: trirail run, or name its address"),
+        (
+            f"stop --connect {NOBODY}",
+            1,
+            f"no service at {NOBODY}: connection refused; start what is to answer there, trirail run or trirail "
+            "router, or name another address with --connect (in Python connect=)",
+        ),
+        ("stop --connect tcp/no..name:1", 1, "its host name is none; start what is to answer there"),
     ],
 )
 def test_what_is_typed_wrongly_is_told_with_what_would_be_right(line: str, code: int, said: str, run: Run) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -188,6 +189,46 @@ def test_a_robot_is_there_before_its_router_and_after_it_is_gone(net: Net) -> No
                 assert answers(local, "trirail/demo/info") == [b"demo"]
             with router.routing(net.config), net.session("eva") as eva:
                 assert until_answered(eva, "trirail/demo/info") == b"demo"
+
+
+@pytest.mark.parametrize(
+    ("impostor", "why"),
+    [
+        ("", "connection refused"),
+        ("stray", "its certificate is in the name of stray, not of hub"),  # another robot's
+        ("ann", "its certificate is not accepted: unsuitable certificate purpose"),  # a user's
+    ],
+)
+def test_a_robot_says_why_it_has_no_router_and_obeys_nobody_in_its_place(net: Net, impostor: str, why: str) -> None:
+    with ExitStack() as opened, Robot(net, "demo") as demo:
+        assert demo.guard.linked(demo.session) == set()
+        if impostor:
+            theirs = Credentials.read(user(net.folder, impostor))
+            settings = zenoh_session.router([net.locator], theirs, None, [], {})
+            opened.enter_context(zenoh_session.open_router(settings))
+        assert demo.guard.why_not_linked(net.locator).startswith(why)
+        if impostor:  # it is dialled every 0.2 to 1 s
+            with (
+                zenoh_session.open_client(net.locator, Credentials.read(user(net.folder, "max")))
+                if (impostor == "stray")
+                else nullcontext() as asking
+            ):
+                threading.Event().wait(2.0)
+                assert asking is None or not answers(asking, "trirail/demo/cmd/max/stop")
+        assert demo.guard.linked(demo.session) == set()
+
+
+def test_a_link_to_the_router_comes_and_goes(net: Net) -> None:
+    with Robot(net, "demo") as demo:
+        for there in (True, False):
+            with router.routing(net.config) if there else nullcontext():
+                enough = threading.Event()
+                for _ in range(round(WITHIN / 0.1)):
+                    if (demo.guard.linked(demo.session) == {net.locator}) is there:
+                        break
+                    enough.wait(0.1)
+                assert demo.guard.linked(demo.session) == ({net.locator} if there else set())
+                assert demo.guard.why_not_linked(net.locator) == ("" if there else "connection refused")
 
 
 def test_routers_make_a_tree_and_each_speaks_for_its_own_robots_alone(net: Net) -> None:

@@ -71,6 +71,8 @@ class Machine(Struct, frozen=True):
     """What python-can's interface would lack, with the remedy; "" for nothing."""
     guard: Guard | str | None = None
     """Who may do what over the network, or why its certificates cannot be used."""
+    routers: tuple[tuple[str, str], ...] = ()
+    """Each endpoint of zenoh.connect with why it cannot be reached, "" where it can."""
 
 
 def examine(config: Config, machine: Machine) -> list[Check]:
@@ -87,6 +89,7 @@ def examine(config: Config, machine: Machine) -> list[Check]:
         *corrected(config),
         load(config),
         *network(config, machine),
+        *routers(machine.routers),
         *metrics(config),
         lateness(machine.ticks, config),
     ]
@@ -275,6 +278,17 @@ def network(config: Config, machine: Machine) -> list[Check]:
         warnings = machine.guard.certificate_warnings()
         found += [Check("certificates", "warning", warning) for warning in warnings]
     return found
+
+
+def routers(found: Sequence[tuple[str, str]]) -> list[Check]:
+    """Whether the routers answer that users come through: without them the robot goes on for who is beside it."""
+    remedy = "start trirail router there, or correct zenoh.connect, zenoh.router and certificates"
+    return [
+        Check("router", "warning", f"{endpoint}: {why}", remedy)
+        if why
+        else Check("router", "ok", f"{endpoint} answers")
+        for endpoint, why in found
+    ]
 
 
 def metrics(config: Config) -> list[Check]:

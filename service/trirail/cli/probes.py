@@ -34,6 +34,7 @@ def machine(config: Config) -> Machine:
     channel = config.can.channel if config.can.interface == "socketcan" else ""
     before = counted(channel)
     ticked = ticks(config.period)
+    door = guard(config)
     return Machine(
         release=platform.release(),
         preempt_rt=_text(SYSTEM / "kernel/realtime") == "1" or "PREEMPT_RT" in platform.version(),
@@ -48,7 +49,10 @@ def machine(config: Config) -> Machine:
         ticks=ticked,
         passed=passed(before, counted(channel)),
         adapter=adapters.lacking(config.can.interface),
-        guard=guard(config),
+        guard=door,
+        routers=()
+        if isinstance(door, str)
+        else tuple((each, door.why_not_linked(each)) for each in config.zenoh.connect),
     )
 
 

@@ -11,6 +11,7 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import zenoh_session
 from trirail.wire.access import access_control
 from trirail.wire.credentials import Credentials, with_role
+from trirail.wire.dialling import why_not
 from trirail.wire.endpoints import ReachableBy, reach, socket_file
 from trirail.wire.vocabulary import Role
 
@@ -44,6 +45,14 @@ class Guard:
         for path in filter(None, map(socket_file, self._listen)):
             path.chmod(SOCKET_MODE)
         return opened
+
+    def linked(self, opened: zenoh.Session) -> set[str]:
+        """Return to which endpoints of `connect` a session has a link to the router that is obeyed."""
+        return zenoh_session.linked(opened, self._connect, self._router)
+
+    def why_not_linked(self, endpoint: str) -> str:
+        """Return what keeps from a link to an endpoint of `connect`, "" where nothing is seen; it may take seconds."""
+        return why_not(endpoint, self._credentials, self._router)
 
     def role(self, user: str) -> Role | None:
         """Return what a user may: all where nobody is asked for a certificate, nothing where he is not named."""

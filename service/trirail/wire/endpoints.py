@@ -49,6 +49,22 @@ def tcp_address(endpoint: str) -> tuple[str, int] | None:
     return (host.strip("[]"), int(port)) if protocol in {"tcp", "tls", "ws"} else None
 
 
+def leads_to(endpoint: str, reached: str) -> bool:
+    """Whether an endpoint that is dialled leads to one that was reached, of whose host the IP address is known.
+
+    A host name may stand for any address.
+    """
+    (protocol, address), (as_protocol, as_address) = _parts(endpoint), _parts(reached)
+    if protocol != as_protocol or protocol not in _WITH_PORT:
+        return (protocol, address) == (as_protocol, as_address)
+    (host, _, port), (as_host, _, as_port) = address.rpartition(":"), as_address.rpartition(":")
+    try:
+        same_host = ipaddress.ip_address(host.strip("[]")) == ipaddress.ip_address(as_host.strip("[]"))
+    except ValueError:
+        same_host = True
+    return same_host and port == as_port
+
+
 def same_port(one: tuple[str, int], other: tuple[str, int]) -> bool:
     """Whether two hosts and ports cannot be listened on at once; of host names only those that are equal."""
     if one[1] != other[1]:
