@@ -326,3 +326,32 @@ def test_a_robot_or_router_that_is_revoked_is_not_let_in(net: Net, tmp_path: Pat
     )
     with router.routing(without):
         pass
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("ann", "ann/cert.pem: the certificate of user ann, with which nobody serves others"),
+        ("demo", "demo: the certificate of demo, which is behind this router"),
+        ("other", "other: the certificate of other, which is behind this router"),
+    ],
+)
+def test_a_router_does_not_start_as_a_user_or_as_one_of_its_robots(net: Net, name: str, said: str) -> None:
+    table = msgspec.structs.replace(net.config.zenoh, tls=Tls(str(user(net.folder, name))))
+    behind = {"routers": {"north": ("other",)}, "robots": ("demo",)}
+    with pytest.raises(ServiceError, match=said):
+        router.settings(msgspec.structs.replace(net.config, zenoh=table, **behind))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("ann", "the certificate of user ann, with which nobody serves others"),
+        ("other", "the certificate of other, and a router takes robot demo by its name alone"),
+    ],
+)
+def test_a_robot_does_not_start_as_a_user_nor_behind_a_router_as_another(net: Net, name: str, said: str) -> None:
+    config = net.robot("demo")
+    table = msgspec.structs.replace(config.zenoh, tls=Tls(str(user(net.folder, name))))
+    with pytest.raises(ServiceError, match=said):
+        Guard(msgspec.structs.replace(config, zenoh=table))

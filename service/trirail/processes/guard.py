@@ -7,7 +7,7 @@ from pathlib import Path
 import zenoh
 
 from trirail.config import Config
-from trirail.errors import RefusalCode, RefusedError
+from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import zenoh_session
 from trirail.wire.access import access_control
 from trirail.wire.credentials import Credentials, with_role
@@ -31,7 +31,12 @@ class Guard:
         self._gone: list[str] = []
         if config.zenoh.tls is not None:
             folder = Path(config.zenoh.tls.directory)
-            self._credentials = Credentials.read(folder)
+            self._credentials = Credentials.read_server(folder)
+            if self._connect and self._credentials.name != self._robot:
+                raise ServiceError(
+                    f"{folder}: the certificate of {self._credentials.name}, and a router takes robot {self._robot} "
+                    f"by its name alone: trirail keys robot {self._robot} makes its own"
+                )
             self.users = with_role(config.zenoh.users, folder)
             self._gone = [user for user in config.zenoh.users if user not in self.users]
 

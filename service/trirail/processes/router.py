@@ -79,8 +79,14 @@ def settings(config: RouterConfig) -> dict[str, Any]:
             f"{', '.join(gone)}: revoked, and who has the certificate would be taken for it: take the name out of "
             "robots and routers; a robot or router that goes on gets a certificate of another name"
         )
+    own = Credentials.read_server(folder)
+    if own.name in (*config.behind, *config.all_robots):
+        raise ServiceError(
+            f"{folder}: the certificate of {own.name}, which is behind this router: a router has a name of its own, "
+            "by trirail keys init --robot or trirail keys robot"
+        )
     rules = router_access_control(config.behind, with_role(config.zenoh.users, folder), config.zenoh.router)
-    return zenoh_session.router(listen, Credentials.read(folder), rules, connect, thinned)
+    return zenoh_session.router(listen, own, rules, connect, thinned)
 
 
 @contextmanager
