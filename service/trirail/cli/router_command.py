@@ -27,6 +27,7 @@ def router(config: Path, /, *, print_config: Annotated[bool, Flag] = False) -> i
 
         terminal.json(nested(routers.settings(settings)))
         return 0
-    terminal.say(f"routing  {', '.join(settings.zenoh.listen)}  between users and {len(settings.all_robots)} robots")
+    robots = terminal.counted(len(settings.all_robots), "robot")
+    terminal.say(f"routing  {', '.join(settings.zenoh.listen)}  between users and {robots}")
     routers.run(settings)
     return 0

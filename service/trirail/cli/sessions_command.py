@@ -135,7 +135,8 @@ def _print(found: list[RecordedSession], of: int) -> None:
         )
     if found:
         terminal.out.print(table)
-    terminal.say(f"{len(found)} of {of} sessions" if len(found) < of else f"{of} sessions")
+    sessions = terminal.counted(of, "session")
+    terminal.say(f"{len(found)} of {sessions}" if len(found) < of else sessions)
 
 
 def _lasted(session: RecordedSession) -> str:
