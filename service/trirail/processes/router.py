@@ -16,7 +16,7 @@ from msgspec import Meta, Struct
 from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
-from trirail.config import UserName, Zenoh, check_reach
+from trirail.config import UserName, Zenoh, check_reach, explain
 from trirail.errors import ConfigError, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import router_access_control
@@ -50,11 +50,11 @@ class RouterConfig(Struct, frozen=True, forbid_unknown_fields=True):
 def load(path: Path) -> RouterConfig:
     """Read a router's configuration. Raises ConfigError."""
     try:
-        config = msgspec.convert(tomllib.loads(files.text(path)), RouterConfig)
+        config = _parsed(files.text(path))
         check_reach(config.zenoh)
     except FileError as error:
         raise ConfigError(str(error)) from error
-    except (ConfigError, msgspec.ValidationError, ValueError, RecursionError) as error:
+    except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     if config.zenoh.tls is not None:
         tls = msgspec.structs.replace(config.zenoh.tls, directory=str(path.parent / config.zenoh.tls.directory))
@@ -65,6 +65,19 @@ def load(path: Path) -> RouterConfig:
     if twice := [name for name, times in named.items() if times > 1]:
         raise ConfigError(f"{path}: robots, routers, zenoh.users: {', '.join(twice)} stands twice: names must differ")
     return config
+
+
+def _parsed(text: str) -> RouterConfig:
+    try:
+        raw = tomllib.loads(text)
+    except RecursionError as error:
+        raise ConfigError("not a configuration: its tables or arrays are nested too deeply") from error
+    except ValueError as error:
+        raise ConfigError(f"not TOML: {error}") from error
+    try:
+        return msgspec.convert(raw, RouterConfig)
+    except msgspec.ValidationError as error:
+        raise ConfigError(explain(str(error), raw, RouterConfig)) from error
 
 
 def settings(config: RouterConfig) -> dict[str, Any]:
