@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 from msgspec import Struct
@@ -12,6 +12,7 @@ from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.cli import units
+from trirail.cli.key_folder import Issued
 from trirail.config import Config, as_built
 from trirail.processes.clock import Tick
 from trirail.processes.guard import Guard
@@ -73,6 +74,8 @@ class Machine(Struct, frozen=True):
     """Who may do what over the network, or why its certificates cannot be used."""
     routers: tuple[tuple[str, str], ...] = ()
     """Each endpoint of zenoh.connect with why it cannot be reached, "" where it can."""
+    issued: tuple[Issued, ...] | None = None
+    """The certificates of the authority whose folder is that of [zenoh.tls]; None where it is elsewhere."""
 
 
 def examine(config: Config, machine: Machine) -> list[Check]:
@@ -277,6 +280,23 @@ def network(config: Config, machine: Machine) -> list[Check]:
         found.append(Check("users", "ok" if users else "warning", users or "none, so nobody can do anything"))
         warnings = machine.guard.certificate_warnings()
         found += [Check("certificates", "warning", warning) for warning in warnings]
+        found += without_certificate(machine.guard.users, machine.issued)
+    return found
+
+
+def without_certificate(users: Iterable[str], issued: Sequence[Issued] | None) -> list[Check]:
+    """Who has a role and no certificate with which to use it, as far as the authority's folder is here."""
+    if issued is None:
+        return []
+    known = {each.name: each for each in issued}
+    found = []
+    for user in users:
+        if user not in known:
+            found.append(
+                Check("certificates", "warning", f"{user} has a role and no certificate", f"trirail keys add {user}")
+            )
+        elif trouble := known[user].trouble():
+            found.append(Check("certificates", "warning", f"{user} cannot connect: {trouble}"))
     return found
 
 

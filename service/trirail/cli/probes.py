@@ -15,6 +15,7 @@ from msgspec import structs
 from trirail_drivers.bus import adapters
 
 from trirail.cli.doctor import Machine, Passed
+from trirail.cli.key_folder import AUTHORITY_KEY, Issued, KeyFolder
 from trirail.config import Config, LoopTable
 from trirail.errors import ServiceError
 from trirail.processes import realtime
@@ -50,6 +51,7 @@ def machine(config: Config) -> Machine:
         passed=passed(before, counted(channel)),
         adapter=adapters.lacking(config.can.interface),
         guard=door,
+        issued=issued(config),
         routers=()
         if isinstance(door, str)
         else tuple((each, door.why_not_linked(each)) for each in config.zenoh.connect),
@@ -62,6 +64,17 @@ def guard(config: Config) -> Guard | str:
         return Guard(config)
     except ServiceError as error:
         return str(error)
+
+
+def issued(config: Config) -> tuple[Issued, ...] | None:
+    """Read which certificates there are, where the authority's folder is that of [zenoh.tls]."""
+    if config.zenoh.tls is None:
+        return None
+    folder = Path(config.zenoh.tls.directory)
+    try:
+        return tuple(KeyFolder(folder).issued()) if (folder / AUTHORITY_KEY).exists() else None
+    except ServiceError:  # what the guard says of it is said already
+        return None
 
 
 def processors(text: str) -> tuple[int, ...]:
