@@ -205,7 +205,7 @@ def test_what_is_expired_and_who_has_no_certificate_stand_out(
         "demo": "",
         "ann": "expired: trirail keys renew ann makes a new one",
         "bob": "",
-        "ghost": "no cert.pem: delete keys/users/ghost, then trirail keys add ghost",
+        "ghost": "no cert.pem: delete keys/users/ghost, then trirail keys add ghost --role ROLE",
         "left": "",
     }
     assert {name: each["trouble"] for name, each in listed.items()} == troubles

@@ -15,6 +15,7 @@ import pytest
 import zenoh
 from certificates import ROLES, user
 from conftest import CONFIG
+from trirail.cli import router_command
 from trirail.cli.key_folder import KeyFolder
 from trirail.config import Config, Tls, Zenoh
 from trirail.errors import ConfigError, ServiceError
@@ -366,3 +367,14 @@ def test_a_robot_does_not_start_as_a_user_nor_behind_a_router_as_another(net: Ne
     table = msgspec.structs.replace(config.zenoh, tls=Tls(str(user(net.folder, name))))
     with pytest.raises(ServiceError, match=said):
         Guard(msgspec.structs.replace(config, zenoh=table))
+
+
+def test_a_router_that_does_not_start_does_not_say_that_it_routes(
+    net: Net, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "router.toml"
+    ann = user(net.folder, "ann")
+    file.write_text(f'robots = ["demo"]\n[zenoh]\nlisten = ["tls/127.0.0.1:1"]\n[zenoh.tls]\ndirectory = "{ann}"\n')
+    with pytest.raises(ServiceError, match="the certificate of user ann"):
+        router_command.router(file)
+    assert capsys.readouterr().out == ""

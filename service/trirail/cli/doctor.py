@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from msgspec import Struct
@@ -17,6 +17,7 @@ from trirail.config import Config, as_built
 from trirail.processes.clock import Tick
 from trirail.processes.guard import Guard
 from trirail.wire.endpoints import ReachableBy, endpoint_of, reach
+from trirail.wire.vocabulary import Role
 
 Verdict = Literal["ok", "warning", "failure"]
 
@@ -284,16 +285,21 @@ def network(config: Config, machine: Machine) -> list[Check]:
     return found
 
 
-def without_certificate(users: Iterable[str], issued: Sequence[Issued] | None) -> list[Check]:
+def without_certificate(users: Mapping[str, Role], issued: Sequence[Issued] | None) -> list[Check]:
     """Who has a role and no certificate with which to use it, as far as the authority's folder is here."""
     if issued is None:
         return []
     known = {each.name: each for each in issued}
     found = []
-    for user in users:
+    for user, role in users.items():
         if user not in known:
             found.append(
-                Check("certificates", "warning", f"{user} has a role and no certificate", f"trirail keys add {user}")
+                Check(
+                    "certificates",
+                    "warning",
+                    f"{user} has a role and no certificate",
+                    f"trirail keys add {user} --role {role}",
+                )
             )
         elif trouble := known[user].trouble():
             found.append(Check("certificates", "warning", f"{user} cannot connect: {trouble}"))

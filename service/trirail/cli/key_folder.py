@@ -46,7 +46,7 @@ class Issued(NamedTuple):
     def trouble(self, now: datetime | None = None) -> str:
         """Say why it opens no session; "" where it does."""
         if self.expires is None:
-            return f"no {CERTIFICATE}: delete {self.folder}, then trirail keys add {self.name}"
+            return f"no {CERTIFICATE}: delete {self.folder}, then trirail keys add {self.name} --role ROLE"
         expired = self.expires < (now or datetime.now(UTC))
         return f"expired: trirail keys renew {self.name} makes a new one" if expired else ""
 

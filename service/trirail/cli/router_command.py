@@ -28,6 +28,6 @@ def router(config: Path, /, *, print_config: Annotated[bool, Flag] = False) -> i
         terminal.json(nested(routers.settings(settings)))
         return 0
     robots = terminal.counted(len(settings.all_robots), "robot")
-    terminal.say(f"routing  {', '.join(settings.zenoh.listen)}  between users and {robots}")
-    routers.run(settings)
+    words = f"routing  {', '.join(settings.zenoh.listen)}  between users and {robots}"
+    routers.run(settings, lambda: terminal.say(words))
     return 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import tomllib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -114,11 +114,12 @@ def routing(config: RouterConfig) -> Iterator[zenoh.Session]:
         zenoh_session.close(opened)
 
 
-def run(config: RouterConfig) -> None:
-    """Route until SIGTERM or SIGINT."""
+def run(config: RouterConfig, up: Callable[[], None]) -> None:
+    """Route until SIGTERM or SIGINT; `up` is called once it does."""
     ends = {signal.SIGTERM, signal.SIGINT}
     signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # before Zenoh's threads begin, that they have it too
     with routing(config):
+        up()
         signal.sigwait(ends)
 
 
