@@ -11,10 +11,11 @@ from trirail import Geometry, Leg, inverse, forward, jacobians   # the robot's m
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    __version__: str
+
     from trirail.client.async_client import AsyncRobot
     from trirail.client.client import Robot
     from trirail.errors import ConfigError, KinematicsError, RefusalCode, RefusedError, ServiceError, TrirailError
@@ -40,8 +41,6 @@ __all__ = [
     "read",
 ]
 
-__version__ = version("trirail")
-
 _HOMES = {
     "trirail.client.async_client": ("AsyncRobot",),
     "trirail.client.client": ("Robot",),
@@ -55,6 +54,10 @@ _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 def __getattr__(name: str) -> object:
     """Load a public name from its module: PEP 562."""
+    if name == "__version__":
+        from importlib.metadata import version  # it takes longer than all the rest
+
+        return version("trirail")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_HOME[name]), name)

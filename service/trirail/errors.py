@@ -88,7 +88,11 @@ class RefusalCode(StrEnum):
     )
 
     LEASED = "leased", "another user holds the lease", "wait until it is free, or take it over"
-    NO_LEASE = "no_lease", "nobody holds the lease, and this robot moves for its holder alone", "send acquire"
+    NO_LEASE = (
+        "no_lease",
+        "nobody holds the lease: none to release, or this robot moves for a holder alone",
+        "send acquire",
+    )
     LEASE_OVER = "lease_over", "the lease was released, taken over, or kept by no sign of life", "acquire a new one"
 
     # What the robot's mode allows.

@@ -6,9 +6,11 @@ import json
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -118,6 +120,8 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
         ("goto ../../etc", 1, "pose '../../etc' cannot be in a key: letters, digits, - and _, at most 64 are taken"),
         ("goto a/b", 1, "letters, digits, - and _"),
         ("goto 5mm", 2, "goto takes X, Y and PHI, or the NAME of a pose"),
+        ("goto 5mm 0", 2, "goto takes X, Y and PHI: here are X = 5mm and Y = 0.000 mm, and PHI is missing, the angle"),
+        ("acquire --timeout 60s", 2, "--timeout: 60 s is none: 0.1 to 10 s would be right"),
         ("teach 5mm", 1, "pose '5mm' reads as a number or a quantity"),
         ("teach 10", 1, "pose '10' reads as a number or a quantity"),
         ("goto 0 0 0 --speed 50", 2, "--speed: '50' is no share of the limits: 0.001 to 1, or 0.1% to 100%"),
@@ -128,7 +132,13 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
         ("override 300", 2, "'300' is no override: 0, or 1 to 200 %"),
         ("override 0.5%", 2, "'0.5%' is no override: 0, or 1 to 200 %"),
         ("sessions --since yesterday", 2, "'yesterday' is no day or time such as 2026-01-31 or 2026-01-31T12:00:00"),
-        (f"goto 0 0 0 --connect {NOBODY}", 1, "start one with: trirail run, or name its address"),
+        (
+            f"stop --connect {NOBODY}",
+            1,
+            f"no service at {NOBODY}: connection refused; start what is to answer there, trirail run or trirail "
+            "router, or name another address with --connect (in Python connect=)",
+        ),
+        ("stop --connect tcp/no..name:1", 1, "its host name is none; start what is to answer there"),
     ],
 )
 def test_what_is_typed_wrongly_is_told_with_what_would_be_right(line: str, code: int, said: str, run: Run) -> None:
@@ -382,3 +392,41 @@ def test_a_second_ctrl_c_leaves_and_says_that_the_goal_goes_on() -> None:
     with pytest.raises(ServiceError, match="goal g-1 goes on"):
         terminal.follow(goal, goal, "away", show=False)
     assert goal.cancelled.wait(10.0)
+
+
+def test_ctrl_c_while_a_command_is_loaded_ends_it_without_a_word() -> None:
+    loading = (
+        "import signal, sys, os\n"
+        "class Loading:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'cyclopts': os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Loading())\n"
+        "from trirail.__main__ import main\n"
+        "main()\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", loading], capture_output=True, check=False, timeout=60)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, b"", b"")
+
+
+def test_a_number_of_things_is_said_as_people_say_it() -> None:
+    assert [terminal.counted(number, "robot") for number in (0, 1, 2)] == ["0 robots", "1 robot", "2 robots"]
+
+
+def test_watch_into_a_pipe_is_a_line_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing can be drawn anew there, and what is drawn at the end never comes."""
+    at = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: at[0])
+    goal, position = SimpleNamespace(id="g-1", progress=0.4), (0.01, 0.0, 0.0)
+    said: list[str] = []
+    monkeypatch.setattr(live, "say", said.append)
+
+    class Moving(Slow):
+        def states(self, timeout: float) -> Iterator[SimpleNamespace]:
+            for number in range(24):
+                yield SimpleNamespace(t=number / 8, mode="moving", pose=position, goal=goal, faults=("a",))
+                at[0] += 1 / 8
+
+    with pytest.raises(ServiceError, match="silent"):
+        live.watch(Moving(1.0), json_lines=False)  # type: ignore[arg-type]
+    assert [line.split("   ")[0] for line in said] == [f"{t} s  moving  x 10.000 mm" for t in ("0.00", "1.00", "2.00")]
+    assert said[0].endswith("goal g-1 40%  a")

@@ -287,3 +287,18 @@ def test_who_can_read_the_metrics_is_told(address: str, tls: bool, verdict: str,
     (check,) = doctor.metrics(changed(config, "zenoh", tls=Tls() if tls else None))
     assert (check.verdict, check.found) == (verdict, f"tcp/{address}:9464: {by} can read them")
     assert doctor.metrics(SIMULATED) == []
+
+
+def test_whether_the_routers_answer_is_told() -> None:
+    good, bad = doctor.routers([("tls/192.0.2.9:7447", ""), ("tls/192.0.2.8:7447", "connection refused")])
+    assert (good.verdict, good.found) == ("ok", "tls/192.0.2.9:7447 answers")
+    assert (bad.verdict, bad.found) == ("warning", "tls/192.0.2.8:7447: connection refused")
+    assert bad.remedy
+
+
+def test_the_routers_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "MEASURED", 0.02)
+    nobody = "tcp/127.0.0.1:1"
+    config = changed(SIMULATED, "zenoh", connect=(nobody,))
+    config = changed(config, "loop", realtime="off")
+    assert probes.machine(config).routers == ((nobody, "connection refused"),)

@@ -8,11 +8,18 @@ import subprocess
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import msgspec
 import pytest
-from trirail.cli import commands, key_folder
+from conftest import CONFIG
+from cyclopts import CycloptsError
+from trirail.cli import commands, doctor, key_folder, probes
 from trirail.cli.key_folder import KeyFolder
+from trirail.config import Tls, Zenoh
 from trirail.errors import ServiceError
+from trirail.processes.guard import Guard
+from trirail.wire.certificates import Pair, issue
 from trirail.wire.credentials import Credentials, revoked
+from trirail.wire.vocabulary import Role
 
 
 @pytest.fixture(autouse=True)
@@ -177,3 +184,54 @@ def test_the_end_is_told_thirty_days_before(here: Path) -> None:
         Credentials.read(here / "keys/users/ann", credentials.expires + timedelta(seconds=1))
     with pytest.raises(ServiceError, match="is this machine's clock right"):
         Credentials.read(here / "keys/users/ann", datetime.now(UTC) - timedelta(days=1))
+
+
+def test_what_is_expired_and_who_has_no_certificate_stand_out(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    keys("init")
+    for name in ("ann", "bob"):
+        keys("add", name, "--role", "viewer")
+    keys("robot", "left")
+    by = Pair((here / "keys/ca.pem").read_bytes(), (here / "keys/ca-key.pem").read_bytes())
+    past = issue(by, "ann", 1.0, now=datetime.now(UTC) - timedelta(days=2))
+    (here / "keys/users/ann/cert.pem").write_bytes(past.certificate)
+    (here / "keys/users/ghost").mkdir()
+    capsys.readouterr()
+    assert keys("list", "--json") == 0
+    listed = {each["name"]: each for each in json.loads(capsys.readouterr().out)["certificates"]}
+    troubles = {
+        "demo": "",
+        "ann": "expired: trirail keys renew ann makes a new one",
+        "bob": "",
+        "ghost": "no cert.pem: delete keys/users/ghost, then trirail keys add ghost --role ROLE",
+        "left": "",
+    }
+    assert {name: each["trouble"] for name, each in listed.items()} == troubles
+    assert [name for name, each in listed.items() if each["robot"]] == ["demo", "left"]
+    assert keys("list") == 0
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    assert all(trouble in lines[name] for name, trouble in troubles.items())
+
+    users = dict.fromkeys(("ann", "bob", "ghost", "nobody"), Role.VIEWER)
+    zenoh = Zenoh(listen=("tls/127.0.0.1:7447",), tls=Tls(str(here / "keys")), users=users)
+    config = msgspec.structs.replace(CONFIG, zenoh=zenoh)
+    told = doctor.without_certificate(Guard(config).users, probes.issued(config))
+    assert [(check.verdict, check.found) for check in told] == [
+        ("warning", f"ann cannot connect: {troubles['ann']}"),
+        ("warning", f"ghost cannot connect: {troubles['ghost'].replace('keys/users', f'{here}/keys/users')}"),
+        ("warning", "nobody has a role and no certificate"),
+    ]
+    (here / "keys/ca-key.pem").unlink()  # the authority is on another machine
+    assert doctor.without_certificate(Guard(config).users, probes.issued(config)) == []
+
+
+@pytest.mark.parametrize(
+    "address", ["not an address!", "192.0.2.7:7447", "tls/192.0.2.7", "300.0.0.1", "a..b", "-a", ""]
+)
+@pytest.mark.parametrize("words", [("init",), ("robot", "left")])
+def test_an_address_that_is_none_is_refused(here: Path, words: tuple[str, ...], address: str) -> None:
+    with pytest.raises(CycloptsError, match="is no host name or IP address, as"):
+        keys(*words, f"--address={address}")
+    assert list(here.iterdir()) == []

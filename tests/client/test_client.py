@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import threading
 from collections.abc import Callable, Iterator
@@ -11,8 +12,9 @@ import msgspec
 import pytest
 import zenoh
 from trirail.client import client
+from trirail.client.async_client import AsyncRobot
 from trirail.client.client import GoalHandle, Robot
-from trirail.errors import ServiceError
+from trirail.errors import RefusedError, ServiceError
 from trirail.wire.messages import Event
 from trirail.wire.zenoh_session import open_service
 
@@ -88,3 +90,33 @@ def test_events_are_told_once_and_in_order_whatever_comes_again(noisy: Robot) ->
     told = [event.seq for event in noisy.events(timeout=TIMEOUT)]
     assert told == sorted(set(told))
     assert told[-1] == NEWEST.seq
+
+
+@pytest.mark.parametrize("kind", [Robot, AsyncRobot])
+def test_the_environment_says_which_robot_and_where_as_in_a_shell(
+    kind: type[Robot | AsyncRobot], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    nowhere = f"unixsock-stream/{tmp_path}/none"
+    monkeypatch.setenv("TRIRAIL_CONNECT", nowhere)
+    monkeypatch.setenv("TRIRAIL_ROBOT", "left")
+
+    async def enter(robot: AsyncRobot) -> None:
+        async with robot:
+            pass
+
+    def opened(**given: str) -> None:
+        robot = kind(**given)
+        if isinstance(robot, AsyncRobot):
+            asyncio.run(enter(robot))
+
+    with pytest.raises(ServiceError, match=rf"no service at {nowhere}: no such file or directory; .*connect="):
+        opened()
+    with pytest.raises(ServiceError, match=r"no service at tcp/127.0.0.1:1: connection refused"):
+        opened(connect="tcp/127.0.0.1:1")  # what is given counts
+    monkeypatch.setenv("TRIRAIL_ROBOT", "a/b")
+    with pytest.raises(RefusedError, match="robot 'a/b'"):
+        kind()
+    monkeypatch.setenv("TRIRAIL_CONNECT", "tls/127.0.0.1:1")
+    monkeypatch.setenv("TRIRAIL_TLS", str(tmp_path / "keys"))
+    with pytest.raises(ServiceError, match=f"{tmp_path}/keys/ca.pem"):
+        kind("left")

@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -99,6 +100,27 @@ def test_one_look_as_json(
         publisher.join()
     (robot,) = json.loads(capsys.readouterr().out)["robots"]
     assert (robot["robot"], robot["need"], robot["fault"]) == ("demo", "fault", "drive B: EMCY 8700")
+
+
+def test_into_a_pipe_each_robot_is_a_line_whenever_it_has_changed(
+    hub: tuple[str, zenoh.Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    locator, service = hub
+    said: list[str] = []
+    monkeypatch.setattr(fleet_command, "REFRESH", 0.01)
+    monkeypatch.setattr(terminal, "say", said.append)
+    over = threading.Event()
+    with Fleet(locator, "demo") as fleet:
+        printing = threading.Thread(target=fleet_command._say_changes, args=(fleet, over))
+        printing.start()
+        try:
+            for number, summary in enumerate((OK, FAULT), 1):
+                publish = partial(service.put, "trirail/demo/summary", msgspec.json.encode(summary))
+                until(lambda number=number: len(said) == number, publish)
+        finally:
+            over.set()
+            printing.join()
+    assert [line.split("  ", 1)[1] for line in said] == ["demo  holding", "demo  fault  drive B: EMCY 8700"]
 
 
 def test_the_table_says_what_each_needs_and_hides_what_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -101,7 +101,7 @@ def test_every_command_is_its_holders_but_what_stops_the_robot(users: Users, nam
 def test_where_it_is_required_nothing_else_is_taken_without_it(name: Command) -> None:
     users = Users(Rig(REQUIRED))
     said = code(users.tell("ann", name))
-    assert (said is RefusalCode.NO_LEASE) == (name not in EVERYBODYS)
+    assert (said is RefusalCode.NO_LEASE) == (name not in EVERYBODYS - {"release"})
     goal = code(users.send("ann", "g"))
     assert goal is (RefusalCode.NOT_ENABLED if name is Command.ACQUIRE else RefusalCode.NO_LEASE)
 
@@ -185,10 +185,27 @@ def test_a_goal_that_is_being_planned_when_another_acquires_it_does_not_begin(us
 def test_a_lease_of_another_client_of_the_same_user_is_not_taken_in_silence(users: Users) -> None:
     users.tell("ann", "acquire", "l")
     assert code(users.tell("ann", "acquire", "m")) is RefusalCode.LEASED
-    users.tell("ann", "release", "m")
+    assert code(users.tell("ann", "release", "m")) is RefusalCode.LEASED
     assert users.rig.control.lease.user == "ann"
     users.tell("ann", "release")  # whichever it is
     assert users.rig.control.lease.user is None
+
+
+def test_who_does_not_hold_the_lease_releases_nothing_and_is_told_so(users: Users) -> None:
+    def said(answer: Answer) -> tuple[RefusalCode, str] | None:
+        return (answer.code, answer.message) if isinstance(answer, Refused) else None
+
+    nobody = RefusalCode.NO_LEASE, "nobody holds the lease: there is nothing to release"
+    assert said(users.tell("bob", "release")) == nobody
+    users.tell("ann", "acquire", "l")
+    other = RefusalCode.LEASED, "ann holds the lease, and only its holder can release it"
+    assert said(users.tell("bob", "release")) == other
+    assert said(users.tell("bob", "release", "l")) == other
+    assert users.rig.control.lease.user == "ann"
+    assert isinstance(users.tell("ann", "release", "l"), Confirmed)
+    over = RefusalCode.LEASE_OVER, "lease released by ann: there is nothing to release"
+    assert said(users.tell("ann", "release", "l")) == over
+    assert said(users.tell("ann", "release")) == nobody
 
 
 def test_ids_of_leases_that_are_over_are_remembered_each_users_own_and_not_for_ever() -> None:

@@ -29,7 +29,7 @@ from trirail.telemetry.sinks import free_port
 from trirail.wire import packets, zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import Event
-from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Request
+from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, PoseChanged, Request
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import Command
 
@@ -119,7 +119,9 @@ def test_a_role_does_what_it_may_and_is_told_of_the_rest(served: Served, name: s
         if RANK.index(role) >= RANK.index(needed):
             DOES[does](asking)
             if does not in ("info", "poses"):
-                assert loop.asked[before].user == name
+                asked = loop.asked[before]
+                assert isinstance(asked, GoalRequest | CommandRequest | PoseChanged)
+                assert asked.user == name
             return
         began = time.monotonic()
         with pytest.raises(RefusedError) as caught:

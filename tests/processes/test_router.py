@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ import pytest
 import zenoh
 from certificates import ROLES, user
 from conftest import CONFIG
+from trirail.cli import router_command
 from trirail.cli.key_folder import KeyFolder
 from trirail.config import Config, Tls, Zenoh
 from trirail.errors import ConfigError, ServiceError
@@ -190,6 +192,46 @@ def test_a_robot_is_there_before_its_router_and_after_it_is_gone(net: Net) -> No
                 assert until_answered(eva, "trirail/demo/info") == b"demo"
 
 
+@pytest.mark.parametrize(
+    ("impostor", "why"),
+    [
+        ("", "connection refused"),
+        ("stray", "its certificate is in the name of stray, not of hub"),  # another robot's
+        ("ann", "its certificate is not accepted: unsuitable certificate purpose"),  # a user's
+    ],
+)
+def test_a_robot_says_why_it_has_no_router_and_obeys_nobody_in_its_place(net: Net, impostor: str, why: str) -> None:
+    with ExitStack() as opened, Robot(net, "demo") as demo:
+        assert demo.guard.linked(demo.session) == set()
+        if impostor:
+            theirs = Credentials.read(user(net.folder, impostor))
+            settings = zenoh_session.router([net.locator], theirs, None, [], {})
+            opened.enter_context(zenoh_session.open_router(settings))
+        assert demo.guard.why_not_linked(net.locator).startswith(why)
+        if impostor:  # it is dialled every 0.2 to 1 s
+            with (
+                zenoh_session.open_client(net.locator, Credentials.read(user(net.folder, "max")))
+                if (impostor == "stray")
+                else nullcontext() as asking
+            ):
+                threading.Event().wait(2.0)
+                assert asking is None or not answers(asking, "trirail/demo/cmd/max/stop")
+        assert demo.guard.linked(demo.session) == set()
+
+
+def test_a_link_to_the_router_comes_and_goes(net: Net) -> None:
+    with Robot(net, "demo") as demo:
+        for there in (True, False):
+            with router.routing(net.config) if there else nullcontext():
+                enough = threading.Event()
+                for _ in range(round(WITHIN / 0.1)):
+                    if (demo.guard.linked(demo.session) == {net.locator}) is there:
+                        break
+                    enough.wait(0.1)
+                assert demo.guard.linked(demo.session) == ({net.locator} if there else set())
+                assert demo.guard.why_not_linked(net.locator) == ("" if there else "connection refused")
+
+
 def test_routers_make_a_tree_and_each_speaks_for_its_own_robots_alone(net: Net) -> None:
     own = (f"tls/127.0.0.1:{free_port()}",)
     tls = Tls(str(user(net.folder, "north")))
@@ -248,17 +290,26 @@ def test_zenohd_is_given_the_same(net: Net) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('robots = ["demo"]', "zenoh"),
+        ('robots = ["demo"]', "zenoh: missing section"),
         ('robots = []\n[zenoh]\nlisten = ["tcp/127.0.0.1:1"]', "robots"),
-        ('robots = ["a b"]\n[zenoh]\n', "robots"),
-        ('robots = ["demo"]\nodd = 1\n[zenoh]\n', "odd"),
+        ('robots = ["a b"]\n[zenoh]\n', r"robots\[0\] = 'a b': expected"),
+        ('robots = "demo"\n[zenoh]\n', "robots = 'demo': expected array, got str"),
+        ('robots = ["demo"]\nodd = 1\n[zenoh]\n', "odd: unknown section; allowed are zenoh, robots, routers, state_hz"),
+        ('robots = ["demo"]\n[zenoh]\nlisten = "tls/x:1"', "zenoh.listen = 'tls/x:1': expected array, got str"),
+        (
+            'robots = ["demo"]\n[zenoh]\nlisten = ["tls/x:1"]\n[zenoh.users]\nann = "boss"',
+            "users.ann = 'boss': allowed are",
+        ),
+        ('state_hz = "fast"\nrobots = ["demo"]\n[zenoh]', "state_hz = 'fast': expected float, got str"),
+        ('robots = ["demo"]\n[zenoh]\n[routers]\nnorth = 7', "routers.north = 7: expected array, got int"),
+        ('robots = ["demo"]\n[zenoh]\n[routers]\nnorth = ["a b"]', r"routers.north\[0\] = 'a b': expected"),
         ('robots = ["demo"]\n[zenoh]\nlisten = ["tcp/0.0.0.0:7447"]', "insecure = true"),
         (
             'robots = ["ann"]\n[zenoh]\nlisten = ["tls/0.0.0.0:7447"]\n[zenoh.tls]\n[zenoh.users]\nann = "viewer"',
             "names",
         ),
         ('robots = ["a"]\n[routers]\nnorth = ["b", "a"]\n[zenoh]', "a stands twice"),
-        ("robots = [", "Invalid"),
+        ("robots = [", "not TOML: Invalid"),
     ],
 )
 def test_a_routers_file_that_is_wrong_is_refused_with_its_name(text: str, said: str, tmp_path: Path) -> None:
@@ -267,6 +318,8 @@ def test_a_routers_file_that_is_wrong_is_refused_with_its_name(text: str, said: 
     with pytest.raises(ConfigError, match=said) as refused:
         router.load(path)
     assert str(refused.value).startswith(str(path))
+    assert "`" not in str(refused.value)
+    assert " - at " not in str(refused.value)
 
 
 @pytest.mark.parametrize("name", [ROBOTS[0], "north"])
@@ -285,3 +338,43 @@ def test_a_robot_or_router_that_is_revoked_is_not_let_in(net: Net, tmp_path: Pat
     )
     with router.routing(without):
         pass
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("ann", "ann/cert.pem: the certificate of user ann, with which nobody serves others"),
+        ("demo", "demo: the certificate of demo, which is behind this router"),
+        ("other", "other: the certificate of other, which is behind this router"),
+    ],
+)
+def test_a_router_does_not_start_as_a_user_or_as_one_of_its_robots(net: Net, name: str, said: str) -> None:
+    table = msgspec.structs.replace(net.config.zenoh, tls=Tls(str(user(net.folder, name))))
+    behind = {"routers": {"north": ("other",)}, "robots": ("demo",)}
+    with pytest.raises(ServiceError, match=said):
+        router.settings(msgspec.structs.replace(net.config, zenoh=table, **behind))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("ann", "the certificate of user ann, with which nobody serves others"),
+        ("other", "the certificate of other, and a router takes robot demo by its name alone"),
+    ],
+)
+def test_a_robot_does_not_start_as_a_user_nor_behind_a_router_as_another(net: Net, name: str, said: str) -> None:
+    config = net.robot("demo")
+    table = msgspec.structs.replace(config.zenoh, tls=Tls(str(user(net.folder, name))))
+    with pytest.raises(ServiceError, match=said):
+        Guard(msgspec.structs.replace(config, zenoh=table))
+
+
+def test_a_router_that_does_not_start_does_not_say_that_it_routes(
+    net: Net, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "router.toml"
+    ann = user(net.folder, "ann")
+    file.write_text(f'robots = ["demo"]\n[zenoh]\nlisten = ["tls/127.0.0.1:1"]\n[zenoh.tls]\ndirectory = "{ann}"\n')
+    with pytest.raises(ServiceError, match="the certificate of user ann"):
+        router_command.router(file)
+    assert capsys.readouterr().out == ""

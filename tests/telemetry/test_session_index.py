@@ -15,6 +15,7 @@ import made
 import msgspec
 import numpy as np
 import pytest
+from cyclopts import CycloptsError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.cli.commands import app
@@ -159,6 +160,27 @@ def test_what_the_recorder_enters_is_what_its_files_hold(tmp_path: Path) -> None
 )
 def test_sessions_are_found_by_what_was_in_them(shelf: Path, options: list[str], found: list[str]) -> None:
     assert [session.robot for session in sessions(shelf, *options) if session.reason is None] == found
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--fault", "zzz"], "0 sessions\nno recorded fault says zzz: there are emcy 0x8700\n"),
+        (["--fault", "0x8611"], "0 sessions\nno recorded fault says 0x8611: there are emcy 0x8700\n"),
+        (["--fault", "emcy", "--user", "max"], "0 sessions\n"),
+    ],
+)
+def test_a_fault_that_never_was_is_told_with_those_that_were(
+    shelf: Path, options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert app(["sessions", str(shelf), *options], exit_on_error=False, result_action="return_value") == 0
+    assert capsys.readouterr().out == said
+
+
+@pytest.mark.parametrize("words", ["0xzzz", "0x87000000000"])
+def test_a_code_that_no_fault_can_have_is_refused(shelf: Path, words: str) -> None:
+    with pytest.raises(CycloptsError, match=f"{words}' is no code such as 0x8700"):
+        app(["sessions", str(shelf), "--fault", words], exit_on_error=False, print_error=False)
 
 
 @pytest.fixture(scope="module")

@@ -49,6 +49,36 @@ def test_a_message_is_decoded_up_to_its_size_and_not_a_byte_beyond() -> None:
     assert refused(lambda: boundary.decode(longer, Goal, "not a goal")) is RefusalCode.TOO_LARGE
 
 
+POSE = b'"x":0.1,"y":0,"phi":0'
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b'{"kind":"pose","x":-0.1,%b}' % POSE, "not a goal: x stands twice: once would be right"),
+        (b'{"kind":"pose","x":-0.1,"x":0,%b}' % POSE, "not a goal: x stands 3 times: once would be right"),
+        (b'{"kind":"pose","\\u0078":-0.1,%b}' % POSE, "not a goal: x stands twice: once would be right"),
+        (b'{"kind":"pose","kind":"pose",%b}' % POSE, "not a goal: kind stands twice: once would be right"),
+        (
+            b'{"kind":"trajectory","points":[{"t":0,%b},{"t":1,"t":2,%b}]}' % (POSE, POSE),
+            "not a goal: t stands twice: once would be right",
+        ),
+        (b'{"kind":"pose","limits":{"velocity":[1,1,1],"velocity":[2,2,2]},%b}' % POSE, "velocity stands twice"),
+    ],
+)
+def test_a_key_that_stands_twice_is_refused_by_name(content: bytes, said: str) -> None:
+    with pytest.raises(RefusedError, match=said) as caught:
+        boundary.decode(content, Goal, "not a goal")
+    assert caught.value.code is RefusalCode.MALFORMED
+
+
+def test_the_same_key_in_several_objects_and_strings_that_look_like_keys_are_taken() -> None:
+    both = b'{"kind":"trajectory","points":[{"t":0,%b},{"t":1,%b}]}' % (POSE, POSE)
+    assert len(boundary.decode(both, Goal, "not a goal").points) == 2
+    odd = b'{"kind":"pose","id":"\\"x\\":1,\\"x\\":2",%b}' % POSE
+    assert boundary.decode(odd, Goal, "not a goal").id == '"x":1,"x":2'
+
+
 @pytest.mark.parametrize(
     ("cycles", "taken"),
     [

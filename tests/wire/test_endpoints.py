@@ -13,6 +13,7 @@ from trirail.wire.endpoints import (
     endpoint_of,
     fault_of,
     is_local,
+    leads_to,
     reach,
     same_port,
     socket_file,
@@ -125,3 +126,22 @@ def test_an_ipv6_address_is_in_brackets_and_a_file_needs_no_port() -> None:
 def test_a_port_can_be_listened_on_once_an_address(one: str, other: str, same: bool) -> None:
     assert same_port((one, 7447), (other, 7447)) is same_port((other, 7447), (one, 7447)) is same
     assert not same_port((one, 7447), (other, 7448))
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "reached", "does"),
+    [
+        ("tls/192.0.2.9:7447", "tls/192.0.2.9:7447", True),
+        ("tls/192.0.2.9:7447?rel=1", "tls/192.0.2.9:7447", True),
+        ("tls/192.0.2.9:7447", "tls/192.0.2.8:7447", False),
+        ("tls/192.0.2.9:7447", "tls/192.0.2.9:7448", False),
+        ("tls/192.0.2.9:7447", "tcp/192.0.2.9:7447", False),
+        ("tls/hub.example.org:7447", "tls/192.0.2.9:7447", True),
+        ("tls/hub.example.org:7447", "tls/192.0.2.9:51234", False),  # who has dialled us, by a port of his own
+        ("tls/[0:0::1]:7447", "tls/[::1]:7447", True),
+        ("unixsock-stream/a/hub", "unixsock-stream/a/hub", True),
+        ("unixsock-stream/a/hub", "unixsock-stream/a/other", False),
+    ],
+)
+def test_an_endpoint_leads_to_what_may_be_the_address_behind_it(endpoint: str, reached: str, does: bool) -> None:
+    assert leads_to(endpoint, reached) is does

@@ -20,6 +20,7 @@ from trirail.wire.packets import (
     PoseChanged,
     Refused,
     RefusedRequest,
+    Remark,
     Request,
     Status,
     Welcome,
@@ -36,6 +37,7 @@ from trirail.wire.vocabulary import Command
         CommandRequest(2, "ann", Command.STOP),
         RefusedRequest("ann", "no"),
         PoseChanged("ann", "pose pick removed by ann"),
+        Remark("info", "linked to the router tls/192.0.2.9:7447"),
     ],
 )
 def test_requests(request_: Request) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from msgspec import Struct
@@ -12,10 +12,12 @@ from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.cli import units
+from trirail.cli.key_folder import Issued
 from trirail.config import Config, as_built
 from trirail.processes.clock import Tick
 from trirail.processes.guard import Guard
 from trirail.wire.endpoints import ReachableBy, endpoint_of, reach
+from trirail.wire.vocabulary import Role
 
 Verdict = Literal["ok", "warning", "failure"]
 
@@ -71,6 +73,10 @@ class Machine(Struct, frozen=True):
     """What python-can's interface would lack, with the remedy; "" for nothing."""
     guard: Guard | str | None = None
     """Who may do what over the network, or why its certificates cannot be used."""
+    routers: tuple[tuple[str, str], ...] = ()
+    """Each endpoint of zenoh.connect with why it cannot be reached, "" where it can."""
+    issued: tuple[Issued, ...] | None = None
+    """The certificates of the authority whose folder is that of [zenoh.tls]; None where it is elsewhere."""
 
 
 def examine(config: Config, machine: Machine) -> list[Check]:
@@ -87,6 +93,7 @@ def examine(config: Config, machine: Machine) -> list[Check]:
         *corrected(config),
         load(config),
         *network(config, machine),
+        *routers(machine.routers),
         *metrics(config),
         lateness(machine.ticks, config),
     ]
@@ -274,7 +281,40 @@ def network(config: Config, machine: Machine) -> list[Check]:
         found.append(Check("users", "ok" if users else "warning", users or "none, so nobody can do anything"))
         warnings = machine.guard.certificate_warnings()
         found += [Check("certificates", "warning", warning) for warning in warnings]
+        found += without_certificate(machine.guard.users, machine.issued)
     return found
+
+
+def without_certificate(users: Mapping[str, Role], issued: Sequence[Issued] | None) -> list[Check]:
+    """Who has a role and no certificate with which to use it, as far as the authority's folder is here."""
+    if issued is None:
+        return []
+    known = {each.name: each for each in issued}
+    found = []
+    for user, role in users.items():
+        if user not in known:
+            found.append(
+                Check(
+                    "certificates",
+                    "warning",
+                    f"{user} has a role and no certificate",
+                    f"trirail keys add {user} --role {role}",
+                )
+            )
+        elif trouble := known[user].trouble():
+            found.append(Check("certificates", "warning", f"{user} cannot connect: {trouble}"))
+    return found
+
+
+def routers(found: Sequence[tuple[str, str]]) -> list[Check]:
+    """Whether the routers answer that users come through: without them the robot goes on for who is beside it."""
+    remedy = "start trirail router there, or correct zenoh.connect, zenoh.router and certificates"
+    return [
+        Check("router", "warning", f"{endpoint}: {why}", remedy)
+        if why
+        else Check("router", "ok", f"{endpoint} answers")
+        for endpoint, why in found
+    ]
 
 
 def metrics(config: Config) -> list[Check]:

@@ -6,7 +6,6 @@ import contextlib
 import threading
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import msgspec
 from rich.live import Live
@@ -14,9 +13,8 @@ from rich.table import Table
 
 from trirail.cli import terminal
 from trirail.cli.options import HERE, Service
-
-if TYPE_CHECKING:
-    from trirail.client.fleet import Member
+from trirail.client.fleet import Attention, Fleet, Member
+from trirail.wire.text import wall_clock
 
 LOOK = 2.5
 """How long it is listened before what was heard is printed with --json [s]: each robot says something once a second."""
@@ -27,10 +25,9 @@ REFRESH = 0.5
 def fleet(*, service: Service = HERE) -> int:
     """Show all robots that answer at --connect, a router as a rule, until Ctrl-C: who needs somebody stands first.
 
-    A robot is silent where its loop has said nothing for 3 s. With --json, one look of 2.5 s.
+    A robot is silent where its loop has said nothing for 3 s. Into a file or pipe, a line whenever a robot
+    has changed. With --json, one look of 2.5 s.
     """
-    from trirail.client.fleet import Fleet
-
     never = threading.Event()
     with Fleet(service.connect, service.robot, service.tls) as seen:
         if service.json:
@@ -38,10 +35,32 @@ def fleet(*, service: Service = HERE) -> int:
             now = time.monotonic()
             terminal.json({"robots": [_described(member, now) for member in seen.members()]})
             return 0
-        with contextlib.suppress(KeyboardInterrupt), Live(console=terminal.out, auto_refresh=False) as live:
-            while not never.wait(REFRESH):
-                live.update(table(seen.members(), time.monotonic()), refresh=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            if not terminal.out.is_terminal:
+                _say_changes(seen, never)
+            with Live(console=terminal.out, auto_refresh=False) as live:
+                while not never.wait(REFRESH):
+                    live.update(table(seen.members(), time.monotonic()), refresh=True)
     return 0
+
+
+def _say_changes(seen: Fleet, never: threading.Event) -> None:
+    """Print a line for each robot, and again whenever that has changed."""
+    said: dict[str, str] = {}
+    while not never.wait(REFRESH):
+        for member in seen.members():
+            line = _line(member, time.monotonic())
+            if said.get(member.robot) != line:
+                said[member.robot] = line
+                terminal.say(f"{wall_clock(time.time())}  {line}")
+
+
+def _line(member: Member, now: float) -> str:
+    said, need = member.summary, member.need(now)
+    if need is Attention.SILENT:
+        return f"{member.robot}  silent"
+    words = (member.robot, said.mode, said.fault or "", f"goal {said.goal}" if said.goal else "")
+    return "  ".join(filter(None, words))
 
 
 def _described(member: Member, now: float) -> dict[str, object]:
@@ -51,8 +70,6 @@ def _described(member: Member, now: float) -> dict[str, object]:
 
 def table(members: Sequence[Member], now: float) -> Table:
     """Draw the robots, a line each."""
-    from trirail.client.fleet import Attention
-
     drawn = Table("robot", "mode", "needs", "goal", "lateness p99.9", "missed", "version", box=None, pad_edge=False)
     for member in members:
         said, need = member.summary, member.need(now)
@@ -71,5 +88,6 @@ def table(members: Sequence[Member], now: float) -> Table:
             str(said.missed),
             terminal.plain(said.version),
         )
-    drawn.caption = f"{len(members)} robots, {sum(m.need(now) is not Attention.NOTHING for m in members)} need somebody"
+    needy = sum(member.need(now) is not Attention.NOTHING for member in members)
+    drawn.caption = f"{terminal.counted(len(members), 'robot')}, {needy} need{'s' if needy == 1 else ''} somebody"
     return drawn

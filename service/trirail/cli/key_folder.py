@@ -14,7 +14,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from shutil import rmtree
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from cryptography import x509
 from trirail_drivers import files
 
 from trirail.errors import ServiceError
-from trirail.wire.certificates import Pair, authority, common_name, issue, renew
+from trirail.wire.certificates import Pair, authority, common_name, issue, renew, serves
 from trirail.wire.credentials import AUTHORITY, CERTIFICATE, KEY, REVOKED, Credentials, revoked
 
 AUTHORITY_KEY = "ca-key.pem"
@@ -32,12 +32,23 @@ PRIVATE, PUBLIC = 0o600, 0o644
 
 
 class Issued(NamedTuple):
-    """A certificate that the authority has made."""
+    """A certificate that the authority has made, or a folder in which there is none."""
 
     name: str
     is_robot: bool
-    expires: datetime
+    """Whether it is that of the authority's own robot."""
+    serves: bool
+    """Whether it is any robot's, or a router's."""
+    expires: datetime | None
+    """None where there is no certificate."""
     folder: Path
+
+    def trouble(self, now: datetime | None = None) -> str:
+        """Say why it opens no session; "" where it does."""
+        if self.expires is None:
+            return f"no {CERTIFICATE}: delete {self.folder}, then trirail keys add {self.name} --role ROLE"
+        expired = self.expires < (now or datetime.now(UTC))
+        return f"expired: trirail keys renew {self.name} makes a new one" if expired else ""
 
 
 class KeyFolder:
@@ -117,11 +128,13 @@ class KeyFolder:
 
 def _issued(folder: Path, *, is_robot: bool) -> Issued:
     file = folder / CERTIFICATE
+    if not is_robot and not file.exists():
+        return Issued(folder.name, False, False, None, folder)
     try:
         certificate = x509.load_pem_x509_certificate(_read(file))
     except ValueError as error:
         raise ServiceError(f"{file}: not a certificate as PEM") from error
-    return Issued(common_name(certificate), is_robot, certificate.not_valid_after_utc, folder)
+    return Issued(common_name(certificate), is_robot, serves(certificate), certificate.not_valid_after_utc, folder)
 
 
 def _write_pair(folder: Path, pair: Pair) -> None:

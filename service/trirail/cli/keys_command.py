@@ -12,17 +12,31 @@ from cyclopts import App, Parameter
 from trirail.cli import terminal
 from trirail.cli.options import Flag
 from trirail.wire.boundary import check_name
+from trirail.wire.endpoints import is_host
+from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Role
 
 app = App(name="keys", help="Make, list, renew and revoke the certificates of a robot and its users, for zenoh.tls.")
 
 Folder = Annotated[Path, Parameter(name="--folder")]
 Days = Annotated[float, Parameter(validator=lambda _kind, days: _check_days(days))]
+Addresses = Annotated[
+    tuple[str, ...],
+    Parameter(consume_multiple=True, negative="", validator=lambda _kind, addresses: _check_hosts(addresses)),
+]
 HERE = Path("keys")
 LOCAL = ("localhost", "127.0.0.1", "::1")
 """Addresses that every robot's certificate has: those of its own machine."""
 LONGEST = 3650.0
 """For how many days a certificate is made at most: the authority itself is good for no longer."""
+
+
+def _check_hosts(addresses: tuple[str, ...]) -> None:
+    for address in addresses:
+        if not is_host(address):
+            raise ValueError(
+                f"{quoted(address)!r} is no host name or IP address, as 192.0.2.7, without protocol and port"
+            )
 
 
 def _check_days(days: float) -> None:
@@ -34,7 +48,7 @@ def _check_days(days: float) -> None:
 def init(
     *,
     robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT")] = "demo",
-    address: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    address: Addresses = (),
     days: Days = 365.0,
     folder: Folder = HERE,
     json: Annotated[bool, Flag] = False,
@@ -115,7 +129,7 @@ def further(
     name: str,
     /,
     *,
-    address: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    address: Addresses = (),
     days: Days = 365.0,
     folder: Folder = HERE,
     json: Annotated[bool, Flag] = False,
@@ -164,14 +178,18 @@ def show(*, folder: Folder = HERE, json: Annotated[bool, Flag] = False) -> int:
 
     issued, gone = KeyFolder(folder).issued(), sorted(revoked(folder))
     if json:
-        found = [{"name": each.name, "robot": each.is_robot, "expires": each.expires} for each in issued]
+        found = [
+            {"name": each.name, "robot": each.serves, "expires": each.expires, "trouble": each.trouble()}
+            for each in issued
+        ]
         terminal.json({"folder": str(folder), "certificates": found, "revoked": gone})
         return 0
-    table = terminal.table("name", "", "until", "days left")
+    table = terminal.table("name", "", "until", "days left", "")
     now = datetime.now(UTC)
     for each in issued:
-        left = (each.expires - now).days
-        table.add_row(each.name, "robot" if each.is_robot else "user", f"{each.expires:%Y-%m-%d}", str(max(0, left)))
+        left = (str(max(0, (each.expires - now).days)), f"{each.expires:%Y-%m-%d}") if each.expires else ("", "")
+        trouble = f"[red]{terminal.plain(each.trouble(now))}[/]"
+        table.add_row(terminal.plain(each.name), "robot" if each.serves else "user", left[1], left[0], trouble)
     for name in gone:
         table.add_row(name, "revoked")
     terminal.out.print(table)

@@ -14,7 +14,7 @@ from rich.table import Table
 from trirail_drivers.interface import NAMES, MissingProtection
 
 from trirail.cli import units
-from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain, slowed
+from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain, say, slowed
 from trirail.client.client import Jog, Robot
 from trirail.errors import ServiceError
 from trirail.wire.messages import GoalReply
@@ -45,11 +45,24 @@ def watch(robot: Robot, *, json_lines: bool) -> None:
         if json_lines:
             for state in robot.states(SILENT):
                 json(msgspec.to_builtins(state))
+        elif not out.is_terminal:
+            _say_once_a_second(robot)
         else:
             with Live(console=out, refresh_per_second=10, transient=False) as live:
                 for state in robot.states(SILENT):
                     live.update(table(state, robot.name, limits))
         raise ServiceError("the service has gone silent")
+
+
+def _say_once_a_second(robot: Robot) -> None:
+    """Print a line of the state once a second, for a file or pipe, in which nothing can be drawn anew."""
+    due = -math.inf
+    for state in robot.states(SILENT):
+        if time.monotonic() >= due:
+            due = time.monotonic() + 1.0
+            goal = f"  goal {state.goal.id} {state.goal.progress:.0%}" if state.goal else ""
+            faults = "".join(f"  {fault}" for fault in state.faults)
+            say(f"{state.t:.2f} s  {state.mode}  {units.pose(state.pose)}{goal}{faults}")
 
 
 def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:

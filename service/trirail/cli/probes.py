@@ -15,6 +15,7 @@ from msgspec import structs
 from trirail_drivers.bus import adapters
 
 from trirail.cli.doctor import Machine, Passed
+from trirail.cli.key_folder import AUTHORITY_KEY, Issued, KeyFolder
 from trirail.config import Config, LoopTable
 from trirail.errors import ServiceError
 from trirail.processes import realtime
@@ -34,6 +35,7 @@ def machine(config: Config) -> Machine:
     channel = config.can.channel if config.can.interface == "socketcan" else ""
     before = counted(channel)
     ticked = ticks(config.period)
+    door = guard(config)
     return Machine(
         release=platform.release(),
         preempt_rt=_text(SYSTEM / "kernel/realtime") == "1" or "PREEMPT_RT" in platform.version(),
@@ -48,7 +50,11 @@ def machine(config: Config) -> Machine:
         ticks=ticked,
         passed=passed(before, counted(channel)),
         adapter=adapters.lacking(config.can.interface),
-        guard=guard(config),
+        guard=door,
+        issued=issued(config),
+        routers=()
+        if isinstance(door, str)
+        else tuple((each, door.why_not_linked(each)) for each in config.zenoh.connect),
     )
 
 
@@ -58,6 +64,17 @@ def guard(config: Config) -> Guard | str:
         return Guard(config)
     except ServiceError as error:
         return str(error)
+
+
+def issued(config: Config) -> tuple[Issued, ...] | None:
+    """Read which certificates there are, where the authority's folder is that of [zenoh.tls]."""
+    if config.zenoh.tls is None:
+        return None
+    folder = Path(config.zenoh.tls.directory)
+    try:
+        return tuple(KeyFolder(folder).issued()) if (folder / AUTHORITY_KEY).exists() else None
+    except ServiceError:  # what the guard says of it is said already
+        return None
 
 
 def processors(text: str) -> tuple[int, ...]:

@@ -15,6 +15,7 @@ from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
 from trirail.cli.options import poses as poses_of_robot
 from trirail.wire.boundary import check_name, check_new_pose
+from trirail.wire.messages import LONGEST_LEASE, SHORTEST_LEASE
 from trirail.wire.vocabulary import Command
 
 if TYPE_CHECKING:
@@ -67,7 +68,10 @@ def goto(
     from trirail.client.client import Robot
 
     if y is None or phi is None:
-        if y is not None or units.is_length(x) or tool is not None or frame != "base":
+        if y is not None:
+            typed = f"X = {x} and Y = {units.written(y, 'mm', 3)}"
+            raise CycloptsError(msg=f"goto takes X, Y and PHI: here are {typed}, and PHI is missing, the angle, as 0")
+        if units.is_length(x) or tool is not None or frame != "base":
             raise CycloptsError(
                 msg="goto takes X, Y and PHI, or the NAME of a pose, that knows no --tool and no --frame"
             )
@@ -242,7 +246,7 @@ def follow(
     points = read(file)
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         goal = robot.follow(points, stretch=stretch)
-        return _follow(service, robot, goal, wait, f"{file.name}: {len(points)} points")
+        return _follow(service, robot, goal, wait, f"{file.name}: {terminal.counted(len(points), 'point')}")
 
 
 def teach(name: str, /, *, service: Service = HERE) -> int:
@@ -312,17 +316,25 @@ def override(percent: units.Percent, /, *, service: Service = HERE) -> int:
     return 0
 
 
-def acquire(*, force: Annotated[bool, Flag] = False, service: Service = HERE) -> int:
+def acquire(*, force: Annotated[bool, Flag] = False, timeout: units.Time = 1.0, service: Service = HERE) -> int:
     """Hold the lease until Ctrl-C, or until it is lost.
 
     Parameters
     ----------
     force
         Take it over from who holds it: a maintainer's, if [control] takeover does not say otherwise.
+    timeout
+        After how long without a sign of life from here it ends, with a controlled stop: 0.1 to 10 s.
     """
     from trirail.client.client import Robot
 
-    with Robot(service.robot, service.connect, tls=service.tls) as robot, robot.lease(force=force) as lease:
+    if not SHORTEST_LEASE <= timeout <= LONGEST_LEASE:
+        allowed = f"{SHORTEST_LEASE:g} to {LONGEST_LEASE:g} s would be right"
+        raise CycloptsError(msg=f"Invalid value for --timeout: {timeout:g} s is none: {allowed}")
+    with (
+        Robot(service.robot, service.connect, tls=service.tls) as robot,
+        robot.lease(force=force, timeout=timeout) as lease,
+    ):
         show(service, {"lease": robot.user}, f"{robot.user} holds the lease until Ctrl-C")
         with contextlib.suppress(KeyboardInterrupt):
             lease.wait()

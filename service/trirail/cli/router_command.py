@@ -27,6 +27,7 @@ def router(config: Path, /, *, print_config: Annotated[bool, Flag] = False) -> i
 
         terminal.json(nested(routers.settings(settings)))
         return 0
-    terminal.say(f"routing  {', '.join(settings.zenoh.listen)}  between users and {len(settings.all_robots)} robots")
-    routers.run(settings)
+    robots = terminal.counted(len(settings.all_robots), "robot")
+    words = f"routing  {', '.join(settings.zenoh.listen)}  between users and {robots}"
+    routers.run(settings, lambda: terminal.say(words))
     return 0

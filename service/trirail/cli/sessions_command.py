@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import sys
 import time
@@ -48,7 +49,7 @@ def sessions(
     robot: Annotated[str | None, Parameter(env_var="TRIRAIL_ROBOT")] = None,
     since: Moment | None = None,
     until: Moment | None = None,
-    fault: str | None = None,
+    fault: Annotated[str | None, Parameter(validator=lambda _kind, words: _check_code(words))] = None,
     user: str | None = None,
     outcome: Outcome | None = None,
     last: int = 20,
@@ -95,6 +96,7 @@ def sessions(
             index.clear()
         _update(index)
         found = index.find(wanted)
+        recorded = index.faults() if fault is not None and not index.find(Wanted(fault=fault)) else []
     except (sqlite3.Error, OSError) as error:
         raise ServiceError(f"{folder}: the index of its recordings cannot be used: {error}") from error
     shown = found[-last:] if last else found
@@ -102,7 +104,15 @@ def sessions(
         terminal.json({"folder": str(folder), "found": len(found), "sessions": msgspec.to_builtins(shown)})
         return 0
     _print(shown, len(found))
+    if recorded:
+        terminal.say(f"no recorded fault says {quoted(fault or '')}: there are {', '.join(recorded)}")
     return 0
+
+
+def _check_code(words: str | None) -> None:
+    """Refuse what begins as a code and can be none: they have 16 bits or, an ODrive's, 32."""
+    if words and words[:2].lower() == "0x" and re.fullmatch(r"[0-9a-fA-F]{0,8}", words[2:]) is None:
+        raise ValueError(f"{quoted(words)!r} is no code such as 0x8700")
 
 
 SAID_EVERY = 1.0
@@ -135,7 +145,8 @@ def _print(found: list[RecordedSession], of: int) -> None:
         )
     if found:
         terminal.out.print(table)
-    terminal.say(f"{len(found)} of {of} sessions" if len(found) < of else f"{of} sessions")
+    sessions = terminal.counted(of, "session")
+    terminal.say(f"{len(found)} of {sessions}" if len(found) < of else sessions)
 
 
 def _lasted(session: RecordedSession) -> str:

@@ -44,6 +44,11 @@ def plain(words: str) -> str:
     return escape(printable(words))
 
 
+def counted(number: int, what: str) -> str:
+    """Return a number of things: 1 robot, 2 robots."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 def say(words: str) -> None:
     """Print a line."""
     out.print(plain(words), soft_wrap=True)

@@ -22,12 +22,12 @@ from trirail.client.async_connection import AsyncConnection
 from trirail.client.async_goal import AsyncGoalHandle, AsyncJog
 from trirail.client.async_lease import AsyncLease
 from trirail.client.async_track import AsyncTrack
-from trirail.client.client import HOME_WITHIN, Robot, identity, message_of, result_of
+from trirail.client.client import HOME_WITHIN, Robot, address, identity, message_of, result_of
 from trirail.client.connection import REPLY_WITHIN
 from trirail.client.goal import GoalHandle
 from trirail.client.track import Taker
 from trirail.errors import RefusedError, ServiceError
-from trirail.wire import boundary, zenoh_session
+from trirail.wire import boundary
 from trirail.wire.goals import Goal
 from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, Stop
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
@@ -83,11 +83,12 @@ class AsyncRobot:
 
     def __init__(
         self,
-        name: str = "demo",
-        connect: str = zenoh_session.DEFAULT_LOCATOR,
+        name: str | None = None,
+        connect: str | None = None,
         user: str | None = None,
         tls: Path | str | None = None,
     ) -> None:
+        name, connect, tls = address(name, connect, tls)
         self.name = boundary.check_name(name, "robot")
         self.user, self._credentials = identity(self.name, connect, user, tls)
         self._connect = connect

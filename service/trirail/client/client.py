@@ -8,6 +8,7 @@ with Robot("demo") as robot:
 from __future__ import annotations
 
 import getpass
+import os
 import re
 import threading
 import uuid
@@ -26,6 +27,7 @@ from trirail.client.track import Taker, Track
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.credentials import Credentials, credentials_for
+from trirail.wire.endpoints import ReachableBy, reach
 from trirail.wire.goals import (
     Goal,
     MoveGoal,
@@ -52,8 +54,9 @@ HOME_WITHIN = 600.0
 class Robot:
     """A connection to one robot's service; several threads may share it.
 
-    `name` is that of the robot's configuration, `connect` the Zenoh locator of its service or of a router, `user` who
-    is told to have sent goals and commands (the login name if absent). At a locator tls/HOST:PORT the folder `tls`,
+    `name` is that of the robot's configuration, `connect` the Zenoh locator of its service or of a router, both from
+    TRIRAIL_ROBOT and TRIRAIL_CONNECT if absent, or demo on this machine; `user` is who is told to have sent goals and
+    commands (the login name if absent). At a locator tls/HOST:PORT the folder `tls`, TRIRAIL_TLS or
     ~/.config/trirail/<name> if absent, has ca.pem, cert.pem and key.pem, and the user is whom the certificate names;
     RefusedError not_allowed says which role would be needed. Poses are x, y [m] of the platform's centre in
     the base frame and its angle phi [rad], counterclockwise. Any call raises ServiceError where nobody answers and
@@ -62,11 +65,12 @@ class Robot:
 
     def __init__(
         self,
-        name: str = "demo",
-        connect: str = zenoh_session.DEFAULT_LOCATOR,
+        name: str | None = None,
+        connect: str | None = None,
         user: str | None = None,
         tls: Path | str | None = None,
     ) -> None:
+        name, connect, tls = address(name, connect, tls)
         self.name = boundary.check_name(name, "robot")
         self.user, credentials = identity(self.name, connect, user, tls)
         self._connection = Connection(self.name, connect, credentials)
@@ -396,6 +400,15 @@ class Robot:
             goal = self._goals.pop(result.id, None)
         if goal is not None:
             goal.end(result)
+
+
+def address(robot: str | None, connect: str | None, tls: Path | str | None) -> tuple[str, str, Path | str | None]:
+    """Return which robot, where, and with whose folder: what is not given as the environment has it, as in a shell."""
+    robot = robot or os.environ.get("TRIRAIL_ROBOT") or "demo"
+    connect = connect or os.environ.get("TRIRAIL_CONNECT") or zenoh_session.DEFAULT_LOCATOR
+    if tls is None and reach(connect) is ReachableBy.CERTIFICATE:
+        tls = os.environ.get("TRIRAIL_TLS") or None
+    return robot, connect, tls
 
 
 def identity(robot: str, connect: str, user: str | None, tls: Path | str | None) -> tuple[str, Credentials | None]:

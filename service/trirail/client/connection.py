@@ -140,7 +140,8 @@ class Connection:
     def why_nobody(self, parts: tuple[str, ...], reply: RoleReply | None) -> ServiceError | RefusedError:
         """Return what to raise where nobody answers, and this did when the user's role was asked for."""
         return (reply and self._denied(parts, reply.user, reply.role)) or ServiceError(
-            f"no robot {self._robot!r} answers at {self._connect}: is its service running, is the name right (--robot)?"
+            f"no robot {self._robot!r} answers at {self._connect}: is its service running, is the name right "
+            "(--robot), is it linked to the router if this is one?"
         )
 
     def _denied(self, parts: tuple[str, ...], user: str, role: str | None) -> RefusedError | None:

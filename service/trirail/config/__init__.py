@@ -1,6 +1,7 @@
 """A configuration: its keys (`tables`), how it is read (`loading`) and what is refused (`checks`, `explained`)."""
 
 from trirail.config.checks import check_as_built, check_reach
+from trirail.config.explained import explain
 from trirail.config.loading import SIM, load, parse
 from trirail.config.tables import (
     BASE,
@@ -46,6 +47,7 @@ __all__ = [
     "check_as_built",
     "check_reach",
     "corrected_geometry",
+    "explain",
     "geometry",
     "load",
     "metrics_url",

@@ -6,7 +6,7 @@ import difflib
 import re
 from collections.abc import Iterator
 from types import UnionType
-from typing import Any, get_args, get_origin
+from typing import Annotated, Any, get_args, get_origin
 
 import msgspec
 
@@ -32,29 +32,29 @@ NAMED = "[...]"
 _FIELD = re.compile(r"^Object (?P<how>contains unknown|missing required) field `(?P<name>[^`]*)`")
 
 
-def explain(error: str, raw: dict[str, Any]) -> str:
-    """Turn msgspec's words into a key, the value found there, and what is allowed."""
+def explain(error: str, raw: dict[str, Any], kind: type[msgspec.Struct] = Config) -> str:
+    """Turn msgspec's words of a file of a kind into a key, the value found there, and what is allowed."""
     found = _AT.match(error)
     what, path = (found["what"], (found["path"] or "").lstrip(".")) if found else (error, "")
     if field := _FIELD.match(what):
         key = f"{path}.{field['name']}" if path else field["name"]
         if field["how"] == "missing required":
             return f"{key}: missing {'key' if path else 'section'}"
-        allowed = _type_at(path).__struct_fields__
+        allowed = _type_at(path, kind).__struct_fields__
         close = difflib.get_close_matches(field["name"], allowed, n=1)
         hint = f"did you mean {close[0]}?" if close else f"allowed are {', '.join(allowed)}"
         return f"{key}: unknown {'key' if path else 'section'}; {hint}"
     keys = bool(found and found["key"])
     if keys or NAMED in path:
         table, _, rest = path.partition(NAMED)
-        name = _culprit(_at(table, raw), get_args(_type_at(table))[0 if keys else 1], of_keys=keys)
+        name = _culprit(_at(table, raw), get_args(_type_at(table, kind))[0 if keys else 1], of_keys=keys)
         if keys:
             return f"{table}: {name!r} is no name here: {what[0].lower()}{what[1:].replace('`', '')}"
         path = f"{table}.{name}{rest}"
     value = _at(path, raw)
     if what.startswith("Invalid enum value"):
-        kind = _type_at(path)
-        values = [str(each) for each in kind] if kind is Role else get_args(kind)
+        enum = _type_at(path, kind)
+        values = [str(each) for each in enum] if enum is Role else get_args(enum)
         return f"{path} = {value!r}: allowed are {', '.join(map(repr, values))}"
     return f"{path} = {value!r}: {what[0].lower()}{what[1:].replace('`', '')}"
 
@@ -81,9 +81,8 @@ def _parts(path: str) -> list[str]:
     return re.findall(r"[^.\[\]]+", path)
 
 
-def _type_at(path: str) -> Any:
-    """The type that the key or table at `path` must have."""
-    kind: Any = Config
+def _type_at(path: str, kind: Any) -> Any:
+    """The type that the key or table at `path` of a kind of file must have."""
     for part in _parts(path):
         if part.isdigit():
             kind = get_args(kind)[0]
@@ -91,6 +90,6 @@ def _type_at(path: str) -> Any:
             kind = get_args(kind)[1]
         else:
             kind = next(field.type for field in msgspec.structs.fields(kind) if field.name == part)
-        if isinstance(kind, UnionType):
+        if isinstance(kind, UnionType) or (get_origin(kind) is Annotated and get_origin(get_args(kind)[0]) is not None):
             kind = get_args(kind)[0]
     return kind

@@ -97,10 +97,8 @@ class Commands:
 
     def _take_lease(self, request: CommandRequest) -> None:
         """Let a user have the lease, keep it, or give it back."""
-        if request.name is Command.ACQUIRE:
-            change = self._lease.acquire(request, self._modes.cycle)
-        else:
-            change = self._lease.release(request)
+        acquires = request.name is Command.ACQUIRE
+        change = self._lease.acquire(request, self._modes.cycle) if acquires else self._lease.release(request)
         if change is not None:
             self._change_lease(change)
         self._ledger.undertake(request, self._modes.cycle)

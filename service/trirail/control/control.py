@@ -36,6 +36,7 @@ from trirail.wire.packets import (
     PlannerLost,
     PoseChanged,
     RefusedRequest,
+    Remark,
     Request,
 )
 from trirail.wire.planning import PlanAnswer
@@ -105,7 +106,7 @@ class Control:
                 match what:
                     case Disturbance():
                         self.modes.happen(ModeEvent[what.event], what.reason)
-                    case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged():
+                    case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged() | Remark():
                         self.handle(what, now_ns)
                     case PlannerLost():
                         self._planner.lose(what.reason)
@@ -174,6 +175,8 @@ class Control:
                 self._commands.take(request)
             elif isinstance(request, PoseChanged):
                 self.ledger.tell("pose", "info", request.message, user=request.user)
+            elif isinstance(request, Remark):
+                self.ledger.tell("service", request.level, request.message)
             else:
                 self.ledger.tell("refused", "warning", request.message, user=request.user)
         except RefusedError as refusal:

@@ -76,12 +76,17 @@ class LeaseArbiter:
         self._held = _Held(user, request.lease, request.timeout, cycle + round(request.timeout / self._period))
         return change
 
-    def release(self, request: CommandRequest) -> LeaseChange | None:
-        """Let a user give his lease back; None where he has none, or not that one."""
+    def release(self, request: CommandRequest) -> LeaseChange:
+        """Let a user give his lease back. Raises RefusedError where he has none, or not that one."""
         held = self._held
-        if held is None or held.user != request.user or request.lease not in (None, held.id):
-            return None
-        return self._end("info", f"lease released by {held.user}")
+        if held is not None and held.user == request.user and request.lease in (None, held.id):
+            return self._end("info", f"lease released by {held.user}")
+        if request.lease is not None and (why := self._over.get((request.user, request.lease))) is not None:
+            raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: there is nothing to release")
+        if held is None:
+            raise RefusedError(RefusalCode.NO_LEASE, "nobody holds the lease: there is nothing to release")
+        whose = "another client of the same user" if held.user == request.user else held.user
+        raise RefusedError(RefusalCode.LEASED, f"{whose} holds the lease, and only its holder can release it")
 
     def silent(self, cycle: int) -> LeaseChange | None:
         """End the lease where no sign of life has come in time."""

@@ -24,6 +24,7 @@ from trirail.wire.packets import (
     PoseChanged,
     Refused,
     RefusedRequest,
+    Remark,
     Request,
 )
 from trirail.wire.vocabulary import Command
@@ -205,7 +206,7 @@ class Ledger:
 
         Everyone is told, of a track's renewals once: hundreds may follow before their sender hears of it.
         """
-        if isinstance(request, RefusedRequest | PoseChanged):
+        if isinstance(request, RefusedRequest | PoseChanged | Remark):
             return
         text = str(refusal)
         self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))

@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
 import msgspec
 import zenoh
@@ -26,6 +27,7 @@ from trirail.processes.publications import Publications
 from trirail.processes.refusals import Refusals
 from trirail.processes.replies import Replies
 from trirail.processes.requests import Requests
+from trirail.processes.router_links import RouterLinks
 from trirail.processes.state import StateMaker
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Goal
@@ -39,6 +41,7 @@ from trirail.wire.packets import (
     Kind,
     PoseChanged,
     Refused,
+    Remark,
     Status,
     Welcome,
     decode_answer,
@@ -84,8 +87,10 @@ class Gateway:
         self._replies = Replies(self._robot)
         self._refusals = Refusals(link, self._replies)
         self._inbox = Inbox(opened, self._robot, self._refusals.too_much)
-        self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._tell_of_pose, self._inbox.wake)
+        self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._tell, self._inbox.wake)
         self._requests = Requests(config, link, guard, self._replies, self._last_words)
+        connect = config.zenoh.connect
+        self._routers = RouterLinks(connect, partial(guard.linked, opened), guard.why_not_linked, self._tell)
         self._ending = False
         self._publications = Publications(opened, self._robot)
 
@@ -107,6 +112,7 @@ class Gateway:
                     self._hear(packet, ready)
                 self._requests.send_goals()  # those for which there was no room
                 self._poses.settle()
+                self._routers.look()
                 self._requests.give_up_late()
                 self._summarize()
                 self._refusals.tell_of_overruns()
@@ -116,13 +122,14 @@ class Gateway:
         finally:
             with contextlib.suppress(Closed):
                 self._poses.close()
+            self._routers.close()
             for incoming in self._requests:
                 self._replies.send(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
             self._replies.close()
 
     def warnings(self) -> tuple[str, ...]:
         """Return what people should know of how the service is run, one line each."""
-        return (*self._guard.warnings(), *self._poses.warnings())
+        return (*self._guard.warnings(), *self._poses.warnings(), *self._routers.warnings())
 
     def end(self) -> None:
         """End soon; safe from a signal handler."""
@@ -188,8 +195,8 @@ class Gateway:
         if name.stops and goal is None and (name.everybodys or self._states.lease in (None, user)):
             self._requests.backlog.withdraw_all(reason, incoming.number)
 
-    def _tell_of_pose(self, changed: PoseChanged) -> None:
-        self._link.send(message(changed))
+    def _tell(self, what: PoseChanged | Remark) -> None:
+        self._link.send(message(what))
 
     # ------------------------------------------------------------------ loop to Zenoh
 

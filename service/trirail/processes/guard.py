@@ -7,10 +7,11 @@ from pathlib import Path
 import zenoh
 
 from trirail.config import Config
-from trirail.errors import RefusalCode, RefusedError
+from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import zenoh_session
 from trirail.wire.access import access_control
 from trirail.wire.credentials import Credentials, with_role
+from trirail.wire.dialling import why_not
 from trirail.wire.endpoints import ReachableBy, reach, socket_file
 from trirail.wire.vocabulary import Role
 
@@ -30,7 +31,12 @@ class Guard:
         self._gone: list[str] = []
         if config.zenoh.tls is not None:
             folder = Path(config.zenoh.tls.directory)
-            self._credentials = Credentials.read(folder)
+            self._credentials = Credentials.read_server(folder)
+            if self._connect and self._credentials.name != self._robot:
+                raise ServiceError(
+                    f"{folder}: the certificate of {self._credentials.name}, and a router takes robot {self._robot} "
+                    f"by its name alone: trirail keys robot {self._robot} makes its own"
+                )
             self.users = with_role(config.zenoh.users, folder)
             self._gone = [user for user in config.zenoh.users if user not in self.users]
 
@@ -44,6 +50,14 @@ class Guard:
         for path in filter(None, map(socket_file, self._listen)):
             path.chmod(SOCKET_MODE)
         return opened
+
+    def linked(self, opened: zenoh.Session) -> set[str]:
+        """Return to which endpoints of `connect` a session has a link to the router that is obeyed."""
+        return zenoh_session.linked(opened, self._connect, self._router)
+
+    def why_not_linked(self, endpoint: str) -> str:
+        """Return what keeps from a link to an endpoint of `connect`, "" where nothing is seen; it may take seconds."""
+        return why_not(endpoint, self._credentials, self._router)
 
     def role(self, user: str) -> Role | None:
         """Return what a user may: all where nobody is asked for a certificate, nothing where he is not named."""

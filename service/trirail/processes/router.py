@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import tomllib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +16,7 @@ from msgspec import Meta, Struct
 from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
-from trirail.config import UserName, Zenoh, check_reach
+from trirail.config import UserName, Zenoh, check_reach, explain
 from trirail.errors import ConfigError, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import router_access_control
@@ -50,11 +50,11 @@ class RouterConfig(Struct, frozen=True, forbid_unknown_fields=True):
 def load(path: Path) -> RouterConfig:
     """Read a router's configuration. Raises ConfigError."""
     try:
-        config = msgspec.convert(tomllib.loads(files.text(path)), RouterConfig)
+        config = _parsed(files.text(path))
         check_reach(config.zenoh)
     except FileError as error:
         raise ConfigError(str(error)) from error
-    except (ConfigError, msgspec.ValidationError, ValueError, RecursionError) as error:
+    except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     if config.zenoh.tls is not None:
         tls = msgspec.structs.replace(config.zenoh.tls, directory=str(path.parent / config.zenoh.tls.directory))
@@ -65,6 +65,19 @@ def load(path: Path) -> RouterConfig:
     if twice := [name for name, times in named.items() if times > 1]:
         raise ConfigError(f"{path}: robots, routers, zenoh.users: {', '.join(twice)} stands twice: names must differ")
     return config
+
+
+def _parsed(text: str) -> RouterConfig:
+    try:
+        raw = tomllib.loads(text)
+    except RecursionError as error:
+        raise ConfigError("not a configuration: its tables or arrays are nested too deeply") from error
+    except ValueError as error:
+        raise ConfigError(f"not TOML: {error}") from error
+    try:
+        return msgspec.convert(raw, RouterConfig)
+    except msgspec.ValidationError as error:
+        raise ConfigError(explain(str(error), raw, RouterConfig)) from error
 
 
 def settings(config: RouterConfig) -> dict[str, Any]:
@@ -79,8 +92,14 @@ def settings(config: RouterConfig) -> dict[str, Any]:
             f"{', '.join(gone)}: revoked, and who has the certificate would be taken for it: take the name out of "
             "robots and routers; a robot or router that goes on gets a certificate of another name"
         )
+    own = Credentials.read_server(folder)
+    if own.name in (*config.behind, *config.all_robots):
+        raise ServiceError(
+            f"{folder}: the certificate of {own.name}, which is behind this router: a router has a name of its own, "
+            "by trirail keys init --robot or trirail keys robot"
+        )
     rules = router_access_control(config.behind, with_role(config.zenoh.users, folder), config.zenoh.router)
-    return zenoh_session.router(listen, Credentials.read(folder), rules, connect, thinned)
+    return zenoh_session.router(listen, own, rules, connect, thinned)
 
 
 @contextmanager
@@ -95,11 +114,12 @@ def routing(config: RouterConfig) -> Iterator[zenoh.Session]:
         zenoh_session.close(opened)
 
 
-def run(config: RouterConfig) -> None:
-    """Route until SIGTERM or SIGINT."""
+def run(config: RouterConfig, up: Callable[[], None]) -> None:
+    """Route until SIGTERM or SIGINT; `up` is called once it does."""
     ends = {signal.SIGTERM, signal.SIGINT}
     signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # before Zenoh's threads begin, that they have it too
     with routing(config):
+        up()
         signal.sigwait(ends)
 
 

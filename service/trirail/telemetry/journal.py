@@ -26,6 +26,7 @@ from trirail.wire.packets import (
     PlannerLost,
     PoseChanged,
     RefusedRequest,
+    Remark,
 )
 from trirail.wire.planning import Extended, NotPlanned, Planned
 
@@ -104,5 +105,5 @@ def _words(what: ControlInput) -> str:
             return f"plan {number}: {message}"
         case PlannerLost(reason=reason):
             return reason
-        case RefusedRequest(message=message) | PoseChanged(message=message):
+        case RefusedRequest(message=message) | PoseChanged(message=message) | Remark(message=message):
             return message

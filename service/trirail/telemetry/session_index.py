@@ -133,6 +133,16 @@ class SessionIndex:
             self._do(look)
         return list(found.values())
 
+    def faults(self) -> list[str]:
+        """Return every fault that is recorded, by cause and code, each once."""
+        found: list[str] = []
+
+        def look(index: sqlite3.Connection) -> None:
+            found.extend(said for (said,) in index.execute(f"SELECT DISTINCT {_CAUSE} FROM fault ORDER BY cause, code"))
+
+        self._do(look)
+        return found
+
     def _do(self, what: Callable[[sqlite3.Connection], object]) -> bool:
         """Do something with the index in one transaction; whether it was damaged and has been made anew for that."""
         try:
@@ -232,4 +242,5 @@ def _conditions(wanted: Wanted) -> tuple[list[str], list[str | float]]:
     return [condition for condition, _ in conditions], [value for _, values in conditions for value in values]
 
 
-_SAID: Final = "cause || ' ' || printf('0x%04X', code) || ' ' || message"
+_CAUSE: Final = "cause || ' ' || printf('0x%04X', code)"
+_SAID: Final = f"{_CAUSE} || ' ' || message"

@@ -65,15 +65,22 @@ def renew(by: Pair, certificate: bytes, days: float, now: datetime | None = None
     key = old.public_key()
     if not isinstance(key, ec.EllipticCurvePublicKey):
         raise ValueError("the certificate's key is none of an elliptic curve")  # noqa: TRY004 - content of a file
-    purposes = old.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
-    serves = ExtendedKeyUsageOID.SERVER_AUTH in purposes
-    return _certificate(by, common_name(old), key, days, addresses_of(old), serves, now)
+    return _certificate(by, common_name(old), key, days, addresses_of(old), serves(old), now)
 
 
 def common_name(certificate: x509.Certificate) -> str:
     """Return in whose name a certificate is: that of its common name, "" where it has none or several."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if len(names) == 1 else ""
+
+
+def serves(certificate: x509.Certificate) -> bool:
+    """Whether clients take who shows it for a robot or router; a user's is good for a client and no more."""
+    try:
+        purposes = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    except x509.ExtensionNotFound:
+        return False
+    return ExtendedKeyUsageOID.SERVER_AUTH in purposes
 
 
 def addresses_of(certificate: x509.Certificate) -> list[str]:

@@ -27,6 +27,8 @@ class Credentials(NamedTuple):
     """When it, or that of its authority, ends, whichever is first."""
     addresses: tuple[str, ...]
     """At which host names and IP addresses clients find a robot; none for a user's."""
+    serves: bool = False
+    """Whether it is a robot's or a router's; a user's is good for a client alone."""
 
     @property
     def files(self) -> tuple[Path, Path, Path]:
@@ -41,7 +43,7 @@ class Credentials(NamedTuple):
         from cryptography.exceptions import InvalidSignature
         from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-        from trirail.wire.certificates import addresses_of, common_name
+        from trirail.wire.certificates import addresses_of, common_name, serves
 
         authority_file, certificate_file, key_file = (folder / name for name in (AUTHORITY, CERTIFICATE, KEY))
         authority_pem, certificate_pem, key_pem = map(_content, (authority_file, certificate_file, key_file))
@@ -65,7 +67,18 @@ class Credentials(NamedTuple):
         expires = min(certificate.not_valid_after_utc, authority.not_valid_after_utc)
         if now > expires:
             raise ServiceError(f"{certificate_file}: expired on {expires:%Y-%m-%d}; trirail keys renew makes a new one")
-        return cls(folder, common_name(certificate), expires, tuple(addresses_of(certificate)))
+        return cls(folder, common_name(certificate), expires, tuple(addresses_of(certificate)), serves(certificate))
+
+    @classmethod
+    def read_server(cls, folder: Path) -> Self:
+        """Read the folder of a robot or router. Raises ServiceError as `read`, and for a user's."""
+        found = cls.read(folder)
+        if not found.serves:
+            raise ServiceError(
+                f"{folder / CERTIFICATE}: the certificate of user {found.name}, with which nobody serves others: "
+                "trirail keys init or trirail keys robot makes one for a robot or router"
+            )
+        return found
 
     def warning(self, now: datetime | None = None) -> str:
         """Say that it expires soon; "" where it does not."""

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from enum import StrEnum
 from pathlib import Path
 
 LIKE = "an endpoint is protocol/address, as tcp/127.0.0.1:7447"
 _WITH_PORT = frozenset({"tcp", "tls", "udp", "quic", "ws"})
 _LAST_PORT = 65535
+_HOST = re.compile(
+    r"(?=.{1,253}$)[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?)*"
+)
 _Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
@@ -47,6 +51,32 @@ def tcp_address(endpoint: str) -> tuple[str, int] | None:
     protocol, address = _parts(endpoint)
     host, _, port = address.rpartition(":")
     return (host.strip("[]"), int(port)) if protocol in {"tcp", "tls", "ws"} else None
+
+
+def is_host(text: str) -> bool:
+    """Whether it is an IP address or may be a host name (RFC 1123, and with _), without port and protocol."""
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        *_, last = text.split(".")
+        return _HOST.fullmatch(text) is not None and not last.isdigit()
+    return True
+
+
+def leads_to(endpoint: str, reached: str) -> bool:
+    """Whether an endpoint that is dialled leads to one that was reached, of whose host the IP address is known.
+
+    A host name may stand for any address.
+    """
+    (protocol, address), (as_protocol, as_address) = _parts(endpoint), _parts(reached)
+    if protocol != as_protocol or protocol not in _WITH_PORT:
+        return (protocol, address) == (as_protocol, as_address)
+    (host, _, port), (as_host, _, as_port) = address.rpartition(":"), as_address.rpartition(":")
+    try:
+        same_host = ipaddress.ip_address(host.strip("[]")) == ipaddress.ip_address(as_host.strip("[]"))
+    except ValueError:
+        same_host = True
+    return same_host and port == as_port
 
 
 def same_port(one: tuple[str, int], other: tuple[str, int]) -> bool:

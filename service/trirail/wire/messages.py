@@ -41,7 +41,9 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
     """Its id; none for the robot as a whole."""
 
 
-LeaseTimeout = Annotated[float, Meta(ge=0.1, le=10.0)]
+SHORTEST_LEASE, LONGEST_LEASE = 0.1, 10.0
+"""Time-outs of a lease [s]."""
+LeaseTimeout = Annotated[float, Meta(ge=SHORTEST_LEASE, le=LONGEST_LEASE)]
 
 
 class AcquireLease(Struct, frozen=True, forbid_unknown_fields=True):

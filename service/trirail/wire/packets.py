@@ -72,6 +72,13 @@ class PoseChanged(Struct, frozen=True, tag=True):
     message: str
 
 
+class Remark(Struct, frozen=True, tag=True):
+    """Gateway or recorder to loop: something that everyone is to know; wants an event."""
+
+    level: Level
+    message: str
+
+
 class Accepted(Struct, frozen=True, tag=True):
     """Loop to gateway: the goal is the loop's now."""
 
@@ -171,7 +178,7 @@ class PlannerLost(Struct, frozen=True, tag=True):
     reason: str
 
 
-Request = GoalRequest | CommandRequest | RefusedRequest | PoseChanged
+Request = GoalRequest | CommandRequest | RefusedRequest | PoseChanged | Remark
 GivenInput = Request | Disturbance | DrivesFault | PlanAnswer | PlannerLost
 
 
@@ -187,13 +194,6 @@ class ControlInput(Struct, frozen=True, tag="Input"):  # as recordings have it
     now_ns: int
     """The monotonic clock then: how old a goal was."""
     given: GivenInput
-
-
-class Remark(Struct, frozen=True, tag=True):
-    """Recorder to loop: something that everyone is to know."""
-
-    level: Level
-    message: str
 
 
 class Unrecorded(Struct, frozen=True, tag=True):

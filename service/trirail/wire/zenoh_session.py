@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import zenoh
 
 from trirail.errors import ServiceError
 from trirail.wire.credentials import Credentials
+from trirail.wire.dialling import why_not
+from trirail.wire.endpoints import leads_to
 from trirail.wire.sizes import MAX_TRANSPORT
 
 DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
@@ -48,14 +50,18 @@ def open_service(
     return _open(
         settings,
         f"cannot listen on {', '.join(listen)}",
-        "another service may hold it: end that, or set zenoh.listen to another address",
+        lambda: "; another service may hold it: end that, or set zenoh.listen to another address",
     )
 
 
 def open_router(settings: Mapping[str, Any]) -> zenoh.Session:
     """Open a router's session, of what `router` returns."""
     listen = ", ".join(settings["listen/endpoints"])
-    return _open(dict(settings), f"cannot listen on {listen}", "another one may hold it: end that, or choose another")
+    return _open(
+        dict(settings),
+        f"cannot listen on {listen}",
+        lambda: "; another one may hold it: end that, or choose another",
+    )
 
 
 def router(
@@ -128,10 +134,6 @@ def serving(
 
 def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.Session:
     """Open a client's session to a service or router, with credentials where that asks for them."""
-    refused, otherwise = "", ""
-    if credentials is not None:
-        refused = " or these certificates"
-        otherwise = ", its authority's folder with --tls; where a router is away, name the robot's own address"
     return _open(
         {
             "mode": "client",
@@ -142,9 +144,27 @@ def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.S
             "listen/endpoints": [],
             **_tls(credentials),
         },
-        f"no service at {locator}, or none that takes more clients{refused}",
-        f"start one with: trirail run, or name its address with --connect{otherwise}",
+        f"no service at {locator}",
+        lambda: _why_nobody(locator, credentials),
     )
+
+
+def _why_nobody(locator: str, credentials: Credentials | None) -> str:
+    """Say why no session opens at a locator, and what to do; a second look, for Zenoh does not tell."""
+    taken = "clients" if credentials is None else "clients, or not these certificates"
+    why = why_not(locator, credentials) or f"nobody answers, or takes more {taken}"
+    start = "start one with: trirail run"
+    if locator != DEFAULT_LOCATOR:
+        start = "start what is to answer there, trirail run or trirail router"
+    folder = " and its authority's folder with --tls" if credentials is not None else ""
+    return f": {why}; {start}, or name another address with --connect{folder} (in Python connect=)"
+
+
+def linked(opened: zenoh.Session, endpoints: Sequence[str], router: str | None) -> set[str]:
+    """Return to which endpoints there is a link now; with the name of `router` only where its certificate has that."""
+    links = opened.info.links()
+    reached = [str(link.dst) for link in links if router is None or link.auth_identifier == router]
+    return {endpoint for endpoint in endpoints if any(leads_to(endpoint, other) for other in reached)}
 
 
 def close(opened: zenoh.Session) -> None:
@@ -172,7 +192,7 @@ def _tls(credentials: Credentials | None) -> dict[str, Any]:
     }
 
 
-def _open(settings: dict[str, Any], failure: str, remedy: str) -> zenoh.Session:
+def _open(settings: dict[str, Any], failure: str, explain: Callable[[], str]) -> zenoh.Session:
     zenoh.init_log_from_env_or("off")  # what zenoh would print is in the error below
     config = zenoh.Config()
     try:
@@ -183,4 +203,4 @@ def _open(settings: dict[str, Any], failure: str, remedy: str) -> zenoh.Session:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise ServiceError(f"{failure}; {remedy}") from error
+        raise ServiceError(f"{failure}{explain()}") from error
