@@ -235,7 +235,7 @@ class _Recorded:
         """Return that no drive has told of a fault: what was wrong is told by `read`."""
         return None, None, None
 
-    def configure(self, period: float) -> None:
+    def configure(self, period: float, fastest: float | None = None) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
     def write(self, position: Triple, velocity: Triple) -> None:
@@ -289,5 +289,5 @@ def _simulated(records: NDArray[np.void], config: Config, clock: _Clock) -> Driv
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)
     can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives
     drives = connect(can, config.drives, clock)
-    drives.configure(config.period)
+    drives.configure(config.period, config.limits.slider.velocity)
     return drives
