@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import sqlite3
 import time
 from collections.abc import Callable
@@ -80,8 +81,7 @@ class Recorder:
             self._frames = CandumpLog(first.with_suffix(".log"), channel) if captured else None
         except OSError as error:
             raise ServiceError(
-                f"cannot write a recording to {path or directory}: {error.strerror}; "
-                "telemetry.directory must be a folder that can be written"
+                f"cannot write a recording to {path or directory}: {error.strerror}; {_remedy(error)}"
             ) from error
         self._frames_cause = ""
         self._streams = streams = Streams(ShownRobot.configured(config), session, started_ns - monotonic_ns())
@@ -268,6 +268,13 @@ class Recorder:
             f"missing so far: {self.lost} batches in the file{because}, {self.skipped} in the live view, "
             f"{self._absent} cycles that the recorder was too slow for"
         )
+
+
+def _remedy(error: OSError) -> str:
+    """What is to be done where no file can be begun."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "make room on that disk; telemetry.keep_mb bounds what recordings take of it"
+    return "telemetry.directory must be a folder that can be written"
 
 
 def _overwrite(path: Path) -> Path:
