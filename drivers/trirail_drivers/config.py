@@ -127,7 +127,8 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     missed_positions: Annotated[int, Meta(ge=1, le=1000)] = 3
     """So many cycles in a row without a drive's position are a loss of that drive."""
     following_error: Distance = 0.005
-    """The following error window [m]: the drives' own, object 6065h; for ODrives, which have none, the driver's."""
+    """The following error window [m]: the drives' own, object 6065h; for ODrives, which have none, the driver's. Wider
+    than `[limits.slider] following_error`, so that the service stops all three before one of them faults."""
     quick_stop_deceleration: Acceleration = 10.0
     """The quick-stop ramp [m/s²]: the drives' own, object 6085h; for ODrives, which have none, the driver's."""
     stop_timeout: Timeout = 1.0

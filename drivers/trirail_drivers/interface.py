@@ -113,8 +113,11 @@ class DriveGroup(Protocol):
     def told(self) -> tuple[DriveFault | None, ...]:
         """Of each drive the first fault that it has told of by itself since the last reset, whichever came first."""
 
-    def configure(self, period: float) -> None:
-        """Set the drives up for a cycle of `period` seconds, check what can be read back, start them without power."""
+    def configure(self, period: float, fastest: float | None = None) -> None:
+        """Set the drives up for a cycle of `period` seconds, check what can be read back, start them without power.
+
+        `fastest` is the sliders' limit of velocity [m/s]: where it is given, drives that cannot be told it are refused.
+        """
 
     def sync(self) -> None:
         """Begin a cycle: the drives take up the setpoints written in the last one and sample their positions."""

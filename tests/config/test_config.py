@@ -358,6 +358,11 @@ def run_a_little(config: Config) -> str:
         ),
         (
             "counts_per_metre = 1e7",
+            'counts_per_metre = 1e7\nvelocity_unit = "1e9 counts/s"',
+            'drives.A.velocity_unit = "1e9 counts/s": limits.slider.velocity = 1 is 0.01 of it, and a drive',
+        ),
+        (
+            "counts_per_metre = 1e7",
             'counts_per_metre = 1e7\nvelocity_unit = "1e400 counts/s"',
             'drives.A.velocity_unit = "1e400 counts/s" is no unit of velocities; wanted one as',
         ),

@@ -115,7 +115,7 @@ class Sliders:
         assert alone is None
         self._said = self._said._replace(state=ON)
 
-    def configure(self, period: float) -> None:
+    def configure(self, period: float, fastest: float | None = None) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
     def home(self) -> None:

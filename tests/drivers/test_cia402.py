@@ -191,7 +191,7 @@ class TestConfigure:
         other = Rig()
         other.drives.configure(PERIOD)
         writes = [
-            data for can_id, data in other.bus.sent if can_id == frames.SDO_REQUEST + 1 and data[0] & 0xE0 == 0x20
+            data for can_id, data in other.bus.sent if can_id == frames.SDO_REQUEST + 1 and data[0] & 0xE2 == 0x22
         ]
         settings = [*dict.fromkeys((int.from_bytes(data[1:3], "little"), data[3]) for data in writes)]
         settings = [key for key in settings if key not in ((0x6040, 0), (0x6060, 0))]  # 6041 and 6061 tell

@@ -9,6 +9,7 @@ import pytest
 import rigs
 from edsfiles import make_eds
 from trirail.config import SIM, Config, load
+from trirail_drivers.bus.load import HIGH
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import DriveGroup, Feedback, PowerState
 from trirail_drivers.protocols import PROTOCOLS
@@ -73,8 +74,9 @@ def test_there_is_an_example_of_each_make() -> None:
 
 
 @pytest.mark.parametrize("name", DICTIONARIES)
-def test_an_example_starts_moves_and_stops(name: str, tmp_path: Path) -> None:
-    config = example(name, tmp_path)
+@pytest.mark.parametrize("alone", [False, True], ids=["with its EDS", "as it is copied"])
+def test_an_example_starts_moves_and_stops(name: str, alone: bool, tmp_path: Path) -> None:
+    config = load(FOLDER / f"{name}.toml") if alone else example(name, tmp_path)
     run = Run(config)
     try:
         run.cycle()
@@ -111,6 +113,14 @@ def test_what_an_example_says_of_its_drives_it_needs_to_say(name: str, tmp_path:
     else:
         with pytest.raises(DriveError, match=r"drive A|drives\.A"):
             Run(plain)
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_an_example_leaves_room_on_its_bus_and_names_what_its_drives_can_answer(path: Path) -> None:
+    config = load(path)
+    protocol = PROTOCOLS[config.drives.protocol]
+    assert protocol.traffic.bus_load(config.loop.rate_hz, config.can.bitrate, config.drives.heartbeat) <= HIGH
+    assert ("trirail drives FILE" in path.read_text(encoding="utf-8")) == (protocol.inspect is not None)
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)

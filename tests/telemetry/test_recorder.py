@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import socket
 import threading
@@ -19,10 +20,11 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk, RrdReader
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
+from trirail.telemetry.candump import CandumpLog
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.shown_robot import ShownRobot
-from trirail.telemetry.sinks import BACKLOG, Archive, Relay, free_port
+from trirail.telemetry.sinks import BACKLOG, RESERVE, Archive, Relay, free_port
 from trirail.telemetry.streams import Streams
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
@@ -350,6 +352,50 @@ def test_captured_frames_are_a_log_that_python_can_reads(tmp_path: Path) -> None
     assert (third.arbitration_id, third.is_remote_frame, second.is_remote_frame) == (0x029, True, False)
     assert (fourth.arbitration_id, fourth.is_extended_id, bytes(fourth.data)) == (0x1ABCDEF0, True, b"\x07")
     assert (fifth.is_error_frame, first.is_error_frame) == (True, False)
+
+
+def test_the_log_of_frames_leaves_the_reserve_free_says_so_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = namedtuple("usage", "free")
+    told: list[str] = []
+    recording = recorder(tmp_path, configured(capture_can=True), warn=told.append)
+
+    def frame(number: int) -> None:
+        recording.frames(FRAME.pack(number, Frame(0x200 + number).packed))
+
+    frame(1)
+    with monkeypatch.context() as full:
+        full.setattr(shutil, "disk_usage", lambda _: usage(free=RESERVE))
+        frame(2)
+        frame(3)
+        assert recording.unrecorded[0] == "no CAN frames are captured"
+        assert f"{tmp_path} is full" in recording.unrecorded[1]
+        recording.records(made.records(0.1).tobytes())
+    frame(4)
+    assert recording.unrecorded == ("", "")
+    recording.close()
+    with can.CanutilsLogReader(recording.path.with_suffix(".log")) as log:
+        assert [message.arbitration_id for message in log] == [0x201, 0x204]
+    assert len(told) == 1
+    assert f"missing so far: 2 batches in the file ({tmp_path} is full" in told[0]
+
+
+def test_a_batch_of_frames_that_the_disk_takes_in_part_leaves_no_part(tmp_path: Path) -> None:
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    log = CandumpLog(tmp_path / "x.log", "can0")
+    batch = FRAME.pack(1.0, Frame(0x201, bytes(8)).packed)
+    log.write(batch)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (50, limit[1]))
+        log.write(batch)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert (log.lost, log.trouble) == (1, f"{tmp_path / 'x.log'} takes no more: No space left on device")
+    log.write(batch)
+    log.close()
+    assert (log.lost, log.trouble) == (1, "")
+    assert (tmp_path / "x.log").read_text() == "(1.000000) can0 201#0000000000000000\n" * 2
 
 
 def test_frames_are_not_kept_unless_asked_for(tmp_path: Path) -> None:

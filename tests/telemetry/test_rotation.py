@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -345,3 +346,19 @@ def test_a_black_box_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
     blocked.write_text("")
     _, told = faulted(blocked / "x", 1.0, at=0.6, after=0.2)
     assert told[0].startswith("the last minute before the fault is not kept: cannot write a recording to")
+    assert told[0].endswith("Not a directory; telemetry.directory must be a folder that can be written")
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_where_the_disk_is_full_a_black_box_asks_for_room(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_descriptor: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("trirail.telemetry.rotation._try", full)
+    _, told = faulted(tmp_path, 1.0, at=0.6, after=0.2)
+    assert told[0].endswith(
+        f"{os.strerror(number)}; make room on that disk; telemetry.keep_mb bounds what recordings take of it"
+    )
+    assert list(tmp_path.iterdir()) == []

@@ -25,15 +25,12 @@ def check(drives: Drives, required: Requirements) -> None:
 
 
 def _check_velocity(name: str, drive: Drive, required: Requirements) -> None:
-    """Feed-forward in the unit that is configured, where that is known of a metre, is a 32-bit integer too."""
+    """Feed-forward in the unit that is configured, where that is known of a metre, is a 32-bit integer, and not 0."""
     key = f"drives.{name}.velocity_unit"
     unit = units.written(key, drive.velocity_unit, 1) if drive.velocity_unit is not None else None
     per_metre = unit.per_metre(drive.counts_per_metre, drive.revolutions_per_metre) if unit is not None else None
-    if per_metre is not None and 2.0 * required.velocity * per_metre >= INT32_MAX:
-        raise DriveError(
-            f'{key} = "{drive.velocity_unit}": limits.slider.velocity = {required.velocity:g} is '
-            f"{required.velocity * per_metre:g} of it, and twice that must be below {INT32_MAX}; wanted a coarser unit"
-        )
+    if per_metre is not None and (why := units.unfit(required.velocity, per_metre)):
+        raise DriveError(f'{key} = "{drive.velocity_unit}": {why}')
 
 
 def _finer(widest: float) -> str:

@@ -1,4 +1,4 @@
-"""What one drive has and should have: reads first, notes the differences, and writes only those, if it is to write."""
+"""What one drive has and should have: reads first, writes the differences alone, and notes them."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ class Difference(NamedTuple):
 
 
 class Differences:
-    """Brings one drive's objects to what is wanted; with `apply` false it only looks."""
+    """Brings one drive's objects to what is wanted."""
 
-    def __init__(self, remote: Remote, *, apply: bool) -> None:
+    def __init__(self, remote: Remote) -> None:
         self.remote = remote
-        self.apply = apply
         self.found: list[Difference] = []
         self.notes: list[str] = []
         """What is done otherwise, and is told once."""
@@ -47,9 +46,6 @@ class Differences:
         found = self.remote.look(*key)
         if found is not None and same(index, subindex, found, value):
             return value
-        self.note(key, found, value)
-        if not self.apply:
-            return value
         refusal: SdoRefused | None = None
         for candidate in (value, *also):
             if found == candidate:
@@ -59,6 +55,7 @@ class Differences:
             except SdoRefused as error:
                 refusal = error
                 continue
+            self.note(key, found, candidate)
             self.confirm(key, candidate)
             return candidate
         if refusal is None:
@@ -107,15 +104,18 @@ class Differences:
         if text not in self.notes:
             self.notes.append(text)
 
-    def check_accepted(self, accepted: Sequence[str]) -> None:
-        """Refuse the drive where it lacks a protection that the configuration does not name; tell of the others."""
+    def refusal(self, accepted: Sequence[str]) -> str:
+        """Why the drive is refused: it lacks a protection that the configuration does not name. Tells of the others."""
         refused = [name for name in self.lacking if name not in accepted]
-        if refused:
-            what = "; ".join(f"{name}, {PROTECTIONS[name].purpose}: {self.lacking[name]}" for name in refused)
-            listed = ", ".join(f'"{name}"' for name in sorted({*refused, *accepted}))
-            raise DriveError(
-                f"drive {self.remote.name} lacks protections: {what}. To drive it all the same say "
-                f"drives.{self.remote.name}.accept_without = [{listed}]"
-            )
         for name, reason in self.lacking.items():
-            self.tell(f"lacks {name} ({PROTECTIONS[name].purpose}): {reason}; accepted, so {PROTECTIONS[name].without}")
+            if name in accepted:
+                used = PROTECTIONS[name]
+                self.tell(f"lacks {name} ({used.purpose}): {reason}; accepted, so {used.without}")
+        if not refused:
+            return ""
+        what = "; ".join(f"{name}, {PROTECTIONS[name].purpose}: {self.lacking[name]}" for name in refused)
+        listed = ", ".join(f'"{name}"' for name in sorted({*refused, *accepted}))
+        return (
+            f"drive {self.remote.name} lacks protections: {what}. To drive it all the same say "
+            f"drives.{self.remote.name}.accept_without = [{listed}]"
+        )

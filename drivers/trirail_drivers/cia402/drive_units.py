@@ -141,8 +141,6 @@ def _in_counts(drive: Differences, index: int, told: Unit) -> Unit:
     wanted = Unit(Of.COUNTS, 1.0, "counts/s" if index == 0x60A9 else "counts/s2")
     code, remote = _IN_COUNTS[index], drive.remote
     drive.note((index, 0), remote.look(index), code, "its unit, for nobody says its revolutions per metre")
-    if not drive.apply:
-        return wanted
     try:
         remote.write(index, 0, code)
         if remote.look(index) == code:

@@ -42,15 +42,16 @@ class Cia402(Driver[Cia402Axis]):
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
 
-    def configure(self, period: float) -> None:
+    def configure(self, period: float, fastest: float | None = None) -> None:
         """Set the drives up for a cycle of `period` seconds, read every value back, start them without power.
 
-        Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout, ConfigurationRefused.
+        Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout, ConfigurationRefused; of a drive
+        that takes velocities in a unit that cannot say the sliders' limit `fastest` [m/s], where that is given.
         A drive in fault is not an error here; feedback tells of it and `reset` clears it.
         """
         self._set_period(period, frames.TRAFFIC)
         scales = tuple(axis.scale for axis in self._axes)
-        done = setup.configure(self._wire.bus, self._drives, scales, period, self._clock)
+        done = setup.configure(self._wire.bus, self._drives, scales, period, self._clock, fastest)
         self._set_period(period, ways.traffic(made.way for made, _ in done))
         for axis, (made, start) in zip(self._axes, done, strict=True):
             axis.way, axis.units = made.way, made.units

@@ -44,10 +44,11 @@ def _give_guarding(drive: Differences, period: int, node: int) -> bool:
     if not (remote.has(0x100C) and remote.has(0x100D)):
         return False
     found = remote.look(0x100C), remote.look(0x100D)
-    if drive.apply and remote.look(0x1017):
+    heartbeats = remote.look(0x1017)
+    if heartbeats:
         drive.give(0x1017, 0, 0)  # CiA 301: a node has heartbeats or is guarded, not both
     unset = 0 in found
-    if not drive.apply and (remote.look(0x1017) or unset):
+    if remote.rehearsed and (heartbeats or unset):
         _set_guarding(drive, period, MISSED)  # it may answer none as it is; setting it up will tell
         return True
     # Asked before it is set, for with the first guarding after that its life time begins (CiA 301, 7.2.8.2.2).
@@ -97,7 +98,7 @@ def _emergency(drive: Differences, drives: Drives, node: int) -> int:
         drive.give(0x1014, 0, usual)
         now = remote.look(0x1014) or 0
         others = {frames.EMCY + other.node for other in drives.each} | {frames.SYNC}
-        if drive.apply and now & 0x7FF != usual and not now & 1 << 31 and now & 0x7FF not in others:
+        if now & 0x7FF != usual and not now & 1 << 31 and now & 0x7FF not in others:
             usual = now & 0x7FF
     if remote.look(0x1015):
         drive.give(0x1015, 0, 0)

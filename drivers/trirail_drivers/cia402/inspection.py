@@ -14,8 +14,12 @@ from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES, Clock
 
 
-def inspect(bus: can.BusABC, drives: Drives, period: float, clock: Clock, *, apply: bool) -> list[dict[str, Any]]:
+def inspect(
+    bus: can.BusABC, drives: Drives, period: float, clock: Clock, fastest: float | None = None, *, apply: bool
+) -> list[dict[str, Any]]:
     """What each drive is, and the differences between what it holds and what the cycle needs.
+
+    `fastest` is the sliders' limit of velocity [m/s], which their units must be able to say.
 
     With `apply` the differences are written, to all three or none of them, without power and never stored in a drive;
     else nothing is written. A drive that does not answer, or is refused, is told of in "refused". Raises DriveError
@@ -23,20 +27,24 @@ def inspect(bus: can.BusABC, drives: Drives, period: float, clock: Clock, *, app
     """
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
     if apply:
-        done = setup.configure(bus, drives, scales, period, clock)
+        done = setup.configure(bus, drives, scales, period, clock, fastest)
         for drive in drives.each:
             bus.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node).message())
         return [_told(made) for made, _ in done]
-    found = []
+    found, looked = [], []
     for name, drive, scale in zip(NAMES, drives.each, scales, strict=True):
         try:
-            made = setup.look(bus, name, drives, scale, period, clock)
+            made = setup.look(bus, name, drives, scale, period, clock, fastest)
         except DriveError as error:
             found.append({"name": name, "node": drive.node, "refused": str(error)})
             continue
-        lacking = [each for each in made.lacking if each not in drive.accept_without]
-        refused = f"accept_without lacks {', '.join(lacking)}" if lacking else ""
-        found.append({**_told(made), "refused": refused})
+        looked.append(made)
+        found.append(_told(made))
+    try:
+        setup.check_identifiers(looked)
+    except DriveError as error:
+        for each in found:
+            each["refused"] = each["refused"] or str(error)
     return found
 
 
@@ -73,5 +81,5 @@ def _told(made: setup.SetUp) -> dict[str, Any]:
         "differences": [difference._asdict() for difference in made.differences],
         "notes": list(made.notes),
         "lacking": list(made.lacking),
-        "refused": "",
+        "refused": made.refused,
     }

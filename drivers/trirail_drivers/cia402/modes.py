@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.homing import HOMING
+from trirail_drivers.cia402.objects import MODE, MODE_DISPLAY
 from trirail_drivers.cia402.sdo import Remote, SdoRefused
 from trirail_drivers.cia402.ways import CYCLIC_SYNCHRONOUS_POSITION, INTERPOLATED_POSITION, POSITIONS
 from trirail_drivers.errors import ConfigurationRefused, DriveError
@@ -38,16 +39,14 @@ def choose_mode(remote: Remote, *, homes: bool) -> int:
 def give_mode(drive: Differences, mode: int) -> None:
     """Put the drive into a mode; ConfigurationRefused where 6061h tells another."""
     remote = drive.remote
-    if remote.look(0x6060) != mode or remote.look(0x6061) != mode:
-        drive.note((0x6060, 0), remote.look(0x6060), mode)
-        if drive.apply:
-            remote.write(0x6060, 0, mode)
+    if remote.look(*MODE) != mode or remote.look(*MODE_DISPLAY) != mode:
+        drive.note(MODE, remote.look(*MODE), mode)
+        remote.write(*MODE, mode)
     if mode == INTERPOLATED_POSITION:
         _give_interpolation(drive)
-    if drive.apply:
-        found = remote.read(0x6061)
-        if found != mode:
-            raise ConfigurationRefused(remote.name, remote.name_of((0x6061, 0)), 0x6061, 0, mode, found)
+    found = remote.read(*MODE_DISPLAY)
+    if found != mode:
+        raise ConfigurationRefused(remote.name, remote.name_of(MODE_DISPLAY), *MODE_DISPLAY, mode, found)
 
 
 def _give_interpolation(drive: Differences) -> None:
@@ -55,7 +54,7 @@ def _give_interpolation(drive: Differences) -> None:
     remote = drive.remote
     if remote.has(0x60C0):
         drive.give(0x60C0, 0, _LINEAR)
-    if drive.apply and remote.has(0x60C4, 6):
+    if remote.has(0x60C4, 6):
         for value in (0, 1):  # 0 empties the buffer and closes it, 1 opens it
             try:
                 remote.write(0x60C4, 6, value)

@@ -12,6 +12,8 @@ from typing import Final, NamedTuple
 
 Key = tuple[int, int]
 """Index and subindex of an object."""
+MODE: Final[Key] = 0x6060, 0
+MODE_DISPLAY: Final[Key] = 0x6061, 0
 
 
 class Need(StrEnum):

@@ -127,20 +127,18 @@ class Pdos:
                 pdo = self._pdo(index)
                 if index in self._used or not pdo.valid or pdo.cob_id is None:
                     continue
-                self._drive.note((index, 1), pdo.cob_id, pdo.cob_id | INVALID, "a PDO that is not used")
-                if self._drive.apply:
-                    try:
-                        self._remote.write(index, 1, pdo.cob_id | INVALID)
-                    except SdoRefused:
-                        self._drive.tell(f"PDO {index:04X} cannot be switched off, so it stays on, unused")
+                try:
+                    self._remote.write(index, 1, pdo.cob_id | INVALID)
+                except SdoRefused:
+                    self._drive.tell(f"PDO {index:04X} cannot be switched off, so it stays on, unused")
+                else:
+                    self._drive.note((index, 1), pdo.cob_id, pdo.cob_id | INVALID, "a PDO that is not used")
 
     # ------------------------------------------------------------------ mapping
 
     def _map(self, index: int, identifier: int, kind: int, entries: tuple[int, ...]) -> int | None:
         """Map a PDO in the order that CiA 301 wants; return its identifier, None where the drive does not let it."""
         if not self._remote.has(index, 1) or not self._remote.has(index + 0x200):
-            return None
-        if any(not self._remote.has(entry >> 16, entry >> 8 & 0xFF) for entry in entries):
             return None
         found = self._pdo(index)
         sending = index >= TPDO
@@ -151,14 +149,24 @@ class Pdos:
         if alike and not (timer or inhibit):
             self._used.add(index)
             return identifier
+        if not all(self._travels(entry, sending) for entry in entries):
+            return None
+        noted = len(self._drive.found)
         self._note(found, cob_id, kind, entries, timer, inhibit)
-        if not self._drive.apply:
-            self._used.add(index)
-            return identifier
         kept = self._try_to_map(found, cob_id, kind, entries, timer, inhibit)
-        if kept is not None:
+        if kept is None:
+            del self._drive.found[noted:]
+        else:
             self._used.add(index)
         return kept
+
+    def _travels(self, entry: int, sending: bool) -> bool:
+        """Whether the drive has an object that PDOs of one direction may carry, and of that length (CiA 301, 1600h)."""
+        index, subindex, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
+        remote = self._remote
+        if not remote.has(index, subindex) or remote.bits(index, subindex) != bits:
+            return False
+        return remote.look(index, subindex) is not None if sending else remote.may_be_written(index, subindex)
 
     def _try_to_map(
         self,
@@ -293,11 +301,11 @@ class Pdos:
 
     def _timer(self) -> bool:
         """Whether the drive repeats its statusword by itself."""
-        return self._remote.look(TPDO, 5) == round(1000 * frames.STATUS_PERIOD) or not self._drive.apply
+        return self._remote.look(TPDO, 5) == round(1000 * frames.STATUS_PERIOD)
 
     def _can_be_prompt(self, index: int) -> bool:
         """Whether the inhibit time is 0, or can be set to it: else a statusword may come late."""
-        if not self._remote.has(index, 3) or self._remote.look(index, 3) == 0 or not self._drive.apply:
+        if not self._remote.has(index, 3) or self._remote.look(index, 3) == 0:
             return True
         cob_id = self._remote.look(index, 1) or 0
         try:

@@ -73,11 +73,11 @@ def _give_plain(drive: Differences, key: Key, wanted: int, bits: int) -> None:
     found = remote.look(*key)
     if found is None or found & bits == wanted:
         return
-    if key == (0x1019, 0) and drive.apply and remote.look(0x1006):
+    if key == (0x1019, 0) and remote.look(0x1006):
         with suppress(SdoRefused):
             remote.write(0x1006, 0, 0)  # CiA 301: the counter changes only while the period is 0
     drive.give(*key, wanted)
-    if drive.apply and (remote.look(*key) or 0) & bits != wanted:
+    if (remote.look(*key) or 0) & bits != wanted:
         raise DriveError(
             f"drive {remote.name}: {title(key)} is {shown(*key, found)} and stays; wanted {shown(*key, wanted)}"
         )
@@ -107,10 +107,10 @@ def _give_interpolation(drive: Differences, periods: list[tuple[int, int]]) -> N
 
 
 def _write(drive: Differences, key: tuple[int, int], value: int) -> None:
-    drive.note(key, drive.remote.look(*key), value)
-    if drive.apply:
-        drive.remote.write(*key, value)
-        drive.confirm(key, value)
+    found = drive.remote.look(*key)
+    drive.remote.write(*key, value)
+    drive.note(key, found, value)
+    drive.confirm(key, value)
 
 
 def give_reactions(drive: Differences, drives: Drives, units: Units) -> None:

@@ -16,7 +16,7 @@ from trirail_drivers.cia402.guarding import give_watchdogs
 from trirail_drivers.cia402.modes import choose_mode, give_mode
 from trirail_drivers.cia402.objects import FOLLOWING_BIT
 from trirail_drivers.cia402.pdos import Pdos
-from trirail_drivers.cia402.sdo import Client, Remote, SdoRefused
+from trirail_drivers.cia402.sdo import Client, Rehearsal, Remote, SdoRefused
 from trirail_drivers.cia402.settings import (
     check_nodes,
     give_cycle,
@@ -64,6 +64,8 @@ class SetUp(NamedTuple):
     """What is done otherwise than usual, and the protections that it lacks: lines for people."""
     lacking: tuple[str, ...]
     """Protections that it lacks, as `accept_without` names them."""
+    refused: str
+    """Why it is refused for those; "" where it is not."""
 
 
 class Start(NamedTuple):
@@ -78,9 +80,16 @@ class Start(NamedTuple):
 
 
 def configure(
-    bus: can.BusABC, drives: Drives, scales: tuple[Scale, ...], period: float, clock: Clock
+    bus: can.BusABC,
+    drives: Drives,
+    scales: tuple[Scale, ...],
+    period: float,
+    clock: Clock,
+    fastest: float | None = None,
 ) -> tuple[tuple[SetUp, Start], ...]:
     """Set the three drives up for a cycle of `period` seconds; without power, and NMT operational at the end.
+
+    `fastest` is the sliders' limit of velocity [m/s]: where it is given, the drives' units must be able to say it.
 
     Raises DriveError; of its kinds, ConfigurationRefused for a value that reads back differently and
     DriveTimeout for a drive that does not answer.
@@ -94,30 +103,65 @@ def configure(
     for remote in asked:
         _check_is_servo(remote)
         _take_power_off(remote)
-    for remote, drive, scale in zip(asked, drives.each, scales, strict=True):
-        # Everything is refused that can be, of every drive, before the first value is written.
-        _bring(remote, drive, drives, scale, period, apply=False)[1].check_accepted(drive.accept_without)
-    done = []
-    for remote, drive, scale in zip(asked, drives.each, scales, strict=True):
-        made, differences = _bring(remote, drive, drives, scale, period, apply=True)
-        differences.check_accepted(drive.accept_without)
-        done.append(made._replace(notes=tuple(differences.notes), lacking=tuple(differences.lacking)))
-    _check_identifiers(done)
+    # Everything is refused that can be, of every drive, before the first value is written.
+    rehearsed = [
+        _rehearse(remote, drive, drives, scale, period)
+        for remote, drive, scale in zip(asked, drives.each, scales, strict=True)
+    ]
+    _check(rehearsed)
+    done = [
+        _bring(remote, drive, drives, scale, period)
+        for remote, drive, scale in zip(asked, drives.each, scales, strict=True)
+    ]
+    _check(done)
+    for made in done:
+        _check_velocity(made, fastest)
     for drive in drives.each:
         _send(bus, frames.nmt(frames.NMT_START, drive.node))
     return tuple((made, _start(remote)) for made, remote in zip(done, asked, strict=True))
 
 
-def look(bus: can.BusABC, name: str, drives: Drives, scale: Scale, period: float, clock: Clock) -> SetUp:
+def look(
+    bus: can.BusABC,
+    name: str,
+    drives: Drives,
+    scale: Scale,
+    period: float,
+    clock: Clock,
+    fastest: float | None = None,
+) -> SetUp:
     """Read what the drive called `name` is and what its set-up would change; nothing is written, no state changes."""
     at = NAMES.index(name)
-    remote, drive = remotes(bus, drives, clock)[at], drives.each[at]
-    _check_is_servo(remote)
-    return _bring(remote, drive, drives, scale, period, apply=False)[0]
+    made = _rehearse(remotes(bus, drives, clock)[at], drives.each[at], drives, scale, period)
+    _check_velocity(made, fastest)
+    return made
 
 
-def _check_identifiers(done: Sequence[SetUp]) -> None:
-    """No two drives may hear or send frames of one identifier, as fixed ones of drives with one default would."""
+def _rehearse(remote: Remote, drive: Drive, drives: Drives, scale: Scale, period: float) -> SetUp:
+    """Go through the whole set-up of a drive without writing."""
+    rehearsal = Rehearsal(remote)
+    _check_is_servo(rehearsal)
+    _take_power_off(rehearsal)
+    made = _bring(rehearsal, drive, drives, scale, period)
+    _start(rehearsal)
+    return made
+
+
+def _check(made: Sequence[SetUp]) -> None:
+    for each in made:
+        if each.refused:
+            raise DriveError(each.refused)
+    check_identifiers(made)
+
+
+def _check_velocity(made: SetUp, fastest: float | None) -> None:
+    """Refuse a unit of velocities that is not known, or unfit. A drive may refuse to map any: then it is no matter."""
+    if made.way.setpoints.has_velocity:
+        made.units.check_velocity(made.name, fastest)
+
+
+def check_identifiers(done: Sequence[SetUp]) -> None:
+    """Refuse two drives that hear or send frames of one identifier, as fixed ones of drives with one default do."""
     owners: dict[int, str] = {}
     for made in done:
         way = made.way
@@ -150,11 +194,9 @@ def remotes(bus: can.BusABC, drives: Drives, clock: Clock) -> list[Remote]:
     return made
 
 
-def _bring(
-    remote: Remote, drive: Drive, drives: Drives, scale: Scale, period: float, *, apply: bool
-) -> tuple[SetUp, Differences]:
-    """Bring one drive to what the cycle needs, or only look what that would change."""
-    differences = Differences(remote, apply=apply)
+def _bring(remote: Remote, drive: Drive, drives: Drives, scale: Scale, period: float) -> SetUp:
+    """Bring one drive to what the cycle needs."""
+    differences = Differences(remote)
     mode = choose_mode(remote, homes=drive.homing is not None)
     units = read_units(differences, drive, scale)
     give_cycle(differences, period)
@@ -165,8 +207,6 @@ def _bring(
         give_homing(differences, drive.homing, units)
     pdos = Pdos(differences, drive.node)
     setpoints, controlword = pdos.setpoints(mode)
-    if apply and setpoints.has_velocity:  # a drive may refuse to map it, and then its unit does not matter
-        units.check_velocity(remote.name)
     feedback, status, polled = pdos.feedback()
     pdos.switch_off_others()
     for key in ((0x603F, 0), (0x1001, 0)):
@@ -188,9 +228,18 @@ def _bring(
     )
     vendor, product, revision, serial = (remote.look(0x1018, subindex) for subindex in range(1, 5))
     identity = Identity(remote.look(0x1000) or 0, vendor, product, revision, serial, remote.look(0x6502))
-    found, notes = tuple(differences.found), tuple(differences.notes)
-    made = SetUp(remote.name, drive.node, identity, way, units, found, notes, tuple(differences.lacking))
-    return made, differences
+    refused = differences.refusal(drive.accept_without)
+    return SetUp(
+        remote.name,
+        drive.node,
+        identity,
+        way,
+        units,
+        tuple(differences.found),
+        tuple(differences.notes),
+        tuple(differences.lacking),
+        refused,
+    )
 
 
 def _send(bus: can.BusABC, frame: Frame) -> None:
@@ -213,7 +262,7 @@ def _check_is_servo(remote: Remote) -> None:
 def _take_power_off(remote: Remote) -> None:
     remote.write(0x6040, 0, frames.DISABLE_VOLTAGE)
     statusword = remote.read(0x6041)
-    if frames.power_state(statusword) in HAS_POWER:
+    if not remote.rehearsed and frames.power_state(statusword) in HAS_POWER:
         raise DriveError(f"drive {remote.name}: keeps its power on when told off (statusword {statusword:04X})")
 
 

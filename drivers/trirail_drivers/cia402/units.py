@@ -21,7 +21,7 @@ from enum import StrEnum
 from typing import Final
 
 from trirail_drivers.config import Drive
-from trirail_drivers.driver.scaling import UINT32_MAX, Scale
+from trirail_drivers.driver.scaling import INT32_MAX, UINT32_MAX, Scale
 from trirail_drivers.errors import DriveError
 
 
@@ -175,9 +175,14 @@ class Units:
         """A slider velocity [m/s]; ValueError or OverflowError if it is not finite."""
         return round(self.velocity_per_metre * velocity)
 
-    def check_velocity(self, name: str) -> None:
-        """DriveError where nobody said what the unit of velocities is, which the velocity offset is in."""
+    def check_velocity(self, name: str, fastest: float | None = None) -> None:
+        """DriveError where nobody said what the unit of velocities is, which the velocity offset is in.
+
+        Likewise where it cannot say the sliders' limit of velocity, `fastest` [m/s].
+        """
         _known(name, "velocity", self.velocity_per_metre)
+        if fastest is not None and (why := unfit(fastest, abs(self.velocity_per_metre))):
+            raise DriveError(f"drive {name}: its unit of velocity (60A9, or 6096) is {self.velocity_name}: {why}")
 
     def length(self, name: str, key: str, value: float) -> int:
         """A length [m] of configuration key `key` as UNSIGNED32, as of a following error."""
@@ -192,6 +197,17 @@ class Units:
         """An acceleration [m/s²] of configuration key `key` as UNSIGNED32."""
         _known(name, "acceleration", self.acceleration_per_metre)
         return _unsigned(name, key, value, self.acceleration_per_metre, self.acceleration_name)
+
+
+def unfit(fastest: float, per_metre: float) -> str:
+    """Why a unit of velocities, of which 1 m/s is so many, cannot say the sliders' limit [m/s]; "" where it can."""
+    limit = fastest * per_metre
+    said = f"limits.slider.velocity = {fastest:g} is {limit:g} of it"
+    if limit < 1.0:
+        return f"{said}, and a drive takes whole ones; wanted a finer unit"
+    if 2.0 * limit >= INT32_MAX:  # a velocity may be a little beyond its limit
+        return f"{said}, and twice that must be below {INT32_MAX}; wanted a coarser unit"
+    return ""
 
 
 def _known(name: str, quantity: str, per_metre: float) -> None:

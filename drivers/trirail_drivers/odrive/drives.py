@@ -57,7 +57,7 @@ class Odrive(Driver[OdriveAxis]):
         self._due: deque[Triple | None] = deque([None] * drives.missed_positions, maxlen=drives.missed_positions)
         """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
 
-    def configure(self, period: float) -> None:
+    def configure(self, period: float, fastest: float | None = None) -> None:  # noqa: ARG002  their unit says any
         """Find the drives and leave them without power, for a cycle of `period` seconds.
 
         Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout for a drive that is not there.

@@ -36,11 +36,14 @@ def mechanics_of(drive: config.Drive) -> Mechanics:
         per_metre = units.written(key, text, power).per_metre(counts, revolutions) if text is not None else None
         return counts / per_metre if per_metre is not None else 1.0
 
+    configured = ((0x60A9, drive.velocity_unit), (0x60AA, drive.acceleration_unit))
     return Mechanics(
         counts_per_metre=counts,
         counts_per_revolution=math.nan if revolutions is None else counts / revolutions,
         velocity=fixed("velocity_unit", drive.velocity_unit, 1),
         acceleration=fixed("acceleration_unit", drive.acceleration_unit, 2),
+        # Without its maker's EDS it stands for a drive that does not tell the units that the configuration names.
+        untold=tuple(index for index, unit in configured if unit is not None and drive.eds is None),
     )
 
 

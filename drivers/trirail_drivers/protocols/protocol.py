@@ -30,8 +30,8 @@ class Protocol:
     simulated_drive: Callable[[config.Simulated, config.Drives, config.Drive, float], SimulatedDevice]
     """Makes one simulated drive, its slider at rest at a position [m]."""
     inspect: Callable[..., list[dict[str, Any]]] | None
-    """Tells what each drive is and what its set-up would change, from the bus, section [drives], the period [s] and
-    the clock, and whether to `apply` that; None where drives have nothing to tell."""
+    """Tells what each drive is and what its set-up would change, from the bus, section [drives], the period [s],
+    the clock and the sliders' limit of velocity [m/s], and whether to `apply` that; None where they tell nothing."""
     protections: Mapping[str, str]
     """What `accept_without` may name, and what each means, for people."""
     inputs: Callable[[can.BusABC, config.Drives, Clock], Callable[[str], int | None]] | None

@@ -109,7 +109,11 @@ class ObjectEntry:
 
     def encode(self) -> bytes:
         """The value as it travels, little-endian."""
-        return self.value.to_bytes(self.size or 0, "little", signed=self._signed) if self.integer else self.content
+        return (
+            self._wrapped(self.value).to_bytes(self.size or 0, "little", signed=self._signed)
+            if self.integer
+            else self.content
+        )
 
     def load(self, data: bytes) -> None:
         """Take its bytes from the bus; refused, it raises SdoAbort and leaves the old ones."""

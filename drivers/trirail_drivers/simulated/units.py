@@ -33,6 +33,8 @@ class Mechanics:
     """The fixed unit of velocity [counts/s]."""
     acceleration: float = 1.0
     """The fixed unit of acceleration [counts/s²]."""
+    untold: tuple[int, ...] = ()
+    """Which of 60A9h and 60AAh are 0, whatever its EDS has: their units are those fixed here."""
 
 
 class FactorGroup:
@@ -47,6 +49,9 @@ class FactorGroup:
         """Unit of 6084h, 6085h, 609Ah [counts/s²]."""
         self._mechanics = mechanics
         self._codes = [objects.internal(index, 0) for index in (0x60A8, 0x60A9, 0x60AA)]
+        for index in mechanics.untold:
+            entry = objects.internal(index, 0)
+            entry.value = entry.default = 0
         ratios = [(objects.internal(index, 1), objects.internal(index, 2)) for index in _RATIOS]
         self._ratios = dict(zip(_RATIOS, ratios, strict=True))
         self._at_power_on = self._counts_per_unit()

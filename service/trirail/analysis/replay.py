@@ -161,8 +161,9 @@ def _check(recording: Recording, records: NDArray[np.void], config: Config) -> N
     begins, cycle = MODES[int(records["mode"][0])], int(records["cycle"][0])
     if begins is not Mode.DISABLED:
         raise ServiceError(
-            f"the recording begins at cycle {cycle} in mode {begins}, and what led there is not in it: "
-            "a replay needs one that begins disabled; give all files of the session"
+            f"the recording begins at cycle {cycle} in mode {begins}, and what led there is not in it: a replay needs "
+            "one that begins disabled. Of a rotated one (-part2 and on) give all files; a black box, and what a "
+            "recorder wrote that was started again meanwhile, have none before: trirail report and export read it"
         )
     rate = round(1.0 / float(np.median(np.diff(recording.t[:1000])))) if len(recording.t) > 1 else 0
     if rate and rate != config.loop.rate_hz:
@@ -235,7 +236,7 @@ class _Recorded:
         """Return that no drive has told of a fault: what was wrong is told by `read`."""
         return None, None, None
 
-    def configure(self, period: float) -> None:
+    def configure(self, period: float, fastest: float | None = None) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
     def write(self, position: Triple, velocity: Triple) -> None:
@@ -289,5 +290,5 @@ def _simulated(records: NDArray[np.void], config: Config, clock: _Clock) -> Driv
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)
     can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives
     drives = connect(can, config.drives, clock)
-    drives.configure(config.period)
+    drives.configure(config.period, config.limits.slider.velocity)
     return drives

@@ -91,6 +91,7 @@ def examine(config: Config, machine: Machine) -> list[Check]:
         *can_interface(config, machine),
         *protections(config),
         *corrected(config),
+        *windows(config),
         load(config),
         *network(config, machine),
         *routers(machine.routers),
@@ -158,6 +159,16 @@ def corrected(config: Config) -> list[Check]:
     section = config.correction
     told = as_built.told(section.map, section.as_built, section.backlash)
     return [] if told is None else [Check("correction", "ok", units.correction(told))]
+
+
+def windows(config: Config) -> list[Check]:
+    """Who notices a following error first: the service, which then stops all three, or one drive, by its own fault."""
+    ours, theirs = config.limits.slider.following_error, config.drives.following_error
+    if theirs > ours:
+        return []
+    found = f"drives.following_error = {theirs:g} m is not more than limits.slider.following_error, {ours:g} m"
+    remedy = f"a drive faults before the service stops all three: drives.following_error beyond {ours:g}"
+    return [Check("following error", "warning", found, remedy)]
 
 
 def can_interface(config: Config, machine: Machine) -> list[Check]:

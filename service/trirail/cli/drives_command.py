@@ -36,9 +36,11 @@ def drives(
     settings = load(config or SIM)
     inspect = PROTOCOLS[settings.drives.protocol].inspect
     if inspect is None:
-        raise DriveError(f"drives of protocol {settings.drives.protocol} have no objects to be shown")
+        protocol = settings.drives.protocol
+        raise DriveError(f"drives of protocol {protocol} have no objects to be shown; trirail commission finds them")
     with open_bus(settings.can, settings.drives) as bus:
-        found = inspect(bus, settings.drives, settings.period, time.monotonic, apply=apply)
+        fastest = settings.limits.slider.velocity
+        found = inspect(bus, settings.drives, settings.period, time.monotonic, fastest, apply=apply)
     fit = not any(each["refused"] for each in found)
     if json:
         terminal.json({"ok": fit, "applied": apply, "drives": found})

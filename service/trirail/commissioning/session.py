@@ -66,7 +66,8 @@ class Session:
         if inspect is None:
             words = (f"drives of protocol {drives.protocol} have no objects to be shown; the next step finds them",)
             return Judged("ok", words), {}
-        self._told = inspect(self.place.bus, drives, self._config.period, time.monotonic, apply=False)
+        fastest = self._config.limits.slider.velocity
+        self._told = inspect(self.place.bus, drives, self._config.period, time.monotonic, fastest, apply=False)
         lines = tuple(line for each in self._told for line in drives_told.identity(each))
         refused = tuple(f"drive {each['name']}: {each['refused']}" for each in self._told if each["refused"])
         measured: dict[str, Number] = {}

@@ -93,7 +93,7 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     jerk: Jerk
     """Greatest jerk of each slider [m/s³]."""
     following_error: Distance
-    """Setpoint less measured position beyond which everything stops [m]."""
+    """Setpoint less measured position beyond which everything stops [m]; less than `[drives] following_error`."""
 
 
 Window = Annotated[float, Meta(ge=1e-9, le=1.0)]

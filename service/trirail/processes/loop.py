@@ -190,7 +190,7 @@ def main(config: Config, ports: Ports, heartbeats: Heartbeats, ready: Callable[[
         ports.planner.await_peer(PLANNER_WITHIN)
         capture = Capture() if config.telemetry.capture_can else None
         drives = connect(config.can, config.drives, capture=capture)
-        drives.configure(config.period)
+        drives.configure(config.period, config.limits.slider.velocity)
         lacking = realtime.acquire(config.loop)
         loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)
 

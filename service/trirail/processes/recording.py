@@ -56,7 +56,7 @@ class Intake:
         self._link = link
         self._ready = ready
         self._cycle = 0
-        self._told_unrecorded = False
+        self._told_unrecorded = ""
         self._last_words = LastWords(config.period)
         path = Path(record) if record else None
         directory = Path(config.telemetry.directory)
@@ -85,11 +85,9 @@ class Intake:
     def save(self) -> None:
         """Write what has been taken; tell everyone where that fails, and once it does no more."""
         self.recorder.save()
-        trouble = self.recorder.trouble  # whose words change with every byte of the disk
-        if bool(trouble) != self._told_unrecorded and self._send(
-            Unrecorded(trouble and f"nothing is recorded: {trouble}")
-        ):
-            self._told_unrecorded = bool(trouble)
+        what, why = self.recorder.unrecorded  # its reason changes with every byte of the disk
+        if what != self._told_unrecorded and self._send(Unrecorded(what and f"{what}: {why}")):
+            self._told_unrecorded = what
 
     def loop_gone(self) -> None:
         """The loop has gone: where it has died, keep what it can no longer say."""

@@ -2,28 +2,53 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import os
 from pathlib import Path
 
 from trirail_drivers.bus.capture import FRAME
 from trirail_drivers.bus.frames import CAN_FRAME, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
 
+from trirail.telemetry.sinks import RESERVE, no_room
+
 
 class CandumpLog:
-    """A log of one bus's frames."""
+    """A log of one bus's frames. It leaves RESERVE bytes of the disk free, and goes on where there is room again."""
 
     def __init__(self, path: Path, channel: str) -> None:
-        self.failures = 0
-        """Writes that the disk refused; their frames are missing."""
+        self.lost = 0
+        """Batches that are not in the file."""
+        self.trouble = ""
+        """Why the last batch is not in the file; empty if it is."""
+        self._path = path
         self._channel = channel
         self._file = path.open("wb", buffering=0)
+        self._size = 0
 
     def write(self, batch: bytes) -> None:
-        """Append a batch of captured frames."""
+        """Append a batch of captured frames, or count it as lost."""
+        self.trouble = self._append(batch)
+        self.lost += bool(self.trouble)
+
+    def _append(self, batch: bytes) -> str:
+        """Append a batch, whole or not at all; return why it could not be, or nothing."""
+        if full := no_room(self._path.parent, RESERVE):
+            return full
         lines = "".join(f"({t:.6f}) {self._channel} {_written(frame)}\n" for t, frame in FRAME.iter_unpack(batch))
+        content = lines.encode()
         try:
-            self._file.write(lines.encode())
-        except OSError:
-            self.failures += 1
+            written = self._file.write(content)
+            if written == len(content):
+                self._size += written
+                return ""
+            reason = os.strerror(errno.ENOSPC)
+        except OSError as error:
+            reason = error.strerror or str(error)
+        with contextlib.suppress(OSError):  # half a line would spoil the next one
+            self._file.truncate(self._size)
+            self._file.seek(self._size)
+        return f"{self._path} takes no more: {reason}"
 
     def close(self) -> None:
         """Close the file."""

@@ -123,7 +123,10 @@ def join(parts: Sequence[Recording]) -> Recording:
     first, *others = sorted(parts, key=lambda part: int(part.records["cycle"][0]))
     for other in others:
         if (other.name, other.texts) != (first.name, first.texts):
-            raise ServiceError(f"{other.name!r} is not of the same session as {first.name!r}: give the parts of one")
+            raise ServiceError(
+                f"{other.name!r} is not of the same session as {first.name!r}: give the parts of one, "
+                "which have one name but for -part2 and on"
+            )
     _, rows = np.unique(np.concatenate([part.records["cycle"] for part in parts]), return_index=True)
     return Recording(
         name=first.name,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import sqlite3
 import time
 from collections.abc import Callable
@@ -80,9 +81,9 @@ class Recorder:
             self._frames = CandumpLog(first.with_suffix(".log"), channel) if captured else None
         except OSError as error:
             raise ServiceError(
-                f"cannot write a recording to {path or directory}: {error.strerror}; "
-                "telemetry.directory must be a folder that can be written"
+                f"cannot write a recording to {path or directory}: {error.strerror}; {_remedy(error)}"
             ) from error
+        self._frames_cause = ""
         self._streams = streams = Streams(ShownRobot.configured(config), session, started_ns - monotonic_ns())
         self._warn = warn or (lambda words: streams.say("warning", words))
         self._index, self._reason, self._wall_offset_ns = index, reason, started_ns - monotonic_ns()
@@ -114,18 +115,21 @@ class Recorder:
     @property
     def lost(self) -> int:
         """Batches of records, events or frames that the disk did not take."""
-        return self._files.lost + (self._frames.failures if self._frames else 0)
+        return self._files.lost + (self._frames.lost if self._frames else 0)
 
     @property
     def cause(self) -> str:
         """Why the disk did not take the newest of them; empty if none is lost."""
-        frames = "the log of CAN frames takes no more" if self._frames and self._frames.failures else ""
-        return self._files.cause or frames
+        return self._files.cause or self._frames_cause
 
     @property
-    def trouble(self) -> str:
-        """Why what is taken now gets into no file; empty while it does."""
-        return self._files.trouble
+    def unrecorded(self) -> tuple[str, str]:
+        """What is taken now and gets into no file, and why; empty while all does."""
+        if self._files.trouble:
+            return "nothing is recorded", self._files.trouble
+        if self._frames and self._frames.trouble:
+            return "no CAN frames are captured", self._frames.trouble
+        return "", ""
 
     @property
     def skipped(self) -> int:
@@ -180,6 +184,7 @@ class Recorder:
         """Take captured CAN frames, packed as trirail_drivers.bus.capture.FRAME."""
         if self._frames:
             self._frames.write(batch)
+            self._frames_cause = self._frames.trouble or self._frames_cause
 
     def close(self) -> None:
         """Write what is left and complete the file; waits a few seconds at most for a stuck disk or viewer."""
@@ -263,6 +268,13 @@ class Recorder:
             f"missing so far: {self.lost} batches in the file{because}, {self.skipped} in the live view, "
             f"{self._absent} cycles that the recorder was too slow for"
         )
+
+
+def _remedy(error: OSError) -> str:
+    """What is to be done where no file can be begun."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "make room on that disk; telemetry.keep_mb bounds what recordings take of it"
+    return "telemetry.directory must be a folder that can be written"
 
 
 def _overwrite(path: Path) -> Path:

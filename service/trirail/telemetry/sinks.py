@@ -29,6 +29,17 @@ PATIENCE = 2.0
 """How long to wait for the disk, or for a thread to end [s]."""
 
 
+def no_room(directory: Path, reserve: int) -> str:
+    """Why nothing is to be written there, where so many bytes are to stay free; empty while it is."""
+    try:
+        free = shutil.disk_usage(directory).free
+    except OSError as error:
+        return f"{directory}: {error.strerror}"
+    if free > reserve:
+        return ""
+    return f"{directory} is full: {free / 1e6:.0f} MB are free, {reserve / 1e6:.0f} MB are to stay so"
+
+
 class Archive:
     """A recording file; every batch is handed to the operating system before the next.
 
@@ -62,14 +73,8 @@ class Archive:
 
     def _write(self, chunks: list[Chunk]) -> str:
         """Write a batch; return why it could not be, or nothing."""
-        try:
-            free = shutil.disk_usage(self._directory).free
-        except OSError as error:
-            return f"{self._directory}: {error.strerror}"
-        if free <= self._reserve:
-            return (
-                f"{self._directory} is full: {free / 1e6:.0f} MB are free, {self._reserve / 1e6:.0f} MB are to stay so"
-            )
+        if full := no_room(self._directory, self._reserve):
+            return full
         if not self._stuck or self._flushed(0.01):
             self._stream.send_chunks(chunks)
             self._flushed(PATIENCE)

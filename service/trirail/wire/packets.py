@@ -154,7 +154,7 @@ class Status(Struct, frozen=True, tag=True):
     lag: float | None = None
     """Of a track, as in trirail.wire.messages.GoalReply, when it was last renewed."""
     unrecorded: str = ""
-    """Why nothing is recorded now; empty while it is."""
+    """Why nothing is recorded now, or no CAN frames are captured; empty while all is."""
 
 
 class Disturbance(Struct, frozen=True, tag="Mishap"):  # as recordings have it

@@ -144,7 +144,7 @@ class State(Struct, frozen=True):
     """How well the loop keeps its time."""
     warnings: tuple[str, ...] = ()
     """What people should know of how the service is run, one line each: that it is open to a network, that its
-    certificate expires soon, or that nothing is recorded and why."""
+    certificate expires soon, or that nothing is recorded, or no CAN frames, and why."""
     lease: str | None = None
     """The user who holds the lease: his goals and commands alone move the robot; None where nobody does."""
 
