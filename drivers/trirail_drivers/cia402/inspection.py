@@ -27,6 +27,9 @@ def inspect(
     """
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
     if apply:
+        for each in inspect(bus, drives, period, clock, fastest, apply=False):
+            if each["refused"]:
+                raise DriveError(each["refused"])
         done = setup.configure(bus, drives, scales, period, clock, fastest)
         for drive in drives.each:
             bus.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node).message())

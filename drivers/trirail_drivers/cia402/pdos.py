@@ -164,6 +164,8 @@ class Pdos:
         """Whether the drive has an object that PDOs of one direction may carry, and of that length (CiA 301, 1600h)."""
         index, subindex, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
         remote = self._remote
+        if not remote.asks:
+            return True  # it says so itself when it is mapped
         if not remote.has(index, subindex) or remote.bits(index, subindex) != bits:
             return False
         return remote.look(index, subindex) is not None if sending else remote.may_be_written(index, subindex)

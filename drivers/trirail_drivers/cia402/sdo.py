@@ -160,6 +160,8 @@ class Remote:
 
     rehearsed = False
     """Whether nothing is written."""
+    asks = False
+    """Whether the drive is asked what it would take."""
 
     def __init__(self, name: str, client: Client) -> None:
         self.name = name
@@ -307,7 +309,7 @@ class Remote:
 
 
 class Rehearsal(Remote):
-    """A drive's object dictionary that nothing is written to: the drive is asked whether it would take it.
+    """A drive's object dictionary that nothing is written to; where it `asks`, the drive says whether it would take it.
 
     What is written is read back as if the drive held it. What a drive says of a value itself, it says only when it
     gets it.
@@ -315,8 +317,9 @@ class Rehearsal(Remote):
 
     rehearsed = True
 
-    def __init__(self, remote: Remote) -> None:
+    def __init__(self, remote: Remote, *, asks: bool) -> None:
         super().__init__(remote.name, remote.client)
+        self.asks = asks
         self._read, self._missing, self._writable = remote._read, remote._missing, remote._writable
         self._written: dict[Key, bytes] = {}
 
@@ -333,7 +336,8 @@ class Rehearsal(Remote):
         """Ask the drive whether an object may be written; SdoRefused where it may not."""
         key = index, subindex
         data = self._encoded(key, value)
-        self._try_to_write(f"write {shown(index, subindex, value)} to", key, len(data))
+        if self.asks:
+            self._try_to_write(f"write {shown(index, subindex, value)} to", key, len(data))
         self._written[key] = data
         if key == MODE and self.bits(*MODE_DISPLAY) == self.bits(*MODE):
             self._written[MODE_DISPLAY] = data

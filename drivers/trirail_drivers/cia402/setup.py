@@ -103,9 +103,9 @@ def configure(
     for remote in asked:
         _check_is_servo(remote)
         _take_power_off(remote)
-    # Everything is refused that can be, of every drive, before the first value is written.
+    # Everything is refused that can be told by reading, of every drive, before the first value is written.
     rehearsed = [
-        _rehearse(remote, drive, drives, scale, period)
+        _rehearse(remote, drive, drives, scale, period, asks=False)
         for remote, drive, scale in zip(asked, drives.each, scales, strict=True)
     ]
     _check(rehearsed)
@@ -132,14 +132,14 @@ def look(
 ) -> SetUp:
     """Read what the drive called `name` is and what its set-up would change; nothing is written, no state changes."""
     at = NAMES.index(name)
-    made = _rehearse(remotes(bus, drives, clock)[at], drives.each[at], drives, scale, period)
+    made = _rehearse(remotes(bus, drives, clock)[at], drives.each[at], drives, scale, period, asks=True)
     _check_velocity(made, fastest)
     return made
 
 
-def _rehearse(remote: Remote, drive: Drive, drives: Drives, scale: Scale, period: float) -> SetUp:
-    """Go through the whole set-up of a drive without writing."""
-    rehearsal = Rehearsal(remote)
+def _rehearse(remote: Remote, drive: Drive, drives: Drives, scale: Scale, period: float, *, asks: bool) -> SetUp:
+    """Go through the whole set-up of a drive without writing; where it `asks`, the drive tells what it would take."""
+    rehearsal = Rehearsal(remote, asks=asks)
     _check_is_servo(rehearsal)
     _take_power_off(rehearsal)
     made = _bring(rehearsal, drive, drives, scale, period)
