@@ -11,7 +11,7 @@ from trirail.config import Config
 from trirail.control.modes import ModeEvent
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, FaultCause, Mode
 
 PERIOD = CONFIG.period
 NEVER = 10**9
@@ -342,6 +342,30 @@ def test_what_is_refused_in_fault_says_which_and_only_there(rig: Rig) -> None:
 def refused(answer: object) -> str:
     assert isinstance(answer, Refused)
     return answer.message
+
+
+def test_the_first_reason_of_a_fault_stays_and_is_told_once(rig: Rig) -> None:
+    rig.enable()
+    rig.command("quick_stop")
+    told = len(rig.notices)
+    rig.control.modes.trip("what came of it", FaultCause.INTERNAL)
+    assert rig.control.fault == "quick_stop by ann"
+    assert len(rig.notices) == told
+
+
+@pytest.mark.parametrize("override", [0.25, 0.5, 2.0])
+def test_what_is_resumed_goes_on_at_the_override(rig: Rig, override: float) -> None:
+    def takes(rate: float, x: float) -> int:
+        """Cycles from a resume just after the start to the end, at a speed that the limits leave room for."""
+        rig.command("override", rate)
+        rig.send(f"g{x}", PoseGoal(x, 0.0, 0.0, speed=0.2))
+        rig.cycles(5)
+        rig.command("pause")
+        rig.order("resume")
+        return rig.until(rig.holds, 60_000)
+
+    rig.enable()
+    assert takes(override, 0.05) * override == pytest.approx(takes(1.0, 0.0), rel=0.1)
 
 
 def test_another_goal_may_follow_a_jog_that_brakes(rig: Rig) -> None:
