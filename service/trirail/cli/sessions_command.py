@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 from cyclopts import Parameter, Token
-from rich.table import Table
+from rich.padding import Padding
 
 from trirail.cli import terminal
 from trirail.cli.options import Flag
@@ -129,22 +129,20 @@ def _update(index: SessionIndex) -> None:
 
 
 def _print(found: list[RecordedSession], of: int) -> None:
-    table = Table("began", "lasted", "robot", "goals", "users", "faults", "files", box=None, pad_edge=False)
     for session in found:
-        table.add_row(
-            wall_clock(session.began) if session.began is not None else "nothing recorded",
+        head = (
+            f"[bold]{wall_clock(session.began) if session.began is not None else 'nothing recorded'}[/]",
             _lasted(session),
-            terminal.plain(session.robot),
-            " ".join(
+            f"[bold]{terminal.plain(session.robot)}[/]",
+            *(
                 f"[{palette.code(palette.OUTCOMES[outcome])}]{times} {outcome}[/]"
                 for outcome, times in session.goals.items()
             ),
-            terminal.plain(" ".join(session.users)),
-            _faults(session),
-            terminal.plain(" ".join(session.files)),
+            terminal.plain(", ".join(session.users)),
         )
-    if found:
-        terminal.out.print(table)
+        terminal.out.print("  ".join(filter(None, head)))
+        for line in filter(None, (*map(terminal.plain, session.files), _faults(session))):
+            terminal.out.print(Padding(line, (0, 0, 0, 4)))
     sessions = terminal.counted(of, "session")
     terminal.say(f"{len(found)} of {sessions}" if len(found) < of else sessions)
 
