@@ -167,7 +167,7 @@ def test_what_ik_and_fk_print_is_what_they_take(run: Run) -> None:
         ("goto -- -0.06 0 0 --speed 0.5", "--speed stands behind --"),
         ("goto -- -0.06 0 0 --speed=0.5", "--speed stands behind --"),
         ("goto 0 0 0 --sped 0.5", "Did you mean --speed?"),
-        ("goto 0 0", "goto takes X, Y and PHI, or the NAME of a pose"),
+        ("goto 0 0", "goto takes X, Y and PHI: here are X = 0 and Y = 0.000 mm, and PHI is missing"),
         ("jog 1mm/s 0", "jog takes VX, VY and W, or none of them"),
     ],
 )
@@ -205,7 +205,7 @@ def test_a_tool_is_a_point_or_a_name(line: str, tool: object) -> None:
         ("goto 0 0 0 --tool 0.02", "'0.02' is half a point: U V, as 20mm 0, or a name of [frames.tool]"),
         ("goto 0 0 0 --tool 20mm,x", "'x' is not a length"),
         ("goto 0 0 0 --tool a/b", "'a/b' is neither a point, as 20mm 0, nor a name"),
-        ("goto 0 0", "goto takes X, Y and PHI, or the NAME of a pose"),
+        ("goto 0 0", "goto takes X, Y and PHI: here are X = 0 and Y = 0.000 mm, and PHI is missing"),
         ("goto 0.5", "goto takes X, Y and PHI, or the NAME of a pose"),
         (
             "goto pick --tool camera",
