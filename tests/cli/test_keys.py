@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from conftest import CONFIG
 from cyclopts import CycloptsError
-from trirail.cli import commands, doctor, key_folder, probes
+from trirail.cli import commands, doctor, key_folder, probes, terminal
 from trirail.cli.key_folder import KeyFolder
 from trirail.config import Tls, Zenoh
 from trirail.errors import ServiceError
@@ -189,7 +189,7 @@ def test_the_end_is_told_thirty_days_before(here: Path) -> None:
 def test_what_is_expired_and_who_has_no_certificate_stand_out(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(terminal.out, "width", 200)
     keys("init")
     for name in ("ann", "bob"):
         keys("add", name, "--role", "viewer")
