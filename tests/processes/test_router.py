@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, nullcontext
@@ -378,3 +379,4 @@ def test_a_router_that_does_not_start_does_not_say_that_it_routes(
     with pytest.raises(ServiceError, match="the certificate of user ann"):
         router_command.router(file)
     assert capsys.readouterr().out == ""
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()), "what this process starts could not be ended"

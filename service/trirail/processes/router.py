@@ -117,10 +117,13 @@ def routing(config: RouterConfig) -> Iterator[zenoh.Session]:
 def run(config: RouterConfig, up: Callable[[], None]) -> None:
     """Route until SIGTERM or SIGINT; `up` is called once it does."""
     ends = {signal.SIGTERM, signal.SIGINT}
-    signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # before Zenoh's threads begin, that they have it too
-    with routing(config):
-        up()
-        signal.sigwait(ends)
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # before Zenoh's threads begin, that they have it too
+    try:
+        with routing(config):
+            up()
+            signal.sigwait(ends)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 def _tell_roles(opened: zenoh.Session, config: RouterConfig, folder: Path) -> None:
