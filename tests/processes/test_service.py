@@ -839,7 +839,7 @@ def test_nobody_there(tmp_path: Path) -> None:
     failed = trirail("status", locator=f"unixsock-stream/{tmp_path}/none")
     assert failed.returncode == 1
     assert failed.stderr.startswith("trirail: no service at unixsock-stream/")
-    assert "start one with: trirail run, or" in failed.stderr
+    assert "start what is to answer there, trirail run or trirail router, or name another address" in failed.stderr
 
 
 def test_the_demo_never_drives_another_service(tmp_path: Path) -> None:
