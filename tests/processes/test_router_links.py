@@ -86,6 +86,14 @@ def test_nobody_waits_for_the_answer_why_there_is_none() -> None:
     assert [remark.level for remark in net.told] == ["warning"]
 
 
+def test_whatever_answers_there_ends_nothing() -> None:
+    net = Net()
+    net.links._why_not = lambda _: str(bytes.fromhex("no certificate"))
+    net.wait(100)
+    assert [remark.level for remark in net.told] == ["warning"]
+    assert "ValueError" in net.told[0].message
+
+
 def test_without_routers_nothing_is_looked_at() -> None:
     links = RouterLinks([], lambda: pytest.fail("looked"), lambda _: "", lambda _: None)
     links.look()

@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 from trirail.wire.packets import Remark
+from trirail.wire.text import quoted
 
 LOOK_EVERY = 1.0
 """How often it is looked which links there are [s]."""
@@ -81,7 +82,9 @@ class RouterLinks:
             router.ask_at = now + ASK_EVERY
         if router.asked is None or not router.asked.done():
             return
-        why, router.asked = router.asked.result(), None
+        error = router.asked.exception()  # whoever answers there says what he likes, and nobody here may end of it
+        why = quoted(f"{error!r}") if error is not None else router.asked.result()
+        router.asked = None
         why = why or "it answers, but opens no session: is it a router that takes this robot?"
         router.warning = f"no link to the router {router.endpoint}: {why}; it is dialled again, local control goes on"
         if router.linked is not False:
