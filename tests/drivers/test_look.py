@@ -78,9 +78,9 @@ class Rig(DriverRig[SimulatedDrive, Cia402]):
             return str(error)
         return ""
 
-    def held(self) -> list[tuple[int, bytes]]:
-        """All that drive A holds, but what tells of its motion."""
-        entries = self.devices[0].objects
+    def held(self, number: int = 0) -> list[tuple[int, bytes]]:
+        """All that a drive holds, A the first."""
+        entries = self.devices[number].objects
         return [(entries[row[:2]].value, entries[row[:2]].content) for row in OWN if row[:2] in entries]
 
 
@@ -142,6 +142,33 @@ def test_what_is_refused_is_named(key: tuple[int, int], kind: int, access: str, 
     assert named in rig.look()
     shown = inspection.inspect(rig.bus, rig.config, STEP, rig.clock, FASTEST, apply=False)
     assert [named in each["refused"] for each in shown] == [True, False, False]
+    before = [rig.held(number) for number in range(3)]
+    with pytest.raises(DriveError, match=named):
+        inspection.inspect(rig.bus, rig.config, STEP, rig.clock, FASTEST, apply=True)
+    assert [rig.held(number) for number in range(3)] == before, "all three are written, or none"
+    rig.drives.close()
+
+
+def test_a_drive_is_asked_by_a_look_alone_and_not_by_the_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin, asked = SdoServer._start_download, []
+
+    def listening(server: SdoServer, data: bytes) -> None:
+        asked.append(not data[0] & 2)  # not expedited: only the length comes with it
+        begin(server, data)
+
+    monkeypatch.setattr(SdoServer, "_start_download", listening)
+    path = tmp_path / "a.eds"
+    path.write_text(eds(OWN))
+    rig = Rig(path)
+    assert rig.look() == ""
+    assert asked
+    assert all(asked)
+    asked.clear()
+    assert rig.set_up() == ""
+    assert asked
+    assert not any(asked)
     rig.drives.close()
 
 
