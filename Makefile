@@ -4,26 +4,27 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 
-# Tests that fail are repeated alone, once: a machine may stall. Who passes then is unsteady, and named in both lists.
-tests = $(VENV)/bin/pytest $(1) -m "$(2)" || \
-	{ [ $$? -eq 1 ] && $(VENV)/bin/pytest --verbose --last-failed --last-failed-no-failures none -m "$(2)"; }
-
-.PHONY: demo test hil chaos soak ci-packages bench clean
+.PHONY: demo test hil explore chaos soak ci-packages bench clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
 
+test: export PYTHONHASHSEED = 0
 test: $(READY)  ## everything that decides: lint, format, types, import contracts, tests
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
-	$(call tests,--numprocesses auto --dist worksteal,not slow and not viewer)
-	$(call tests,,slow or viewer)
+	$(VENV)/bin/pytest --numprocesses auto --dist worksteal -m "not slow and not viewer"
+	$(VENV)/bin/pytest -m "slow or viewer"
 
 hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; installs what that needs, as root on Debian
 	$(VENV)/bin/python -m pip install --quiet --group hil
 	$(VENV)/bin/python tools/hil.py --install $(ARGS)
+
+MINUTES ?= 30
+explore: $(READY)  ## generated tests with ever new examples on every core, for make explore MINUTES=…; ARGS="--only motion"
+	$(VENV)/bin/python tools/explore.py $(MINUTES) $(ARGS)
 
 chaos: $(READY)  ## every process killed, ended and frozen in every mode; half an hour; options: make chaos ARGS="--sample 10"
 	$(VENV)/bin/python tools/chaos.py $(ARGS)

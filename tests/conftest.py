@@ -19,7 +19,6 @@ import msgspec
 import numpy as np
 import pytest
 import trirail
-from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
 from trirail.control.control import Control, Given
@@ -41,15 +40,7 @@ CONFIG = load(SIM)
 _STATE = tempfile.TemporaryDirectory(prefix="trirail-tests-")
 os.environ["STATE_DIRECTORY"] = _STATE.name  # the poses that somebody has taught on this machine are no test's
 
-# How fast this machine is, or how many random robots are thrown away, says nothing of the code. What decides whether
-# a change lands tries the same examples every time; by hand they are new ones at every run.
-settings.register_profile(
-    "trirail",
-    deadline=None,
-    derandomize="CI" in os.environ,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
-)
-settings.load_profile("trirail")
+pytest_plugins = ["generated"]
 
 
 def changed(config: Config, **simulated: object) -> Config:

@@ -366,7 +366,7 @@ class Crowd:
 
 
 @pytest.mark.parametrize("policy", ["optional", "required"])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.generated(0, 1)
 def test_never_two_holders_and_never_a_goal_of_another(seed: int, policy: LeasePolicy) -> None:
     """2500 acts of eight clients that come, hold, take over, die and send goals; four times."""
     crowd = Crowd(seed, policy)

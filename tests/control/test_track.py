@@ -95,7 +95,7 @@ def test_behind_a_sine_it_is_within_half_a_millimetre(rig: Rig, delay: int) -> N
     assert_within_limits(rig)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.generated(0, 1, 2)
 def test_with_jitter_and_lost_messages_it_is_within_double_that(rig: Rig, seed: int) -> None:
     rig.enable()
     assert behind(track(rig, sine(), disturbed(100.0, 4.0, 0.005, 0.05, seed))) < 1.0e-3

@@ -70,7 +70,7 @@ def told(geometry: Geometry) -> Array:
 # ---- what is recovered
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.generated(*range(5))
 def test_exact_data_gives_the_exact_robot(seed: int) -> None:
     random = np.random.default_rng(seed)
     robot, seen = as_built(random), poses(random, 60)
@@ -80,7 +80,7 @@ def test_exact_data_gives_the_exact_robot(seed: int) -> None:
     assert found.open == ()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.generated(*range(5))
 def test_noisy_data_gives_poses_better_than_it_has(seed: int) -> None:
     random = np.random.default_rng(seed)
     robot, seen, unseen = as_built(random), poses(random, 60), poses(random, 200)

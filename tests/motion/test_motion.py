@@ -416,8 +416,9 @@ def meddle(rnd: random.Random, rig: Rig) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig) -> None:
-    rnd = random.Random(20_090_901)
+@pytest.mark.generated(20_090_901)
+def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig, seed: int) -> None:
+    rnd = random.Random(seed)
     rig.enable()
     number = 10_000
     for k in range(number):

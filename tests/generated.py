@@ -1,0 +1,144 @@
+"""Generated tests: the same examples at every run, and ever new ones with --explore, for tools/explore.py.
+
+Hypothesis tests are generated, and so are those that draw from a seed: @pytest.mark.generated(0, 1, 2) on a test with
+an argument `seed` has it run with each of these, or with as many fresh ones. What exploring finds stays: as @example(…)
+of a hypothesis test, as one more seed of the others.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import random
+import re
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, Phase, is_hypothesis_test, seed, settings
+from hypothesis.database import DirectoryBasedExampleDatabase
+from hypothesis.internal.conjecture import providers
+
+# How fast this machine is, or how many random robots are thrown away, says nothing of the code.
+CHECKS = [HealthCheck.too_slow, HealthCheck.filter_too_much]
+EXAMPLES = Path(__file__).parents[1] / ".explore"
+"""Where what was found is kept from run to run: it is tried first."""
+
+settings.register_profile("gate", deadline=None, derandomize=True, database=None, suppress_health_check=CHECKS)
+settings.register_profile(
+    "explore",
+    deadline=None,
+    derandomize=False,
+    database=DirectoryBasedExampleDatabase(EXAMPLES),
+    suppress_health_check=CHECKS,
+    phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.target, Phase.shrink],
+    report_multiple_bugs=False,
+)
+settings.load_profile("gate")
+
+RUNS = pytest.StashKey[int]()
+"""How often the body of a test has run."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options of tools/explore.py."""
+    group = parser.getgroup("generated tests")
+    group.addoption("--explore", type=int, metavar="SEED", help="generated tests alone, with new examples by this seed")
+    group.addoption("--effort", type=int, default=1, metavar="N", help="so many times the examples")
+    group.addoption("--found", type=Path, metavar="FILE", help="add a line of JSON for each test to this file")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Choose how examples come about before the first test is read."""
+    config.addinivalue_line("markers", "generated(*seeds): drawn from `seed`: these, or fresh ones with --explore")
+    if config.getoption("explore") is None:
+        # Hypothesis draws some values from the constants of all modules that happen to be loaded: a test would have
+        # other examples alone than in company.
+        fixed = pytest.MonkeyPatch()
+        fixed.setattr(providers, "_get_local_constants", lambda: providers._local_constants)
+        config.add_cleanup(fixed.undo)
+    else:
+        settings.load_profile("explore")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Give a test that draws from a seed those that it names, or fresh ones."""
+    marker = metafunc.definition.get_closest_marker("generated")
+    if marker is None or not marker.args:
+        return
+    seeds, explore = list(marker.args), metafunc.config.getoption("explore")
+    if explore is not None:
+        chance = random.Random(f"{explore} {metafunc.definition.nodeid}")
+        seeds = [chance.randrange(2**32) for _ in seeds * metafunc.config.getoption("effort")]
+    metafunc.parametrize("seed", seeds)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave what is generated, in an order of its own, if it is explored."""
+    explore = config.getoption("explore")
+    if explore is None:
+        return
+    kept = [item for item in items if _hypothesis(item) or item.get_closest_marker("generated")]
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    random.Random(explore).shuffle(kept)
+    items[:] = kept
+    _note(config, {"tests": len({item.nodeid.partition("[")[0] for item in kept})})
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Have a hypothesis test try more examples, and count them."""
+    item.stash[RUNS] = 0
+    if item.config.getoption("explore") is None or not _hypothesis(item):
+        return
+    assert isinstance(item, pytest.Function)
+    test = getattr(item.obj, "__func__", item.obj)
+    test.hypothesis.inner_test = _counted(item, test.hypothesis.inner_test)
+    given = test._hypothesis_internal_use_settings
+    more = given.max_examples * item.config.getoption("effort")
+    seed(item.config.getoption("explore"))(test)  # without a database, but for the next line
+    test._hypothesis_internal_use_settings = settings(given, max_examples=more)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Note how it went."""
+    report = yield
+    if report.when == "call" or report.outcome != "passed":
+        line: dict[str, Any] = {"test": item.nodeid, "examples": item.stash[RUNS] or 1, "outcome": report.outcome}
+        if report.outcome == "failed" and call.excinfo is not None:
+            drawn = item.callspec.params.get("seed") if hasattr(item, "callspec") else None
+            line |= finding(call.excinfo.value, drawn)
+        _note(item.config, line)
+    return report
+
+
+def _note(config: pytest.Config, line: dict[str, Any]) -> None:
+    file: Path | None = config.getoption("found")
+    if file is not None:
+        with file.open("a", encoding="utf-8") as lines:
+            lines.write(json.dumps(line) + "\n")
+
+
+def finding(error: BaseException, drawn: int | None) -> dict[str, str]:
+    """Return what was found, and what is to be written above the test so that it stays."""
+    noted = "\n".join(getattr(error, "__notes__", ()))
+    example = re.search(r"^Fail.*?: \w+(\(.*?^\))", noted, re.MULTILINE | re.DOTALL)  # Failing test case: test_x(…)
+    keep = f"@example{example[1]}" if example else f"@pytest.mark.generated(…, {drawn})" if drawn is not None else noted
+    return {"error": f"{type(error).__name__}: {error}"[:2000], "keep": keep}
+
+
+def _hypothesis(item: pytest.Item) -> bool:
+    return isinstance(item, pytest.Function) and is_hypothesis_test(item.obj)
+
+
+def _counted(item: pytest.Item, body: Callable[..., object]) -> Callable[..., object]:
+    @functools.wraps(body)
+    def run(*args: object, **kwargs: object) -> object:
+        item.stash[RUNS] += 1
+        return body(*args, **kwargs)
+
+    return run

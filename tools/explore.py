@@ -1,0 +1,180 @@
+"""Generated tests with ever new examples, on every core, until the time is over: what it finds stays as an example.
+
+python tools/explore.py 30                      half an hour
+python tools/explore.py 30 --only motion        tests whose name or file contains this
+python tools/explore.py 5 --seed 7              the same examples as before, as far as it gets
+
+Each core goes through all of them in an order of its own, over and over, each time with twice the examples and another
+seed. What is found is shown at the end with the lines that keep it, and is tried first by the next run. Exit 1 then.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+NICE = 10
+"""What the machine has beside to do comes first."""
+TIMEOUT = 600
+"""So long may a test take that tries its usual number of examples, and makes what it finds small [s]."""
+SAID_EVERY = 30.0
+"""Progress [s]."""
+GRACE = 20.0
+"""So long may a test take to put away what it has begun [s]."""
+
+
+class Summary(NamedTuple):
+    """What was tried and found so far."""
+
+    tests: int
+    """That there are."""
+    examples: Counter[str]
+    """By test."""
+    findings: dict[str, dict[str, str]]
+    """By test: the first error, and the line that keeps it."""
+
+    @classmethod
+    def of(cls, lines: Sequence[dict[str, Any]]) -> Summary:
+        """Sum up what rounds have told."""
+        examples: Counter[str] = Counter()
+        findings: dict[str, dict[str, str]] = {}
+        for line in lines:
+            if "test" in line:
+                test = line["test"].partition("[")[0]
+                examples[test] += line["examples"] if line["outcome"] != "skipped" else 0
+                if line["outcome"] == "failed":
+                    findings.setdefault(test, {"error": line["error"], "keep": line["keep"]})
+        return cls(max((line.get("tests", 0) for line in lines), default=0), examples, findings)
+
+    def __str__(self) -> str:
+        tried = sum(count > 0 for count in self.examples.values())
+        return f"{self.examples.total():,} examples of {tried} of {self.tests} tests, {len(self.findings)} findings"
+
+    def told(self) -> Iterator[str]:
+        """Yield it line by line, for people."""
+        for test, count in sorted(self.examples.items()):
+            yield f"{count:10,}  {test}"
+        for test, found in self.findings.items():
+            yield f"\nfound in {test}:\n{found['error']}\nto keep it, write above the test:\n{found['keep']}"
+        yield f"\n{self}"
+
+
+class Core:
+    """Rounds of the generated tests, one after another, each in a process of its own."""
+
+    def __init__(self, folder: Path, number: int, seed: int, only: str) -> None:
+        self.found = folder / f"{number}.jsonl"
+        self._log = folder / f"{number}.log"
+        self._chance = random.Random(f"{seed} {number}")
+        self._only = only
+        self._effort = 1
+        self._begin()
+
+    def _begin(self) -> None:
+        command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-k", self._only, f"--found={self.found}"]
+        command += [f"--explore={self._chance.randrange(2**32)}", f"--effort={self._effort}"]
+        command += [f"--timeout={TIMEOUT * self._effort}"]
+        with self._log.open("wb") as log:  # Ctrl-C is for this program alone, which ends them in good order
+            self._process = subprocess.Popen(
+                ["nice", "-n", str(NICE), *command], cwd=ROOT, stdout=log, stderr=log, start_new_session=True
+            )
+
+    def go_on(self) -> str | None:
+        """Begin the next round if one is over; return why there can be none."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        if code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+            return f"pytest has ended with {code}:\n{self._log.read_text(encoding='utf-8')[-3000:]}"
+        self._effort *= 2
+        self._begin()
+        return None
+
+    def interrupt(self) -> None:
+        """Have the test under way put away what it has begun."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGINT)
+
+    def end(self) -> None:
+        """Wait for that, not for ever."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(GRACE)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+    def lines(self) -> list[dict[str, Any]]:
+        """Return what its rounds have told so far; a line that is being written is not yet one."""
+        if not self.found.exists():
+            return []
+        whole = self.found.read_text(encoding="utf-8").rpartition("\n")[0]
+        return [json.loads(line) for line in whole.splitlines()]
+
+
+def explore(cores: Sequence[Core], seconds: float) -> str | None:
+    """Let them go on for so long, and say so; return why they could not, "" where they were interrupted."""
+    begun = said = time.monotonic()
+    trouble = None
+    try:
+        while trouble is None and time.monotonic() - begun < seconds:
+            time.sleep(0.2)
+            trouble = next(filter(None, (core.go_on() for core in cores)), None)
+            if time.monotonic() - said >= SAID_EVERY:
+                said = time.monotonic()
+                gone = said - begun
+                print(f"{gone / 60:.1f} of {seconds / 60:g} min: {summary(cores)}", file=sys.stderr, flush=True)
+    except KeyboardInterrupt:
+        trouble = ""
+    for core in cores:
+        core.interrupt()
+    for core in cores:
+        core.end()
+    return trouble
+
+
+def summary(cores: Sequence[Core]) -> Summary:
+    """Return what all of them have told so far."""
+    return Summary.of([line for core in cores for line in core.lines()])
+
+
+def main() -> int:
+    """Explore for as long as is asked; print what was tried and found, or with --json one object."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("minutes", type=float)
+    arguments.add_argument("--only", default="", help="tests whose name or file contains this, as pytest -k has it")
+    arguments.add_argument("--seed", type=int, help="of the examples; another one each time if absent")
+    arguments.add_argument("--json", action="store_true", help="print one JSON object")
+    options = arguments.parse_args()
+    seed = random.SystemRandom().randrange(2**32) if options.seed is None else options.seed
+    with tempfile.TemporaryDirectory(prefix="trirail-explore-") as folder:
+        cores = [Core(Path(folder), number, seed, options.only) for number in range(os.cpu_count() or 1)]
+        trouble = explore(cores, 60.0 * options.minutes)
+        found = summary(cores)
+    if trouble:
+        print(f"explore: {trouble}", file=sys.stderr)
+        return 2
+    if options.json:
+        told = {"seed": seed, "tests": found.tests, "examples": found.examples, "findings": found.findings}
+        print(json.dumps(told | {"interrupted": trouble is not None}))
+    else:
+        print("\n".join(found.told()) + f"; --seed {seed}" + ("; interrupted" if trouble is not None else ""))
+    return 130 if trouble is not None else int(bool(found.findings))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
