@@ -171,13 +171,14 @@ class Rig:
 
     def go_on_with(self, state: MotionState) -> None:
         """Let the run under way have this motion in the next cycle, whatever it has now."""
-        run = self.control._schedule.runs[0]
+        run = self.control.schedule.runs[0]
         pieces = np.zeros((1, 3, 6))
         pieces[0, :, :3] = np.transpose(state)
         pieces[0, :, 2] /= 2.0
         run.path = Path(np.array([0.0, FOR_EVER]), pieces)
         run.change_law(constant(1.0), 1.0)
         run.time = -self.config.period
+        run.furthest[:] = -math.inf
 
     def order(self, name: str, value: float | None = None) -> None:
         """Send a command in this cycle and do not wait for its answer."""

@@ -619,7 +619,7 @@ def test_a_goal_that_is_paused_too_late_arrives_all_the_same(rig: Rig, before: i
     rig.enable()
     answer = rig.goal("g1", 0.05, 0.0, 0.0)
     assert isinstance(answer, Accepted)
-    rig.until(lambda: rig.control._schedule.progress[1] < (before + 0.5) * PERIOD)
+    rig.until(lambda: rig.control.schedule.progress[1] < (before + 0.5) * PERIOD)
     rig.command("pause")
     rig.until(lambda: rig.mode is Mode.HOLDING)
     assert rig.control.commanded.pose == pytest.approx((0.05, 0.0, 0.0), abs=1e-9)

@@ -172,7 +172,7 @@ def test_a_goal_that_comes_while_a_trajectory_dwells_is_planned_from_where_it_go
     still = {"velocity": (0.0, 0.0, 0.0), "acceleration": (0.0, 0.0, 0.0)}
     rows = (0.0, 0.0), (0.3, 0.01), (0.5, 0.01), (0.8, 0.02)
     rig.send("g1", TrajectoryGoal(tuple(TrajectoryPoint(t, x, 0.0, 0.0, **still) for t, x in rows)))
-    schedule = rig.control._schedule
+    schedule = rig.control.schedule
     rig.until(lambda: schedule.runs[0].at.s > 0.5 - 1.5 * PERIOD)
     assert rig.control.commanded.at_rest
     meddler.asked.clear()

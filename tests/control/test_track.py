@@ -217,8 +217,8 @@ def test_the_path_itself_ends_at_rest(rig: Rig) -> None:
     """Also where it is far from its target: no motion that is taken needs anybody to end it."""
     rig.enable()
     rig.post("t1", TrackGoal(0.14, 0.0, 0.0, velocity=(0.1, 0.1, 0.0), timeout=0.1))
-    rig.until(lambda: bool(rig.control._schedule.runs))
-    run = rig.control._schedule.runs[-1]
+    rig.until(lambda: bool(rig.control.schedule.runs))
+    run = rig.control.schedule.runs[-1]
     assert run.path.duration < 0.1 + 2.0 * braking(CONFIG) * PERIOD
     assert run.state(run.path.duration, rig.control.commanded.pose).velocity == pytest.approx(STILL, abs=1e-9)
 

@@ -51,7 +51,7 @@ def test_a_goal_that_stops_the_robot_first_stops_it_within_a_share_of_the_path_b
     answer = accepted(rig, "g2", PoseGoal(-0.05, 0.05, -0.3))
     assert answer.stops_first
     begun = len(rig.rows)
-    schedule = rig.control._schedule
+    schedule = rig.control.schedule
     rig.until(lambda: len(schedule.runs) == 1)
     stood = rig.control.commanded.pose
     assert 0.0 < stood[0] < 0.075
@@ -72,11 +72,11 @@ def test_a_robot_that_stops_first_beyond_a_waiting_goals_seam_is_still_on_its_wa
     rig.enable()
     accepted(rig, "q0", PoseGoal(0.05, 0.0, 0.0, blend=0.03))
     accepted(rig, "q1", PoseGoal(0.1, 0.05, 0.0))
-    run = rig.control._schedule.runs[0]
+    run = rig.control.schedule.runs[0]
     seam = run.seams[0].s
     rig.until(lambda: run.at.s > seam - before * PERIOD)
     assert accepted(rig, "g2", PoseGoal(0.0, -0.05, 0.2)).stops_first
-    rig.until(lambda: rig.control._schedule.runs[0].at.s > seam)
+    rig.until(lambda: rig.control.schedule.runs[0].at.s > seam)
     rig.cycles(2)
     assert rig.control.ledger.goal is not None
     assert rig.control.ledger.goal.id == "g2"

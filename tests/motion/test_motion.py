@@ -278,9 +278,9 @@ def test_what_waits_no_more_slows_nothing(rig: Rig) -> None:
     rig.cycles(100)
     rig.command("override", 2.0)
     rig.cycles(50)
-    assert rig.control._schedule.runs[0].target == pytest.approx(1.0, rel=1e-3)
+    assert rig.control.schedule.runs[0].target == pytest.approx(1.0, rel=1e-3)
     rig.cycle(CommandRequest(99, "ann", Command.STOP, goal="fast"))
-    rig.until(lambda: rig.control._schedule.runs[0].target > 1.9, 50)
+    rig.until(lambda: rig.control.schedule.runs[0].target > 1.9, 50)
     rig.until(rig.holds)
     assert rig.outcomes() == [("fast", "stopped"), ("slow", "done")]
     assert_within_limits(rig)
@@ -294,7 +294,7 @@ def test_what_is_over_slows_nothing(rig: Rig) -> None:
     rig.until(lambda: ("fast", "done") in rig.outcomes())
     rig.cycles(50)
     rig.command("override", 2.0)
-    rig.until(lambda: rig.control._schedule.runs[0].target > 1.2, 50)
+    rig.until(lambda: rig.control.schedule.runs[0].target > 1.2, 50)
     rig.until(rig.holds)
     assert_within_limits(rig)
 
@@ -545,7 +545,7 @@ def test_a_stop_is_kept_though_the_rate_of_the_goal_to_come_is_thought_about(
     rig.cycles(100)
     assert accepted(rig.goal("g2", -0.05, 0.05, -0.3)).stops_first
     rig.order("override", 1.5)
-    schedule = rig.control._schedule
+    schedule = rig.control.schedule
     rig.cycles(later)
     assert len(schedule.runs) == 2
     assert rig.control._planner._change is not None or later
@@ -591,7 +591,7 @@ def test_a_goal_that_waits_for_its_turn_is_not_done_where_another_would_have_beg
         rig.enable()
         rig.send("q0", PoseGoal(0.05, 0.02, 0.3, blend=0.01))
         rig.send("q1", PoseGoal(-0.05, 0.05, -0.3))
-        run = rig.control._schedule.runs[0]
+        run = rig.control.schedule.runs[0]
         while run.at.s <= run.seams[0].s - before * PERIOD:
             rig.cycle()
         answer = accepted(rig.goal("g2", 0.0, -0.05, 0.4))

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import msgspec
 import numpy as np
 import pytest
 from conftest import CONFIG
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from motion.test_runs import FAR, HERE, ROBOT, at, run_of, way
-from trirail.motion.feasibility import Checker
+from trirail.motion.feasibility import PLATFORM_LAWS, Checker
 from trirail.motion.limits import Bounds
+from trirail.motion.paths import Path, constant, falls
 from trirail.motion.runs import Rate, stretched
-from trirail.motion.time_scaling import TimeScaling
+from trirail.motion.time_scaling import SHARES, TimeScaling
 
 PERIOD = CONFIG.period
 LIMITS = CONFIG.limits
-SCALING = TimeScaling(ROBOT, LIMITS.platform, Checker(ROBOT, LIMITS, Bounds(LIMITS, PERIOD), PERIOD), PERIOD)
-CHANGE = min(a / v for a, v in zip(LIMITS.platform.acceleration, LIMITS.platform.velocity, strict=True))
-JERK = min(j / v for j, v in zip(LIMITS.platform.jerk, LIMITS.platform.velocity, strict=True))
-"""What brakes a motion at full speed within the platform's limits of acceleration and jerk [1/s², 1/s³]."""
+SCALING = TimeScaling(ROBOT, Checker(ROBOT, LIMITS, Bounds(LIMITS, PERIOD), PERIOD), PERIOD)
+_, OF_ACCELERATION, OF_JERK = PLATFORM_LAWS
+CHANGE = OF_ACCELERATION * min(
+    a / v for a, v in zip(LIMITS.platform.acceleration, LIMITS.platform.velocity, strict=True)
+)
+JERK = OF_JERK * min(j / v for j, v in zip(LIMITS.platform.jerk, LIMITS.platform.velocity, strict=True))
+"""What brakes a motion at full speed within the platform's limits of acceleration and jerk [1/s, 1/s²]."""
 RATE = st.sampled_from([0.0, 0.3, 1.0, 2.0])
 SHARE = st.floats(0.01, 1.0)
 
@@ -61,11 +66,11 @@ def test_the_coordinate_that_can_brake_least_decides(coordinate: int, quantity: 
     weaker[coordinate] /= 4.0
     platform = msgspec.structs.replace(LIMITS.platform, **{quantity: tuple(weaker)})
     limits = msgspec.structs.replace(LIMITS, platform=platform)
-    scaling = TimeScaling(ROBOT, platform, Checker(ROBOT, limits, Bounds(limits, PERIOD), PERIOD), PERIOD)
+    scaling = TimeScaling(ROBOT, Checker(ROBOT, limits, Bounds(limits, PERIOD), PERIOD), PERIOD)
     law = scaling.ramp(Rate(0.0, 1.0, 0.0), 0.0, 1.0)
     assert law is not None
-    most = min(a / v for a, v in zip(platform.acceleration, platform.velocity, strict=True))
-    jerk = min(j / v for j, v in zip(platform.jerk, platform.velocity, strict=True))
+    most = OF_ACCELERATION * min(a / v for a, v in zip(platform.acceleration, platform.velocity, strict=True))
+    jerk = OF_JERK * min(j / v for j, v in zip(platform.jerk, platform.velocity, strict=True))
     assert (most < CHANGE) or (jerk < JERK)
     assert float(law.knots[-2]) == pytest.approx(braking(1.0, most, jerk), abs=1e-6)
 
@@ -103,3 +108,66 @@ def test_the_first_stop_that_fits_is_taken_and_ends_at_rest(over: float) -> None
     assert at(law, 1e3)[1:, 0] == pytest.approx((0.0, 0.0), abs=1e-9)
     run.change_law(law, 0.0)
     assert run.ends >= float(quickest.knots[-2]) - 1e-9
+
+
+# ---------------------------------------------------------------------- time along a path never runs backwards
+
+STARTS = (0.0, 0.3, 5.0)
+RATES = (0.0, 1e-9, 1e-3, 0.02, 0.2, 0.5, 0.9, 1.0, 1.4, 2.0)
+TARGETS = (0.0, 0.2, 1.0, 2.0)
+
+
+def fall(law: Path) -> float:
+    """By how much the time along a path falls under a law at most, by the roots of its rate [s]."""
+    s = []
+    for piece, span in zip(law.pieces[:, 0, :4], np.diff(law.knots), strict=True):
+        cubic = np.polynomial.Polynomial(piece)
+        turns = [root.real for root in cubic.deriv().roots() if abs(root.imag) < 1e-9 and 0.0 < root.real < span]
+        s += [float(cubic(time)) for time in (0.0, *sorted(turns), span)]
+    return float((np.maximum.accumulate(s) - s).max())
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_whatever_a_law_begins_with_its_time_never_falls(share: float) -> None:
+    """Over all states of a law: where it begins, its rate, the change of that, where to and at which share."""
+    lawful = 0
+    for s, rate, change, target in itertools.product(STARTS, RATES, np.linspace(-1.0, 1.0, 9) * CHANGE, TARGETS):
+        law = SCALING.ramp(Rate(s, rate, float(change)), target, share)
+        unavoidable = rate - min(change, 0.0) ** 2 / (2.0 * share * JERK)
+        if law is None:
+            assert unavoidable < 1e-9, (s, rate, change, target)
+            continue
+        lawful += 1
+        assert unavoidable > -1e-6
+        assert not falls(law.knots, law.pieces)
+        assert float(law.pieces[0, 0, 0]) == s
+        assert float(law.pieces[-1, 0, 1]) == target
+    assert lawful > 400
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.01, 0.5), st.floats(-160.0, 160.0)), min_size=1, max_size=6),
+    st.floats(0.0, 2.0),
+    st.floats(-8.0, 8.0),
+)
+def test_falling_is_told_as_dense_looks_tell_it(
+    pieces: list[tuple[float, float]], rate: float, change: float
+) -> None:
+    """Laws of random jerks, which fall or do not."""
+    knots, rows, s = [0.0], [], 0.0
+    for span, jerk in pieces:
+        rows.append([s, rate, change / 2.0, jerk / 6.0, 0.0, 0.0])
+        s += span * (rate + span * (change / 2.0 + span * jerk / 6.0))
+        rate += span * (change + span * jerk / 2.0)
+        change += span * jerk
+        knots.append(knots[-1] + span)
+    law = Path(np.array(knots), np.array(rows)[:, None, :])
+    by = fall(law)
+    assume(not 1e-14 < by < 1e-10)  # rounding decides
+    assert falls(law.knots, law.pieces) == (by > 1e-12)
+
+
+def test_a_law_of_a_higher_power_is_none() -> None:
+    law = constant(1.0)
+    law.pieces[0, 0, 4] = 1e-3
+    assert falls(law.knots, law.pieces)

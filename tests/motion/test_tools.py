@@ -15,7 +15,7 @@ from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.robot import forward
 from trirail.motion.goals import Goals
-from trirail.motion.limits import PLATFORM_EXCESS
+from trirail.motion.limits import EXCESS
 from trirail.motion.packing import pack_path, unpack_path
 from trirail.motion.paths import Path, path_motion
 from trirail.motion.runs import MotionState, of_centre, of_tool, rest
@@ -220,10 +220,10 @@ def assert_continuous(found: list[MotionState]) -> None:
     """Position, velocity and acceleration of the centre go on as their derivatives say, within the platform's jerk."""
     limits = CONFIG.limits.platform
     rows = np.array(found)
-    jerk = np.array(limits.jerk) * (1.0 + PLATFORM_EXCESS[2]) * PERIOD
+    jerk = np.array(limits.jerk) * (1.0 + EXCESS) * PERIOD
     between = (rows[1:, 1] + rows[:-1, 1]) / 2.0 * PERIOD
     assert (np.abs(np.diff(rows[:, 0], axis=0) - between) <= jerk * PERIOD**2).all()
-    assert (np.abs(np.diff(rows[:, 1], axis=0)) <= np.array(limits.acceleration) * 1.05 * PERIOD).all()
+    assert (np.abs(np.diff(rows[:, 1], axis=0)) <= np.array(limits.acceleration) * (1.0 + EXCESS) * PERIOD).all()
     assert (np.abs(np.diff(rows[:, 2], axis=0)) <= jerk).all()
 
 

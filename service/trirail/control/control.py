@@ -54,13 +54,13 @@ class Control:
         robot = corrected_geometry(config)
         self._drives = drives
         self._period = config.period
-        self._schedule = Schedule(rest(STILL), config.period)
-        self._planner = PlanRequests(config, planner, self._schedule)
+        self.schedule = Schedule(rest(STILL), config.period)
+        self._planner = PlanRequests(config, planner, self.schedule)
         self.ledger = Ledger()
         frames, queue = NamedFrames(config.frames), config.motion.queue
         self.lease = LeaseArbiter(config.control.lease, config.period)
         self.goal_queue = GoalQueue(
-            self.ledger, self.lease, self._planner, self._schedule, frames, queue, config.period
+            self.ledger, self.lease, self._planner, self.schedule, frames, queue, config.period
         )
         legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
         self._following_error_limit = config.limits.slider.following_error
@@ -70,7 +70,7 @@ class Control:
         )
         self.setpoints = Setpoints(legs, Bounds(config.limits, config.period, EDGE), self.measured, step_length)
         self.modes = Transitions(
-            drives, self._schedule, self._planner, self.ledger, self.goal_queue, self.measured, self.setpoints
+            drives, self.schedule, self._planner, self.ledger, self.goal_queue, self.measured, self.setpoints
         )
         self._commands = Commands(
             *(config, self.modes, self.lease, self.ledger),
@@ -191,7 +191,7 @@ class Control:
         beginning = self.goal_queue.think(self.cycles, self._admit, self._place)
         if beginning is not None:
             self.modes.go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
-        self._run = self._schedule.begin_cycle()
+        self._run = self.schedule.begin_cycle()
 
     def solve(self) -> None:
         """Move the commanded motion on by one period, solve the sliders by the paper's recursion, pass the last gate.
@@ -201,7 +201,7 @@ class Control:
         if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed:
             self._follow_measured()
             return
-        schedule, run = self._schedule, self._run
+        schedule, run = self.schedule, self._run
         single = schedule.single
         found = self.setpoints.solve(schedule, run)
         if found and run is not None:
@@ -216,7 +216,7 @@ class Control:
     def _conclude(self, found: int) -> None:
         """Trip where the last gate has refused the setpoints; hold where the motion has come to rest."""
         refused = self.setpoints.refusal(found)
-        schedule = self._schedule
+        schedule = self.schedule
         if refused:
             self.modes.trip(refused, FaultCause.LIMIT)
         elif self.state.mode in (Mode.MOVING, Mode.STOPPING) and schedule.runs[0].stands:
@@ -231,7 +231,7 @@ class Control:
     @property
     def commanded(self) -> MotionState:
         """The platform's motion commanded in this cycle."""
-        return self._schedule.commanded
+        return self.schedule.commanded
 
     @property
     def override(self) -> float:
@@ -241,7 +241,7 @@ class Control:
     @property
     def target(self) -> Triple | None:
         """The pose that the running goal leads to, or that its target was last told to have; None for a jog."""
-        last, goal = self._schedule.last, self.ledger.goal
+        last, goal = self.schedule.last, self.ledger.goal
         if goal is None or last is None:
             return None
         if goal.renewed is not None:
@@ -265,13 +265,13 @@ class Control:
         """
         if origin == "measured":
             return self.measured.pose
-        if self.state.paused or (self.override == 0.0 and self._schedule.last is not None):
+        if self.state.paused or (self.override == 0.0 and self.schedule.last is not None):
             raise RefusedError(
                 RefusalCode.MOVING,
                 "a goal waits half-way, and a move would count from its end: send stop first, or resume it, or move "
                 "from where the robot is measured to be",
             )
-        last, goal = self._schedule.last, self.ledger.goal
+        last, goal = self.schedule.last, self.ledger.goal
         if last is None or goal is None or goal.renewed is not None:
             return self.commanded.pose
         return last.end(self.commanded.pose)
@@ -330,7 +330,7 @@ class Control:
 
     def _homing_over(self) -> None:
         """Hold where homing has ended, or was stopped."""
-        if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self._schedule.runs:
+        if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self.schedule.runs:
             return  # no homing has been under way
         if self.measured.homed:
             try:
@@ -352,11 +352,11 @@ class Control:
         if pose is None:
             self.modes.trip("the measured sliders belong to no pose", FaultCause.PLACE)
             return False
-        self._schedule.commanded = rest(pose)
+        self.schedule.commanded = rest(pose)
         return True
 
     def _follow_measured(self) -> None:
         """Command the pose that is measured, and the sliders to where they are."""
         held = self.state.mode not in (Mode.DISABLED, Mode.FAULT)
         stopped_now = self.state.mode is Mode.FAULT and self.modes.entered == self.cycles
-        self.setpoints.follow(self._schedule, held=held, stopped_now=stopped_now)
+        self.setpoints.follow(self.schedule, held=held, stopped_now=stopped_now)

@@ -30,15 +30,17 @@ from trirail.kinematics.closure import forward_into, inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.limits import BOUNDS, gate
-from trirail.motion.paths import law_at, platform_at
+from trirail.motion.paths import FALL, law_at, platform_at
 from trirail.wire.records import DTYPE
 
-__all__ = ["FEEDBACK", "OLDEST", "PASSED", "SAID", "STANDS", "command", "follow", "hold", "observe", "refusal"]
+__all__ = ["BACKWARDS", "FEEDBACK", "OLDEST", "PASSED", "SAID", "STANDS", "command", "follow", "hold", "observe", "refusal"]
 
 OLDEST = 3
 """The greatest age of a position that is looked at, in SYNCs: at the next one the drive is silent."""
 PASSED, STANDS = 1, 2
 """What command finds beside what is refused: the goal under way has ended on the path, the motion stands."""
+BACKWARDS = -1
+"""What command refuses where the time along the path would fall."""
 OLDEST_RECORDED = 255
 """No feedback is recorded as older [SYNCs]."""
 
@@ -159,7 +161,7 @@ def _solve(
 @compiled(
     i8(
         *(_LEGS, _BOUNDS, _KNOTS, _PIECES, b1, f8[:, ::1], _KNOTS, _PIECES),
-        *(f8, f8, f8, f8, f8, _MOTION, _SLIDERS, _BACKLASH, f8[::1], _RECORD),
+        *(f8, f8, f8[::1], f8, f8, f8, _MOTION, _SLIDERS, _BACKLASH, f8[::1], _RECORD),
     )
 )
 def command(
@@ -173,6 +175,7 @@ def command(
     law_pieces: Array,
     time: float,
     target: float,
+    furthest: Array,
     begun: float,
     end: float,
     arrival: float,
@@ -184,7 +187,7 @@ def command(
 ) -> int:
     """Move the platform on along its path, to a time of its law [s], and solve the sliders for that.
 
-    `target` is the rate that the law leads to; the goal under way began and ends at the times `begun` and `end` along
+    `target` is the rate that the law leads to, `furthest` (1,) the greatest time along the path so far; the goal under way began and ends at the times `begun` and `end` along
     the path, and the law comes there at `arrival` [s]. Returns a sum of PASSED, STANDS and 4 times what is refused: see
     `refusal`.
     """
@@ -193,7 +196,12 @@ def command(
     motion[1] = motion[0]
     if platform_at(legs, knots, pieces, in_sliders, tools, law, motion[1, 0], motion[0]) != 0:
         motion[0] = math.nan
-    refused = _solve(legs, bounds, motion, sliders, kept, found)
+    if s >= furthest[0] - FALL:
+        furthest[0] = max(s, furthest[0])
+        refused = _solve(legs, bounds, motion, sliders, kept, found)
+    else:
+        found[0], found[1] = s, furthest[0]
+        refused = BACKWARDS
     progress = max(0.0, min(1.0, (s - begun) / (end - begun))) if end > begun else 1.0
     remaining = max(0.0, arrival - time if target != 0.0 else end - s)
     _tell(motion, sliders, progress, remaining, record)
@@ -222,7 +230,8 @@ def hold(
 def refusal(code: int) -> int:
     """Return what is refused, from what `command` and `hold` return.
 
-    0 for nothing, 1 + i where leg i is singular or a number is not finite, or 3 + a code for Bounds.violation.
+    0 for nothing, BACKWARDS, 1 + i where leg i is singular or a number is not finite, or 3 + a code for
+    Bounds.violation.
     """
     return code >> 2
 

@@ -18,7 +18,7 @@ from trirail.config import Config, corrected_geometry
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
-from trirail.motion.packing import pack_run, unpack_path, unpack_run
+from trirail.motion.packing import pack_run, unpack_law, unpack_path, unpack_run
 from trirail.motion.paths import Path, constant
 from trirail.motion.planning import revision
 from trirail.motion.rate_change import RateChange
@@ -72,7 +72,7 @@ class PlanRequests:
         robot, self._period = corrected_geometry(config), config.period
         limits = planned_limits(config.limits, config.correction.backlash)
         checker = Checker(robot, limits, Bounds(limits, self._period), self._period)
-        self._scaling = TimeScaling(robot, limits.platform, checker, self._period)
+        self._scaling = TimeScaling(robot, checker, self._period)
         self._legs = robot.packed()
         self._revision = revision(config)
         self._port = port
@@ -233,7 +233,7 @@ class PlanRequests:
         run = under_way.copy()
         run.seams.clear()
         if planned.stop is not None:
-            run.change_law(unpack_path(planned.stop, 1), 0.0)
+            run.change_law(unpack_law(planned.stop), 0.0)
         return run
 
     def _continues(self, runs: Iterable[Run]) -> bool:

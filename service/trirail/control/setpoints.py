@@ -57,7 +57,7 @@ class Setpoints:
             return cycle.hold(legs, bounds, motion, sliders, kept, found, record)
         path, law, (begun, end, arrival) = run.path, run.law, run.course
         return cycle.command(
-            *(legs, bounds, *path, law.knots, law.pieces, run.time, run.target),
+            *(legs, bounds, *path, law.knots, law.pieces, run.time, run.target, run.furthest),
             *(begun, end, arrival, motion, sliders, kept, found, record),
         )
 
@@ -66,6 +66,9 @@ class Setpoints:
         refused = cycle.refusal(code)
         if refused == 0:
             return None
+        if refused == cycle.BACKWARDS:
+            now, furthest = self._bounds.found.tolist()
+            return f"no setpoint: time along the path would run backwards, from {furthest:.6g} to {now:.6g} s"
         if refused <= len(NAMES):
             return f"slider {NAMES[refused - 1]}: no setpoint, the commanded pose is singular or not a number"
         return f"setpoint refused: {self._bounds.violation(refused - len(NAMES))}"

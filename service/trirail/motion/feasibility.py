@@ -16,7 +16,7 @@ from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.limits import COORDINATES, Bounds, Violation
 from trirail.motion.path_sampling import survey
-from trirail.motion.paths import ROUNDING, Path, advance, constant, reached, value
+from trirail.motion.paths import Path, advance, constant, falls, reached, value
 from trirail.motion.runs import STILL
 
 PLANNED = (0.98, 0.98, 0.93)
@@ -24,10 +24,13 @@ PLANNED = (0.98, 0.98, 0.93)
 between the moments that are looked at, where jerk varies most."""
 LAWS = (0.99, 0.99, 0.98)
 """Share of the same that changes of a path's rate make use of, on top of what the path itself does."""
-PLATFORM_PLANNED = (1.0 + 1e-6,) * 3
-"""Share of the platform's limits that plans make use of: all of it, but for rounding."""
-PLATFORM_LAWS = (1.0 + 1e-6, 1.01, 1.05)
-"""Share of the same while a path's rate changes: none is planned with room for that, and the robot must stop."""
+PLATFORM_PLANNED = (1.0, 0.98, 0.957)
+"""Share of the platform's limits of velocity, acceleration and jerk that plans make use of: between what is looked at
+the platform's rates vary little, and a change of rate adds no velocity."""
+PLATFORM_LAWS = (1.0, 0.99, 0.985)
+"""Share of the same that changes of a path's rate make use of: the room in which a robot at its limits can brake."""
+ROUNDED = 1.0 + 1e-6
+"""How many times more than its share a path or law may take, by rounding."""
 SUBJECTS = ("a slider", *(f"the platform's {name}" for name in (*COORDINATES, "centre in x", "centre in y")))
 """What the rows of Look.worst are of. The centre has its own where a path is that of another point: limits hold for
 both."""
@@ -48,7 +51,7 @@ class Look(NamedTuple):
     worst: Array
     """Velocity, acceleration and jerk (6, 3) of SUBJECTS, as shares of what plans use."""
     within_limits: bool
-    """Whether sliders and platform can bear it, with what is kept for changes of rate."""
+    """Whether sliders and platform can bear it, with what is kept for changes of rate, and its time never falls."""
     leaves_at: float
     """When it is out of reach [s]; not a number where it never is."""
 
@@ -95,12 +98,17 @@ class Checker:
         platform, slider = limits.platform, limits.slider
         x, y, phi = np.array([platform.velocity, platform.acceleration, platform.jerk]).T
         each = np.array([[slider.velocity, slider.acceleration, slider.jerk], x, y, phi, x, y])
-        self._planned = each * [PLANNED, *[PLATFORM_PLANNED] * 5]
-        self._laws = each * [LAWS, *[PLATFORM_LAWS] * 5] / self._planned * (1.0 + ROUNDING)
-        self.slider_limits = self._planned[0]
+        planned = each * [PLANNED, *[PLATFORM_PLANNED] * 5]
+        self.slider_limits = planned[0]
         """Velocity, acceleration and jerk that plans make use of."""
-        self.centre_limits = self._planned[4:]
+        self.platform_limits = planned[1:4]
+        """Likewise of the platform in x, y and phi (3, 3)."""
+        self.centre_limits = planned[4:]
         """Likewise of the platform's centre in x and y, on a path of another point (2, 3)."""
+        self.law_limits = each[1:4] * PLATFORM_LAWS
+        """What changes of rate make use of, of the platform (3, 3)."""
+        self._planned = planned * ROUNDED
+        self._laws = each * [LAWS, *[PLATFORM_LAWS] * 5] / planned
         self._legs = geometry.packed()
         self._bounds = bounds
         self._period = period
@@ -116,7 +124,8 @@ class Checker:
         worst, start = np.zeros((len(SUBJECTS), 3)), np.array(pose, dtype=np.float64)
         leaves_at = survey(self._legs, *path, *law[:2], first, until, even, self._period, start, self._box, worst)
         worst /= self._planned
-        return Look(worst, math.isnan(leaves_at) and self.bears(worst), leaves_at)
+        within_limits = math.isnan(leaves_at) and self.bears(worst) and not falls(*law[:2])
+        return Look(worst, within_limits, leaves_at)
 
     def bears(self, worst: Array) -> bool:
         """Whether sliders and platform can bear a motion of such shares, with what is kept for changes of rate."""

@@ -68,9 +68,8 @@ class Goals:
         self._checker = checker
         self._period = period
         self._planner = Planner(geometry, limits.platform, limits.slider, bounds, checker, period)
-        platform = Kinodynamic(limits.platform.velocity, limits.platform.acceleration, limits.platform.jerk)
-        self._tracker = Tracker(self._planner, platform, bounds, checker)
-        self.time_scaling = TimeScaling(geometry, limits.platform, checker, period)
+        self._tracker = Tracker(self._planner, Kinodynamic(*checker.platform_limits.T.tolist()), bounds, checker)
+        self.time_scaling = TimeScaling(geometry, checker, period)
 
     def plan(self, goal: PlannedGoal, schedule: Schedule, rate: float, lead: int) -> PlannedMotion:
         """Return the motion to a goal, its time to run at `rate`, from the commanded state of the motion under way.

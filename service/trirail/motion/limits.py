@@ -21,9 +21,8 @@ UNITS = ("m", "m", "rad")
 EDGE = 1e-6
 """By so much may a setpoint be beyond a limit of position that its path was checked against [m, rad]."""
 EXCESS = 1e-3
-"""By that share may a setpoint exceed a limit of velocity, acceleration or jerk that its path was checked against."""
-PLATFORM_EXCESS = (0.01, 0.05, 0.1)
-"""Likewise the platform's velocity, acceleration and jerk: plans make use of all of it (feasibility.PLATFORM_LAWS)."""
+"""By that share may a setpoint exceed a limit of velocity, acceleration or jerk that its path was checked against, of
+a slider or the platform."""
 
 BOUNDS = np.dtype(
     [
@@ -168,10 +167,10 @@ def _check_platform(bounds: NDArray[np.void], motion: Array, before: Array, foun
         limits = bounds[0].platform[n]
         for row in range(2):
             value = motion[1 + row, n]
-            if not abs(value) <= limits[row] * (1.0 + PLATFORM_EXCESS[row]):
+            if not abs(value) <= limits[row] * (1.0 + EXCESS):
                 return _found(_PLATFORM + row, n, value, math.copysign(limits[row], value), found)
         jerk = _jerk(motion, before, n, bounds[0].period)
-        if not jerk <= limits[2] * (1.0 + PLATFORM_EXCESS[2]):
+        if not jerk <= limits[2] * (1.0 + EXCESS):
             return _found(_PLATFORM + 2, n, jerk, limits[2], found)
     return 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from trirail.kinematics.arrays import Array
-from trirail.motion.paths import Path, sound
+from trirail.motion.paths import Path, falls, sound
 from trirail.motion.runs import Run, Seam
 from trirail.wire.planning import PackedPath, PackedRun
 
@@ -36,6 +36,14 @@ def unpack_path(packed: PackedPath, degrees: int) -> Path:
     return Path(knots, pieces.reshape(number, degrees, POWERS), packed.in_sliders, tools.reshape(-1, 2))
 
 
+def unpack_law(packed: PackedPath) -> Path:
+    """Return a law from how it was sent. Raises ValueError where it is none: as a path, or where its time falls."""
+    law = unpack_path(packed, 1)
+    if falls(law.knots, law.pieces):
+        raise ValueError("a law by which the time along its path falls")
+    return law
+
+
 def pack_run(run: Run) -> PackedRun:
     """Return a run as it is sent."""
     seams = tuple(seam.s for seam in run.seams)
@@ -48,7 +56,7 @@ def unpack_run(legs: Array, packed: PackedRun) -> Run:
     What the path was before its seams is not sent: nobody plans from there.
     """
     path = unpack_path(packed.path, 3)
-    run = Run(legs, path, unpack_path(packed.law, 1), packed.target)
+    run = Run(legs, path, unpack_law(packed.law), packed.target)
     run.time = packed.time
     run.seams.extend(Seam(s, path) for s in packed.seams)
     return run

@@ -25,6 +25,7 @@ __all__ = [
     "Path",
     "advance",
     "constant",
+    "falls",
     "law_at",
     "path_motion",
     "platform_at",
@@ -41,6 +42,8 @@ HALVINGS = 48
 """Of an interval, until it is narrower than numbers of its size can tell."""
 ROUNDING = 1e-9
 """By so much may a position be beyond its limit, or two times be the same [m, rad, s]."""
+FALL = 1e-12
+"""By so much may the time along a path be less than it has been, by rounding [s]."""
 CENTRE = np.zeros((0, 2))
 """The tools of a path of the platform's centre."""
 
@@ -223,6 +226,31 @@ def sound(knots: Array, coefficients: Array, tools: Array) -> bool:
             return False
         last = knot
     return True
+
+
+@compiled("b1(f8[::1], f8[:, :, ::1])")
+def falls(law_knots: Array, law_pieces: Array) -> bool:
+    """Tell whether a law lets the time along a path fall anywhere, by more than FALL: then it is no law.
+
+    Pieces of a law are cubic, so that the time is least or greatest at a knot or where its rate, a parabola, is zero;
+    of a higher power it is not known, and no law either.
+    """
+    highest = -math.inf
+    for k in range(len(law_pieces)):
+        p, span = law_pieces[k, 0], law_knots[k + 1] - law_knots[k]
+        if p[4] != 0.0 or p[5] != 0.0:
+            return True
+        a, b, c = 3.0 * p[3], p[2], p[1]  # rate a t^2 + 2 b t + c, zero where t = (-b -+ root) / a
+        root = math.sqrt(max(0.0, b * b - a * c))
+        q = -(b + math.copysign(root, b))
+        one, other = q / a if a != 0.0 else math.inf, c / q if q != 0.0 else math.inf
+        for t in (0.0, min(one, other), max(one, other), span):
+            if 0.0 <= t <= span:
+                s = p[0] + t * (p[1] + t * (p[2] + t * p[3]))
+                if s < highest - FALL:
+                    return True
+                highest = max(highest, s)
+    return False
 
 
 @compiled("f8(f8[::1], f8[:, :, ::1], f8, f8)")

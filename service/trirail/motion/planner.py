@@ -64,7 +64,8 @@ class Planner:
         period: float,
     ) -> None:
         self._legs = geometry.packed()
-        self._platform = Kinodynamic(platform.velocity, platform.acceleration, platform.jerk)
+        self._most = Kinodynamic(platform.velocity, platform.acceleration, platform.jerk)
+        self._platform = Kinodynamic(*checker.platform_limits.T.tolist())
         self._centre = checker.centre_limits
         self._sliders = Kinodynamic(*([ROOM * limit] * 3 for limit in checker.slider_limits.tolist()))
         self._checked_sliders = Kinodynamic(*([limit] * 3 for limit in checker.slider_limits.tolist()))
@@ -102,7 +103,8 @@ class Planner:
         self, velocity: Sequence[float] | None, acceleration: Sequence[float] | None, jerk: Sequence[float] | None
     ) -> Kinodynamic:
         """Return the platform's limits with a goal's own in their place. RefusedError where these are not lower."""
-        for name, own, limits in zip(Kinodynamic._fields, (velocity, acceleration, jerk), self._platform, strict=True):
+        asked = velocity, acceleration, jerk
+        for name, own, limits in zip(Kinodynamic._fields, asked, self._most, strict=True):
             for coordinate, value, limit in zip(COORDINATES, own or limits, limits, strict=True):
                 if value > limit:
                     text = "limits.{} of {} is {}: the robot's limit is {}".format(
@@ -110,9 +112,7 @@ class Planner:
                     )
                     raise RefusedError(RefusalCode.ABOVE_LIMIT, text, value=value, limit=limit)
         return Kinodynamic(
-            velocity or self._platform.velocity,
-            acceleration or self._platform.acceleration,
-            jerk or self._platform.jerk,
+            *(np.minimum(own or planned, planned).tolist() for own, planned in zip(asked, self._platform, strict=True))
         )
 
     def to_pose(

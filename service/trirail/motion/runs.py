@@ -86,6 +86,8 @@ class Run:
         """The rate that the law leads to."""
         self.time = 0.0
         """Time since the law began [s]."""
+        self.furthest = np.full(1, -np.inf)
+        """The time along the path that has been commanded, (1,) [s]: it never falls."""
         self.seams: deque[Seam] = deque()
         self._begun = 0.0
         self._course = Course(0.0, 0.0, 0.0)
@@ -164,6 +166,7 @@ class Run:
         """Return the same motion, to be changed by itself."""
         other = Run(self._legs, self.path, self.law, self.target)
         other.time, other.seams, other._begun = self.time, self.seams.copy(), self._begun
+        other.furthest[:] = self.furthest
         return other
 
     def append(self, s: float, path: Path) -> None:

@@ -7,28 +7,30 @@ from collections.abc import Sequence
 
 from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
-from trirail.config import PlatformLimits
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker, Look
-from trirail.motion.paths import Path, constant
+from trirail.motion.paths import Path, constant, falls
 from trirail.motion.ruckig_call import solved
 from trirail.motion.runs import Rate, Run, arrival, law_from_ruckig
 
-SHARES = tuple(0.6**k for k in range(12))
-"""Of the quickest change of rate, tried one after the other."""
+FINE, COARSE = 0.88, 0.6
+SHARES = (*(FINE**k for k in range(12)), *(FINE**11 * COARSE**k for k in range(1, 9)))
+"""Of the quickest change of rate, tried one after the other. To brake takes as long as its share is small: so they are
+close together where a stop is quick, and far apart where a robot with weak sliders needs any at all."""
 
 
 class TimeScaling:
     """Makes the laws of time for the paths of one robot."""
 
-    def __init__(self, geometry: Geometry, platform: PlatformLimits, checker: Checker, period: float) -> None:
+    def __init__(self, geometry: Geometry, checker: Checker, period: float) -> None:
         self._legs = geometry.packed()
         self._checker = checker
         self._period = period
         self._ruckig = Ruckig(1)
-        # What of a full-speed motion's rate the platform's limits can take away in a second, and change of that.
-        self._change = min(a / v for a, v in zip(platform.acceleration, platform.velocity, strict=True))
-        self._change_jerk = min(j / v for j, v in zip(platform.jerk, platform.velocity, strict=True))
+        velocity, acceleration, jerk = checker.law_limits.T
+        # The change of rate [1/s], and its change [1/s²], at which a motion at full speed meets the platform's limits.
+        self._change = float((acceleration / velocity).min())
+        self._change_jerk = float((jerk / velocity).min())
 
     def begin(self, path: Path, rate: float, pose: Sequence[float]) -> Run:
         """Start a path at a rate, or as near to it as the limits allow."""
@@ -56,7 +58,10 @@ class TimeScaling:
         return self._checker.look(path, law, first, until, pose)
 
     def ramp(self, at: Rate, rate: float, share: float) -> Path | None:
-        """Return the law from one rate to another, at a share of the quickest change; None without one."""
+        """Return the law from one rate to another, at a share of the quickest change; None without one.
+
+        A rate that falls needs jerk enough to stop falling before it is zero: at too small a share there is no law.
+        """
         request = InputParameter(1)
         request.control_interface = ControlInterface.Velocity
         request.current_position, request.current_velocity = [at.s], [at.rate]
@@ -64,7 +69,10 @@ class TimeScaling:
         request.max_acceleration = [max(share * self._change, abs(at.change))]
         request.max_jerk = [share * self._change_jerk]
         trajectory = Trajectory(1)
-        return law_from_ruckig(trajectory, rate) if solved(self._ruckig, request, trajectory) else None
+        if not solved(self._ruckig, request, trajectory):
+            return None
+        law = law_from_ruckig(trajectory, rate)
+        return None if falls(law.knots, law.pieces) else law
 
 
 def greatest(rate: float, found: Look) -> float:

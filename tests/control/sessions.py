@@ -1,0 +1,165 @@
+"""Whole sessions of the control, a cycle at a time, over drives that are where they were told to be; what is judged."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+from conftest import CONFIG
+from numpy.typing import NDArray
+from trirail.config import Config
+from trirail.control.control import Control, Given
+from trirail.control.local_planner import LocalPlanner
+from trirail.control.notices import Notice
+from trirail.wire.goals import Goal
+from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
+from trirail.wire.records import DTYPE
+from trirail.wire.vocabulary import Command, Mode
+from trirail_drivers.interface import DriveFault, Feedback, MissingProtection, PowerState, Triple
+
+STILL = (0.0, 0.0, 0.0)
+OFF, ON = (PowerState.SWITCH_ON_DISABLED,) * 3, (PowerState.OPERATION_ENABLED,) * 3
+EXCESS = 1e-3
+"""By that share, and no more, may a setpoint exceed a limit: what is between the moments at which a path is looked at."""
+
+
+class PerfectDrives:
+    """Drives that are at once where they were told to be two SYNCs ago, and power up and down within a cycle."""
+
+    bus_load = 0.0
+    missing_protections: tuple[MissingProtection, ...] = ()
+    traffic = 0
+    told: tuple[DriveFault | None, ...] = (None, None, None)
+
+    def __init__(self, position: Triple = STILL) -> None:
+        self._state = OFF
+        self._due = position, position
+        self._position = position
+
+    def configure(self, period: float, fastest: float | None = None) -> None:
+        """Do nothing: there is nothing to set up."""
+
+    def sync(self) -> None:
+        """Reach what was written a cycle before the last one."""
+        self._position = self._due[0]
+
+    def read(self) -> Feedback:
+        """Tell where the sliders are."""
+        return Feedback(self._position, self._state, None)
+
+    def write(self, position: Triple, velocity: Triple) -> None:
+        """Take setpoints, as from the next SYNC on."""
+        self._due = self._due[1], position
+
+    def enable(self, alone: str | None = None) -> None:
+        """Power up."""
+        self._state = ON
+
+    def disable(self) -> None:
+        """Power down."""
+        self._state = OFF
+
+    quick_stop = disable
+
+    def home(self) -> None:
+        """Do nothing: every position is absolute."""
+
+    def stop_homing(self) -> None:
+        """Do nothing."""
+
+    def reset(self) -> None:
+        """Do nothing: they have no fault."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class Session:
+    """A robot that is enabled, and what it was sent and told; `rows` are the records of its cycles."""
+
+    def __init__(self, config: Config = CONFIG, delay: int = 1) -> None:
+        self.config = config
+        self.drives = PerfectDrives()
+        self.planner = LocalPlanner(config, delay)
+        self.control = Control(config, self.drives, self.planner)
+        self.control.start(self.drives.read())
+        self.answers: list[Answer] = []
+        self.notices: list[Notice] = []
+        self.rows: list[NDArray[np.void]] = []
+        self._tickets = itertools.count(1)
+        self._now = 100.0
+        self.order(Command.ENABLE)
+        self.until(lambda: self.mode is Mode.HOLDING, 10)
+
+    @property
+    def mode(self) -> Mode:
+        """The robot's mode."""
+        return self.control.state.mode
+
+    def cycle(self, request: Request | None = None) -> None:
+        """Run one cycle, with a request or without."""
+        self._now += self.config.period
+        now_ns = round(self._now * 1e9)
+        given: list[Given] = [] if request is None else [(request, now_ns)]
+        given += [(answer, now_ns) for answer in self.planner.answers()]
+        self.drives.sync()
+        self.control.cycle(self.drives.read(), given)
+        self.rows.append(self.control.measured.record.copy())
+        ledger = self.control.ledger
+        self.answers += ledger.answers
+        self.notices += ledger.notices
+        ledger.answers.clear()
+        ledger.notices.clear()
+
+    def cycles(self, number: int) -> None:
+        """Run so many cycles."""
+        for _ in range(number):
+            self.cycle()
+
+    def until(self, condition: Callable[[], bool], within: int) -> int:
+        """Run cycles until something holds; return how many."""
+        for number in range(within):
+            if condition():
+                return number
+            self.cycle()
+        raise AssertionError(f"not within {within} cycles; the mode is {self.mode}")
+
+    def order(self, name: Command, value: float | None = None) -> None:
+        """Send a command in the next cycle."""
+        self.cycle(CommandRequest(next(self._tickets), "ann", name, value))
+
+    def send(self, name: str, goal: Goal) -> None:
+        """Send a goal in the next cycle."""
+        self.cycle(GoalRequest(next(self._tickets), "ann", name, goal, round((self._now + self.config.period) * 1e9)))
+
+    @property
+    def outcomes(self) -> dict[str | None, str | None]:
+        """How each goal has ended."""
+        return {said.id: said.outcome for said in self.notices if said.kind == "goal"}
+
+    @property
+    def records(self) -> NDArray[np.void]:
+        """The records of all cycles, (cycles,)."""
+        return np.concatenate(self.rows) if self.rows else np.zeros(0, DTYPE)
+
+
+def shares(config: Config, records: NDArray[np.void]) -> dict[str, float]:
+    """Return the greatest share of each limit that was made use of, by name; jerk from cycle to cycle, as drives see it."""
+    platform, slider = config.limits.platform, config.limits.slider
+    found = {}
+    for name, prefix, limits in (
+        ("platform", "commanded_pose", (platform.velocity, platform.acceleration, platform.jerk)),
+        ("slider", "commanded", (slider.velocity, slider.acceleration, slider.jerk)),
+    ):
+        velocity, acceleration = records[f"{prefix}_velocity"], records[f"{prefix}_acceleration"]
+        jerk = np.diff(acceleration, axis=0) / config.period
+        for quantity, rows, limit in zip(("velocity", "acceleration", "jerk"), (velocity, acceleration, jerk), limits, strict=True):
+            found[f"{name} {quantity}"] = float((np.abs(rows) / limit).max(initial=0.0))
+    return found
+
+
+def assert_within_limits(config: Config, records: NDArray[np.void]) -> None:
+    """Every limit of rate holds, but for rounding and what lies between two looks."""
+    over = {name: share for name, share in shares(config, records).items() if share > 1.0 + EXCESS}
+    assert not over
