@@ -15,7 +15,7 @@ from trirail.control.notices import Notice
 from trirail.wire.goals import Goal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.records import DTYPE
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import MODES, Command, Mode
 from trirail_drivers.interface import DriveFault, Feedback, MissingProtection, PowerState, Triple
 
 STILL = (0.0, 0.0, 0.0)
@@ -105,7 +105,9 @@ class Session:
         given += [(answer, now_ns) for answer in self.planner.answers()]
         self.drives.sync()
         self.control.cycle(self.drives.read(), given)
-        self.rows.append(self.control.measured.record.copy())
+        record = self.control.measured.record.copy()
+        record["mode"] = MODES.index(self.mode)
+        self.rows.append(record)
         ledger = self.control.ledger
         self.answers += ledger.answers
         self.notices += ledger.notices
@@ -145,7 +147,12 @@ class Session:
 
 
 def shares(config: Config, records: NDArray[np.void]) -> dict[str, float]:
-    """Return the greatest share of each limit that was made use of, by name; jerk from cycle to cycle, as drives see it."""
+    """Return the greatest share of each limit that was made use of, by name; jerk from cycle to cycle, as drives see it.
+
+    Where the robot follows what is measured, without power or in fault, it is commanded no motion.
+    """
+    commanded = np.isin(records["mode"], [MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING)])
+    both = commanded[1:] & commanded[:-1]
     platform, slider = config.limits.platform, config.limits.slider
     found = {}
     for name, prefix, limits in (
@@ -153,8 +160,11 @@ def shares(config: Config, records: NDArray[np.void]) -> dict[str, float]:
         ("slider", "commanded", (slider.velocity, slider.acceleration, slider.jerk)),
     ):
         velocity, acceleration = records[f"{prefix}_velocity"], records[f"{prefix}_acceleration"]
-        jerk = np.diff(acceleration, axis=0) / config.period
-        for quantity, rows, limit in zip(("velocity", "acceleration", "jerk"), (velocity, acceleration, jerk), limits, strict=True):
+        jerk = np.diff(acceleration, axis=0)[both] / config.period
+        velocity, acceleration = velocity[commanded], acceleration[commanded]
+        for quantity, rows, limit in zip(
+            ("velocity", "acceleration", "jerk"), (velocity, acceleration, jerk), limits, strict=True
+        ):
             found[f"{name} {quantity}"] = float((np.abs(rows) / limit).max(initial=0.0))
     return found
 

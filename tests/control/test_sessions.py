@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import random
 from functools import cache
 
@@ -83,8 +82,7 @@ def go_through(seed: int, path: int, instant: int, first: str, delay: int, secon
     assert set(session.outcomes.values()) <= {"done", "stopped", "preempted", "rejected"}
 
 
-@pytest.mark.generated
-@pytest.mark.parametrize("seed", range(SAMPLE))
+@pytest.mark.generated(*range(SAMPLE))
 def test_two_events_at_any_instants_break_no_limit_and_turn_no_time_back(seed: int) -> None:
     chance = random.Random(seed)
     path = chance.randrange(len(PATHS))
@@ -154,8 +152,8 @@ def quickest(session: Session) -> float:
     return min(times)
 
 
-@pytest.mark.generated
-@pytest.mark.parametrize(("path", "seed"), itertools.product(range(len(PATHS)), range(12)))
+@pytest.mark.generated(*range(12))
+@pytest.mark.parametrize("path", range(len(PATHS)))
 def test_a_stop_stands_nearly_as_soon_as_any_law_could(path: int, seed: int) -> None:
     session = Session()
     session.send("g", PATHS[path])
@@ -166,8 +164,8 @@ def test_a_stop_stands_nearly_as_soon_as_any_law_could(path: int, seed: int) -> 
     assert took * session.config.period <= 1.2 * least + len(SHARES) * session.config.period
 
 
-@pytest.mark.generated
-@pytest.mark.parametrize(("path", "seed"), itertools.product(range(len(PATHS)), range(8)))
+@pytest.mark.generated(*range(8))
+@pytest.mark.parametrize("path", range(len(PATHS)))
 def test_a_resume_takes_effect_at_the_latest_when_the_robot_stands(path: int, seed: int) -> None:
     chance = random.Random(seed)
     instant, delay = chance.randrange(5, cycles_of(path) - 30), chance.choice(DELAYS)

@@ -24,11 +24,9 @@ from trirail_drivers.interface import Feedback, PowerState
 LIMITS = CONFIG.limits
 PLATFORM = np.array([LIMITS.platform.velocity, LIMITS.platform.acceleration, LIMITS.platform.jerk])
 Rows = list[list[float]]
-BETWEEN = 0.02
-"""What may lie between the moments at which a path is looked at."""
+BETWEEN = 1e-3
+"""What may lie between the moments at which a path is looked at, beyond a limit itself: what the gate lets through."""
 # The code's own margins, written down once more: a test that took them from the code would follow wherever they go.
-RAMPS = np.array((1.0, 0.99, 0.985))
-"""What a change of a path's rate may use of the platform's velocity, acceleration and jerk, as shares of the limits."""
 EDGE = 1e-6
 """How far beyond a limit of position the last gate lets a setpoint through [m, rad]."""
 EXCESS = 1e-3
@@ -82,8 +80,7 @@ def test_the_platforms_limits_bind_every_kind_at_every_override(kind: str, overr
     rig.command("override", override)
     assert isinstance(rig.send("g1", KINDS[kind]), Accepted)
     rig.until(rig.holds)
-    ramps = RAMPS if kind == "jog" else 1.0  # nobody renews it: it brakes on its path
-    assert (rig.used() <= ramps + BETWEEN).all()
+    assert (rig.used() <= 1.0 + BETWEEN).all()
     rate = (rig.used() ** (1.0, 1.0 / 2.0, 1.0 / 3.0)).max()
     assert rate >= 0.9 * min(1.0, override * (0.5 if "half" in kind else 1.0))  # nor slower than they must
     assert_within_limits(rig)
@@ -121,7 +118,7 @@ TURNED = tuple(inverse(ROBOT, np.array((0.0, 0.0, -0.5))).position.tolist())
 @example([(SlidersGoal(TURNED), 167), (PoseGoal(0.0, 0.0, 0.0), 98)])  # 1.2 % between two looks
 @given(st.lists(STEP, min_size=2, max_size=10))
 def test_no_sequence_takes_the_platform_beyond_its_limits(steps: list[tuple[object, int]]) -> None:
-    """Beyond them by RAMPS where the rate along a path changes, and by what lies between two looks."""
+    """Nor while the rate along a path changes."""
     rig = Watched()
     rig.enable()
     for number, (what, wait) in enumerate(steps):
@@ -136,7 +133,7 @@ def test_no_sequence_takes_the_platform_beyond_its_limits(steps: list[tuple[obje
     rig.order("stop")
     rig.until(lambda: rig.mode is Mode.HOLDING)
     assert rig.control.fault is None
-    assert (rig.used() <= RAMPS + BETWEEN).all()
+    assert (rig.used() <= 1.0 + BETWEEN).all()
     assert_within_limits(rig)
     rig.bus.shutdown()
 
@@ -433,7 +430,7 @@ def test_a_goal_that_preempts_at_an_override_goes_on_as_the_robot_moves(
     taken = rig.until(rig.holds) * PERIOD - LIMITS.in_position.dwell
     assert taken == pytest.approx(answer.duration, rel=0.1)
     assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
-    assert (rig.used() <= RAMPS + BETWEEN).all()
+    assert (rig.used() <= 1.0 + BETWEEN).all()
     assert_within_limits(rig)
     rig.bus.shutdown()
 

@@ -12,7 +12,7 @@ from conftest import CONFIG
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from motion.test_runs import FAR, HERE, ROBOT, at, run_of, way
-from trirail.motion.feasibility import PLATFORM_LAWS, Checker
+from trirail.motion.feasibility import PLATFORM_LAWS, PLATFORM_PLANNED, Checker
 from trirail.motion.limits import Bounds
 from trirail.motion.paths import Path, constant, falls
 from trirail.motion.runs import Rate, stretched
@@ -50,8 +50,9 @@ def test_a_rate_changes_as_quickly_as_a_motion_at_full_speed_may(rate: float, ta
 
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), SHARE)
 def test_to_raise_a_rate_takes_as_long_as_to_lower_it(by: float, changing: float, share: float) -> None:
-    """Also where it is changing already, faster than this share would have it."""
+    """Also where it is changing already, faster than this share would have it: if it does not fall to zero by that."""
     change = changing * CHANGE
+    assume(1.0 + by / 2.0 - change**2 / (2.0 * share * JERK) > 0.0)
     up = SCALING.ramp(Rate(0.0, 1.0 - by / 2.0, change), 1.0 + by / 2.0, share)
     down = SCALING.ramp(Rate(0.0, 1.0 + by / 2.0, -change), 1.0 - by / 2.0, share)
     assert up is not None
@@ -91,10 +92,14 @@ def test_a_law_is_looked_at_until_it_changes_no_more(
 
 @given(st.floats(1.0, 3.0), RATE)
 def test_a_path_runs_at_the_rate_at_which_it_meets_a_limit_and_no_faster(slower: float, rate: float) -> None:
-    """On this one, stretched, it is the platform's velocity along x."""
+    """On this one, stretched, it is the platform's jerk along x, of which plans use a share."""
     path = stretched(way((0.1, 0.0, 0.0)), slower)
     run = SCALING.begin(path, rate, HERE)
-    assert run.target == run.at.rate == pytest.approx(min(rate, max(1.0, slower)), rel=1e-5)
+    assert (
+        run.target
+        == run.at.rate
+        == pytest.approx(min(rate, max(1.0, slower * PLATFORM_PLANNED[2] ** (1 / 3))), rel=1e-5)
+    )
 
 
 @pytest.mark.parametrize("over", [0.45, 0.5, 0.55])
@@ -122,7 +127,8 @@ def fall(law: Path) -> float:
     s = []
     for piece, span in zip(law.pieces[:, 0, :4], np.diff(law.knots), strict=True):
         cubic = np.polynomial.Polynomial(piece)
-        turns = [root.real for root in cubic.deriv().roots() if abs(root.imag) < 1e-9 and 0.0 < root.real < span]
+        rate = cubic.deriv().trim(1e-12)
+        turns = [root.real for root in rate.roots() if abs(root.imag) < 1e-9 and 0.0 < root.real < span]
         s += [float(cubic(time)) for time in (0.0, *sorted(turns), span)]
     return float((np.maximum.accumulate(s) - s).max())
 
@@ -146,13 +152,11 @@ def test_whatever_a_law_begins_with_its_time_never_falls(share: float) -> None:
 
 
 @given(
-    st.lists(st.tuples(st.floats(0.01, 0.5), st.floats(-160.0, 160.0)), min_size=1, max_size=6),
+    st.lists(st.tuples(st.floats(0.01, 0.5), st.integers(-160, 160)), min_size=1, max_size=6),
     st.floats(0.0, 2.0),
     st.floats(-8.0, 8.0),
 )
-def test_falling_is_told_as_dense_looks_tell_it(
-    pieces: list[tuple[float, float]], rate: float, change: float
-) -> None:
+def test_falling_is_told_as_dense_looks_tell_it(pieces: list[tuple[float, int]], rate: float, change: float) -> None:
     """Laws of random jerks, which fall or do not."""
     knots, rows, s = [0.0], [], 0.0
     for span, jerk in pieces:

@@ -33,7 +33,19 @@ from trirail.motion.limits import BOUNDS, gate
 from trirail.motion.paths import FALL, law_at, platform_at
 from trirail.wire.records import DTYPE
 
-__all__ = ["BACKWARDS", "FEEDBACK", "OLDEST", "PASSED", "SAID", "STANDS", "command", "follow", "hold", "observe", "refusal"]
+__all__ = [
+    "BACKWARDS",
+    "FEEDBACK",
+    "OLDEST",
+    "PASSED",
+    "SAID",
+    "STANDS",
+    "command",
+    "follow",
+    "hold",
+    "observe",
+    "refusal",
+]
 
 OLDEST = 3
 """The greatest age of a position that is looked at, in SYNCs: at the next one the drive is silent."""

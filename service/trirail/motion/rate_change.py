@@ -12,7 +12,7 @@ import numpy as np
 
 from trirail.motion.feasibility import SUBJECTS, Look, parts
 from trirail.motion.paths import Path, constant
-from trirail.motion.runs import Run
+from trirail.motion.runs import Run, arrival
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import SHARES, TimeScaling, greatest
 
@@ -37,8 +37,8 @@ class _Candidate(NamedTuple):
 class RateChange:
     """Lets the last motion of a schedule run at another rate: as soon as the limits allow, as fast as they do.
 
-    Until then the old law goes on. A stop becomes quicker as it goes on: the slower the motion, the more is left of the
-    limits. A motion that has not begun yet begins at the new rate.
+    Until then the old law goes on. A stop, and a rise, become quicker as they go on: the slower the motion, the more is
+    left of the limits. A motion that has not begun yet begins at the new rate.
     """
 
     def __init__(self, scaling: TimeScaling, schedule: Schedule, rate: float, period: float) -> None:
@@ -46,7 +46,7 @@ class RateChange:
         self.tried = 0
         """Cycles that it has taken."""
         self.made = False
-        """Whether the motion has been told of the rate: what is left is to make a stop quicker."""
+        """Whether the motion has been told of the rate: what is left is to make the change quicker."""
         self._scaling = scaling
         self._schedule = schedule
         self._period = period
@@ -74,15 +74,19 @@ class RateChange:
         if len(schedule.runs) > 1:
             self._take(run, constant(self._possible))
             return True
-        if run.arrived or (self.made and (self.rate != 0.0 or run.stands)):
+        if run.arrived or self._is_over(run):
             return True
         if not self.made and self._possible == run.target == 0.0:
             self.made = True
             return False
         self._try(run)
-        return self.made and self.rate != 0.0
+        return self._is_over(run)
 
     # ------------------------------------------------------------------ inside
+
+    def _is_over(self, run: Run) -> bool:
+        """Whether a motion that has been told of the rate has come to it, or is slowing down to another than zero."""
+        return self.made and (run.stands if self.rate == 0.0 else run.at.rate >= self._possible)
 
     def _begin_anew(self) -> None:
         """Begin with the motion as it is now."""
@@ -150,8 +154,11 @@ class RateChange:
         return None
 
     def _sooner(self, run: Run, law: Path, cycles: int) -> bool:
-        """Whether the run comes to stand sooner by a law than by the one that it has."""
-        if (cycles - 1) * self._period + float(law.knots[-2]) <= run.ends - run.time - self._period:
+        """Whether the run comes to stand sooner by a law than by the one that it has, on its path or at the end."""
+        stands = arrival(law, self._possible, run.path.duration)
+        if self._possible == 0.0:
+            stands = min(stands, float(law.knots[-2]))
+        if (cycles - 1) * self._period + stands <= run.ends - run.time - self._period:
             return True
         self._share = -1  # slower changes would be no sooner: begin with the quickest again
         return False

@@ -252,7 +252,7 @@ def law_from_ruckig(trajectory: Trajectory, target: float) -> Path:
     """Take a one-dimensional Ruckig trajectory over as a law: after it the rate stays what it is."""
     ramp = from_ruckig(trajectory)
     last = np.zeros((1, 1, 6))
-    last[0, 0, :2] = trajectory.at_time(trajectory.duration)[0][0], target
+    last[0, 0, :2] = ramp.end[0], target
     return Path(np.append(ramp.knots, ramp.knots[-1] + FOR_EVER), np.concatenate([ramp.pieces, last]))
 
 
