@@ -21,7 +21,7 @@ from trirail_drivers.interface import DriveFault, Feedback, MissingProtection, P
 STILL = (0.0, 0.0, 0.0)
 OFF, ON = (PowerState.SWITCH_ON_DISABLED,) * 3, (PowerState.OPERATION_ENABLED,) * 3
 EXCESS = 1e-3
-"""By that share, and no more, may a setpoint exceed a limit: what is between the moments at which a path is looked at."""
+"""By that share may a setpoint exceed a limit: what lies between the moments at which a path is looked at."""
 
 
 class PerfectDrives:
@@ -147,7 +147,7 @@ class Session:
 
 
 def shares(config: Config, records: NDArray[np.void]) -> dict[str, float]:
-    """Return the greatest share of each limit that was made use of, by name; jerk from cycle to cycle, as drives see it.
+    """Return the greatest share of each limit that was made use of, by name; jerk from cycle to cycle.
 
     Where the robot follows what is measured, without power or in fault, it is commanded no motion.
     """

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from trirail.config import Config, corrected_geometry, geometry
 from trirail.config.as_built import AsBuilt, geometry_of
 from trirail.kinematics.robot import inverse
-from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrackGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import CommandRequest
 from trirail.wire.vocabulary import Command, Mode
@@ -79,9 +78,9 @@ def random_goal(chance: random.Random, session: Session) -> Goal:
         case "track":
             return TrackGoal(*pose, velocity=(pose[1], pose[0], pose[2]), timeout=0.05)
         case _:
-            start: MotionState = session.control.commanded
-            end = [value + chance.uniform(-0.01, 0.01) for value in start.pose]
-            points = TrajectoryPoint(0.0, *start.pose), TrajectoryPoint(0.3, *end)
+            x, y, phi = session.control.commanded.pose
+            u, v, psi = (value + chance.uniform(-0.01, 0.01) for value in (x, y, phi))
+            points = TrajectoryPoint(0.0, x, y, phi), TrajectoryPoint(0.3, u, v, psi)
             return TrajectoryGoal(points, stretch=chance.random() < 0.5)
 
 

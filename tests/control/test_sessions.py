@@ -1,4 +1,4 @@
-"""Whole sessions on a grid of instants and delays: time along the path never falls, every limit holds, nothing faults."""
+"""Sessions on a grid of instants and delays: time along the path never falls, every limit holds, nothing faults."""
 
 from __future__ import annotations
 

@@ -127,9 +127,9 @@ def fall(law: Path) -> float:
     s = []
     for piece, span in zip(law.pieces[:, 0, :4], np.diff(law.knots), strict=True):
         cubic = np.polynomial.Polynomial(piece)
-        rate = cubic.deriv().trim(1e-12)
-        turns = [root.real for root in rate.roots() if abs(root.imag) < 1e-9 and 0.0 < root.real < span]
-        s += [float(cubic(time)) for time in (0.0, *sorted(turns), span)]
+        roots = np.asarray(cubic.deriv().trim(1e-12).roots(), dtype=np.complex128)
+        turns = np.sort(roots.real[np.abs(roots.imag) < 1e-9])
+        s += [float(cubic(time)) for time in (0.0, *turns[(turns > 0.0) & (turns < span)], span)]
     return float((np.maximum.accumulate(s) - s).max())
 
 

@@ -199,9 +199,9 @@ def command(
 ) -> int:
     """Move the platform on along its path, to a time of its law [s], and solve the sliders for that.
 
-    `target` is the rate that the law leads to, `furthest` (1,) the greatest time along the path so far; the goal under way began and ends at the times `begun` and `end` along
-    the path, and the law comes there at `arrival` [s]. Returns a sum of PASSED, STANDS and 4 times what is refused: see
-    `refusal`.
+    `target` is the rate that the law leads to, `furthest` (1,) the greatest time along the path so far [s]: less is
+    refused. The goal under way began and ends at the times `begun` and `end` along the path, and the law comes there at
+    `arrival` [s]. Returns a sum of PASSED, STANDS and 4 times what is refused: see `refusal`.
     """
     law = law_at(law_knots, law_pieces, time)
     s, rate, change = law
