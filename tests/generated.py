@@ -22,19 +22,10 @@ from hypothesis.internal.conjecture import providers
 
 # How fast this machine is, or how many random robots are thrown away, says nothing of the code.
 CHECKS = [HealthCheck.too_slow, HealthCheck.filter_too_much]
-EXAMPLES = Path(__file__).parents[1] / ".explore"
-"""Where what was found is kept from run to run: it is tried first."""
+EXAMPLES = ".explore"
+"""The folder of the checkout where what was found is kept from run to run: it is tried first."""
 
 settings.register_profile("gate", deadline=None, derandomize=True, database=None, suppress_health_check=CHECKS)
-settings.register_profile(
-    "explore",
-    deadline=None,
-    derandomize=False,
-    database=DirectoryBasedExampleDatabase(EXAMPLES),
-    suppress_health_check=CHECKS,
-    phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.target, Phase.shrink],
-    report_multiple_bugs=False,
-)
 settings.load_profile("gate")
 
 RUNS = pytest.StashKey[int]()
@@ -59,6 +50,15 @@ def pytest_configure(config: pytest.Config) -> None:
         fixed.setattr(providers, "_get_local_constants", lambda: providers._local_constants)
         config.add_cleanup(fixed.undo)
     else:
+        settings.register_profile(
+            "explore",
+            deadline=None,
+            derandomize=False,
+            database=DirectoryBasedExampleDatabase(config.rootpath / EXAMPLES),
+            suppress_health_check=CHECKS,
+            phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.target, Phase.shrink],
+            report_multiple_bugs=False,
+        )
         settings.load_profile("explore")
 
 

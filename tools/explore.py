@@ -160,6 +160,9 @@ def main() -> int:
     arguments.add_argument("--seed", type=int, help="of the examples; another one each time if absent")
     arguments.add_argument("--json", action="store_true", help="print one JSON object")
     options = arguments.parse_args()
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell has it ignored in the background, and pytest then
     seed = random.SystemRandom().randrange(2**32) if options.seed is None else options.seed
     with tempfile.TemporaryDirectory(prefix="trirail-explore-") as folder:
         cores = [Core(Path(folder), number, seed, options.only) for number in range(os.cpu_count() or 1)]
