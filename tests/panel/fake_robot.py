@@ -105,6 +105,8 @@ class FakeRobot:
         if name not in self.named:
             raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {name!r}")
         self.gone_to.append(name)
+        if "goal" in self._hanging:
+            self._hanging["goal"].wait()
         return GoalHandle(name, self.robot().command)
 
     def lease(self) -> Lease:

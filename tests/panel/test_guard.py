@@ -214,7 +214,7 @@ def test_a_tab_that_goes_in_whatever_way_is_no_error(panel: Panel, end: str, cap
     before = set(threading.enumerate())
     opened = connect(socket_of(panel), legacy=True)
     opened.recv(10.0)
-    serving = [thread for thread in threading.enumerate() if thread not in before and "sock_handler" in thread.name]
+    serving = [thread for thread in threading.enumerate() if thread not in before and thread.name == "connection"]
     assert serving
     if end == "cut off":
         opened.socket.shutdown(socket.SHUT_RDWR)

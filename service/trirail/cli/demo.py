@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from trirail.client import own_service
 from trirail.client.client import Result, Robot
 from trirail.config import SIM, load
 from trirail.errors import RefusedError
+from trirail.processes.signals import Signals
 from trirail.wire.state import State
 
 GOAL_WITHIN = 15.0
@@ -138,5 +138,5 @@ def _stay() -> None:
     out.print("The service stays up, enabled. In another terminal: trirail goto 0.03 0.02 0.2 --wait")
     out.print("Live view: trirail view, or in the browser: trirail view --web")
     out.print("Ctrl-C ends it.")
-    with contextlib.suppress(KeyboardInterrupt):
-        signal.pause()
+    with Signals() as ends:
+        ends.take()

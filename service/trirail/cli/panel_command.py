@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import signal
-import threading
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -32,6 +30,7 @@ def panel(
     """
     from trirail.client.client import Robot
     from trirail.panel.server import Panel
+    from trirail.processes.signals import Signals
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with Robot(service.robot, service.connect, tls=service.tls) as robot, Panel(robot, port) as served:
@@ -44,6 +43,6 @@ def panel(
             import webbrowser
 
             webbrowser.open(served.url)
-        with contextlib.suppress(KeyboardInterrupt):
-            threading.Event().wait()
+        with Signals() as ends:
+            ends.take()
     return 0

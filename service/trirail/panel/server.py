@@ -16,6 +16,7 @@ from websockets.sync.server import Server, ServerConnection, serve
 
 from trirail.client.client import Robot
 from trirail.errors import ServiceError
+from trirail.panel.connections import Connections
 from trirail.panel.feed import Feed
 from trirail.panel.guard import refused
 from trirail.panel.tab import Tab
@@ -27,6 +28,8 @@ SOCKET = "socket"
 """The name below the token under which the page's WebSocket is."""
 LONGEST = 4096
 """Messages of the page are shorter than that [bytes]."""
+OPENING = 5.0
+"""So long may a request take: it comes from this machine [s]."""
 TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 HEADERS = {
     # Nothing from elsewhere, in no frame of elsewhere (clickjacking), and the token is told to nobody.
@@ -57,9 +60,12 @@ class Panel:
             compression=None,  # a small message at once, not a smaller one later
             server_header=None,
             max_size=LONGEST,
+            open_timeout=OPENING,
             close_timeout=1.0,
         )
-        self._thread = threading.Thread(target=self._server.serve_forever, name="panel", daemon=True)
+        refusal = _response(HTTPStatus.SERVICE_UNAVAILABLE, b"the panel has too many connections\n", "txt").serialize()
+        self._connections = Connections(listening, self._server.handler, refusal)
+        self._thread = threading.Thread(target=self._connections.accept, name="panel", daemon=True)
 
     def __enter__(self) -> Panel:
         self._feed.start()
@@ -68,13 +74,15 @@ class Panel:
 
     def __exit__(self, *_: object) -> None:
         self._feed.close()
-        self._server.shutdown()
+        self._connections.close()
         self._thread.join()
+        self._server.shutdown_watcher.close()
+        self._server.shutdown_notifier.close()
 
     def _serve(self, opened: ServerConnection) -> None:
         Tab(opened, self._robot, self._feed).serve()
 
-    def _answer(self, _opened: ServerConnection, request: Request) -> Response | None:
+    def _answer(self, opened: ServerConnection, request: Request) -> Response | None:
         """Answer a request for a file, refuse what may not ask; None lets the WebSocket open."""
         headers = request.headers
         path = request.path.partition("?")[0]
@@ -82,7 +90,9 @@ class Panel:
             return _response(HTTPStatus.FORBIDDEN, f"{why}\n".encode(), "txt")
         name = path.removeprefix(f"/{self._token}/") or "index.html"
         if name == SOCKET:
-            return None
+            if self._connections.keep(opened.socket):
+                return None
+            return _response(HTTPStatus.SERVICE_UNAVAILABLE, b"the panel is open in too many tabs: close one\n", "txt")
         if name not in self._files:
             return _response(HTTPStatus.NOT_FOUND, b"no such file\n", "txt")
         return _response(HTTPStatus.OK, self._files[name], name.rpartition(".")[2])

@@ -24,6 +24,11 @@ AHEAD = 3
 FRESH = 500
 """A jog from a page whose newest state is older than that is none: it, or what leads to it, stands still [ms]."""
 
+UNDER_WAY = 8
+"""So many commands of a tab may wait for their answers, and as many that stop the robot."""
+UNSENT = 200
+"""So many answers are kept for a tab that reads none; the eldest go."""
+
 _FROM_PAGE = msgspec.json.Decoder(FromPage)
 
 
@@ -39,9 +44,10 @@ class Tab:
         self._robot = robot
         self._feed = feed
         self._jog = HeldJog(robot.send, lambda why: self._say("ended", message=why))
-        self._outbox: list[bytes] = []
+        self._outbox: deque[bytes] = deque(maxlen=UNSENT)
         self._unseen: deque[int] = deque()
         self._under_way: set[Command] = set()
+        self._stops, self._others = (threading.BoundedSemaphore(UNDER_WAY) for _ in range(2))
         self._lease: Lease | None = None
         self._open = True
 
@@ -87,7 +93,7 @@ class Tab:
     # ------------------------------------------------------------------ doing
 
     def _tell(self, name: Command) -> None:
-        """Send a command, unless it is under way already; what stops the robot is always sent."""
+        """Send a command, unless it is under way already; what stops the robot waits for no other."""
         if name.stops:
             self._jog.release()
         elif name in self._under_way:
@@ -105,7 +111,8 @@ class Tab:
             finally:
                 self._under_way.discard(name)
 
-        self._begin(tell, name)
+        if not self._begin(tell, name):
+            self._under_way.discard(name)
 
     def _acquire(self) -> None:
         """Hold the lease for as long as this tab is open: with it go its signs of life."""
@@ -121,7 +128,13 @@ class Tab:
         if lease is not None:
             lease.__exit__()
 
-    def _begin(self, do: Callable[[], object], what: str, then: str = "done") -> None:
+    def _begin(self, do: Callable[[], object], what: str, then: str = "done") -> bool:
+        """Have it done beside what is under way, and answered; return whether there is a place for it."""
+        places = self._stops if isinstance(what, Command) and what.stops else self._others
+        if not places.acquire(blocking=False):
+            self._say("refused", to=what, message=f"{UNDER_WAY} commands of this page wait for their answers already")
+            return False
+
         def run() -> None:
             try:
                 do()
@@ -129,8 +142,11 @@ class Tab:
                 self._say("refused", to=what, message=str(error))
             else:
                 self._say(then, to=what)
+            finally:
+                places.release()
 
         threading.Thread(target=run, name=what, daemon=True).start()
+        return True
 
     # ------------------------------------------------------------------ showing
 

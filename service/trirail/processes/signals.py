@@ -7,7 +7,11 @@ import socket
 
 
 class Signals:
-    """SIGTERM and SIGINT as something to select on."""
+    """SIGTERM and SIGINT as something to select on.
+
+    Whichever thread the kernel hands a signal: Python's handlers are run by the main thread alone, which nothing wakes
+    from a lock where another one was interrupted.
+    """
 
     def __enter__(self) -> Signals:
         self.reader, self._writer = socket.socketpair()
