@@ -211,8 +211,8 @@ def test_a_goal_that_is_sent_to_a_robot_that_pauses_is_not_paused(rig: Rig, wait
 
 
 def test_a_goal_that_is_sent_to_a_paused_robot_begins(slow: Rig) -> None:
-    slow.goal("running", -0.05, 0.0, 0.0)
-    slow.cycles(60)
+    slow.goal("running", -0.12, 0.0, 0.0)
+    slow.cycles(200)
     slow.command("pause")
     slow.send("g2", PoseGoal(0.0, 0.03, 0.0))
     slow.until(lambda: slow.holds() and slow.control.goal_queue.idle)
@@ -491,6 +491,12 @@ RATES = st.lists(st.tuples(st.one_of(OVERRIDE, st.sampled_from(["pause", "resume
 
 
 @settings(max_examples=40)
+@example(  # acceleration was greatest between two looks
+    [(PoseGoal(-0.0017, 0.0, 0.3686), 200), (0.0, 5), (PoseGoal(0.0115, -0.0293, -0.0748), 30)],
+    (0.0, 0.0, 0.04),
+    0.05,
+    [],
+)
 @given(st.lists(STEP, max_size=6), POSE, st.sampled_from([0.05, 0.2]), RATES)
 def test_a_robot_whose_last_goal_is_a_jog_stands_when_the_dead_man_is_over(
     before: list[tuple[object, int]],

@@ -9,14 +9,19 @@ import pytest
 from conftest import CONFIG
 from motion.test_runs import HERE, run_of, way
 from motion.test_time_scaling import SCALING
+from trirail.motion.feasibility import PLATFORM_PLANNED
 from trirail.motion.paths import Path
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.rate_change import RateChange
-from trirail.motion.runs import Run, rest
+from trirail.motion.runs import Run, rest, stretched
 from trirail.motion.schedule import Schedule
 
 PERIOD = CONFIG.period
 FAR = (0.1, 0.0, 0.0)
+
+
+PLANNED = stretched(way(FAR), PLATFORM_PLANNED[2] ** (-1.0 / 3.0))
+"""A path that takes of the platform's limits what plans do, and no less."""
 
 
 def of_many_pieces(seconds: float) -> Path:
@@ -72,9 +77,7 @@ def test_a_motion_that_has_not_begun_begins_at_the_new_rate(rate: float) -> None
 def test_a_goal_that_was_slow_by_itself_goes_as_fast_as_it_may_from_where_it_is() -> None:
     """Twice as fast as at half the speed, to the last thousandth; and what lies behind does not count."""
     for slow, cycles in ((2.0, 100), (2.0, 700), (1.5, 300)):
-        path = way(FAR)
-        stretched = path._replace(knots=path.knots * slow, pieces=path.pieces / slow ** np.arange(6.0))
-        schedule = begun(run_of(stretched), cycles=cycles)
+        schedule = begun(run_of(stretched(PLANNED, slow)), cycles=cycles)
         change = RateChange(SCALING, schedule, 2.0, PERIOD)
         until_made(schedule, change)
         assert schedule.runs[0].target == pytest.approx(slow, rel=1e-3)
@@ -82,7 +85,7 @@ def test_a_goal_that_was_slow_by_itself_goes_as_fast_as_it_may_from_where_it_is(
 
 @pytest.mark.parametrize("rate", [1.005, 1.5, 2.0])
 def test_a_rate_that_the_path_cannot_take_is_given_up_at_once(rate: float) -> None:
-    schedule = begun(run_of(way(FAR)), cycles=100)
+    schedule = begun(run_of(PLANNED), cycles=100)
     change = RateChange(SCALING, schedule, rate, PERIOD)
     assert until_made(schedule, change) <= 6
     assert schedule.runs[0].target == pytest.approx(1.0, rel=1e-3)

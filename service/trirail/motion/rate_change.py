@@ -154,10 +154,9 @@ class RateChange:
         return None
 
     def _sooner(self, run: Run, law: Path, cycles: int) -> bool:
-        """Whether the run comes to stand sooner by a law than by the one that it has, on its path or at the end."""
-        stands = arrival(law, self._possible, run.path.duration)
-        if self._possible == 0.0:
-            stands = min(stands, float(law.knots[-2]))
+        """Whether the run stands sooner by a law than by the one that it has: where that stops, or at its end."""
+        ends = run.path.duration
+        stands = arrival(law, self._possible, ends) if self._possible else float(law.knots[-2])
         if (cycles - 1) * self._period + stands <= run.ends - run.time - self._period:
             return True
         self._share = -1  # slower changes would be no sooner: begin with the quickest again
