@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from trirail.errors import RefusedError
 from trirail.processes.gateway import Gateway
 from trirail.processes.guard import Guard
-from trirail.processes.inbox import Incoming, Kind
+from trirail.processes.incoming import Incoming, Kind
 from trirail.wire import boundary, links, packets, text, zenoh_session
 from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal
 from trirail.wire.goals import TrajectoryPoint as Point

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from trirail.processes.inbox import UNREAD, UNREAD_OF_ONE, Inbox, Incoming
+from trirail.processes.inbox import UNREAD, UNREAD_OF_ONE, Inbox, _incoming
+from trirail.processes.incoming import Incoming
 from trirail.processes.pace import BURST, RATE, Pace
 from trirail.wire import zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE, MAX_UNREAD
@@ -47,7 +48,7 @@ def readable(inbox: Inbox) -> bool:
 
 def keep(inbox: Inbox, kind: str, payload: bytes = b"", user: str = "ann", name: str = "") -> None:
     key = "/".join(filter(None, ("trirail/demo", kind, user, name)))
-    inbox._keep(kind, key, zenoh.ZBytes(payload), "", None)  # type: ignore[arg-type]
+    inbox._keep(_incoming(kind, key, zenoh.ZBytes(payload), "", None))  # type: ignore[arg-type]
 
 
 def test_messages_are_taken_in_their_order(inbox: Inbox) -> None:
@@ -89,10 +90,11 @@ def test_what_stops_the_robot_for_everybody_comes_first(inbox: Inbox, name: Comm
     assert max(taken, key=lambda incoming: incoming.number).user == "ann"
 
 
-def test_a_stop_of_one_goal_does_not_overtake_that_goal(inbox: Inbox) -> None:
+@pytest.mark.parametrize("content", [b"{}", b'{"goal": "g"}', b"no JSON", bytes(MAX_MESSAGE + 1)])
+def test_a_stop_comes_first_whatever_it_holds(inbox: Inbox, content: bytes) -> None:
     keep(inbox, "goal", b"{}")
-    keep(inbox, "cmd", b'{"goal": "g"}', name="stop")
-    assert [incoming.kind for incoming in inbox.take(2)] == ["goal", "cmd"]
+    keep(inbox, "cmd", content, name="stop")
+    assert [incoming.kind for incoming in inbox.take(2)] == ["cmd", "goal"]
 
 
 def test_who_sends_more_than_his_pace_waits_and_nobody_else(inbox: Inbox, clock: Clock) -> None:

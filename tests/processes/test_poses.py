@@ -20,7 +20,7 @@ from trirail.kinematics.geometry import travels
 from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Bounds
 from trirail.processes import poses
-from trirail.processes.inbox import Incoming, Kind
+from trirail.processes.incoming import Incoming, Kind
 from trirail.processes.pose_file import PoseFile, state_directory
 from trirail.processes.poses import MOST, UNDER_WAY, Poses
 from trirail.telemetry.provenance import toml

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes import refusals
-from trirail.processes.inbox import Incoming
+from trirail.processes.incoming import Incoming
 from trirail.processes.refusals import REFUSALS_OF_ALL, REFUSALS_PER_SECOND, Refusals
 from trirail.wire import packets
 from trirail.wire.messages import ErrorReply
@@ -23,7 +23,7 @@ class Listener:
         self.told: list[Any] = []
         self.answers: list[Any] = []
         link: Any = SimpleNamespace(send=lambda packet: self.told.append(packets.decode_request(packet[1:])))
-        replies: Any = SimpleNamespace(send=lambda _, content: self.answers.append(content))
+        replies: Any = SimpleNamespace(answer=lambda _, content: self.answers.append(content))
         monkeypatch.setattr(refusals, "time", SimpleNamespace(monotonic=lambda: self.now))
         self.refusals = Refusals(link, replies)
 

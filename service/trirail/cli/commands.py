@@ -23,6 +23,7 @@ from trirail.cli import (
     robot_commands,
     router_command,
     sessions_command,
+    stop_commands,
     terminal,
     units,
     workspace_command,
@@ -30,6 +31,7 @@ from trirail.cli import (
 from trirail.cli.completion import Shell, script
 from trirail.cli.options import ALL_HERE, Flag, Services
 from trirail.errors import TrirailError
+from trirail.wire.stop_door import STOPS
 from trirail.wire.vocabulary import Command
 
 app = App(
@@ -157,7 +159,8 @@ app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRID
 app.command(robot_commands.acquire, name=Command.ACQUIRE, help=Command.ACQUIRE.help)
 for each in Command:
     if each not in (Command.OVERRIDE, Command.ACQUIRE):
-        app.command(robot_commands.telling(each), name=each.replace("_", "-"), help=each.help)
+        made = stop_commands.stopping(each) if each in STOPS else robot_commands.telling(each)
+        app.command(made, name=each.replace("_", "-"), help=each.help)
 app.command(config_commands.app)
 app.command(keys_command.app)
 app.command(math_commands.ik)

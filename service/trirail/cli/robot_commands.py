@@ -15,7 +15,7 @@ from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
 from trirail.cli.options import poses as poses_of_robot
 from trirail.wire.boundary import check_name, check_new_pose
-from trirail.wire.messages import LONGEST_LEASE, SHORTEST_LEASE
+from trirail.wire.messages import LONGEST_LEASE, SHORTEST_LEASE, CommandReply
 from trirail.wire.vocabulary import Command
 
 if TYPE_CHECKING:
@@ -392,10 +392,15 @@ def telling(name: Command) -> Callable[..., int]:
 
         with Robot(service.robot, service.connect, tls=service.tls) as robot:
             reply = robot.command(name)
-        show(service, msgspec.to_builtins(reply), f"{name}: done, the robot is {reply.mode}")
+        confirmed(service, name, reply)
         return 0
 
     return tell
+
+
+def confirmed(service: Service, name: Command, reply: CommandReply) -> None:
+    """Print that a command has been carried out."""
+    show(service, msgspec.to_builtins(reply), f"{name}: done, the robot is {reply.mode}")
 
 
 def _sliders(*positions: float) -> str:

@@ -31,6 +31,7 @@ from trirail.wire import boundary
 from trirail.wire.goals import Goal
 from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, Stop
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
+from trirail.wire.stop_door import STOPS
 from trirail.wire.vocabulary import Command
 
 P = ParamSpec("P")
@@ -173,6 +174,8 @@ class AsyncRobot:
 
     async def command(self, name: str, content: bytes | None = None) -> CommandReply:
         """Send a command by its name on the wire, as Robot.command does."""
+        if name in STOPS:
+            return await self._connection.stop(self.user, name, content, REPLY_WITHIN)
         within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
         return await self._connection.ask(("cmd", self.user, name), CommandReply, content, within)
 

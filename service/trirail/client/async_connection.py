@@ -11,10 +11,11 @@ from typing import Any, TypeVar
 import msgspec
 import zenoh
 
-from trirail.client.connection import REPLY_WITHIN, ROLE_WITHIN, Connection, once
+from trirail.client.connection import REPLY_WITHIN, ROLE_WITHIN, Connection, SilenceError, once
+from trirail.client.stop_call import Outcome, Stop
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.wire.credentials import Credentials
-from trirail.wire.messages import Event, RoleReply
+from trirail.wire.messages import CommandReply, Event, RoleReply
 from trirail.wire.state import State
 
 T = TypeVar("T", bound=msgspec.Struct)
@@ -71,6 +72,18 @@ class AsyncConnection:
         finally:
             query.cancel()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
         raise unreadable or await self.nobody(*parts)
+
+    async def stop(self, user: str, name: str, content: bytes | None, within: float) -> CommandReply:
+        """Ask for a stop, quick_stop or disable, as Connection.stop does."""
+        came: asyncio.Queue[Outcome] = asyncio.Queue()
+        stop = Stop.of(self._connection.robot, user, name, content, within)
+        with self._connection.copies(stop, self._hand_over(came.put_nowait)) as outcomes:
+            try:
+                while (reply := outcomes.decide(await came.get())) is None:
+                    pass
+            except SilenceError as error:
+                raise await self.nobody("cmd", user, name) from error
+        return reply
 
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, take: Callable[[T | TrirailError], None]

@@ -42,6 +42,7 @@ from trirail.wire.goals import (
 from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, Override
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
+from trirail.wire.stop_door import STOPS
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command
 
@@ -340,8 +341,11 @@ class Robot:
     def command(self, name: str, content: bytes | None = None) -> CommandReply:
         """Send a command by its name on the wire; return once the service confirms that it has been carried out.
 
-        `content` is its JSON, where it has any: one of trirail.wire.messages.CONTENT.
+        `content` is its JSON, where it has any: one of trirail.wire.messages.CONTENT. What stops the robot is asked for
+        at the service's door for stops as well, which others' connections keep nobody out of.
         """
+        if name in STOPS:
+            return self._connection.stop(self.user, name, content, REPLY_WITHIN)
         within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
         return self._connection.ask(("cmd", self.user, name), CommandReply, content, within)
 

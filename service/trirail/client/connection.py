@@ -13,11 +13,12 @@ import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.samples import SampleReader
+from trirail.client.stop_call import Outcome, Outcomes, Stop
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import least_role
 from trirail.wire.credentials import Credentials
-from trirail.wire.messages import ErrorReply, Event, RoleReply
+from trirail.wire.messages import CommandReply, ErrorReply, Event, RoleReply
 from trirail.wire.state import State
 from trirail.wire.text import is_name, quoted
 from trirail.wire.vocabulary import Role
@@ -32,11 +33,15 @@ POST_WITHIN = 2.0
 T = TypeVar("T", bound=msgspec.Struct)
 
 
+class SilenceError(ServiceError):
+    """A query that nobody has answered."""
+
+
 class Connection:
     """A session to the service of a robot at a Zenoh locator. Raises ServiceError where that cannot be reached."""
 
     def __init__(self, robot: str, connect: str, credentials: Credentials | None = None) -> None:
-        self._robot = robot
+        self.robot = robot
         self._connect = connect
         self._credentials = credentials
         self._session = zenoh_session.open_client(connect, credentials)
@@ -53,16 +58,23 @@ class Connection:
     # ------------------------------------------------------------------ asking
 
     def ask(
-        self, parts: tuple[str, ...], kind: type[T], payload: bytes | None = None, within: float = REPLY_WITHIN
+        self,
+        parts: tuple[str, ...],
+        kind: type[T],
+        payload: bytes | None = None,
+        within: float = REPLY_WITHIN,
+        copy: str | None = None,
     ) -> T:
         """Query the key of these parts and decode the first reply that can be read as a message of `kind`.
+
+        `copy` is the id by which the service knows the copies of a stop for one.
 
         Raises RefusedError where the service says no, ServiceError where nobody answers within so many seconds: nobody
         is there, or may be asked. A reply has the quality of service of its query: one that may be dropped would have
         an answer that may be.
         """
         unreadable: ServiceError | None = None
-        for reply in self._session.get(**self.query(parts, payload, within)):
+        for reply in self._session.get(**self.query(parts, payload, within), attachment=copy):
             answer = self.read(reply, kind)
             if not isinstance(answer, ServiceError):
                 return answer
@@ -96,6 +108,32 @@ class Connection:
             raise refused
         return refused
 
+    def stop(self, user: str, name: str, content: bytes | None, within: float) -> CommandReply:
+        """Ask for a stop, quick_stop or disable, over Zenoh and at the door beside it; return the first answer.
+
+        Raises as `ask`.
+        """
+        came: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
+        with self.copies(Stop.of(self.robot, user, name, content, within), came.put) as outcomes:
+            try:
+                while (reply := outcomes.decide(came.get())) is None:
+                    pass
+            except SilenceError as error:
+                raise self.nobody("cmd", user, name) from error
+        return reply
+
+    @contextlib.contextmanager
+    def copies(self, stop: Stop, take: Callable[[Outcome], None]) -> Iterator[Outcomes]:
+        """Send all copies of a stop, and have what comes of each taken, by whatever thread; until the context ends."""
+        at_door = stop.at_door(self._connect, self._credentials, take)
+        try:
+            query = self.query(stop.parts, stop.content, stop.within) | {"attachment": stop.id}
+            self._post(query, CommandReply, take)
+            yield Outcomes(2 if at_door is not None else 1)
+        finally:
+            if at_door is not None:
+                at_door.cancel()
+
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, take: Callable[[T | TrirailError], None]
     ) -> None:
@@ -103,6 +141,10 @@ class Connection:
 
         It is called once, by a thread of the connection: it must be quick.
         """
+        query = self.query(parts, payload, POST_WITHIN) | {"congestion_control": zenoh.CongestionControl.DROP}
+        self._post(query, kind, take)
+
+    def _post(self, query: dict[str, Any], kind: type[T], take: Callable[[T | TrirailError], None]) -> None:
         answers: list[T | TrirailError] = []
 
         def on_reply(reply: zenoh.Reply) -> None:
@@ -112,12 +154,11 @@ class Connection:
                 answers.append(error)
 
         def on_end() -> None:
-            silent = ServiceError(f"no robot {self._robot!r} answers at {self._connect}: is its service running?")
+            silent = SilenceError(f"no robot {self.robot!r} answers at {self._connect}: is its service running?")
             take(answers[0] if answers else silent)
 
         handler = zenoh.handlers.Callback(on_reply, on_end, indirect=False)
-        asked = self.query(parts, payload, POST_WITHIN) | {"congestion_control": zenoh.CongestionControl.DROP}
-        self._session.get(**asked, handler=handler)
+        self._session.get(**query, handler=handler)
 
     def nobody(self, *parts: str) -> ServiceError | RefusedError:
         """Return what to raise where nobody answers on the key of these parts.
@@ -140,7 +181,7 @@ class Connection:
     def why_nobody(self, parts: tuple[str, ...], reply: RoleReply | None) -> ServiceError | RefusedError:
         """Return what to raise where nobody answers, and this did when the user's role was asked for."""
         return (reply and self._denied(parts, reply.user, reply.role)) or ServiceError(
-            f"no robot {self._robot!r} answers at {self._connect}: is its service running, is the name right "
+            f"no robot {self.robot!r} answers at {self._connect}: is its service running, is the name right "
             "(--robot), is it linked to the router if this is one?"
         )
 
@@ -148,9 +189,9 @@ class Connection:
         """Return the refusal where the user's role does not allow to use the key of these parts."""
         needed = least_role(*parts)
         if role is None:
-            problem = f"{user} has no role at {self._robot}: its [zenoh.users] does not name him, or he is revoked"
+            problem = f"{user} has no role at {self.robot}: its [zenoh.users] does not name him, or he is revoked"
         elif not Role(role).includes(needed):
-            problem = f"{user} is a {role} at {self._robot}: {'/'.join(parts)} needs {needed}"
+            problem = f"{user} is a {role} at {self.robot}: {'/'.join(parts)} needs {needed}"
         else:
             return None
         return RefusedError(RefusalCode.NOT_ALLOWED, problem)
@@ -200,7 +241,7 @@ class Connection:
         return self._session
 
     def _key(self, *parts: str) -> str:
-        return zenoh_session.key(self._robot, *parts)
+        return zenoh_session.key(self.robot, *parts)
 
 
 def once(take: Callable[[Event], object]) -> Callable[[Event], None]:

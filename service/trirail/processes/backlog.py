@@ -10,7 +10,7 @@ from msgspec import structs
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.fair_queue import FairQueue
-from trirail.processes.inbox import Incoming
+from trirail.processes.incoming import Incoming
 from trirail.wire.packets import GoalRequest
 from trirail.wire.sizes import MAX_UNREAD
 
@@ -40,6 +40,8 @@ class Backlog:
         self._goals: FairQueue[WaitingGoal] = FairQueue()
         self._bytes = 0
         self._stop = 0, ""
+        self._stopped: dict[str, tuple[int, str]] = {}
+        """By id, before which message a goal was told to stop that may not be read yet, and why; the newest last."""
 
     def __iter__(self) -> Iterator[WaitingGoal]:
         return iter(self._goals)
@@ -59,9 +61,9 @@ class Backlog:
 
     def add(self, incoming: Incoming, request: GoalRequest) -> None:
         """Put a goal behind the user's others; withdrawn where it had come before the robot was told to stop."""
-        before, reason = self._stop
-        if incoming.number < before:
-            request = structs.replace(request, withdrawn=reason)
+        for before, reason in (self._stop, self._stopped.get(request.id, (0, ""))):
+            if incoming.number < before:
+                request = structs.replace(request, withdrawn=reason)
         self._goals.put(request.user, WaitingGoal(incoming._replace(payload=b""), request))
         self._bytes += incoming.size
 
@@ -83,6 +85,13 @@ class Backlog:
         if found:
             self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.request.id == goal_id else goal)
         return found
+
+    def withdraw_coming(self, goal_id: str, reason: str, before: int) -> None:
+        """Withdraw the goal of an id where it is read after this, and had come before a message."""
+        self._stopped.pop(goal_id, None)
+        self._stopped[goal_id] = before, reason
+        if len(self._stopped) > MOST:
+            del self._stopped[next(iter(self._stopped))]
 
     def withdraw_all(self, reason: str, before: int) -> None:
         """Withdraw every goal that came before a message, those as well that are read after it."""

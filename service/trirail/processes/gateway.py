@@ -16,9 +16,11 @@ import zenoh
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.commands import Commands
 from trirail.processes.guard import Guard
 from trirail.processes.heartbeats import BEAT_EVERY
-from trirail.processes.inbox import Inbox, Incoming
+from trirail.processes.inbox import Inbox
+from trirail.processes.incoming import Incoming
 from trirail.processes.info import info
 from trirail.processes.last_words import LastWords
 from trirail.processes.measured import Meter
@@ -32,7 +34,7 @@ from trirail.processes.state import StateMaker
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Goal
 from trirail.wire.links import Closed, PacketLink
-from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Event, GoalReply, NoContent, RoleReply, Stop
+from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply, RoleReply
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -50,7 +52,7 @@ from trirail.wire.packets import (
 from trirail.wire.records import unpack
 from trirail.wire.state import summary_of
 from trirail.wire.text import quoted
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Mode
 
 SWITCH_EVERY = 0.0005
 """After so long a thread lets another have the interpreter, which Zenoh's threads need to hand a message over [s]."""
@@ -89,6 +91,7 @@ class Gateway:
         self._inbox = Inbox(opened, self._robot, self._refusals.too_much)
         self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._tell, self._inbox.wake)
         self._requests = Requests(config, link, guard, self._replies, self._last_words)
+        self._commands = Commands(self._robot, self._requests, self._replies, self._states, self._inbox)
         connect = config.zenoh.connect
         self._routers = RouterLinks(connect, partial(guard.linked, opened), guard.why_not_linked, self._tell)
         self._ending = False
@@ -96,6 +99,7 @@ class Gateway:
 
     def serve(self, ready: Callable[[], None]) -> None:
         """Serve until told to end or the loop has gone; `ready` is called once the loop has said welcome."""
+        door = self._guard.stop_door(self._inbox.stop_at_door)
         poll = select.poll()
         poll.register(self._link.fileno(), select.POLLIN)
         poll.register(self._inbox.fileno(), select.POLLIN)
@@ -124,7 +128,8 @@ class Gateway:
                 self._poses.close()
             self._routers.close()
             for incoming in self._requests:
-                self._replies.send(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
+                self._replies.answer(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
+            door.close()
             self._replies.close()
 
     def warnings(self) -> tuple[str, ...]:
@@ -153,7 +158,7 @@ class Gateway:
             elif incoming.kind in ("teach", "forget"):
                 self._poses.take(incoming)
             else:
-                self._command(incoming)
+                self._commands.take(incoming)
         except RefusedError as refusal:
             self._refusals.refuse(incoming, refusal)
         except Closed:
@@ -167,33 +172,6 @@ class Gateway:
         (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
         sent: Goal = incoming.content(Goal, "not a goal")
         self._requests.goal(incoming, user, self._poses.of_name(sent))
-
-    def _command(self, incoming: Incoming) -> None:
-        user, called = boundary.names(incoming.key, self._key("cmd"), ("user", "command"))
-        try:
-            name = Command(called)
-        except ValueError as error:
-            problem = f"{quoted(called)}: no such command; there are {', '.join(Command)}"
-            raise RefusedError(RefusalCode.UNKNOWN_COMMAND, problem) from error
-        try:
-            content = incoming.content(CONTENT.get(name, NoContent | None), f"{name} takes {name.content}")
-        except RefusedError as refusal:
-            if not (name.stops and name.everybodys):
-                raise
-            # Whoever says stop, however badly, wants it to stop: it is carried out as if it had no content.
-            self._carry_out(incoming._replace(query=None), user, name, None)
-            raise RefusedError(refusal.code, f"{refusal}; the robot is told to {name} all the same") from refusal
-        self._carry_out(incoming, user, name, content)
-
-    def _carry_out(self, incoming: Incoming, user: str, name: Command, content: msgspec.Struct | None) -> None:
-        goal = content.goal if isinstance(content, Stop) else None
-        reason = f"{name} by {user}"
-        if goal is not None and self._requests.backlog.withdraw(goal, reason):  # before the loop has it
-            self._replies.send(incoming, CommandReply(Command.STOP, self._states.newest().mode))
-            return
-        self._requests.command(incoming, user, name, content)
-        if name.stops and goal is None and (name.everybodys or self._states.lease in (None, user)):
-            self._requests.backlog.withdraw_all(reason, incoming.number)
 
     def _tell(self, what: PoseChanged | Remark) -> None:
         self._link.send(message(what))
@@ -230,9 +208,11 @@ class Gateway:
                 expected = duration if math.isfinite(duration) else None
                 self._requests.answer(ticket, GoalReply(goal_id, expected, slowed, stops_first, queued, lag))
             case Confirmed(ticket, name, mode):
+                self._commands.confirmed(ticket)
                 self._requests.answer(ticket, CommandReply(name, mode))
             case Refused(ticket, code, text, slider, value, limit):
-                self._requests.answer(ticket, ErrorReply(code, text, slider, value, limit))
+                error = ErrorReply(code, text, slider, value, limit)
+                self._requests.answer(ticket, self._commands.refused(ticket, error))
 
     def _publish(self, batch: memoryview) -> None:
         """Take in a batch of records and pass it on; publish the newest state when it is time."""

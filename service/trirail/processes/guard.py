@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import zenoh
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError, ServiceError
-from trirail.wire import zenoh_session
-from trirail.wire.access import access_control
+from trirail.processes.stop_door import Answer, StopDoor
+from trirail.wire import tls, zenoh_session
+from trirail.wire.access import COMMANDS, access_control
 from trirail.wire.credentials import Credentials, with_role
 from trirail.wire.dialling import why_not
 from trirail.wire.endpoints import ReachableBy, reach, socket_file
+from trirail.wire.stop_door import SUFFIX, StopRequest, command_of, stop_address
+from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Role
 
 SOCKET_MODE = 0o660
@@ -50,6 +54,22 @@ class Guard:
         for path in filter(None, map(socket_file, self._listen)):
             path.chmod(SOCKET_MODE)
         return opened
+
+    def stop_door(self, take: Callable[[StopRequest, Answer], None]) -> StopDoor:
+        """Open the door for stops beside each endpoint. Raises ServiceError where an address cannot be listened on."""
+
+        def ask(shown: str, request: StopRequest, answer: Answer) -> None:
+            user, command = command_of(request, self._robot)
+            if self._credentials is not None and user != shown:
+                raise RefusedError(RefusalCode.NOT_ALLOWED, f"{quoted(shown) or 'nobody'} cannot send as {user}")
+            self.check(user, COMMANDS[command], command)
+            take(request, answer)
+
+        secured = None if self._credentials is None else tls.server(self._credentials)
+        door = StopDoor(filter(None, map(stop_address, self._listen)), secured, ask)
+        for path in filter(None, map(socket_file, self._listen)):
+            Path(f"{path}{SUFFIX}").chmod(SOCKET_MODE)
+        return door
 
     def linked(self, opened: zenoh.Session) -> set[str]:
         """Return to which endpoints of `connect` a session has a link to the router that is obeyed."""

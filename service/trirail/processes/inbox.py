@@ -9,61 +9,33 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, Literal, NamedTuple
 
 import zenoh
 
 from trirail.processes.fair_queue import FairQueue
+from trirail.processes.incoming import Incoming, Kind
 from trirail.processes.pace import Pace
-from trirail.wire import boundary, zenoh_session
-from trirail.wire.sizes import MAX_MESSAGE, MAX_UNREAD
-from trirail.wire.vocabulary import Command
+from trirail.processes.stop_door import Answer
+from trirail.wire import zenoh_session
+from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_UNREAD
+from trirail.wire.stop_door import MAX_LINE, STOPS, StopRequest
+from trirail.wire.text import is_id
 
 UNREAD = 8192
 """Messages that may wait to be read; beyond that they are refused, commands at twice as many: a flood of goals must not
 keep a stop out."""
 UNREAD_OF_ONE = 2048
 """Of them those of one user, and likewise."""
-
-Kind = Literal["goal", "cmd", "info", "role", "poses", "teach", "forget"]
-
-_STOPS = frozenset(name for name in Command if name.stops and name.everybodys)
-
-
-class Incoming(NamedTuple):
-    """A query or a put, as Zenoh handed it over."""
-
-    kind: Kind
-    key: str
-    """As it was sent: it may have wildcards."""
-    size: int
-    """Of the payload [bytes]."""
-    payload: bytes
-    """Empty where it is larger than is decoded."""
-    encoding: str
-    query: zenoh.Query | None
-    """None for a put: it has no answer."""
-    arrived_ns: int
-    """When it came, by the monotonic clock: it may have waited since, behind its user's others."""
-    number: int = 0
-    """Messages are numbered as they come."""
-
-    @property
-    def user(self) -> str:
-        """Who is said to have sent it; "" for what names nobody."""
-        return self.key.split("/")[3] if self.key.count("/") > 2 else ""
-
-    def content(self, kind: Any, what: str) -> Any:
-        """Return its payload as a message of that kind, a type or union. Raises RefusedError, beginning with `what`."""
-        boundary.check_size(self.size)
-        return boundary.decode(self.payload, kind, what, self.encoding)
+ALIKE = 32
+"""Stops of one user that are read as one, where they came one behind the other and ask for the same."""
 
 
 class Inbox:
     """Declares what the gateway listens to, and keeps what comes. `too_much` is given what there is no room for.
 
-    Users take turns, each at his pace, so that one who floods waits for himself. What stops the robot as a whole comes
-    before all else: by its number the goals are known that were sent before it. `clock` gives seconds.
+    Users take turns, each at his pace, so that one who floods waits for himself. What stops the robot comes before all
+    else, known by its key alone: by its number the goals are known that were sent before it, and no goal that was sent
+    after it is read before it. `clock` gives seconds.
     """
 
     def __init__(
@@ -78,10 +50,13 @@ class Inbox:
         self._robot = robot
         self._too_much = too_much
         self._lock = threading.Lock()
-        self._stops: FairQueue[Incoming] = FairQueue()
+        self._stops: FairQueue[list[Incoming]] = FairQueue()
+        """Each with those that are alike behind it."""
+        self._newest: dict[str, list[Incoming]] = {}
+        """Where a user's last message of all is a stop that waits: with what it waits."""
         self._others: FairQueue[Incoming] = FairQueue()
-        self._lanes = ((self._stops, Pace()), (self._others, Pace()))
-        """What is read first comes first; who sends many stops has his pace in the rest for himself, and likewise."""
+        self._stops_pace, self._others_pace = Pace(), Pace()
+        """Who sends many stops has his pace in the rest for himself, and likewise."""
         self._number = 0
         self._bytes = 0
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -133,47 +108,112 @@ class Inbox:
         with self._lock:
             return self._due(self._clock())
 
+    def earlier(self, number: int) -> bool:
+        """Whether something that came before a message waits to be read."""
+        with self._lock:
+            return any(self._others.first(user).number < number for user in self._others.users)
+
     def _next(self, now: float) -> Incoming | None:
-        for queue, pace in self._lanes:
-            user = next((user for user in queue.users if not _wait(pace, user, now)), None)
-            if user is not None:
-                pace.count(user, now)
-                incoming = queue.take(user)
-                self._bytes -= len(incoming.payload)
-                return incoming
+        user = next((user for user in self._stops.users if not _wait(self._stops_pace, user, now)), None)
+        if user is not None:
+            self._stops_pace.count(user, now)
+            stop, *alike = stops = self._stops.take(user)
+            if self._newest.get(user) is stops:
+                del self._newest[user]
+            self._bytes -= len(stop.payload)
+            return stop._replace(alike=tuple(alike))
+        user = next((user for user in self._readable() if not _wait(self._others_pace, user, now)), None)
+        if user is not None:
+            self._others_pace.count(user, now)
+            incoming = self._others.take(user)
+            self._bytes -= len(incoming.payload)
+            return incoming
         return None
 
+    def _readable(self) -> Iterator[str]:
+        """Yield users whose next message is none that a stop has to be read before, in the order of their turns."""
+        stop = min((self._stops.first(user)[0].number for user in self._stops.users), default=math.inf)
+        for user in self._others.users:
+            incoming = self._others.first(user)
+            if incoming.kind != "goal" or incoming.number < stop:
+                yield user
+
     def _due(self, now: float) -> float:
-        return min((_wait(pace, user, now) for queue, pace in self._lanes for user in queue.users), default=math.inf)
+        stops = (_wait(self._stops_pace, user, now) for user in self._stops.users)
+        others = (_wait(self._others_pace, user, now) for user in self._readable())
+        return min((*stops, *others), default=math.inf)
+
+    def stop_at_door(self, request: StopRequest, answer: Answer) -> None:
+        """Keep a request at the door for stops; safe from any thread."""
+        content = request.content.encode()
+        stop = Incoming("cmd", request.key, len(content), content, "", None, time.monotonic_ns())
+        self._keep(_named(stop._replace(at_door=answer), request.id))
 
     def _on_query(self, kind: Kind, query: zenoh.Query) -> None:
         encoding = str(query.encoding) if query.encoding is not None else ""
-        self._keep(kind, str(query.key_expr), query.payload, encoding, query)
+        incoming = _incoming(kind, str(query.key_expr), query.payload, encoding, query)
+        if _stops(incoming) and query.attachment is not None and len(query.attachment) <= MAX_NAME:
+            incoming = _named(incoming, query.attachment.to_bytes().decode(errors="replace"))
+        self._keep(incoming)
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
-        self._keep("goal", str(sample.key_expr), sample.payload, str(sample.encoding), None)
+        self._keep(_incoming("goal", str(sample.key_expr), sample.payload, str(sample.encoding), None))
 
-    def _keep(
-        self, kind: Kind, key: str, payload: zenoh.ZBytes | None, encoding: str, query: zenoh.Query | None
-    ) -> None:
-        size = len(payload) if payload is not None else 0
-        content = payload.to_bytes() if payload is not None and size <= MAX_MESSAGE else b""
-        incoming = Incoming(kind, key, size, content, encoding, query, time.monotonic_ns())
-        user, room = incoming.user, 2 if kind == "cmd" else 1
-        stops = kind == "cmd" and size == 0 and key.rpartition("/")[2] in _STOPS
+    def _keep(self, incoming: Incoming) -> None:
+        user, size, room = incoming.user, len(incoming.payload), 2 if incoming.kind == "cmd" else 1
         with self._lock:
             self._number += 1
-            unread, own = len(self._stops) + len(self._others), self._stops.of(user) + self._others.of(user)
-            fits = unread < room * UNREAD and own < room * UNREAD_OF_ONE
-            fits = fits and self._bytes + len(content) <= room * MAX_UNREAD
-            if fits:
-                queue = self._stops if stops else self._others
-                queue.put(user, incoming._replace(number=self._number))
-                self._bytes += len(content)
+            incoming = incoming._replace(number=self._number)
+            fits = self._joins(incoming)
+            if not fits:
+                unread, own = len(self._stops) + len(self._others), self._stops.of(user) + self._others.of(user)
+                fits = unread < room * UNREAD and own < room * UNREAD_OF_ONE
+                fits = fits and self._bytes + size <= room * MAX_UNREAD
+                if fits:
+                    self._put(incoming)
         if fits:
             self.wake()
         else:
             self._too_much(incoming._replace(payload=b""))
+
+    def _joins(self, incoming: Incoming) -> bool:
+        """Whether a message goes with the one before it of its user: a stop that asks for the same, and waits."""
+        stops = self._newest.get(incoming.user)
+        if not _stops(incoming) or stops is None or len(stops) >= ALIKE or _asked(stops[0]) != _asked(incoming):
+            return False
+        stops.append(incoming._replace(payload=stops[0].payload))
+        return True
+
+    def _put(self, incoming: Incoming) -> None:
+        self._newest.pop(incoming.user, None)
+        if _stops(incoming):
+            self._newest[incoming.user] = [incoming]
+            self._stops.put(incoming.user, self._newest[incoming.user])
+        else:
+            self._others.put(incoming.user, incoming)
+        self._bytes += len(incoming.payload)
+
+
+def _stops(incoming: Incoming) -> bool:
+    """Whether it stops the robot, whatever it holds."""
+    return incoming.kind == "cmd" and incoming.key.rpartition("/")[2] in STOPS
+
+
+def _named(stop: Incoming, name: str) -> Incoming:
+    """Return a stop with its id, where it is one; what has more content than the door takes has no copy there."""
+    return stop._replace(id=name) if is_id(name) and stop.size <= MAX_LINE else stop
+
+
+def _asked(stop: Incoming) -> tuple[object, ...]:
+    """What is asked for; of what is too large to be kept nobody knows."""
+    known = stop.size == len(stop.payload)
+    return stop.key, stop.payload, stop.encoding, None if known else stop.arrived_ns
+
+
+def _incoming(kind: Kind, key: str, payload: zenoh.ZBytes | None, encoding: str, query: zenoh.Query | None) -> Incoming:
+    size = len(payload) if payload is not None else 0
+    content = payload.to_bytes() if payload is not None and size <= MAX_MESSAGE else b""
+    return Incoming(kind, key, size, content, encoding, query, time.monotonic_ns())
 
 
 def _wait(pace: Pace, user: str, now: float) -> float:

@@ -27,6 +27,7 @@ from trirail.processes.health import Health
 from trirail.processes.measured import Measurements
 from trirail.processes.metrics import ServiceMetrics
 from trirail.telemetry.provenance import software
+from trirail.wire import tls
 from trirail.wire.credentials import Credentials, with_role
 
 PATIENCE: Final = 2.0
@@ -50,7 +51,7 @@ class MetricsServer:
         self._tls: ssl.SSLContext | None = None
         if config.zenoh.tls is not None and metrics_url(config).startswith("https:"):
             folder = Path(config.zenoh.tls.directory)
-            self._tls = _tls(Credentials.read(folder))
+            self._tls = tls.server(Credentials.read(folder))
             self._users = with_role(config.zenoh.users, folder)
 
     def __enter__(self) -> MetricsServer:
@@ -94,7 +95,8 @@ class _Handler(WSGIRequestHandler):
             self.connection.do_handshake()  # here, in a thread of its own and with a timeout
 
     def get_environ(self) -> dict[str, Any]:
-        return super().get_environ() | {USER: _common_name(self.connection)}
+        shown = tls.peer(self.connection) if isinstance(self.connection, ssl.SSLSocket) else ""
+        return super().get_environ() | {USER: shown}
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the name that it has in http.server
         pass
@@ -152,24 +154,6 @@ def _listen(address: str, port: int, tls: ssl.SSLContext | None) -> _Server:
             f"metrics: cannot listen on {address}:{port}: {error.strerror}; "
             "set telemetry.metrics_port to a free port, or to 0 for no metrics"
         ) from error
-
-
-def _tls(credentials: Credentials) -> ssl.SSLContext:
-    """Who connects must show a certificate of the same authority."""
-    authority, certificate, key = credentials.files
-    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=str(authority))
-    context.verify_mode = ssl.CERT_REQUIRED
-    context.load_cert_chain(certificate, key)
-    return context
-
-
-def _common_name(connection: socket.socket) -> str:
-    """In whose name the certificate is that was shown on a connection; "" without one, or where it has no one name."""
-    if not isinstance(connection, ssl.SSLSocket):
-        return ""
-    subject: Any = (connection.getpeercert() or {}).get("subject", ())
-    names = [value for part in subject for key, value in part if key == "commonName"]
-    return names[0] if len(names) == 1 else ""
 
 
 def _say(start: _Start, status: HTTPStatus, content: object) -> Iterable[bytes]:

@@ -18,7 +18,7 @@ import numpy as np
 from trirail.config import Config, corrected_geometry
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.kinematics.geometry import travels
-from trirail.processes.inbox import Incoming
+from trirail.processes.incoming import Incoming
 from trirail.processes.pose_file import PoseFile, state_directory
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Coordinates, Goal, NamedGoal, PoseGoal

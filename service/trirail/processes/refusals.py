@@ -6,7 +6,7 @@ import time
 from collections import Counter, deque
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.inbox import Incoming
+from trirail.processes.incoming import Incoming
 from trirail.processes.replies import Replies
 from trirail.wire.links import PacketLink
 from trirail.wire.messages import ErrorReply
@@ -44,7 +44,7 @@ class Refusals:
     def refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
         """Answer what cannot be taken, and tell everyone."""
         text = quoted(str(refusal))
-        self._replies.send(incoming, ErrorReply(refusal.code, text))
+        self._replies.answer(incoming, ErrorReply(refusal.code, text))
         self.tell(text, incoming.user if is_name(incoming.user) else "")
 
     def tell(self, text: str, user: str = "") -> None:

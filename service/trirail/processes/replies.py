@@ -11,7 +11,8 @@ import msgspec
 import zenoh
 
 from trirail.errors import RefusedError
-from trirail.processes.inbox import Incoming
+from trirail.processes.copies import Copies
+from trirail.processes.incoming import Incoming
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import ErrorReply
 
@@ -26,6 +27,7 @@ class Replies:
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
+        self.copies = Copies()
         self._changed = threading.Condition()
         # Not bounded: a query that is let go says so to its asker, and that may wait as long as an answer.
         self._of: dict[str, deque[tuple[Incoming, msgspec.Struct]]] = {}
@@ -43,7 +45,9 @@ class Replies:
             return sum(map(len, self._of.values()))
 
     def send(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        """Answer a query; nothing for a put."""
+        """Answer a message alone; nothing for a put. Safe from any thread."""
+        if incoming.at_door is not None:
+            incoming.at_door(content)
         if incoming.query is None:
             return
         # Of a command the user decides and not its name: who asks for one thing and does not listen is the same.
@@ -54,6 +58,28 @@ class Replies:
                 self._idle.append(asker)
                 self._changed.notify()
             self._of[asker].append((incoming, content))
+
+    def answer(self, incoming: Incoming, content: msgspec.Struct) -> None:
+        """Answer what was carried out, or refused, and all that were read as one with it, and the copies of each."""
+        for each in (incoming, *incoming.alike):
+            self.send(each, content)
+            for copy in self.copies.answered(each, content):
+                self.send(copy, content)
+
+    def fresh(self, incoming: Incoming) -> Incoming | None:
+        """Return a stop, and those read as one with it, without the copies of others: these get the answer of those.
+
+        Its number is the newest. None where there are but copies.
+        """
+        fresh = []
+        for each in (incoming, *incoming.alike):
+            if self.copies.first(each):
+                fresh.append(each)
+            elif (known := self.copies.known(each)) is not None:
+                self.send(each, known)
+        if not fresh:
+            return None
+        return fresh[0]._replace(number=fresh[-1].number, alike=tuple(fresh[1:]))
 
     def close(self) -> None:
         """Send what waits, for a while at most."""

@@ -14,7 +14,7 @@ from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.backlog import Backlog
 from trirail.processes.guard import Guard
-from trirail.processes.inbox import Incoming
+from trirail.processes.incoming import Incoming
 from trirail.processes.last_words import LastWords
 from trirail.processes.replies import Replies
 from trirail.wire.goals import Goal, TrackGoal
@@ -97,8 +97,11 @@ class Requests:
 
     # ------------------------------------------------------------------ commands
 
-    def command(self, incoming: Incoming, user: str, name: Command, content: msgspec.Struct | None) -> None:
-        """Give a command to the loop. Raises RefusedError where it has too many, or the user's role forbids it."""
+    def command(self, incoming: Incoming, user: str, name: Command, content: msgspec.Struct | None) -> int:
+        """Give a command to the loop; return its ticket.
+
+        Raises RefusedError where it has too many, or the user's role forbids it.
+        """
         if not name.stops:
             self._check_under_way(user)
         request = self._request(user, name, content)
@@ -107,6 +110,7 @@ class Requests:
         self._commands[request.ticket] = user
         within = self._home_within if name is Command.HOME else REPLY_WITHIN
         self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + within)
+        return request.ticket
 
     def _check_under_way(self, user: str) -> None:
         """Raise RefusedError where the loop has as many commands of a user, or of all, as it is to have."""
@@ -139,7 +143,7 @@ class Requests:
         waiting = self._waiting.pop(ticket, None)
         self._commands.pop(ticket, None)
         if waiting is not None:
-            self._replies.send(waiting.incoming, content)
+            self._replies.answer(waiting.incoming, content)
         if self._ahead.pop(ticket, None) is not None:
             self.send_goals()
 

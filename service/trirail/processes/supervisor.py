@@ -18,6 +18,7 @@ from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.processes.child_process import ChildProcess
 from trirail.processes.compiling import Progress
+from trirail.processes.descriptors import raise_limit
 from trirail.processes.health import Running
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
 from trirail.processes.monitor import Monitor
@@ -99,6 +100,7 @@ class Supervisor:
 
         `up` is called once with what each process said when it was ready.
         """
+        raise_limit()
         parent = os.environ.get("XDG_RUNTIME_DIR")
         runtime = tempfile.TemporaryDirectory(prefix="trirail-", dir=parent)
         with runtime as folder, Signals() as signals, self._monitor:

@@ -6,6 +6,7 @@ import socket
 import ssl
 from contextlib import suppress
 
+from trirail.wire import tls
 from trirail.wire.credentials import Credentials
 from trirail.wire.endpoints import ReachableBy, fault_of, reach, socket_file, tcp_address
 from trirail.wire.text import quoted
@@ -52,11 +53,7 @@ def _why_no_tls(opened: socket.socket, host: str, credentials: Credentials, name
 
     from trirail.wire.certificates import common_name
 
-    authority, certificate, key = credentials.files
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.load_verify_locations(authority)
-    context.load_cert_chain(certificate, key)
-    with context.wrap_socket(opened, server_hostname=host) as secured:
+    with tls.client(credentials).wrap_socket(opened, server_hostname=host) as secured:
         shown = common_name(x509.load_der_x509_certificate(secured.getpeercert(binary_form=True) or b""))
         if name not in (None, shown):
             return f"its certificate is in the name of {quoted(shown) or 'nobody'}, not of {name}"

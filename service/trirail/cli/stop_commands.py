@@ -1,0 +1,33 @@
+"""`trirail stop`, `quick-stop`, `disable`: they wait for no session, which a flooded port may not give."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+
+from trirail.cli.options import HERE, Service
+from trirail.cli.robot_commands import confirmed
+from trirail.errors import TrirailError
+from trirail.wire.vocabulary import Command
+
+
+def stopping(name: Command) -> Callable[..., int]:
+    """Return the command of the command line that sends one of trirail.wire.stop_door.STOPS."""
+
+    def stop(*, service: Service = HERE) -> int:
+        from trirail.client.new_stop import NewStop
+
+        asked = NewStop(name, service.robot, service.connect, service.tls)
+        try:
+            reply = asked.wait()
+        except TrirailError:
+            asked.opening.join()
+            raise
+        confirmed(service, name, reply)
+        if asked.opening.is_alive():  # it may take seconds, and the interpreter cannot end beneath Zenoh's code
+            sys.stdout.flush()
+            os._exit(0)
+        return 0
+
+    return stop

@@ -1,0 +1,51 @@
+"""A stop by a program that has no session yet: it does not wait for one, which a flooded port may not give."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from pathlib import Path
+
+from trirail.client.client import address, identity
+from trirail.client.connection import REPLY_WITHIN, Connection
+from trirail.client.stop_call import Outcome, Outcomes, Stop
+from trirail.errors import TrirailError
+from trirail.wire import boundary
+from trirail.wire.credentials import Credentials
+from trirail.wire.messages import CommandReply
+
+
+class NewStop:
+    """A stop, quick_stop or disable: asked for at the door, while a session opens that asks for it too.
+
+    Raises as Robot does.
+    """
+
+    def __init__(
+        self, name: str, robot: str | None = None, connect: str | None = None, tls: Path | str | None = None
+    ) -> None:
+        robot, connect, tls = address(robot, connect, tls)
+        user, credentials = identity(boundary.check_name(robot, "robot"), connect, None, tls)
+        stop = Stop.of(robot, user, name, None, REPLY_WITHIN)
+        self._came: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
+        at_door = stop.at_door(connect, credentials, self._came.put)
+        self._outcomes = Outcomes(1 if at_door is None else 2)
+        self.opening = threading.Thread(target=self._ask, args=(stop, connect, credentials), daemon=True)
+        """Has a session of its own while it lives. Zenoh cannot be told to give up opening one."""
+        self.opening.start()
+
+    def wait(self) -> CommandReply:
+        """Return the first answer. Raises RefusedError for a no, ServiceError where nobody answers."""
+        while (reply := self._outcomes.decide(self._came.get())) is None:
+            pass
+        return reply
+
+    def _ask(self, stop: Stop, connect: str, credentials: Credentials | None) -> None:
+        try:
+            connection = Connection(stop.robot, connect, credentials)
+            try:
+                self._came.put(connection.ask(stop.parts, CommandReply, stop.content, stop.within, stop.id))
+            finally:
+                connection.close()
+        except TrirailError as error:
+            self._came.put(error)

@@ -1,0 +1,184 @@
+"""A stop asked for in two ways at once: at the service's door for stops, and over Zenoh. The first answer counts.
+
+Both copies have one id, by which the service carries them out once. The door is asked by a thread of its own, again
+and again where it lets the caller go unheard, as one under attack may.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import ssl
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import msgspec
+
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
+from trirail.wire import tls, zenoh_session
+from trirail.wire.credentials import Credentials
+from trirail.wire.messages import CommandReply, ErrorReply
+from trirail.wire.stop_door import MAX_LINE, StopAddress, StopAnswer, StopRequest, encode, stop_address
+
+HEARD_WITHIN: Final = 1.0
+"""How long the door may take to let one in before it is tried anew [s]."""
+AGAIN_AFTER: Final = 0.05
+"""Between two tries [s]."""
+
+Outcome = CommandReply | TrirailError
+
+
+class NoDoorError(ServiceError):
+    """Nobody has answered at the door for stops."""
+
+
+class Stop(NamedTuple):
+    """A stop, quick_stop or disable, of which each copy says the same."""
+
+    robot: str
+    user: str
+    name: str
+    content: bytes | None
+    within: float
+    """How long it may take to be carried out [s]."""
+    id: str
+    """By which the service knows the copies for one."""
+
+    @classmethod
+    def of(cls, robot: str, user: str, name: str, content: bytes | None, within: float) -> Stop:
+        """Return one with an id of its own."""
+        return cls(robot, user, name, content, within, uuid.uuid4().hex)
+
+    @property
+    def parts(self) -> tuple[str, str, str]:
+        """Of its key over Zenoh."""
+        return "cmd", self.user, self.name
+
+    def at_door(
+        self, locator: str, credentials: Credentials | None, take: Callable[[Outcome], None]
+    ) -> StopCall | None:
+        """Ask at the door beside a locator, and have the outcome taken; None where there is no door."""
+        address = stop_address(locator)
+        content = (self.content or b"").decode()
+        line = encode(StopRequest(zenoh_session.key(self.robot, *self.parts), self.id, content))
+        if address is None or len(line) > MAX_LINE:
+            return None
+        return StopCall(address, credentials, line, self.within, take)
+
+
+class Outcomes:
+    """What has come of so many copies of a stop, until that decides."""
+
+    def __init__(self, copies: int) -> None:
+        self._copies = copies
+        self._errors: list[TrirailError] = []
+
+    def decide(self, outcome: Outcome) -> CommandReply | None:
+        """Return the reply, None while another copy may have one. Raises RefusedError, ServiceError for what remains.
+
+        That one way is full is no answer of the robot's while the other may not be.
+        """
+        if isinstance(outcome, CommandReply):
+            return outcome
+        if isinstance(outcome, RefusedError) and outcome.code is not RefusalCode.BUSY:
+            raise outcome
+        self._errors.append(outcome)
+        if len(self._errors) < self._copies:
+            return None
+        raise min(self._errors, key=lambda error: (isinstance(error, NoDoorError), isinstance(error, ServiceError)))
+
+
+class StopCall:
+    """A stop at the door beside a locator; `take` gets its outcome, once, from a thread of its own."""
+
+    def __init__(
+        self,
+        address: StopAddress,
+        credentials: Credentials | None,
+        line: bytes,
+        within: float,
+        take: Callable[[Outcome], None],
+    ) -> None:
+        self._address = address
+        self._credentials = credentials
+        self._line = line
+        self._deadline = time.monotonic() + within
+        self._take = take
+        self._cancelled = threading.Event()
+        threading.Thread(target=self._run, name="stop at the door", daemon=True).start()
+
+    def cancel(self) -> None:
+        """Try no more: nobody waits for it."""
+        self._cancelled.set()
+
+    def _run(self) -> None:
+        try:
+            self._take(self._ask())
+        except TrirailError as error:
+            self._take(error)
+
+    def _ask(self) -> CommandReply:
+        """Ask until there is an answer. Raises RefusedError where that is a no, ServiceError where none comes."""
+        secured = tls.client(self._credentials) if self._address.secured and self._credentials is not None else None
+        why: OSError | None = None
+        while (left := self._deadline - time.monotonic()) > 0.0 and not self._cancelled.is_set():
+            try:
+                return self._try(secured, left)
+            except (
+                ConnectionResetError,
+                BrokenPipeError,
+                TimeoutError,
+                ssl.SSLEOFError,
+                ssl.SSLZeroReturnError,
+            ) as error:
+                why = error  # it has let us go before it heard us
+            except OSError as error:
+                raise NoDoorError(f"nobody takes stops at {self._address}: {error}") from error
+            self._cancelled.wait(AGAIN_AFTER)
+        raise NoDoorError(f"no answer from {self._address}: {why}")
+
+    def _try(self, secured: ssl.SSLContext | None, left: float) -> CommandReply:
+        with contextlib.ExitStack() as opened:
+            connection = opened.enter_context(_connect(self._address, HEARD_WITHIN))
+            if secured is not None and not isinstance(self._address.where, str):
+                connection = opened.enter_context(
+                    secured.wrap_socket(connection, server_hostname=self._address.where[0])
+                )
+            connection.sendall(self._line)
+            connection.settimeout(left)
+            heard = b""
+            while not heard.endswith(b"\n") and len(heard) <= MAX_LINE:
+                if not (more := connection.recv(MAX_LINE)):
+                    raise ConnectionResetError("it has closed the connection")
+                heard += more
+        return _read(heard)
+
+
+def _connect(address: StopAddress, within: float) -> socket.socket:
+    if not isinstance(address.where, str):
+        return socket.create_connection(address.where, within)
+    connection = socket.socket(socket.AF_UNIX)
+    try:
+        connection.settimeout(within)
+        connection.connect(address.where)
+    except OSError:
+        connection.close()
+        raise
+    return connection
+
+
+def _read(line: bytes) -> CommandReply:
+    """Return the reply of an answer's line. Raises RefusedError for a refusal, NoDoorError for what is no answer."""
+    try:
+        answer = msgspec.json.decode(line, type=StopAnswer)
+    except (msgspec.MsgspecError, ValueError) as error:
+        raise NoDoorError(f"somebody else answers at the door for stops: {error}") from error
+    if answer.reply is not None:
+        return answer.reply
+    no = answer.error or ErrorReply(RefusalCode.INTERNAL, "an empty answer")
+    if no.code is RefusalCode.UNKNOWN_KEY:
+        raise NoDoorError(f"it is another robot's door for stops: {no.message}")
+    raise RefusedError(no.code, no.message, slider=no.slider, value=no.value, limit=no.limit)

@@ -1,0 +1,251 @@
+"""The door for stops beside Zenoh's endpoints: a thread that does TLS and framing, and nothing that waits for anybody.
+
+Handshakes go on beside each other. Who connects has a share: by his address until he is known, by his name from then
+on; beyond it the oldest of the same share goes, so that whoever comes anew is served whatever the others hold.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import socket
+import ssl
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from enum import Enum, auto
+from functools import partial
+from typing import Final
+
+import msgspec
+
+from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.descriptors import Reserve, limit
+from trirail.processes.stop_addresses import listen, source
+from trirail.wire import tls
+from trirail.wire.messages import CommandReply, ErrorReply
+from trirail.wire.stop_door import MAX_LINE, StopAddress, StopRequest, answer_with
+from trirail.wire.text import quoted
+
+PLACES: Final = 4096
+"""Connections at once, or a quarter of the process's descriptors where that is less; so many are kept for them."""
+ASKED_WITHIN: Final = 10.0
+"""How long one may take to say what it wants [s]: who holds them for nothing opens the more the shorter it is."""
+ANSWERED_WITHIN: Final = 20.0
+"""How long it may wait for its answer, which comes within 15 s [s]."""
+TURN: Final = 0.25
+"""How often it is looked whose time is over [s]."""
+AT_ONCE: Final = 64
+"""So many connections are accepted before those that there are go on."""
+
+Answer = Callable[[CommandReply | ErrorReply], None]
+"""Takes the answer to a request, from any thread."""
+Take = Callable[[str, StopRequest, Answer], None]
+"""Takes a request, and the name in the certificate of who sent it: "" where nobody shows one."""
+
+
+class _Stage(Enum):
+    SILENT = auto()
+    TALKING = auto()
+    KNOWN = auto()
+    WAITING = auto()
+
+
+_SHARES: Final = {_Stage.SILENT: 1 / 2, _Stage.TALKING: 1 / 8, _Stage.KNOWN: 1 / 8, _Stage.WAITING: 1 / 64}
+"""Of the places: connections of one address that have said nothing yet, or shake hands; of one user, before he has said
+what he wants and after."""
+
+
+class _Caller:
+    """A connection."""
+
+    def __init__(self, connection: socket.socket, source: str, now: float) -> None:
+        self.connection = connection
+        self.number = connection.fileno()
+        self.stage, self.share = _Stage.SILENT, source
+        self.since = now
+        self.user = ""
+        self.heard = b""
+        self.shakes_hands = False
+
+
+class StopDoor:
+    """Listens at these addresses until it is closed. Raises ServiceError where one cannot be listened at."""
+
+    def __init__(self, addresses: Iterable[StopAddress], secured: ssl.SSLContext | None, take: Take) -> None:
+        self._secured = secured
+        self._take = take
+        self._callers: dict[int, _Caller] = {}  # by descriptor
+        self._shares: dict[tuple[_Stage, str], dict[_Caller, None]] = {}  # those first that are longest in it
+        self._answers: deque[tuple[_Caller, bytes]] = deque()
+        self._closing = False
+        self._next_look = 0.0
+        self._selector = selectors.DefaultSelector()
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._selector.register(self._wake, selectors.EVENT_READ, self._woken)
+        self._listening = [listening for address in addresses for listening in listen(address)]
+        for listening in self._listening:
+            self._selector.register(listening, selectors.EVENT_READ, partial(self._accept, listening))
+        self._places = min(PLACES, limit() // 4)
+        self._reserve = Reserve(self._places)
+        self._thread = threading.Thread(target=self._run, name="stop door", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End; what is not answered yet gets no answer here."""
+        self._closing = True
+        os.eventfd_write(self._wake, 1)
+        self._thread.join()
+        for listening in self._listening:
+            listening.close()
+        self._selector.close()
+        os.close(self._wake)
+        self._reserve.end()
+
+    def _run(self) -> None:
+        while not self._closing:
+            for key, _ in self._selector.select(TURN if self._callers else None):
+                if isinstance(key.data, _Caller):
+                    self._go_on(key.data)
+                else:
+                    key.data()
+            self._send_answers()
+            self._drop_late()
+        for caller in list(self._callers.values()):
+            self._drop(caller)
+
+    def _woken(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._wake)
+
+    # ------------------------------------------------------------------ who comes, and who has to go
+
+    def _accept(self, listening: socket.socket) -> None:
+        for _ in range(AT_ONCE):
+            if not self._reserve and self._callers:
+                self._drop(next(iter(self._callers.values())))
+            if self._reserve:
+                self._reserve.release()
+            try:
+                connected, address = listening.accept()
+            except BlockingIOError:
+                break
+            except OSError:  # somebody else was faster where descriptors are short, or the caller has gone
+                continue
+            connected.setblocking(False)
+            caller = _Caller(connected, source(connected, address), time.monotonic())
+            self._callers[caller.number] = caller
+            self._shares.setdefault((caller.stage, caller.share), {})[caller] = None
+            self._selector.register(caller.number, selectors.EVENT_READ, caller)
+            self._go_on(caller)  # what it says is often there already
+            self._keep_to_share(caller)
+        self._reserve.refill(len(self._callers))
+
+    def _enter(self, caller: _Caller, stage: _Stage, share: str) -> None:
+        """Let a connection come to its next stage."""
+        self._leave(caller)
+        caller.stage, caller.share = stage, share
+        self._shares.setdefault((stage, share), {})[caller] = None
+        self._keep_to_share(caller)
+
+    def _leave(self, caller: _Caller) -> None:
+        share = self._shares[caller.stage, caller.share]
+        del share[caller]
+        if not share:
+            del self._shares[caller.stage, caller.share]
+
+    def _keep_to_share(self, caller: _Caller) -> None:
+        share = self._shares.get((caller.stage, caller.share), {})
+        if len(share) > self._places * _SHARES[caller.stage]:
+            self._drop(next(iter(share)))
+
+    def _drop(self, caller: _Caller) -> None:
+        """Let a connection go, unless it has gone."""
+        if self._callers.get(caller.number) is not caller:
+            return
+        del self._callers[caller.number]
+        self._leave(caller)
+        self._selector.unregister(caller.number)
+        caller.connection.detach()
+        self._reserve.close(caller.number)
+
+    def _drop_late(self) -> None:
+        now = time.monotonic()
+        if now < self._next_look:
+            return
+        self._next_look = now + TURN
+        for caller in list(self._callers.values()):
+            within = ANSWERED_WITHIN if caller.stage is _Stage.WAITING else ASKED_WITHIN
+            if now - caller.since > within:
+                self._drop(caller)
+
+    # ------------------------------------------------------------------ what one says, and is told
+
+    def _go_on(self, caller: _Caller) -> None:
+        """Take what a connection says."""
+        if self._callers.get(caller.number) is not caller:
+            return
+        try:
+            self._listen_to(caller)
+        except (BlockingIOError, ssl.SSLWantReadError):
+            return
+        except (OSError, ValueError):  # it has gone, has no good certificate, or says what is no TLS
+            self._drop(caller)
+
+    def _listen_to(self, caller: _Caller) -> None:
+        """Go on as far as there is something to read. Raises BlockingIOError or SSLWantReadError where there is not."""
+        if caller.stage is _Stage.SILENT:
+            if not caller.connection.recv(1, socket.MSG_PEEK):
+                raise ConnectionError
+            if self._secured is not None:
+                caller.connection = self._secured.wrap_socket(
+                    caller.connection, server_side=True, do_handshake_on_connect=False
+                )
+                caller.shakes_hands = True
+            self._enter(caller, _Stage.TALKING, caller.share)
+        if caller.shakes_hands and isinstance(caller.connection, ssl.SSLSocket):
+            caller.connection.do_handshake()
+            caller.shakes_hands = False
+            caller.user = tls.peer(caller.connection)
+            self._enter(caller, _Stage.KNOWN, caller.user)
+        while True:
+            heard = caller.connection.recv(MAX_LINE)
+            if not heard or caller.stage is _Stage.WAITING:  # it has gone, or says more than it is asked to
+                raise ConnectionError
+            caller.heard += heard
+            line, ended, _ = caller.heard.partition(b"\n")
+            if ended:
+                self._ask(caller, line)
+            elif len(caller.heard) > MAX_LINE:
+                raise ConnectionError
+
+    def _ask(self, caller: _Caller, line: bytes) -> None:
+        """Pass a request on."""
+        answer = partial(self._answer, caller)
+        try:
+            request = msgspec.json.decode(line, type=StopRequest)
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            answer(ErrorReply(RefusalCode.MALFORMED, quoted(f"not a stop: {error}")))
+            return
+        user = caller.user or request.key.split("/")[3:4]
+        self._enter(caller, _Stage.WAITING, str(user))
+        caller.heard = b""
+        try:
+            self._take(caller.user, request, answer)
+        except RefusedError as refusal:
+            answer(ErrorReply(refusal.code, quoted(str(refusal))))
+
+    def _answer(self, caller: _Caller, content: CommandReply | ErrorReply) -> None:
+        self._answers.append((caller, answer_with(content)))
+        with contextlib.suppress(OSError):  # it is closed
+            os.eventfd_write(self._wake, 1)
+
+    def _send_answers(self) -> None:
+        while self._answers:
+            caller, line = self._answers.popleft()
+            if self._callers.get(caller.number) is caller:
+                with contextlib.suppress(OSError):  # it has gone, or reads nothing: no line is longer than its buffer
+                    caller.connection.send(line)
+                self._drop(caller)
