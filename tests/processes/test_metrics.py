@@ -23,6 +23,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from trirail.config import SIM, Config
 from trirail.errors import ServiceError
+from trirail.processes.crowding import Use
 from trirail.processes.health import NOT_RUNNING, SILENT, Health, Running
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
 from trirail.processes.measured import (
@@ -69,7 +70,7 @@ class Told:
 
     def newest(self) -> ServiceMeasured:
         self.now += 1.0
-        self.meter.tell(self._states.newest)
+        self.meter.tell(self._states.newest, Use(3, 512, 40, 1024), ())
         return self.measured[-1]
 
 
@@ -247,7 +248,11 @@ def test_health_is_red_until_all_are_up_and_says_which(local: tuple[str, Health]
     status, body = get(f"{url}/healthz")
     assert (status, json.loads(body)) == (
         503,
-        {"ok": False, "processes": dict.fromkeys((*PROCESSES, "supervisor"), "ok") | {"planner": "not running"}},
+        {
+            "ok": False,
+            "processes": dict.fromkeys((*PROCESSES, "supervisor"), "ok") | {"planner": "not running"},
+            "warnings": [],
+        },
     )
 
 

@@ -17,6 +17,7 @@ import zenoh
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.commands import Commands
+from trirail.processes.crowding import Crowding
 from trirail.processes.guard import Guard
 from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox
@@ -94,6 +95,10 @@ class Gateway:
         self._commands = Commands(self._robot, self._requests, self._replies, self._states, self._inbox)
         connect = config.zenoh.connect
         self._routers = RouterLinks(connect, partial(guard.linked, opened), guard.why_not_linked, self._tell)
+        known = {*guard.users, config.zenoh.router or ""}
+        self._crowding = Crowding(
+            partial(guard.links, opened), guard.disconnect, known, zenoh_session.SESSIONS, self._tell
+        )
         self._ending = False
         self._publications = Publications(opened, self._robot)
 
@@ -117,6 +122,7 @@ class Gateway:
                 self._requests.send_goals()  # those for which there was no room
                 self._poses.settle()
                 self._routers.look()
+                self._crowding.look()
                 self._requests.give_up_late()
                 self._summarize()
                 self._refusals.tell_of_overruns()
@@ -134,7 +140,7 @@ class Gateway:
 
     def warnings(self) -> tuple[str, ...]:
         """Return what people should know of how the service is run, one line each."""
-        return (*self._guard.warnings(), *self._poses.warnings(), *self._routers.warnings())
+        return (*self._guard.warnings(), *self._poses.warnings(), *self._routers.warnings(), *self._crowding.warnings())
 
     def end(self) -> None:
         """End soon; safe from a signal handler."""
@@ -222,7 +228,7 @@ class Gateway:
         self._poses.measure(rows[-1])
         if self._meter is not None:
             self._meter.records(rows)
-            self._meter.tell(self._states.newest)
+            self._meter.tell(self._states.newest, self._crowding.use, self._crowding.warnings())
         now = self._heard = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import zenoh
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.processes.descriptors import disconnect
 from trirail.processes.stop_door import Answer, StopDoor
 from trirail.wire import tls, zenoh_session
 from trirail.wire.access import COMMANDS, access_control
 from trirail.wire.credentials import Credentials, with_role
 from trirail.wire.dialling import why_not
-from trirail.wire.endpoints import ReachableBy, reach, socket_file
+from trirail.wire.endpoints import ReachableBy, reach, socket_file, tcp_address
 from trirail.wire.stop_door import SUFFIX, StopRequest, command_of, stop_address
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Role
@@ -70,6 +71,14 @@ class Guard:
         for path in filter(None, map(socket_file, self._listen)):
             Path(f"{path}{SUFFIX}").chmod(SOCKET_MODE)
         return door
+
+    def links(self, opened: zenoh.Session) -> dict[str, str | None]:
+        """Return the name in the certificate of each who is connected, by his address; None where he shows none."""
+        return {str(link.dst): link.auth_identifier for link in opened.info.links()}
+
+    def disconnect(self, addresses: Iterable[str]) -> None:
+        """End the sessions of these addresses. Zenoh has no word for it: their connections are shut down."""
+        disconnect(set(filter(None, map(tcp_address, addresses))))
 
     def linked(self, opened: zenoh.Session) -> set[str]:
         """Return to which endpoints of `connect` a session has a link to the router that is obeyed."""

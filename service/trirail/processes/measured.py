@@ -10,6 +10,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from trirail.processes.crowding import Use
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.state import FrameCounts, State
 
@@ -75,6 +76,10 @@ class ServiceMeasured(Struct, frozen=True):
     goals: dict[str, int]
     """How many ended, by outcome."""
     faults: tuple[FaultCount, ...]
+    use: Use
+    """Of what there is an end to."""
+    warnings: tuple[str, ...]
+    """What is nearly used up."""
 
 
 class RecorderMeasured(Struct, frozen=True):
@@ -139,7 +144,7 @@ class Meter:
                 fault = OTHER
             self._faults[fault] = self._faults.get(fault, 0) + 1
 
-    def tell(self, newest: Callable[[], State]) -> None:
+    def tell(self, newest: Callable[[], State], use: Use, warnings: tuple[str, ...]) -> None:
         """Tell all of it, where that is due."""
         now = self._clock()
         if now < self._due:
@@ -160,5 +165,7 @@ class Meter:
                 settle=self._settle,
                 goals=self._goals,
                 faults=tuple(FaultCount(fault, times) for fault, times in self._faults.items()),
+                use=use,
+                warnings=warnings,
             )
         )

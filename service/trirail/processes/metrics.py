@@ -12,6 +12,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 from trirail_drivers.interface import NAMES
 
+from trirail.processes.crowding import Use
 from trirail.processes.health import Health, Running
 from trirail.processes.measured import Histogram, Measurements, ServiceMeasured
 from trirail.wire.vocabulary import MODES
@@ -42,6 +43,7 @@ class ServiceMetrics(Collector):
             yield from _loop(service)
             yield from _goals(service)
             yield from _can(service)
+            yield from _use(service.use)
         if (recorder := self._measured.recorder) is not None:
             lost = _counter("recorder_lost_batches", "Batches that are missing, by where they should be.", ["sink"])
             lost.add_metric(["file"], recorder.lost)
@@ -105,6 +107,16 @@ def _can(service: ServiceMeasured) -> Iterator[Metric]:
         for kind in FRAMES:
             frames.add_metric([drive, kind], getattr(counts, kind))
     yield frames
+
+
+def _use(use: Use) -> Iterator[Metric]:
+    used = _gauge("gateway_used", "What is in use of what the gateway has so many of.", ["what"])
+    most = _gauge("gateway_most", "How many of it there are.", ["what"])
+    used.add_metric(["sessions"], use.sessions)
+    most.add_metric(["sessions"], use.sessions_most)
+    used.add_metric(["descriptors"], use.descriptors)
+    most.add_metric(["descriptors"], use.descriptors_most)
+    yield from (used, most)
 
 
 def _gauge(name: str, words: str, labels: list[str]) -> GaugeMetricFamily:

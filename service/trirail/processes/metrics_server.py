@@ -45,6 +45,7 @@ class MetricsServer:
         telemetry = config.telemetry
         self._address = telemetry.metrics_address, telemetry.metrics_port
         self._health = health
+        self._measured = measured
         registry = CollectorRegistry(auto_describe=False)
         registry.register(ServiceMetrics(config.robot.name, software().trirail, health, measured))
         self._metrics = make_wsgi_app(registry)
@@ -78,7 +79,9 @@ class MetricsServer:
                 fit = not any(troubles.values())
                 status = HTTPStatus.OK if fit else HTTPStatus.SERVICE_UNAVAILABLE
                 processes = {name: trouble or "ok" for name, trouble in troubles.items()}
-                return _say(start, status, {"ok": fit, "processes": processes})
+                service = self._measured.service
+                warnings = service.warnings if service is not None else ()
+                return _say(start, status, {"ok": fit, "processes": processes, "warnings": warnings})
         return _say(start, HTTPStatus.NOT_FOUND, {"error": "there are /metrics and /healthz"})
 
 

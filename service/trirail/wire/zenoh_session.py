@@ -16,7 +16,7 @@ from trirail.wire.endpoints import leads_to
 from trirail.wire.sizes import MAX_TRANSPORT
 
 DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
-SESSIONS = 256
+SESSIONS = 512
 """Clients that may be connected to a service at once; a router is one."""
 GIVEN_UP_AFTER = 2.0
 """Whoever takes nothing that must not be dropped, an answer or past events, is disconnected after so long [s]."""
