@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -32,8 +34,17 @@ def tls_config(folder: Path) -> Config:
     put(folder, "early", by, issue(by, "ann", 9.0, now=datetime.now(UTC) + timedelta(days=2)))
     put(folder, "foreign", by, issue(authority("demo"), "ann", 100.0))
     users = ROLES | {"gone": Role.OPERATOR}
-    zenoh = Zenoh(listen=(f"tls/127.0.0.1:{free_port()}",), tls=Tls(str(keys.folder)), users=users)
+    zenoh = Zenoh(listen=(f"tls/127.0.0.1:{service_port()}",), tls=Tls(str(keys.folder)), users=users)
     return msgspec.structs.replace(CONFIG, zenoh=zenoh)
+
+
+def service_port() -> int:
+    """Return a port of the loopback that nobody listens on, nor on the one after it, which takes stops."""
+    while True:
+        port = free_port()
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port + 1))
+            return port
 
 
 def user(folder: Path, name: str) -> Path:

@@ -61,6 +61,8 @@ BOUNDS = (
     Bound("Commands under way, of one user and of all", ("trirail.processes.requests:UNDER_WAY commands",
           "trirail.processes.requests:UNDER_WAY_OF_ALL commands"), "refused, `busy`, but for what stops the robot"),
     Bound("Zenoh sessions", ("trirail.wire.zenoh_session:SESSIONS sessions",), "not opened"),
+    Bound("Connections to the door for stops", ("trirail.processes.stop_door:PLACES connections",),
+          "the oldest of the address, or of the user, goes"),
     Bound("Wait of a goal for those before it", ("trirail.processes.backlog:PATIENCE s",),
           "refused, `stopped`; a goal may have its own, `valid_for`: `expired`"),
     Bound("Renewal of a jog", (), "the robot brakes, `jog_over`"),

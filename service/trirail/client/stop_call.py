@@ -108,7 +108,12 @@ class StopCall:
         self._deadline = time.monotonic() + within
         self._take = take
         self._cancelled = threading.Event()
-        threading.Thread(target=self._run, name="stop at the door", daemon=True).start()
+        self._thread = threading.Thread(target=self._run, name="stop at the door", daemon=True)
+        self._thread.start()
+
+    def join(self) -> None:
+        """Wait until its outcome has been taken."""
+        self._thread.join()
 
     def cancel(self) -> None:
         """Try no more: nobody waits for it."""

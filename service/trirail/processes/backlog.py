@@ -95,7 +95,8 @@ class Backlog:
 
     def withdraw_all(self, reason: str, before: int) -> None:
         """Withdraw every goal that came before a message, those as well that are read after it."""
-        self._stop = before, reason
+        if before >= self._stop[0]:  # one that came earlier may be read later
+            self._stop = before, reason
         self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.incoming.number < before else goal)
 
     def withdraw_others(self, user: str | None, reason: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import msgspec
 
 from trirail.errors import RefusalCode, RefusedError
@@ -18,19 +20,28 @@ from trirail.wire.vocabulary import Command
 
 
 class Commands:
-    """Reads commands and has them carried out. Raises RefusedError for those that are not."""
+    """Reads commands and has them carried out; `refuse` answers those that are not."""
 
-    def __init__(self, robot: str, requests: Requests, replies: Replies, states: StateMaker, inbox: Inbox) -> None:
+    def __init__(
+        self,
+        robot: str,
+        requests: Requests,
+        replies: Replies,
+        states: StateMaker,
+        inbox: Inbox,
+        refuse: Callable[[Incoming, RefusedError], None],
+    ) -> None:
         self._prefix = zenoh_session.key(robot, "cmd")
         self._requests = requests
         self._replies = replies
         self._states = states
         self._inbox = inbox
+        self._refuse = refuse
         self._of_unread: set[int] = set()
         """Tickets of stops of one goal before which others had come that were not read yet: that goal for one."""
 
     def take(self, incoming: Incoming) -> None:
-        """Have a command carried out, unless it is a copy of one that is or was."""
+        """Have a command carried out, unless it is a copy of one that is, or was. Raises RefusedError for none."""
         user, called = boundary.names(incoming.key, self._prefix, ("user", "command"))
         try:
             name = Command(called)
@@ -41,14 +52,20 @@ class Commands:
         if fresh is None:
             return
         try:
-            content = fresh.content(CONTENT.get(name, NoContent | None), f"{name} takes {name.content}")
+            self._read(fresh, user, name)
+        except RefusedError as refusal:
+            self._refuse(fresh, refusal)
+
+    def _read(self, incoming: Incoming, user: str, name: Command) -> None:
+        try:
+            content = incoming.content(CONTENT.get(name, NoContent | None), f"{name} takes {name.content}")
         except RefusedError as refusal:
             if name not in STOPS:
                 raise
             # Whoever says stop, however badly, wants it to stop: it is carried out as if it had no content.
-            self._carry_out(fresh.unanswered(), user, name, None)
+            self._carry_out(incoming.unanswered(), user, name, None)
             raise RefusedError(refusal.code, f"{refusal}; the robot is told to {name} all the same") from refusal
-        self._carry_out(fresh, user, name, content)
+        self._carry_out(incoming, user, name, content)
 
     def refused(self, ticket: int, error: ErrorReply) -> CommandReply | ErrorReply:
         """Return the answer to a command that the loop refuses.

@@ -92,7 +92,9 @@ class Gateway:
         self._inbox = Inbox(opened, self._robot, self._refusals.too_much)
         self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._tell, self._inbox.wake)
         self._requests = Requests(config, link, guard, self._replies, self._last_words)
-        self._commands = Commands(self._robot, self._requests, self._replies, self._states, self._inbox)
+        self._commands = Commands(
+            self._robot, self._requests, self._replies, self._states, self._inbox, self._refusals.refuse
+        )
         connect = config.zenoh.connect
         self._routers = RouterLinks(connect, partial(guard.linked, opened), guard.why_not_linked, self._tell)
         known = {*guard.users, config.zenoh.router or ""}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 LIKE = "an endpoint is protocol/address, as tcp/127.0.0.1:7447"
 _WITH_PORT = frozenset({"tcp", "tls", "udp", "quic", "ws"})
-_LAST_PORT = 65535
+LAST_PORT = 65535
 _HOST = re.compile(
     r"(?=.{1,253}$)[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?)*"
 )
@@ -41,8 +41,8 @@ def fault_of(endpoint: str) -> str:
         return f"the host is missing: {LIKE}"
     if ":" in host and not (host.startswith("[") and host.endswith("]")):
         return f"an IPv6 address is in brackets, and the port behind them, as {protocol}/[::1]:7447"
-    if not (port.isascii() and port.isdigit() and len(port) <= len(str(_LAST_PORT)) and 1 <= int(port) <= _LAST_PORT):
-        return f"its port must be 1 to {_LAST_PORT}: {LIKE}"
+    if not (port.isascii() and port.isdigit() and len(port) <= len(str(LAST_PORT)) and 1 <= int(port) <= LAST_PORT):
+        return f"its port must be 1 to {LAST_PORT}: {LIKE}"
     return ""
 
 

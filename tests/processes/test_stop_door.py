@@ -1,0 +1,298 @@
+"""The door for stops among callers of every kind: who is heard, who is refused, and that nobody uses it up."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import resource
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+from certificates import service_port, tls_config, user
+from conftest import CONFIG
+from trirail.client.stop_call import NoDoorError, Outcome, Stop, StopCall
+from trirail.config import Config, Zenoh
+from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.processes import stop_door
+from trirail.processes.descriptors import Reserve
+from trirail.processes.guard import Guard
+from trirail.processes.stop_door import Answer, StopDoor
+from trirail.wire import tls
+from trirail.wire.credentials import Credentials
+from trirail.wire.messages import CommandReply
+from trirail.wire.stop_door import MAX_LINE, STOPS, StopRequest, stop_address
+from trirail.wire.vocabulary import Command
+
+DONE = CommandReply("stop", "holding")
+PLACES = 64
+WITHIN = 10.0
+
+
+class Asked:
+    """What passed the door; each is answered as it is told to be."""
+
+    def __init__(self) -> None:
+        self.requests: list[StopRequest] = []
+        self.held: list[Answer] | None = None
+
+    def __call__(self, request: StopRequest, answer: Answer) -> None:
+        self.requests.append(request)
+        if self.held is None:
+            answer(DONE)
+        else:
+            self.held.append(answer)
+
+
+@pytest.fixture(autouse=True)
+def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stop_door, "PLACES", PLACES)
+
+
+Opened = tuple[str, Asked]
+Does = Callable[[socket.socket, int], None]
+
+
+def opened(config: Config) -> Iterator[Opened]:
+    asked = Asked()
+    door = Guard(config).stop_door(asked)
+    try:
+        yield config.zenoh.listen[0], asked
+    finally:
+        door.close()
+
+
+@pytest.fixture(params=["tcp", "unixsock-stream"])
+def plain(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Opened]:
+    where = f"127.0.0.1:{service_port()}" if request.param == "tcp" else f"{tmp_path}/z"
+    yield from opened(msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=(f"{request.param}/{where}",))))
+
+
+@pytest.fixture
+def secured(tmp_path: Path) -> Iterator[Opened]:
+    yield from opened(tls_config(tmp_path))
+
+
+def call(
+    locator: str, name: str = "stop", user: str = "ann", shown: Path | None = None, content: bytes = b"", **of: str
+) -> Outcome:
+    """Ask once as a client does, and wait for what comes of it."""
+    came: list[Outcome] = []
+    stop = Stop.of(of.get("robot", "demo"), user, name, content, WITHIN)
+    credentials = None if shown is None else Credentials.read(shown)
+    calling = stop.at_door(locator, credentials, came.append)
+    assert calling is not None
+    calling.join()
+    return came[0]
+
+
+def connected(locator: str) -> socket.socket:
+    """Connect to the door and say nothing."""
+    address = stop_address(locator)
+    assert address is not None
+    if not isinstance(address.where, str):
+        return socket.create_connection(address.where, WITHIN)
+    connection = socket.socket(socket.AF_UNIX)
+    connection.settimeout(WITHIN)
+    connection.connect(address.where)
+    return connection
+
+
+@pytest.mark.parametrize("name", sorted(STOPS))
+def test_a_stop_is_passed_on_with_key_id_and_content_and_answered(plain: Opened, name: str) -> None:
+    locator, asked = plain
+    assert call(locator, name, content=b'{"odd": 1') == DONE
+    (request,) = asked.requests
+    assert (request.key, request.content) == (f"trirail/demo/cmd/ann/{name}", '{"odd": 1')
+    assert request.id
+
+
+@pytest.mark.parametrize("name", sorted(set(Command) - STOPS))
+def test_nothing_else_is_taken_there(plain: Opened, name: str) -> None:
+    locator, asked = plain
+    refused = call(locator, name)
+    assert isinstance(refused, RefusedError)
+    assert refused.code is RefusalCode.UNKNOWN_COMMAND
+    assert asked.requests == []
+
+
+def test_another_robots_door_is_none(plain: Opened) -> None:
+    locator, asked = plain
+    assert isinstance(call(locator, robot="other"), NoDoorError)
+    assert asked.requests == []
+
+
+@pytest.mark.parametrize(
+    "line", [b"\n", b"{}\n", b"x" * (MAX_LINE + 1), b"[" * 3000 + b"\n", b'{"key": "a"}\n', b"\xff\n"]
+)
+def test_junk_is_refused_or_let_go_and_the_next_is_heard(plain: Opened, line: bytes) -> None:
+    locator, asked = plain
+    with connected(locator) as junk:
+        with contextlib.suppress(OSError):
+            junk.sendall(line)
+        with contextlib.suppress(OSError):
+            assert b"reply" not in junk.recv(MAX_LINE)
+    assert call(locator) == DONE
+    assert len(asked.requests) == 1
+
+
+def silent(connection: socket.socket, number: int) -> None:
+    """Say nothing."""
+
+
+def half(connection: socket.socket, number: int) -> None:
+    """Say the beginning of a request, or of a handshake."""
+    with contextlib.suppress(OSError):
+        connection.sendall(b'{"key"' if number % 2 else b"\x16\x03\x01\x02\x00\x01")
+
+
+def hold(held: contextlib.ExitStack, locator: str, does: Does, shown: Path | None = None) -> None:
+    """Hold many more connections than there are places, and be heard in between."""
+    for number in range(3 * PLACES):
+        does(held.enter_context(connected(locator)), number)
+        if not number % PLACES:
+            assert call(locator, shown=shown) == DONE
+    assert call(locator, shown=shown) == DONE
+
+
+@pytest.mark.parametrize("does", [silent, half])
+def test_whoever_comes_anew_is_heard_whatever_others_hold(plain: Opened, does: Does) -> None:
+    locator, asked = plain
+    with contextlib.ExitStack() as held:
+        hold(held, locator, does)
+    assert len(asked.requests) == 4
+
+
+@pytest.mark.parametrize("does", [silent, half])
+def test_and_so_is_whoever_has_a_certificate(secured: Opened, tmp_path: Path, does: Does) -> None:
+    locator, asked = secured
+    with contextlib.ExitStack() as held:
+        hold(held, locator, does, user(tmp_path, "ann"))
+    assert len(asked.requests) == 4
+
+
+@pytest.mark.parametrize("name", ["gone", "eva"])
+def test_sessions_of_another_certificate_that_say_nothing_keep_nobody_out(
+    secured: Opened, tmp_path: Path, name: str
+) -> None:
+    locator, _ = secured
+    context = tls.client(Credentials.read(user(tmp_path, name)))
+    with contextlib.ExitStack() as held:
+
+        def shake_hands(connection: socket.socket, _: int) -> None:
+            held.enter_context(context.wrap_socket(connection, server_hostname="127.0.0.1"))
+
+        hold(held, locator, shake_hands, user(tmp_path, "ann"))
+
+
+def test_who_waits_for_his_answer_is_not_pushed_out_by_others(secured: Opened, tmp_path: Path) -> None:
+    locator, asked = secured
+    asked.held = []
+    came: list[Outcome] = []
+    stop = Stop.of("demo", "ann", "stop", None, WITHIN)
+    waiting = stop.at_door(locator, Credentials.read(user(tmp_path, "ann")), came.append)
+    assert isinstance(waiting, StopCall)
+    with contextlib.ExitStack() as held:
+        for _ in range(3 * PLACES):
+            held.enter_context(connected(locator))
+        eva = [
+            stop.at_door(locator, Credentials.read(user(tmp_path, "eva")), came.append)
+            for stop in (Stop.of("demo", "eva", "stop", None, WITHIN) for _ in range(4))
+        ]
+        while len({request.id for request in asked.requests}) < 5:
+            assert not came
+        while asked.held:
+            asked.held.pop()(DONE)
+        waiting.join()
+        for calling in eva:
+            assert calling is not None
+            calling.cancel()
+    assert DONE in came
+
+
+@pytest.mark.parametrize(
+    ("name", "command", "code"),
+    [
+        ("ann", "stop", None),
+        ("ann", "quick_stop", None),
+        ("max", "disable", None),
+        ("eva", "stop", None),
+        ("eva", "quick_stop", RefusalCode.NOT_ALLOWED),
+        ("eva", "disable", RefusalCode.NOT_ALLOWED),
+        ("una", "stop", RefusalCode.NOT_ALLOWED),
+        ("gone", "stop", RefusalCode.NOT_ALLOWED),
+    ],
+)
+def test_it_is_for_the_roles_that_may(
+    secured: Opened, tmp_path: Path, name: str, command: str, code: RefusalCode | None
+) -> None:
+    locator, asked = secured
+    outcome = call(locator, command, user=name, shown=user(tmp_path, name))
+    assert len(asked.requests) == (code is None)
+    assert (outcome.code if isinstance(outcome, RefusedError) else None) is code
+
+
+def test_nobody_asks_in_anothers_name_or_with_a_certificate_that_is_no_good(secured: Opened, tmp_path: Path) -> None:
+    locator, asked = secured
+    refused = call(locator, user="ann", shown=user(tmp_path, "max"))
+    assert isinstance(refused, RefusedError)
+    assert refused.code is RefusalCode.NOT_ALLOWED
+    address = stop_address(locator)
+    assert address is not None
+    unseen = [
+        Credentials(user(tmp_path, name), name, Credentials.read(user(tmp_path, "ann")).expires, ())
+        for name in ("foreign", "late")
+    ]
+    for credentials in unseen:
+        came: list[Outcome] = []
+        calling = Stop.of("demo", "ann", "stop", None, 1.0).at_door(locator, credentials, came.append)
+        assert calling is not None
+        calling.join()
+        assert isinstance(came[0], ServiceError)
+    assert asked.requests == []
+
+
+def test_a_robot_whose_descriptors_are_used_up_hears_it_all_the_same(plain: Opened) -> None:
+    locator, asked = plain
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    client = socket.socket(socket.AF_UNIX if locator.startswith("unix") else socket.AF_INET)
+    address = stop_address(locator)
+    assert address is not None
+    taken: list[socket.socket] = []
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
+        with pytest.raises(OSError, match="Too many open files"):
+            taken.extend(socket.socket() for _ in itertools.count())
+        client.settimeout(WITHIN)
+        client.connect(address.where)
+        client.sendall(msgspec.json.encode(StopRequest("trirail/demo/cmd/ann/stop", "s-1")) + b"\n")
+        assert b'"holding"' in client.recv(MAX_LINE)
+    finally:
+        for one in (*taken, client):
+            one.close()
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert [request.id for request in asked.requests] == ["s-1"]
+
+
+def test_what_is_released_of_a_reserve_is_kept_again(tmp_path: Path) -> None:
+    reserve = Reserve(3)
+    reserve.release()
+    assert len(reserve) == 2
+    opened = os.open(tmp_path / "file", os.O_CREAT | os.O_WRONLY)
+    reserve.close(opened)
+    assert len(reserve) == 3
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.write(opened, b"x")  # it is that of the null device now, for reading
+    reserve.end()
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(opened)
+
+
+def test_an_address_that_is_taken_is_told_with_the_remedy(plain: Opened) -> None:
+    locator, _ = plain
+    if locator.startswith("tcp"):
+        with pytest.raises(ServiceError, match=r"cannot listen for stops at \S+:\d+.*set zenoh.listen to another"):
+            StopDoor([stop_address(locator)], None, lambda *_: None)  # type: ignore[list-item]

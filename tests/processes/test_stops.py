@@ -1,0 +1,233 @@
+"""Stops among everything else that comes, in sequences of every kind: who is answered, and which goals begin."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import zenoh
+from conftest import CONFIG
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.errors import RefusalCode
+from trirail.processes.copies import REMEMBERED, Copies
+from trirail.processes.gateway import Gateway
+from trirail.processes.guard import Guard
+from trirail.processes.inbox import ALIKE
+from trirail.processes.incoming import Incoming
+from trirail.wire import packets, zenoh_session
+from trirail.wire.messages import CommandReply, ErrorReply
+from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused
+from trirail.wire.records import DTYPE
+from trirail.wire.stop_door import STOPS
+
+USERS = ("ann", "bob")
+CONTENTS = (b"", b"{}", b'{"goal": "bob-1"}', b"no JSON")
+
+
+class Goal(NamedTuple):
+    """What a user sends; its id is his name and the place among his goals."""
+
+    user: str
+
+
+class StopSent(NamedTuple):
+    """A stop; with `copy` it has an id, and comes again with the next of the same copy."""
+
+    user: str
+    name: str
+    content: bytes
+    copy: str
+
+
+class Read(NamedTuple):
+    """The gateway reads so many."""
+
+    at_most: int
+
+
+goals = st.builds(Goal, st.sampled_from(USERS))
+stops = st.builds(
+    StopSent,
+    st.sampled_from(USERS),
+    st.sampled_from(sorted(STOPS)),
+    st.sampled_from(CONTENTS),
+    st.sampled_from(["", "", "a", "b"]),
+)
+sequences = st.lists(goals | stops | stops | st.builds(Read, st.integers(1, 4)), max_size=40)
+
+
+class Played:
+    """A gateway that is sent a sequence, before a loop that does at once what it is told."""
+
+    def __init__(self, opened: zenoh.Session, sequence: list[Goal | StopSent | Read]) -> None:
+        self.sent: list[GoalRequest | CommandRequest] = []
+        self.answers: dict[int, list[object]] = {}
+        """Of each message, by its number."""
+        self.messages: dict[int, Goal | StopSent] = {}
+        self.goals: dict[str, int] = {}
+        """The number of each goal, by id."""
+        self._packets: list[bytes] = []
+        self._gateway = Gateway(CONFIG, self, lambda: None, opened, Guard(CONFIG))  # type: ignore[arg-type]
+        self._gateway._states.records(np.zeros(1, DTYPE))
+        number, of = itertools.count(1), Counter[str]()
+        for step in (*sequence, Read(1000)):
+            if isinstance(step, Read):
+                self._read(step.at_most)
+            else:
+                self._keep(next(number), step, of)
+        self._gateway._replies.close()
+
+    def send(self, packet: bytes) -> bool:
+        request = packets.decode_request(packet[1:])
+        if isinstance(request, GoalRequest):
+            self._packets.append(packets.message(Accepted(request.ticket, request.id, 1.0, 1.0, False, False)))
+        elif isinstance(request, CommandRequest):
+            under_way = request.goal is None or any(
+                isinstance(each, GoalRequest) and each.id == request.goal for each in self.sent
+            )
+            no = Refused(request.ticket, RefusalCode.NO_GOAL, "not under way")
+            self._packets.append(
+                packets.message(Confirmed(request.ticket, request.name, "holding") if under_way else no)
+            )
+        else:
+            return True
+        self.sent.append(request)
+        return True
+
+    def _keep(self, number: int, step: Goal | StopSent, of: Counter[str]) -> None:
+        self.messages[number] = step
+        self.answers[number] = []
+        if isinstance(step, Goal):
+            of[step.user] += 1
+            name = f"{step.user}-{of[step.user]}"
+            self.goals[name] = number
+            content = json.dumps({"kind": "pose", "x": 0, "y": 0, "phi": 0, "id": name}).encode()
+            key, copy = f"trirail/demo/goal/{step.user}", ""
+        else:
+            content, key, copy = step.content, f"trirail/demo/cmd/{step.user}/{step.name}", step.copy
+        kind = "goal" if isinstance(step, Goal) else "cmd"
+        incoming = Incoming(kind, key, len(content), content, "", None, time.monotonic_ns())  # type: ignore[arg-type]
+        self._gateway._inbox._keep(incoming._replace(id=copy, at_door=self.answers[number].append))
+
+    def _read(self, at_most: int) -> None:
+        for incoming in self._gateway._inbox.take(at_most):
+            self._gateway._handle(incoming)
+            while self._packets:
+                self._gateway._hear(self._packets.pop(0), lambda: None)
+
+    def acted(self) -> list[int]:
+        """The numbers of the stops but for copies of earlier ones."""
+        seen, first = set(), []
+        for number, message in self.messages.items():
+            if isinstance(message, StopSent):
+                if not message.copy or message not in seen:
+                    first.append(number)
+                seen.add(message)
+        return first
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zenoh.Session]:
+    folder: Path = tmp_path_factory.mktemp("z")
+    with zenoh_session.open_service([f"unixsock-stream/{folder}/z"]) as session:
+        yield session
+
+
+@given(sequence=sequences)
+def test_each_message_is_answered_once_and_numbers_decide_which_goals_begin(
+    opened: zenoh.Session, sequence: list[Goal | StopSent | Read]
+) -> None:
+    played = Played(opened, sequence)
+    assert all(len(answers) == 1 for answers in played.answers.values()), played.answers
+    acted = played.acted()
+    commands = [each for each in played.sent if isinstance(each, CommandRequest)]
+    assert len(commands) <= len(acted)
+    # What begins after a stop had been passed on was sent after it; what was sent after every stop begins.
+    of_all = [n for n in acted if played.messages[n].content != CONTENTS[2] or played.messages[n].name != "stop"]  # type: ignore[union-attr]
+    for place, sent in enumerate(played.sent):
+        if isinstance(sent, GoalRequest) and sent.withdrawn is None:
+            before = sum(isinstance(each, CommandRequest) and each.goal is None for each in played.sent[:place])
+            later = sum(number > played.goals[sent.id] for number in of_all)
+            assert before <= len(of_all) - later
+    one = {"bob-1"} if len(acted) > len(of_all) else set()
+    for sent in played.sent:
+        if isinstance(sent, GoalRequest) and played.goals[sent.id] > max(acted, default=0):
+            assert sent.withdrawn is None
+        if isinstance(sent, GoalRequest) and sent.withdrawn is not None and sent.id not in one:
+            assert any(number > played.goals[sent.id] for number in of_all)
+
+
+@given(sequence=st.lists(stops, max_size=40))
+def test_only_what_is_alike_and_came_one_behind_the_other_is_carried_out_as_one(
+    opened: zenoh.Session, sequence: list[StopSent]
+) -> None:
+    alone = [step._replace(copy="") for step in sequence]
+    played = Played(opened, list(alone))
+    for user in USERS:
+        runs = [(key, len(list(same))) for key, same in itertools.groupby(step for step in alone if step.user == user)]
+        names = [name for (_, name, _, _), length in runs for _ in range(-(-length // ALIKE))]
+        assert [each.name for each in played.sent if isinstance(each, CommandRequest) and each.user == user] == names
+
+
+def test_a_late_copy_stops_nothing_and_has_the_answer_of_the_first(opened: zenoh.Session) -> None:
+    stop = StopSent("ann", "stop", b"", "a")
+    played = Played(opened, [Goal("bob"), stop, Read(9), Goal("bob"), stop, Goal("ann"), Read(9), stop])
+    assert [
+        (each.name if isinstance(each, CommandRequest) else each.id, getattr(each, "withdrawn", None))
+        for each in played.sent
+    ] == [
+        ("stop", None),
+        ("bob-1", "stop by ann"),
+        ("bob-2", None),
+        ("ann-1", None),
+    ]
+    assert played.answers[2] == played.answers[4] == played.answers[6] == [CommandReply("stop", "holding")]
+
+
+def test_a_goal_that_was_not_read_when_it_alone_was_stopped_does_not_begin(opened: zenoh.Session) -> None:
+    played = Played(
+        opened, [Goal("bob"), Goal("ann"), StopSent("ann", "stop", b'{"goal": "bob-1"}', ""), Read(9), Goal("bob")]
+    )
+    passed = {each.id: each.withdrawn for each in played.sent if isinstance(each, GoalRequest)}
+    assert passed == {"bob-1": "stop by ann", "ann-1": None, "bob-2": None}
+    assert isinstance(played.answers[3][0], CommandReply)
+
+
+def test_one_that_cannot_be_read_is_carried_out_first_and_refused(opened: zenoh.Session) -> None:
+    played = Played(
+        opened, [Goal("bob"), StopSent("ann", "stop", b"no JSON", "a"), StopSent("ann", "stop", b"no JSON", "a")]
+    )
+    assert [type(each) for each in played.sent] == [CommandRequest, GoalRequest]
+    for number in (2, 3):
+        (answer,) = played.answers[number]
+        assert isinstance(answer, ErrorReply)
+        assert answer.code is RefusalCode.MALFORMED
+
+
+def stop(name: str, number: int = 1) -> Incoming:
+    return Incoming("cmd", "trirail/demo/cmd/ann/stop", 0, b"", "", None, 0, number, name)
+
+
+def test_a_copy_of_what_was_refused_for_want_of_room_is_carried_out() -> None:
+    copies = Copies()
+    assert copies.first(stop("a"))
+    assert copies.answered(stop("a"), ErrorReply(RefusalCode.BUSY, "send fewer")) == []
+    assert copies.first(stop("a"))
+
+
+def test_copies_are_forgotten_when_nobody_waits_for_them_any_more() -> None:
+    now = 0.0
+    copies = Copies(lambda: now)
+    assert copies.first(stop("a"))
+    assert not copies.first(stop("a"))
+    now = REMEMBERED
+    assert copies.first(stop("b"))
+    assert copies.first(stop("a"))
