@@ -23,7 +23,7 @@ from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.stop_door import MAX_LINE, StopAddress, StopAnswer, StopRequest, encode, stop_address
 
-HEARD_WITHIN: Final = 1.0
+HEARD_WITHIN: Final = 2.0
 """How long the door may take to let one in before it is tried anew [s]."""
 AGAIN_AFTER: Final = 0.05
 """Between two tries [s]."""

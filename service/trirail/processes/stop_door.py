@@ -40,6 +40,9 @@ TURN: Final = 0.25
 AT_ONCE: Final = 64
 """So many connections are accepted before those that there are go on."""
 
+IN_TURN: Final = 16
+"""So many connections go on before it is looked again who has come: a step of a handshake takes a millisecond."""
+
 Answer = Callable[[CommandReply | ErrorReply], None]
 """Takes the answer to a request, from any thread."""
 Take = Callable[[str, StopRequest, Answer], None]
@@ -106,11 +109,15 @@ class StopDoor:
 
     def _run(self) -> None:
         while not self._closing:
-            for key, _ in self._selector.select(TURN if self._callers else None):
-                if isinstance(key.data, _Caller):
-                    self._go_on(key.data)
-                else:
-                    key.data()
+            ready = [key.data for key, _ in self._selector.select(TURN if self._callers else None)]
+            for woken in ready:
+                if not isinstance(woken, _Caller):
+                    woken()
+            callers = [each for each in ready if isinstance(each, _Caller)]
+            # Of hundreds that shake hands at once those first that are nearest to their end, and have come last.
+            callers.sort(key=lambda caller: (caller.stage.value, caller.since), reverse=True)
+            for caller in callers[:IN_TURN]:
+                self._go_on(caller)
             self._send_answers()
             self._drop_late()
         for caller in list(self._callers.values()):
