@@ -23,7 +23,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from trirail.config import SIM, Config
 from trirail.errors import ServiceError
-from trirail.processes.crowding import Use
+from trirail.processes.crowding import InUse
 from trirail.processes.health import NOT_RUNNING, SILENT, Health, Running
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
 from trirail.processes.measured import (
@@ -70,7 +70,7 @@ class Told:
 
     def newest(self) -> ServiceMeasured:
         self.now += 1.0
-        self.meter.tell(self._states.newest, Use(3, 512, 40, 1024), ())
+        self.meter.tell(self._states.newest, InUse(3, 512, 40, 1024), ())
         return self.measured[-1]
 
 

@@ -12,7 +12,7 @@ import msgspec
 import zenoh
 
 from trirail.client.connection import REPLY_WITHIN, ROLE_WITHIN, Connection, SilenceError, once
-from trirail.client.stop_call import Outcome, Stop
+from trirail.client.stop_call import Outcome, StopOrder
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply, Event, RoleReply
@@ -76,7 +76,7 @@ class AsyncConnection:
     async def stop(self, user: str, name: str, content: bytes | None, within: float) -> CommandReply:
         """Ask for a stop, quick_stop or disable, as Connection.stop does."""
         came: asyncio.Queue[Outcome] = asyncio.Queue()
-        stop = Stop.of(self._connection.robot, user, name, content, within)
+        stop = StopOrder.of(self._connection.robot, user, name, content, within)
         with self._connection.copies(stop, self._hand_over(came.put_nowait)) as outcomes:
             try:
                 while (reply := outcomes.decide(await came.get())) is None:

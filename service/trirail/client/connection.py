@@ -13,7 +13,7 @@ import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.samples import SampleReader
-from trirail.client.stop_call import Outcome, Outcomes, Stop
+from trirail.client.stop_call import Outcome, Outcomes, StopOrder
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import least_role
@@ -114,7 +114,7 @@ class Connection:
         Raises as `ask`.
         """
         came: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
-        with self.copies(Stop.of(self.robot, user, name, content, within), came.put) as outcomes:
+        with self.copies(StopOrder.of(self.robot, user, name, content, within), came.put) as outcomes:
             try:
                 while (reply := outcomes.decide(came.get())) is None:
                     pass
@@ -123,7 +123,7 @@ class Connection:
         return reply
 
     @contextlib.contextmanager
-    def copies(self, stop: Stop, take: Callable[[Outcome], None]) -> Iterator[Outcomes]:
+    def copies(self, stop: StopOrder, take: Callable[[Outcome], None]) -> Iterator[Outcomes]:
         """Send all copies of a stop, and have what comes of each taken, by whatever thread; until the context ends."""
         at_door = stop.at_door(self._connect, self._credentials, take)
         try:

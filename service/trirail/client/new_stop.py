@@ -8,8 +8,8 @@ from pathlib import Path
 
 from trirail.client.client import address, identity
 from trirail.client.connection import REPLY_WITHIN, Connection
-from trirail.client.stop_call import Outcome, Outcomes, Stop
-from trirail.errors import TrirailError
+from trirail.client.stop_call import Outcome, Outcomes, StopOrder
+from trirail.errors import ServiceError, TrirailError
 from trirail.wire import boundary
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply
@@ -26,7 +26,7 @@ class NewStop:
     ) -> None:
         robot, connect, tls = address(robot, connect, tls)
         user, credentials = identity(boundary.check_name(robot, "robot"), connect, None, tls)
-        stop = Stop.of(robot, user, name, None, REPLY_WITHIN)
+        stop = StopOrder.of(robot, user, name, None, REPLY_WITHIN)
         self._came: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
         at_door = stop.at_door(connect, credentials, self._came.put)
         self._outcomes = Outcomes(1 if at_door is None else 2)
@@ -40,7 +40,7 @@ class NewStop:
             pass
         return reply
 
-    def _ask(self, stop: Stop, connect: str, credentials: Credentials | None) -> None:
+    def _ask(self, stop: StopOrder, connect: str, credentials: Credentials | None) -> None:
         try:
             connection = Connection(stop.robot, connect, credentials)
             try:
@@ -49,3 +49,5 @@ class NewStop:
                 connection.close()
         except TrirailError as error:
             self._came.put(error)
+        except Exception as error:  # noqa: BLE001 - whoever waits gets an outcome, whatever it is
+            self._came.put(ServiceError(f"no session at {connect}: {error!r}"))

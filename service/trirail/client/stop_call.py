@@ -35,7 +35,7 @@ class NoDoorError(ServiceError):
     """Nobody has answered at the door for stops."""
 
 
-class Stop(NamedTuple):
+class StopOrder(NamedTuple):
     """A stop, quick_stop or disable, of which each copy says the same."""
 
     robot: str
@@ -48,7 +48,7 @@ class Stop(NamedTuple):
     """By which the service knows the copies for one."""
 
     @classmethod
-    def of(cls, robot: str, user: str, name: str, content: bytes | None, within: float) -> Stop:
+    def of(cls, robot: str, user: str, name: str, content: bytes | None, within: float) -> StopOrder:
         """Return one with an id of its own."""
         return cls(robot, user, name, content, within, uuid.uuid4().hex)
 
@@ -124,6 +124,8 @@ class StopCall:
             self._take(self._ask())
         except TrirailError as error:
             self._take(error)
+        except Exception as error:  # noqa: BLE001 - whoever waits gets an outcome, whatever it is
+            self._take(NoDoorError(f"cannot ask at {self._address}: {error!r}"))
 
     def _ask(self) -> CommandReply:
         """Ask until there is an answer. Raises RefusedError where that is a no, ServiceError where none comes."""

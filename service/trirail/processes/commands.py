@@ -1,4 +1,4 @@
-"""Commands as they come to the gateway: what stops the robot is carried out even where it cannot be read."""
+"""CommandReader as they come to the gateway: what stops the robot is carried out even where it cannot be read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command
 
 
-class Commands:
+class CommandReader:
     """Reads commands and has them carried out; `refuse` answers those that are not."""
 
     def __init__(

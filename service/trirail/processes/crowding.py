@@ -24,7 +24,7 @@ EACH: Final = 8
 """So many sessions of a user are never ended."""
 
 
-class Use(NamedTuple):
+class InUse(NamedTuple):
     """What is in use, and of how many."""
 
     sessions: int
@@ -68,7 +68,7 @@ class Crowding:
         self._seen: dict[str, None] = {}
         self._warnings: dict[str, str] = {}
         self._due = 0.0
-        self.use = Use(0, most, 0, descriptors.limit())
+        self.use = InUse(0, most, 0, descriptors.limit())
         """As it was looked last."""
 
     def warnings(self) -> tuple[str, ...]:
@@ -83,7 +83,7 @@ class Crowding:
         self._due = now + LOOK_EVERY
         links = self._links()
         self._seen = {at: None for at in (*self._seen, *links) if at in links}
-        self.use = Use(len(links), self._most, descriptors.used(), descriptors.limit())
+        self.use = InUse(len(links), self._most, descriptors.used(), descriptors.limit())
         named = {at: name for at in self._seen if (name := links[at]) is not None}
         if ending := surplus(named, self._users, self._most):
             self._end(ending)

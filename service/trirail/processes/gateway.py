@@ -16,7 +16,7 @@ import zenoh
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.commands import Commands
+from trirail.processes.commands import CommandReader
 from trirail.processes.crowding import Crowding
 from trirail.processes.guard import Guard
 from trirail.processes.heartbeats import BEAT_EVERY
@@ -92,7 +92,7 @@ class Gateway:
         self._inbox = Inbox(opened, self._robot, self._refusals.too_much)
         self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._tell, self._inbox.wake)
         self._requests = Requests(config, link, guard, self._replies, self._last_words)
-        self._commands = Commands(
+        self._commands = CommandReader(
             self._robot, self._requests, self._replies, self._states, self._inbox, self._refusals.refuse
         )
         connect = config.zenoh.connect

@@ -96,7 +96,8 @@ class Guard:
         """Raise RefusedError where a user's role does not allow what is asked."""
         role = self.role(user)
         if role is None or not role.includes(needed):
-            problem = f"the role of {user} at {self._robot} is {role or 'none'}: {what} needs {needed}"
+            his = f"is a {role}" if role is not None else "has no role"
+            problem = f"{user} {his} at {self._robot}: {what} needs {needed}"
             raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
 
     def warnings(self) -> tuple[str, ...]:

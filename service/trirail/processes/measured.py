@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from trirail.processes.crowding import Use
+from trirail.processes.crowding import InUse
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.state import FrameCounts, State
 
@@ -76,7 +76,7 @@ class ServiceMeasured(Struct, frozen=True):
     goals: dict[str, int]
     """How many ended, by outcome."""
     faults: tuple[FaultCount, ...]
-    use: Use
+    use: InUse
     """Of what there is an end to."""
     warnings: tuple[str, ...]
     """What is nearly used up."""
@@ -144,7 +144,7 @@ class Meter:
                 fault = OTHER
             self._faults[fault] = self._faults.get(fault, 0) + 1
 
-    def tell(self, newest: Callable[[], State], use: Use, warnings: tuple[str, ...]) -> None:
+    def tell(self, newest: Callable[[], State], use: InUse, warnings: tuple[str, ...]) -> None:
         """Tell all of it, where that is due."""
         now = self._clock()
         if now < self._due:

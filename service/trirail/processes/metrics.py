@@ -12,7 +12,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 from trirail_drivers.interface import NAMES
 
-from trirail.processes.crowding import Use
+from trirail.processes.crowding import InUse
 from trirail.processes.health import Health, Running
 from trirail.processes.measured import Histogram, Measurements, ServiceMeasured
 from trirail.wire.vocabulary import MODES
@@ -109,7 +109,7 @@ def _can(service: ServiceMeasured) -> Iterator[Metric]:
     yield frames
 
 
-def _use(use: Use) -> Iterator[Metric]:
+def _use(use: InUse) -> Iterator[Metric]:
     used = _gauge("gateway_used", "What is in use of what the gateway has so many of.", ["what"])
     most = _gauge("gateway_most", "How many of it there are.", ["what"])
     used.add_metric(["sessions"], use.sessions)
