@@ -105,18 +105,20 @@ class Progress:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._seen: tuple[object, float, int] = None, 0.0, 0
+        self._seen: tuple[object, float, float, int] = None, 0.0, 0.0, 0
 
     def look(self, cycle: int) -> None:
-        control, (goal, best, since) = self._session.control, self._seen
+        control, (goal, ends, best, since) = self._session.control, self._seen
         under_way, (now, _) = control.ledger.goal, control.schedule.progress
-        waits = control.override == 0.0 or control.state.paused or len(control.schedule.runs) != 1
-        if under_way is not goal or waits or under_way is None or under_way.renewed is not None or now >= 1.0:
-            self._seen = under_way, now, cycle
+        runs = control.schedule.runs
+        end = runs[0].course.end if runs else 0.0  # another one where a goal is to blend with it, or is no more
+        waits = control.override == 0.0 or control.state.paused or len(runs) != 1 or now >= 1.0
+        if waits or under_way is not goal or under_way is None or under_way.renewed is not None or end != ends:
+            self._seen = under_way, end, now, cycle
             return
         assert now >= best - 1e-9, (cycle, under_way.id, best, now)
         if now > best + 1e-4:
-            self._seen = goal, now, cycle
+            self._seen = goal, end, now, cycle
         else:
             assert cycle - since < WINDOW, (cycle, under_way.id, now)
 
