@@ -13,6 +13,7 @@ from trirail.cli.key_folder import AUTHORITY_KEY, KeyFolder
 from trirail.config import Config, Tls, Zenoh
 from trirail.telemetry.sinks import free_port
 from trirail.wire.certificates import Pair, authority, issue
+from trirail.wire.stop_door import stop_address
 from trirail.wire.vocabulary import Role
 
 ROLES = {"eva": Role.VIEWER, "ann": Role.OPERATOR, "max": Role.MAINTAINER}
@@ -39,11 +40,12 @@ def tls_config(folder: Path) -> Config:
 
 
 def service_port() -> int:
-    """Return a port of the loopback that nobody listens on, nor on the one after it, which takes stops."""
+    """Return a port of the loopback that nobody listens on, nor on the one that takes stops."""
     while True:
         port = free_port()
+        door = stop_address(f"tcp/127.0.0.1:{port}")
         with socket.socket() as probe, contextlib.suppress(OSError):
-            probe.bind(("127.0.0.1", port + 1))
+            probe.bind(door.where if door is not None else ("127.0.0.1", port))
             return port
 
 

@@ -19,7 +19,7 @@ from trirail.motion.feasibility import Look
 from trirail.motion.paths import Path
 from trirail.motion.planning import MotionPlanner, revision
 from trirail.motion.runs import nominal
-from trirail.motion.time_scaling import SHARES, TimeScaling
+from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, GoalRequest, PlannerLost, Refused
 from trirail.wire.planning import (
@@ -444,7 +444,7 @@ def test_at_a_slow_rate_an_answer_has_two_cycles_to_come_in() -> None:
     rig.bus.shutdown()
 
 
-def test_a_goal_waits_for_a_change_of_rate_for_one_try_of_each_share_and_no_longer(rig: Rig, meddler: Meddler) -> None:
+def test_a_goal_waits_for_a_change_of_rate_for_a_dozen_cycles_and_no_longer(rig: Rig, meddler: Meddler) -> None:
     """To find out how fast the rest of the longest path can be taken needs more than that."""
     rig.send("g1", wave(MAX_POINTS, 1.2))
     rig.cycles(100)
@@ -452,7 +452,7 @@ def test_a_goal_waits_for_a_change_of_rate_for_one_try_of_each_share_and_no_long
     rig.order("override", 2.0)
     rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
     change = rig.control._planner._change
-    rig.cycles(len(SHARES) - 3)
+    rig.cycles(9)
     assert not meddler.asked
     rig.cycles(3)
     assert len(meddler.asked) == 1

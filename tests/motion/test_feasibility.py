@@ -76,10 +76,10 @@ def test_where_a_path_leaves_the_workspace_is_said_to_the_moment(share: float) -
 
 
 @pytest.mark.parametrize(
-    ("seconds", "moments"), [(0.01, 16), (0.32, 16), (0.5, 25), (1.0, 50), (1.28, 64), (1.5, 64), (500.0, 64)]
+    ("seconds", "moments"), [(0.01, 16), (0.08, 16), (0.125, 25), (0.25, 50), (0.32, 64), (0.4, 64), (500.0, 64)]
 )
 def test_how_often_a_path_is_looked_at(monkeypatch: pytest.MonkeyPatch, seconds: float, moments: int) -> None:
-    """Beside its knots: every 20 ms, sixteen times at least and sixty-four times at most."""
+    """Beside its knots: every 5 ms, sixteen times at least and sixty-four times at most."""
     asked: list[int] = []
 
     def noted(*arguments: Any) -> float:

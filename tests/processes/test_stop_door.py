@@ -20,7 +20,7 @@ from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.processes import stop_door
 from trirail.processes.descriptors import Reserve
 from trirail.processes.guard import Guard
-from trirail.processes.stop_door import Answer, StopDoor
+from trirail.processes.stop_door import Answer
 from trirail.wire import tls
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply
@@ -291,8 +291,35 @@ def test_what_is_released_of_a_reserve_is_kept_again(tmp_path: Path) -> None:
         os.fstat(opened)
 
 
-def test_an_address_that_is_taken_is_told_with_the_remedy(plain: Opened) -> None:
-    locator, _ = plain
-    if locator.startswith("tcp"):
-        with pytest.raises(ServiceError, match=r"cannot listen for stops at \S+:\d+.*set zenoh.listen to another"):
-            StopDoor([stop_address(locator)], None, lambda *_: None)  # type: ignore[list-item]
+def test_an_address_that_is_taken_is_told_with_the_remedy_and_the_service_goes_on() -> None:
+    port = service_port()
+    config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=(f"tcp/127.0.0.1:{port}",)))
+    address = stop_address(config.zenoh.listen[0])
+    assert address is not None
+    assert not isinstance(address.where, str)
+    guard = Guard(config)
+    with socket.create_server(address.where):
+        door = guard.stop_door(lambda *_: None)
+        assert any(f"no door for stops at {address}" in warning for warning in guard.warnings())
+        door.close()
+    guard.stop_door(lambda *_: None).close()
+    assert not any("no door" in warning for warning in guard.warnings())
+
+
+def test_a_port_that_the_configuration_needs_for_more_is_not_taken() -> None:
+    port = service_port()
+    listen = (f"tcp/127.0.0.1:{port}",)
+    address = stop_address(listen[0])
+    assert address is not None
+    telemetry = msgspec.structs.replace(CONFIG.telemetry, live_port=int(address.where[1]))
+    guard = Guard(msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=listen), telemetry=telemetry))
+    door = guard.stop_door(lambda *_: None)
+    assert any("where [telemetry] listens" in warning for warning in guard.warnings())
+    door.close()
+
+
+@pytest.mark.parametrize(("port", "door"), [(1, 1001), (7447, 8447), (64535, 65535), (64536, 63536), (65535, 64535)])
+def test_where_the_door_is(port: int, door: int) -> None:
+    address = stop_address(f"tls/robot.example:{port}")
+    assert address is not None
+    assert address == (("robot.example", door), True)

@@ -15,8 +15,7 @@ from trirail.config.as_built import AsBuilt
 from trirail.config.tables import BASE, PLATFORM, Config, Limits, Zenoh, corrected_geometry, geometry, room
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry, gains, singular_angles, travels
-from trirail.wire.endpoints import LAST_PORT, ReachableBy, fault_of, reach, same_port, tcp_address
-from trirail.wire.stop_door import stop_address
+from trirail.wire.endpoints import ReachableBy, fault_of, reach, same_port, tcp_address
 from trirail.wire.text import QUANTITY_RULE, is_quantity
 
 
@@ -165,11 +164,6 @@ def _check_ports(config: Config) -> None:
     telemetry = config.telemetry
     addresses = [(f"zenoh.listen[{index}]", tcp_address(at)) for index, at in enumerate(config.zenoh.listen)]
     addresses += [
-        (f"zenoh.listen[{index}], for stops", door.where)
-        for index, at in enumerate(config.zenoh.listen)
-        if (door := stop_address(at)) is not None and not isinstance(door.where, str)
-    ]
-    addresses += [
         ("telemetry.live_port", ("127.0.0.1", telemetry.live_port)),
         ("telemetry.metrics_port", (telemetry.metrics_address, telemetry.metrics_port)),
     ]
@@ -191,12 +185,6 @@ def check_reach(zenoh: Zenoh) -> None:
         raise ConfigError("zenoh.users: without [zenoh.tls] nobody's name is known: add it, or leave users out")
     named = [(f"listen[{index}]", endpoint) for index, endpoint in enumerate(zenoh.listen)]
     named += [(f"connect[{index}]", endpoint) for index, endpoint in enumerate(zenoh.connect)]
-    for index, endpoint in enumerate(zenoh.listen):
-        address = tcp_address(endpoint) if not fault_of(endpoint) else None
-        if address is not None and address[1] == LAST_PORT:
-            raise ConfigError(
-                f"zenoh.listen[{index}] = {endpoint!r}: the port after it takes stops, so it must be lower"
-            )
     for name, endpoint in named:
         key, by = f"zenoh.{name} = {endpoint!r}", reach(endpoint)
         if fault := fault_of(endpoint):

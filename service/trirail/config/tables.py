@@ -188,8 +188,8 @@ class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
 
     listen: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=64)] = ("tcp/127.0.0.1:7447",)
     """Zenoh locators at which clients find the service: tcp on the loopback for every user of this machine,
-    unixsock-stream for those whom the socket's file lets, tls with [zenoh.tls] for the network. Beside each, at
-    the next port or PATH.stop, the service takes stops alone."""
+    unixsock-stream for those whom the socket's file lets, tls with [zenoh.tls] for the network. At a port
+    1000 higher, or PATH.stop, the service takes stops alone."""
     connect: Annotated[tuple[Name, ...], Meta(max_length=8)] = ()
     """Zenoh locators of routers that the service dials, again and again while they are gone: users reach it there."""
     router: UserName | None = None

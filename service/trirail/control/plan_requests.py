@@ -25,7 +25,7 @@ from trirail.motion.rate_change import RateChange
 from trirail.motion.runs import STILL, MotionState, Run, nominal, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import planned_limits
-from trirail.motion.time_scaling import SHARES, TimeScaling
+from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.goals import PlannedGoal, TrackGoal
 from trirail.wire.planning import Extended, NotPlanned, PlanAnswer, Planned, PlanRequest
 
@@ -35,8 +35,8 @@ LEAST_LEAD = 2
 """And in cycles: an answer comes in the next one at the earliest."""
 PATIENCE = 0.5
 """How long the planner may say nothing [s]."""
-ROUND = len(SHARES)
-"""Cycles that a change of rate has for itself before a goal is planned all the same: one try of every share."""
+ROUND = 12
+"""Cycles that a change of rate has for itself before a goal is planned all the same."""
 ROUNDING = (1e-9, 1e-7, 1e-5)
 """By so much may a motion begin beside the one commanded, in position, velocity and acceleration [m, rad, …]."""
 

@@ -10,18 +10,19 @@ import zenoh
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.processes.descriptors import disconnect
+from trirail.processes.stop_addresses import SOCKET_MODE
 from trirail.processes.stop_door import Answer, StopDoor
 from trirail.wire import tls, zenoh_session
 from trirail.wire.access import COMMANDS, access_control
 from trirail.wire.credentials import Credentials, with_role
 from trirail.wire.dialling import why_not
-from trirail.wire.endpoints import ReachableBy, reach, socket_file, tcp_address
-from trirail.wire.stop_door import SUFFIX, StopRequest, command_of, stop_address
+from trirail.wire.endpoints import ReachableBy, reach, same_port, socket_file, tcp_address
+from trirail.wire.stop_door import StopRequest, command_of, stop_address
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Role
 
-SOCKET_MODE = 0o660
-"""Of a Unix socket: its owner and its group may connect, which takes the right to write; nobody else."""
+_NO_DOOR = "no door for stops at"
+_MEANS = "who floods the service's other ports keeps new stops out; end what is there, or move zenoh.listen"
 
 
 class Guard:
@@ -34,6 +35,9 @@ class Guard:
         self.users: dict[str, Role] = {}
         """The role of each user who has one."""
         self._gone: list[str] = []
+        telemetry = config.telemetry
+        self._others = (("127.0.0.1", telemetry.live_port), (telemetry.metrics_address, telemetry.metrics_port))
+        self._without_door: list[str] = []
         if config.zenoh.tls is not None:
             folder = Path(config.zenoh.tls.directory)
             self._credentials = Credentials.read_server(folder)
@@ -57,7 +61,7 @@ class Guard:
         return opened
 
     def stop_door(self, take: Callable[[StopRequest, Answer], None]) -> StopDoor:
-        """Open the door for stops beside each endpoint. Raises ServiceError where an address cannot be listened on."""
+        """Open the door for stops beside each endpoint; `warnings` tells where none can be."""
 
         def ask(shown: str, request: StopRequest, answer: Answer) -> None:
             user, command = command_of(request, self._robot)
@@ -67,9 +71,16 @@ class Guard:
             take(request, answer)
 
         secured = None if self._credentials is None else tls.server(self._credentials)
-        door = StopDoor(filter(None, map(stop_address, self._listen)), secured, ask)
-        for path in filter(None, map(socket_file, self._listen)):
-            Path(f"{path}{SUFFIX}").chmod(SOCKET_MODE)
+        door, self._without_door = StopDoor(secured, ask), []
+        for address in filter(None, map(stop_address, self._listen)):
+            if not isinstance(address.where, str) and any(same_port(address.where, at) for at in self._others):
+                self._without_door.append(f"{_NO_DOOR} {address}, where [telemetry] listens: {_MEANS}")
+                continue
+            try:
+                door.listen(address)
+            except OSError as error:
+                self._without_door.append(f"{_NO_DOOR} {address} ({(error.strerror or str(error)).lower()}): {_MEANS}")
+        door.start()
         return door
 
     def links(self, opened: zenoh.Session) -> dict[str, str | None]:
@@ -107,7 +118,7 @@ class Guard:
             for endpoint in (*self._listen, *self._connect)
             if reach(endpoint) is ReachableBy.NETWORK
         ]
-        return (*insecure, *self.certificate_warnings())
+        return (*insecure, *self._without_door, *self.certificate_warnings())
 
     def certificate_warnings(self) -> tuple[str, ...]:
         """Return which certificate expires soon, and who is revoked though a role is given to him."""

@@ -7,12 +7,14 @@ import struct
 from pathlib import Path
 from typing import Any
 
-from trirail.errors import ServiceError
 from trirail.wire.stop_door import StopAddress
+
+SOCKET_MODE = 0o660
+"""Of a Unix socket: its owner and its group may connect, which takes the right to write; nobody else."""
 
 
 def listen(address: StopAddress) -> list[socket.socket]:
-    """Listen at every address that a host's name stands for. Raises ServiceError where that cannot be."""
+    """Listen at every address that a host's name stands for. Raises OSError where that cannot be."""
     if isinstance(address.where, str):
         Path(address.where).unlink(missing_ok=True)  # of a gateway that was killed: Zenoh's own lock is ours by now
         places: list[tuple[socket.AddressFamily, Any]] = [(socket.AF_UNIX, address.where)]
@@ -27,15 +29,14 @@ def listen(address: StopAddress) -> list[socket.socket]:
             listening.append(opened)
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             opened.bind(where)
+            if isinstance(where, str):
+                Path(where).chmod(SOCKET_MODE)
             opened.listen(socket.SOMAXCONN)
             opened.setblocking(False)
-    except OSError as error:
+    except OSError:
         for opened in listening:
             opened.close()
-        raise ServiceError(
-            f"cannot listen for stops at {address}, beside zenoh.listen: {(error.strerror or str(error)).lower()}; "
-            "another service may hold it: end that, or set zenoh.listen to another address"
-        ) from error
+        raise
     return listening
 
 

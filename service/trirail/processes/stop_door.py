@@ -14,7 +14,7 @@ import ssl
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from enum import Enum, auto
 from functools import partial
 from typing import Final
@@ -75,9 +75,9 @@ class _Caller:
 
 
 class StopDoor:
-    """Listens at these addresses until it is closed. Raises ServiceError where one cannot be listened at."""
+    """Takes stops at addresses, from `start` until it is closed."""
 
-    def __init__(self, addresses: Iterable[StopAddress], secured: ssl.SSLContext | None, take: Take) -> None:
+    def __init__(self, secured: ssl.SSLContext | None, take: Take) -> None:
         self._secured = secured
         self._take = take
         self._callers: dict[int, _Caller] = {}  # by descriptor
@@ -88,12 +88,19 @@ class StopDoor:
         self._selector = selectors.DefaultSelector()
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._selector.register(self._wake, selectors.EVENT_READ, self._woken)
-        self._listening = [listening for address in addresses for listening in listen(address)]
-        for listening in self._listening:
-            self._selector.register(listening, selectors.EVENT_READ, partial(self._accept, listening))
+        self._listening: list[socket.socket] = []
         self._places = min(PLACES, limit() // 4)
         self._reserve = Reserve(self._places)
         self._thread = threading.Thread(target=self._run, name="stop door", daemon=True)
+
+    def listen(self, address: StopAddress) -> None:
+        """Listen at an address, before the start. Raises OSError where that cannot be."""
+        for listening in listen(address):
+            self._listening.append(listening)
+            self._selector.register(listening, selectors.EVENT_READ, partial(self._accept, listening))
+
+    def start(self) -> None:
+        """Begin to take what is asked."""
         self._thread.start()
 
     def close(self) -> None:

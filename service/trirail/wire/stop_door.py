@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
-from trirail.wire.endpoints import ReachableBy, reach, socket_file, tcp_address
+from trirail.wire.endpoints import LAST_PORT, ReachableBy, reach, socket_file, tcp_address
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.vocabulary import Command
 
@@ -20,6 +20,8 @@ STOPS = frozenset(name for name in Command if name.stops and name.everybodys)
 """What is taken there: what brings the robot to rest, whoever has the lease."""
 MAX_LINE = 4096
 """A request or an answer [bytes]."""
+FARTHER = 1000
+"""Its port is so many more than that of the endpoint, or less where there are none: the next may be another robot's."""
 SUFFIX = ".stop"
 """Of the socket's file, behind that of Zenoh's."""
 
@@ -55,7 +57,7 @@ class StopAddress(NamedTuple):
 
 
 def stop_address(endpoint: str) -> StopAddress | None:
-    """Return where the door is that belongs to an endpoint: at the next port, or the file beside a socket's.
+    """Return where the door is that belongs to an endpoint: a port FARTHER, or the file beside a socket's.
 
     None where there is none: of protocols but tcp, tls and unixsock-stream.
     """
@@ -65,7 +67,8 @@ def stop_address(endpoint: str) -> StopAddress | None:
     if address is None or endpoint.startswith("ws/"):
         return None
     host, port = address
-    return StopAddress((host, port + 1), secured=reach(endpoint) is ReachableBy.CERTIFICATE)
+    door = port + FARTHER if port + FARTHER <= LAST_PORT else port - FARTHER
+    return StopAddress((host, door), secured=reach(endpoint) is ReachableBy.CERTIFICATE)
 
 
 def command_of(request: StopRequest, robot: str) -> tuple[str, Command]:
