@@ -48,6 +48,11 @@ class DriveTimeout(DriveError):
 class ConfigurationRefused(DriveError):
     """A drive did not take a value: what was read back differs from what was written."""
 
-    def __init__(self, drive: str, name: str, index: int, subindex: int, wanted: object, found: object) -> None:
-        super().__init__(f"drive {drive}: object {index:04X}:{subindex:02X} ({name}): wanted {wanted}, found {found}")
+    def __init__(
+        self, drive: str, name: str, index: int, subindex: int, wanted: object, found: object, seconds: float
+    ) -> None:
+        super().__init__(
+            f"drive {drive}: object {index:04X}:{subindex:02X} ({name}): wanted {wanted}, found {found} "
+            f"after {seconds:.3g} s"
+        )
         self.drive = drive

@@ -173,7 +173,8 @@ class TestConfigure:
 
     def test_mode_that_is_not_taken_up(self, new: Rig) -> None:
         new.devices[0].objects.on_write(0x6060, lambda entry, old: None)
-        with pytest.raises(ConfigurationRefused, match=r"6061:00 .*wanted 8, found 0"):
+        new.devices[0].objects[0x6061, 0].value = 3
+        with pytest.raises(ConfigurationRefused, match=r"6061:00 .*wanted 8, found 3 after 0\.01\d* s"):
             new.drives.configure(PERIOD)
 
     def test_refused_write_tells_the_drives_reason(self, new: Rig) -> None:

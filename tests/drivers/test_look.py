@@ -64,11 +64,9 @@ class Rig(DriverRig[SimulatedDrive, Cia402]):
 
     def look(self) -> str:
         """Why a look refuses drive A; "" where it does not."""
-        scale = scale_of("A", self.config.A)
-        try:
-            return setup.look(self.bus, "A", self.config, scale, STEP, self.clock, FASTEST).refused
-        except DriveError as error:
-            return str(error)
+        scales = tuple(scale_of(name, drive) for name, drive in zip("ABC", self.config.each, strict=True))
+        found = setup.look(self.bus, self.config, scales, STEP, self.clock, FASTEST)[0]
+        return str(found) if isinstance(found, DriveError) else found.refused
 
     def set_up(self) -> str:
         """Why the set-up refuses; "" where it does not."""

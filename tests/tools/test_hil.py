@@ -20,6 +20,7 @@ from trirail_drivers.cia402 import setup
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.driver.scaling import scale_of
+from trirail_drivers.errors import DriveError
 
 
 def test_the_newest_kernel_with_the_cards_driver_is_taken(tmp_path: Path) -> None:
@@ -74,7 +75,7 @@ def test_the_foreign_drive_says_its_units_and_what_it_lacks() -> None:
     """On a bus of this process: the driver's own thread is this one, the drive's another."""
     counts, turns = hil_second.COUNTS, hil_second.REVOLUTIONS
     a, b, c = (Drive(node=node, counts_per_metre=counts, revolutions_per_metre=turns) for node in (1, 2, 3))
-    drives = Drives("cia402", a, b, c)
+    drives = Drives("cia402", a, b, c, sdo_timeout=0.2)  # A and B, which are not there, are waited for
     ends = [can.Bus("hil", interface="virtual") for _ in range(2)]
     said: list[str] = []
     over = threading.Event()
@@ -84,7 +85,9 @@ def test_the_foreign_drive_says_its_units_and_what_it_lacks() -> None:
     )
     thread.start()
     try:
-        looked = setup.look(ends[0], "C", drives, scale_of("C", drives.C), 0.1, time.monotonic)
+        scales = scale_of("A", a), scale_of("B", b), scale_of("C", c)
+        *_, looked = setup.look(ends[0], drives, scales, 0.1, time.monotonic)
+        assert not isinstance(looked, DriveError), looked
         assert looked.lacking == ("1006",)
         assert looked.units.velocity_name == "rev/min"
     finally:

@@ -7,6 +7,7 @@ import math
 from trirail_drivers.cia402 import frames, ways
 from trirail_drivers.cia402.codes import words
 from trirail_drivers.cia402.second_node import AnswersPerSync
+from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
@@ -55,6 +56,7 @@ class Cia402Axis(Axis):
         "held",
         "homed",
         "left_operational",
+        "mode",
         "mode_bits",
         "mute",
         "poll_due",
@@ -80,10 +82,8 @@ class Cia402Axis(Axis):
         self.units = Units(scale, scale.counts_per_metre, abs(scale.counts_per_metre))
         self.setpoint: tuple[int, int] | None = None
         """Position and velocity that were sent last, in its units."""
-        self.statusword = 0
-        """The newest one."""
-        self.seen_clear = 0
-        """Statusword bits that have been 0 since somebody began to watch."""
+        self.statusword = self.seen_clear = 0
+        """The newest one, and its bits that have been 0 since somebody began to watch."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.controlword = frames.DISABLE_VOLTAGE
         """The last one sent."""
@@ -93,6 +93,7 @@ class Cia402Axis(Axis):
         """Controlword bits that go with "enable operation"."""
         self.held: int | None = None
         """The position [counts] that it gets in place of setpoints."""
+        self.mode = ShownMode(drives.sdo_timeout)
         self.cyclic = True
         """It is for sure in the mode in which it follows setpoints."""
         self.follows = True
@@ -149,12 +150,36 @@ class Cia402Axis(Axis):
             return
         if data[1:3] == self.sdo_asked:
             self.sdo_answer, self.sdo_asked = bytes(data), None
-        if data[:4] == frames.STATUSWORD_UPLOADED:
+        if data[:4] == frames.MODE_DISPLAY_UPLOADED and self.awaits_mode:
+            self._take_mode(data[4])
+        elif data[:4] == frames.STATUSWORD_UPLOADED:
             self.on_status(data[4:6], now)
         elif data[:4] == frames.ERROR_REGISTER_UPLOADED and now < self._register_until:
             self._register_until = -math.inf
             if data[4] == 0:
                 self.error_code = 0  # CiA 301, 1001h: there is no error
+
+    @property
+    def awaits_mode(self) -> bool:
+        """It has power, and is to show its mode before it gets setpoints."""
+        return not self.mode.shown and self.cyclic and self.state is PowerState.OPERATION_ENABLED
+
+    def _take_mode(self, mode: int) -> None:
+        """6061h: 0 is none yet, and no other will do."""
+        self.mode.shown = mode == self.way.mode
+        if not self.mode.shown and mode:
+            self.tell("state", 0, f"shows mode {mode} (object 6061), with power; wanted {self.way.mode}")
+
+    def request(self) -> bytes:
+        """What it is to be asked for by SDO: its statusword, the mode that it shows, or both in turn."""
+        both = self.way.polled or self.mute
+        for_mode = self.awaits_mode and self.mode.is_next(alone=not both)
+        return frames.MODE_DISPLAY_UPLOAD if for_mode else frames.STATUSWORD_UPLOAD
+
+    @property
+    def holds(self) -> int | None:
+        """The position [counts] that it gets in place of setpoints; None where it gets those."""
+        return self.held if self.mode.shown or self.held is not None else self.actual
 
     def on_status(self, data: bytes | bytearray, now: float) -> None:
         """TPDO1: the statusword, when it changes and from time to time."""
@@ -186,7 +211,7 @@ class Cia402Axis(Axis):
     @property
     def shown_state(self) -> PowerState:
         """Its state; "switched on" while it has power and does not say yet that it follows setpoints."""
-        waits = self.way.tells_following and self.cyclic and not self.has_followed
+        waits = self.cyclic and (not self.mode.shown or (self.way.tells_following and not self.has_followed))
         return PowerState.SWITCHED_ON if waits and self.state is PowerState.OPERATION_ENABLED else self.state
 
     def on_emergency(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
@@ -311,7 +336,10 @@ class Cia402Axis(Axis):
 
     def _not_following(self, now: float, wanted: frames.Wanted) -> DriveFault | None:
         """CiA 402-2, modes 7 and 8: bit 12 of the statusword says that setpoints are followed, not ignored."""
-        meant_to = wanted is self.state is PowerState.OPERATION_ENABLED and self.cyclic and self.way.tells_following
+        if (waited := self.mode.waited(now, awaited=self.awaits_mode)) is not None:
+            return self.made("state", 0, f"shows no mode (object 6061) {waited:.3g} s after it got power")
+        enabled = wanted is self.state is PowerState.OPERATION_ENABLED
+        meant_to = enabled and self.cyclic and self.mode.shown and self.way.tells_following
         if not meant_to or self.statusword & frames.FOLLOWS:
             self._followed = meant_to
             self.has_followed = self.has_followed or meant_to

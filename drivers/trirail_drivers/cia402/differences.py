@@ -33,17 +33,17 @@ class Differences:
         self.lacking: dict[str, str] = {}
         """Protections that the drive lacks, as PROTECTIONS names them, and why each is said to lack."""
 
-    def give(self, index: int, subindex: int, value: int, also: Sequence[int] = ()) -> int | None:
+    async def give(self, index: int, subindex: int, value: int, also: Sequence[int] = ()) -> int | None:
         """See that an object holds a value, or one that will do `also`; return what it holds, None where it lacks.
 
         Raises SdoRefused for one that is needed and is not taken, ConfigurationRefused for one that reads back
         differently from what the drive took.
         """
         key = index, subindex
-        if not self.remote.has(*key):
+        if not await self.remote.has(*key):
             self.lack(key, "it has no such object")
             return None
-        found = self.remote.look(*key)
+        found = await self.remote.look(*key)
         if found is not None and same(index, subindex, found, value):
             return value
         refusal: SdoRefused | None = None
@@ -51,24 +51,36 @@ class Differences:
             if found == candidate:
                 return candidate
             try:
-                self.remote.write(index, subindex, candidate)
+                await self.remote.write(index, subindex, candidate)
             except SdoRefused as error:
                 refusal = error
                 continue
             self.note(key, found, candidate)
-            self.confirm(key, candidate)
+            await self.confirm(key, candidate)
             return candidate
         if refusal is None:
             return found
         self.lack(key, f"it keeps {shown(*key, found) if found is not None else 'what it has'}", refusal)
         return None
 
-    def confirm(self, key: Key, value: int) -> None:
-        """Read back what was written; ConfigurationRefused where it differs, nothing where the drive does not tell."""
-        read = self.remote.look(*key)
+    async def is_given(self, key: Key, value: int) -> bool:
+        """See that an object holds a value; return whether the drive lets it have that."""
+        found = await self.remote.look(*key)
+        if found is None or not same(*key, found, value):
+            try:
+                await self.remote.write(*key, value)
+            except SdoRefused:
+                return False
+            self.note(key, found, value)
+            await self.confirm(key, value)
+        return True
+
+    async def confirm(self, key: Key, value: int) -> None:
+        """Read back what was written; ConfigurationRefused where it stays another, nothing where it is not told."""
+        read, waited = await self.remote.becomes(key, lambda found: same(*key, found, value))
         if read is not None and not same(*key, read, value):
             name = self.remote.name_of(key)
-            raise ConfigurationRefused(self.remote.name, name, *key, shown(*key, value), shown(*key, read))
+            raise ConfigurationRefused(self.remote.name, name, *key, shown(*key, value), shown(*key, read), waited)
 
     def note(self, key: Key, found: int | None, wanted: int, why: str = "") -> None:
         """Note that an object is to be given a value."""

@@ -22,16 +22,16 @@ _KEYS: Final = {0x60A9: "velocity_unit", 0x60AA: "acceleration_unit"}
 _FACTORS: Final = {0x60A9: 0x6096, 0x60AA: 0x6097}
 
 
-def read_units(drive: Differences, config: Drive, scale: Scale) -> Units:
+async def read_units(drive: Differences, config: Drive, scale: Scale) -> Units:
     """The units of a drive whose positions have a `scale`.
 
     Raises DriveError where the drive contradicts its configuration, or where neither says what a unit is that is
     needed here: that of the velocity offset, or of the quick-stop ramp.
     """
     remote, counts = drive.remote, abs(scale.counts_per_metre)
-    revolutions = _revolutions(remote, config, counts)
-    velocity = _unit(drive, config, 0x60A9, counts, revolutions, velocity_unit)
-    acceleration = _unit(drive, config, 0x60AA, counts, revolutions, acceleration_unit, velocity)
+    revolutions = await _revolutions(remote, config, counts)
+    velocity = await _unit(drive, config, 0x60A9, counts, revolutions, velocity_unit)
+    acceleration = await _unit(drive, config, 0x60AA, counts, revolutions, acceleration_unit, velocity)
     per_metre = [_per_metre(each, counts, revolutions) for each in (velocity, acceleration)]
     return Units(
         scale,
@@ -47,10 +47,10 @@ def _per_metre(unit: Unit | None, counts: float, revolutions: float | None) -> f
     return math.nan if found is None else found
 
 
-def _revolutions(remote: Remote, config: Drive, counts: float) -> float | None:
+async def _revolutions(remote: Remote, config: Drive, counts: float) -> float | None:
     """Revolutions per metre, as configured or as the drive's own objects have it."""
     derived, source = None, ""
-    told = remote.look(0x60A8)
+    told = await remote.look(0x60A8)
     unit = position_unit(told) if told is not None else None
     if unit is not None and unit.of is Of.METRES:
         _agree(
@@ -64,9 +64,9 @@ def _revolutions(remote: Remote, config: Drive, counts: float) -> float | None:
         derived, source = counts * unit.size, f"60A8 = {told:08X}h, {unit.name}"
     else:
         for index, name in ((0x6092, "feed constant"), (0x608F, "encoder resolution")):
-            per_turn = _ratio(remote, index)
+            per_turn = await _ratio(remote, index)
             if per_turn is not None and per_turn > 1.0:  # 1 stands for "not used"
-                gear = _ratio(remote, 0x6091) or 1.0 if index == 0x608F else 1.0
+                gear = await _ratio(remote, 0x6091) or 1.0 if index == 0x608F else 1.0
                 derived, source = counts / (per_turn * gear), f"{index:04X}, {name}, {per_turn:g} a revolution"
                 break
     if config.revolutions_per_metre is None:
@@ -83,12 +83,12 @@ def _agree(name: str, key: str, configured: float, told: float, source: str) -> 
         )
 
 
-def _ratio(remote: Remote, index: int) -> float | None:
-    above, below = remote.look(index, 1), remote.look(index, 2)
+async def _ratio(remote: Remote, index: int) -> float | None:
+    above, below = await remote.look(index, 1), await remote.look(index, 2)
     return above / below if above and below else None
 
 
-def _unit(
+async def _unit(
     drive: Differences,
     config: Drive,
     index: int,
@@ -101,11 +101,11 @@ def _unit(
     remote, key = drive.remote, _KEYS[index]
     text = config.velocity_unit if index == 0x60A9 else config.acceleration_unit
     configured = written(f"drives.{remote.name}.{key}", text, 1 if index == 0x60A9 else 2) if text is not None else None
-    code = remote.look(index)
+    code = await remote.look(index)
     told = decoded(code) if code else None
     source = f"{index:04X} = {code:08X}h" if told is not None and code is not None else f"{_FACTORS[index]:04X}"
     if told is None:
-        told = _by_factor(remote, index, velocity)
+        told = await _by_factor(remote, index, velocity)
     if told is None:
         if configured is not None and configured.per_metre(counts, revolutions) is None:
             raise DriveError(
@@ -120,13 +120,13 @@ def _unit(
                 f'drives.{remote.name}.{key} = "{text}" contradicts the drive: object {source} is {told.name}'
             )
     if told.per_metre(counts, revolutions) is None:
-        return _in_counts(drive, index, told)
+        return await _in_counts(drive, index, told)
     return told
 
 
-def _by_factor(remote: Remote, index: int, velocity: Unit | None) -> Unit | None:
+async def _by_factor(remote: Remote, index: int, velocity: Unit | None) -> Unit | None:
     """The unit that 6096h or 6097h makes: counts a second, or velocity a second, * numerator / divisor."""
-    factor = _ratio(remote, _FACTORS[index])
+    factor = await _ratio(remote, _FACTORS[index])
     if factor is None:
         return None
     if index == 0x60A9:
@@ -136,14 +136,14 @@ def _by_factor(remote: Remote, index: int, velocity: Unit | None) -> Unit | None
     return Unit(velocity.of, velocity.size / factor, f"{1.0 / factor:g} * {velocity.name} a second")
 
 
-def _in_counts(drive: Differences, index: int, told: Unit) -> Unit:
+async def _in_counts(drive: Differences, index: int, told: Unit) -> Unit:
     """Set the unit to counts, where nobody says what the drive's own is of a metre."""
     wanted = Unit(Of.COUNTS, 1.0, "counts/s" if index == 0x60A9 else "counts/s2")
     code, remote = _IN_COUNTS[index], drive.remote
-    drive.note((index, 0), remote.look(index), code, "its unit, for nobody says its revolutions per metre")
+    drive.note((index, 0), await remote.look(index), code, "its unit, for nobody says its revolutions per metre")
     try:
-        remote.write(index, 0, code)
-        if remote.look(index) == code:
+        await remote.write(index, 0, code)
+        if (await remote.becomes((index, 0), lambda held: held == code))[0] == code:
             return wanted
     except SdoRefused:
         pass

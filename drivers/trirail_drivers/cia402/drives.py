@@ -18,6 +18,7 @@ from trirail_drivers.cia402 import frames, setup, ways
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.cia402.objects import means
+from trirail_drivers.cia402.one_drive import HAS_POWER
 from trirail_drivers.cia402.strangers import Strangers
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, Feedback, MissingProtection, PowerState, Triple
@@ -55,6 +56,7 @@ class Cia402(Driver[Cia402Axis]):
         self._set_period(period, ways.traffic(made.way for made, _ in done))
         for axis, (made, start) in zip(self._axes, done, strict=True):
             axis.way, axis.units = made.way, made.units
+            axis.mode.shown = made.way.mode_shown
             self._listen(axis)
             axis.take_position(start.counts)
             axis.error_code = start.error_code
@@ -145,8 +147,8 @@ class Cia402(Driver[Cia402Axis]):
             self._command()  # where frames have to wait, those that stop go before setpoints
         for axis, frame, metres, rate in zip(self._axes, self._setpoints, position, velocity, strict=True):
             try:
-                if axis.held is not None:
-                    setpoint = axis.held, 0
+                if axis.holds is not None:
+                    setpoint = axis.holds, 0
                 else:
                     offset = axis.units.velocity(rate) if axis.way.setpoints.has_velocity else 0
                     setpoint = axis.scale.counts(metres), offset
@@ -173,6 +175,7 @@ class Cia402(Driver[Cia402Axis]):
         self._off_by = math.inf
         for axis in self._axes:
             axis.powered_up = axis.has_followed = False
+            axis.mode.shown = axis.way.mode_shown
             axis.left_out = alone not in (None, axis.name)
         self._homing.restore()
 
@@ -230,10 +233,10 @@ class Cia402(Driver[Cia402Axis]):
         """Ask for what no PDO tells, without waiting: one request at a time."""
         if axis.sdo_asked is not None:
             return
-        if axis.mute or (axis.way.polled and now >= axis.poll_due):
+        if axis.mute or ((axis.way.polled or axis.awaits_mode) and now >= axis.poll_due):
+            self._wire.send(Frame(frames.SDO_REQUEST + axis.node, axis.request()))
             axis.mute = False
             axis.poll_due = now + frames.POLL_PERIOD
-            self._wire.send(Frame(frames.SDO_REQUEST + axis.node, frames.STATUSWORD_UPLOAD))
 
     def _command(self) -> None:
         """Send the controlwords that are due: one transition per drive at a time."""
@@ -289,7 +292,7 @@ class Cia402(Driver[Cia402Axis]):
             self._wire.wait(left, self._clock)
 
     def _powered(self) -> bool:
-        return any(axis.state in setup.HAS_POWER for axis in self._axes)
+        return any(axis.state in HAS_POWER for axis in self._axes)
 
 
 def _asked_of(axis: Cia402Axis, wanted: frames.Wanted) -> frames.Wanted:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import io
+import logging
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +13,9 @@ from canopen.objectdictionary import ObjectDictionary
 
 from trirail_drivers import files
 from trirail_drivers.errors import DriveError, FileError
+
+# What canopen would say of a file is in the DriveError; standard error is for that one line.
+logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 SERVO: Final = Path(__file__).with_name("servo.eds")
 """Object dictionary of the simulated CiA 402 servo drive: names and types of objects where no maker's EDS is given."""

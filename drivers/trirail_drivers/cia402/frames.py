@@ -42,8 +42,12 @@ ERROR_REGISTER_UPLOAD: Final = b"\x40\x01\x10\x00" + bytes(4)
 """SDO request for the error register 1001h."""
 ERROR_REGISTER_UPLOADED: Final = b"\x4f\x01\x10\x00"
 """How its answer begins; the byte of the register follows."""
+MODE_DISPLAY_UPLOAD: Final = b"\x40\x61\x60\x00" + bytes(4)
+"""SDO request for the mode of operation that is shown, 6061h."""
 CONTROLWORD_DOWNLOAD: Final = b"\x2b\x40\x60\x00"
 """How an SDO begins that writes the controlword 6040h; its two bytes and two empty ones follow."""
+MODE_DISPLAY_UPLOADED: Final = b"\x4f\x61\x60\x00"
+"""How its answer begins; the byte of the mode follows."""
 STATUSWORD_UPLOADED: Final = b"\x4b\x41\x60\x00"
 """How its answer begins; the two bytes of the statusword follow."""
 

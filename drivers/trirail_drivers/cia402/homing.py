@@ -19,7 +19,7 @@ from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.axis import Cia402Axis
-from trirail_drivers.interface import DriveFault
+from trirail_drivers.interface import DriveFault, PowerState
 
 HOMING = 6
 _MODE, _MODE_DISPLAY, _STATUSWORD = 0x6060, 0x6061, 0x6041
@@ -176,6 +176,8 @@ class HomingSequence:
         yield from self._ask(axis, _WRITE_BYTE, _MODE, mode)
         deadline = self._now + self._sdo_timeout
         while (found := (yield from self._ask(axis, _READ, _MODE_DISPLAY))[4]) != mode:
+            if found == 0 and not axis.mode.shown and axis.state is not PowerState.OPERATION_ENABLED:
+                return  # it shows its mode with power
             if self._now >= deadline:
                 raise HomingFailedError(f"object 6061:00 (Modes of operation display): wanted {mode}, found {found}")
 

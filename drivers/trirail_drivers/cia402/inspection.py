@@ -8,9 +8,11 @@ from typing import Any
 import can
 
 from trirail_drivers.cia402 import frames, setup
+from trirail_drivers.cia402.one_drive import SetUp
+from trirail_drivers.cia402.sdo import together
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.scaling import scale_of
-from trirail_drivers.errors import DriveError
+from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import NAMES, Clock
 
 
@@ -27,22 +29,19 @@ def inspect(
     """
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
     if apply:
-        for each in inspect(bus, drives, period, clock, fastest, apply=False):
-            if each["refused"]:
-                raise DriveError(each["refused"])
+        found = inspect(bus, drives, period, clock, fastest, apply=False)
+        refused = dict.fromkeys(each["refused"] for each in found if each["refused"])
+        setup.raise_all([DriveError(text) for text in refused])
         done = setup.configure(bus, drives, scales, period, clock, fastest)
         for drive in drives.each:
             bus.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node).message())
         return [_told(made) for made, _ in done]
-    found, looked = [], []
-    for name, drive, scale in zip(NAMES, drives.each, scales, strict=True):
-        try:
-            made = setup.look(bus, name, drives, scale, period, clock, fastest)
-        except DriveError as error:
-            found.append({"name": name, "node": drive.node, "refused": str(error)})
-            continue
-        looked.append(made)
-        found.append(_told(made))
+    ends = setup.look(bus, drives, scales, period, clock, fastest)
+    looked = [end for end in ends if not isinstance(end, DriveError)]
+    found = [
+        {"name": name, "node": drive.node, "refused": str(end)} if isinstance(end, DriveError) else _told(end)
+        for name, drive, end in zip(NAMES, drives.each, ends, strict=True)
+    ]
     try:
         setup.check_identifiers(looked)
     except DriveError as error:
@@ -59,15 +58,17 @@ def inputs(bus: can.BusABC, drives: Drives, clock: Clock) -> Callable[[str], int
     remotes = {remote.name: remote for remote in setup.remotes(bus, drives, clock)}
 
     def read(name: str) -> int | None:
+        remote = remotes[name]
         try:
-            return remotes[name].read(0x60FD)
-        except DriveError:
+            (found,) = together(bus, clock, [remote], "reading", [remote.read(0x60FD)])
+        except BusError:
             return None
+        return None if isinstance(found, DriveError) else found
 
     return read
 
 
-def _told(made: setup.SetUp) -> dict[str, Any]:
+def _told(made: SetUp) -> dict[str, Any]:
     who = made.identity
     return {
         "name": made.name,

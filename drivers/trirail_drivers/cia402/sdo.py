@@ -1,27 +1,22 @@
-"""A drive's object dictionary over SDO, without threads: reads, writes and checks that name what failed."""
+"""A drive's object dictionary over SDO: reads, writes and checks that name what failed."""
 
 from __future__ import annotations
 
-import logging
-import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Final
+from typing import Any, Final, TypeVar
 
 import can
-import canopen
-from canopen.objectdictionary import INTEGER_TYPES, ObjectDictionary
-from canopen.sdo.client import SdoClient
+from canopen.objectdictionary import INTEGER_TYPES
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402.conversations import side_by_side, until
 from trirail_drivers.cia402.objects import MODE, MODE_DISPLAY, Key, signed, use, width
-from trirail_drivers.errors import BusError, ConfigurationRefused, DriveError, DriveTimeout
+from trirail_drivers.cia402.sdo_client import EXPEDITED, BootedError, Client, NoAnswerError, TwoNodesError
+from trirail_drivers.errors import BusError, DriveError, DriveTimeout
 from trirail_drivers.interface import Clock
 
-# What canopen would say of a failed transfer is in the DriveError; standard error is for that one line.
-logging.getLogger("canopen").addHandler(logging.NullHandler())
-
+T = TypeVar("T")
 
 NO_SUCH_OBJECT: Final = (0x0602_0000, 0x0609_0011)
 """SDO abort codes: object does not exist, subindex does not exist (CiA 301)."""
@@ -37,119 +32,16 @@ NO_REMOTE_REQUEST: Final = 1 << 30
 _BIT_FIELDS: Final = (0x1005, 0x1014, 0x60A8, 0x60A9, 0x60AA, 0x6502)
 
 
-SECOND_ANSWERS: Final = 10
-"""So many requests of one set-up that are answered twice are answered by two nodes."""
-
-
-class TwoNodesError(SdoCommunicationError):
-    """Requests are answered twice."""
-
-    def __init__(self, node: int) -> None:
-        super().__init__(f"two nodes answer as node {node}; give each its own node id")
-
-
-class NoAnswerError(SdoCommunicationError):
-    """The drive has not answered in time."""
-
-
-class Client(SdoClient):
-    """An SDO client that reads the bus itself while it waits, where canopen would have a thread do it.
-
-    A drive may still answer what somebody asked before, this service's last run or an attempt that was given up.
-    So what is taken for the answer to a request is of its kind, and names the same object.
-    """
-
-    def __init__(self, bus: can.BusABC, node: int, objects: ObjectDictionary, timeout: float, clock: Clock) -> None:
-        super().__init__(frames.SDO_REQUEST + node, frames.SDO_ANSWER + node, objects)  # type: ignore[no-untyped-call]
-        self.network = canopen.Network(bus)
-        self.bus = bus
-        self.timeout = timeout
-        self.clock = clock
-        self._asked = self._answered = bytes(8)
-        self._again = 0
-        self._knows_no_segments = False
-
-    def send_request(self, request: bytes | bytearray) -> None:
-        """Send a request, whose answer the next one is that `read_response` takes."""
-        self._asked, self._answered = bytes(request), self._asked
-        super().send_request(request)  # type: ignore[no-untyped-call]
-
-    def read_response(self) -> bytes:
-        """Wait for the drive's answer; other frames are let go, for the cycle starts afresh."""
-        deadline = self.clock() + self.timeout
-        while self.responses.empty():
-            message = self.bus.recv(max(0.0, deadline - self.clock()))
-            if message is None:
-                raise NoAnswerError("no answer")
-            if message.arbitration_id == self.tx_cobid and not message.is_error_frame:
-                data = bytes(message.data)
-                if answers(self._asked, data):
-                    self.responses.put(data)
-                elif answers(self._answered, data):
-                    self._note_second_answer()
-        response: bytes = super().read_response()  # type: ignore[no-untyped-call]
-        return response
-
-    def upload(self, index: int, subindex: int) -> bytes:
-        """All bytes that the drive has for an object: some tell four of one that is shorter."""
-        with self.open(index, subindex, buffering=0) as stream:  # type: ignore[no-untyped-call]
-            return bytes(stream.read())
-
-    def try_download(self, index: int, subindex: int, size: int) -> None:
-        """Begin to write so many bytes and give it up before the first; SdoAbortedError where the drive refuses.
-
-        A segmented download, whose first frame has the length only (CiA 301, SDO download initiate). A drive that
-        answers none is not asked again: it takes expedited ones alone, and each would be waited for.
-        """
-        if self._knows_no_segments:
-            return
-        request = struct.pack("<BHBI", _BEGIN_DOWNLOAD, index, subindex, size)
-        try:
-            self.request_response(request)  # type: ignore[no-untyped-call]
-        except NoAnswerError:
-            self._knows_no_segments = True
-            return
-        self.send_request(struct.pack("<BHBI", _ABORT << 5, index, subindex, _GIVEN_UP))
-        # An abort is not answered, and the next request could overtake it in a drive that has room for one frame.
-        self.bus.recv(PAUSE)
-
-    def _note_second_answer(self) -> None:
-        """The request before was answered already: once may be chance, so many times are two servers."""
-        self._again += 1
-        if self._again >= SECOND_ANSWERS:
-            raise TwoNodesError(self.rx_cobid - frames.SDO_REQUEST)
-
-
-def answers(request: bytes, data: bytes) -> bool:
-    """Whether a frame of an SDO server can be the answer to a request (CiA 301, 7.2.4.3: the first byte's top bits)."""
-    if len(data) != 8:
-        return False
-    asked, answered = request[0] >> 5, data[0] >> 5
-    same_object = asked in _SEGMENTS or data[1:4] == request[1:4]
-    return same_object and answered in (_ANSWERS[asked], _ABORT)
-
-
-_ANSWERS: Final = {0: 1, 1: 3, 2: 2, 3: 0, 4: 4}
-"""Command specifiers: the client's for download segment, download, upload, upload segment, abort; the answer's."""
-_SEGMENTS: Final = (0, 3)
-"""Those whose frames name no object."""
-_ABORT: Final = 4
-_BEGIN_DOWNLOAD: Final = 0x21
-"""Download initiate, not expedited, with the length."""
-_GIVEN_UP: Final = 0x0800_0000
-"""SDO abort code: general."""
-EXPEDITED: Final = 4
-"""So many bytes travel with the first frame."""
-PAUSE: Final = 0.002
-"""What a drive is given to take an abort in [s]."""
-
-
 class SdoRefused(DriveError):
     """A drive refused a request about an object."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
         self.code = code
+
+
+class DriveRestarted(DriveError):
+    """A drive has restarted, and forgotten what it was told."""
 
 
 class Remote:
@@ -163,6 +55,9 @@ class Remote:
     asks = False
     """Whether the drive is asked what it would take."""
 
+    boots = False
+    """Whether its boot-up message is waited for."""
+
     def __init__(self, name: str, client: Client) -> None:
         self.name = name
         self.client = client
@@ -170,13 +65,13 @@ class Remote:
         self._missing: set[Key] = set()
         self._writable: dict[Key, bool] = {}
 
-    def look(self, index: int, subindex: int = 0) -> int | None:
+    async def look(self, index: int, subindex: int = 0) -> int | None:
         """Value of an object; None where the drive has none to tell: it lacks the object, or cannot read it."""
         key = index, subindex
         if key not in self._read and key not in self._missing:
             try:
                 with self._told("read", key):
-                    self._read[key] = self.client.upload(index, subindex)
+                    self._read[key] = await self.client.upload(index, subindex)
             except SdoRefused as refusal:
                 if refusal.code in NO_SUCH_OBJECT:
                     self._missing.add(key)
@@ -185,61 +80,61 @@ class Remote:
         data = self._read.get(key)
         return None if data is None else self._value(key, data)
 
-    def has(self, index: int, subindex: int = 0) -> bool:
+    async def has(self, index: int, subindex: int = 0) -> bool:
         """Whether the drive has an object."""
-        self.look(index, subindex)
+        await self.look(index, subindex)
         return (index, subindex) not in self._missing
 
-    def read(self, index: int, subindex: int = 0) -> int:
+    async def read(self, index: int, subindex: int = 0) -> int:
         """Value of an object, as it is now; SdoRefused where the drive has none to tell."""
         key = index, subindex
         with self._told("read", key):
-            data = self._read[key] = self.client.upload(index, subindex)
+            data = self._read[key] = await self.client.upload(index, subindex)
         return self._value(key, data)
 
-    def write(self, index: int, subindex: int, value: int) -> None:
+    async def write(self, index: int, subindex: int, value: int) -> None:
         """Give an object a value; SdoRefused where the drive does not take it."""
         key = index, subindex
-        data = self._encoded(key, value)
+        data = await self._encoded(key, value)
         self._read.pop(key, None)
         with self._told(f"write {shown(index, subindex, value)} to", key):
-            self.client.download(index, subindex, data)
+            await self.client.download(index, subindex, data)
 
-    def may_be_written(self, index: int, subindex: int = 0) -> bool:
+    async def may_be_written(self, index: int, subindex: int = 0) -> bool:
         """Whether the drive lets an object be written, as far as it says so before it is."""
         key = index, subindex
         if key not in self._writable:
             try:
-                self._try_to_write("write", key, self.bits(index, subindex) // 8)
+                await self._try_to_write("write", key, await self.bits(index, subindex) // 8)
             except SdoRefused:
                 self._writable[key] = False
             else:
                 self._writable[key] = True
         return self._writable[key]
 
-    def _try_to_write(self, attempt: str, key: Key, size: int) -> None:
+    async def _try_to_write(self, attempt: str, key: Key, size: int) -> None:
         """SdoRefused where the drive says that an object may not be written, or not with so many bytes.
 
         What else it says is no such word, as that it takes no segments.
         """
         try:
             with self._told(attempt, key):
-                self.client.try_download(*key, size)
+                await self.client.try_download(*key, size)
         except SdoRefused as refusal:
             read = len(self._read.get(key) or b"") == size  # then the length is right
             if refusal.code in (READ_ONLY, *NO_SUCH_OBJECT, *(() if read else WRONG_LENGTH)):
                 raise
 
-    def bits(self, index: int, subindex: int = 0) -> int:
+    async def bits(self, index: int, subindex: int = 0) -> int:
         """How long an object is: as it was read, else by the drive's EDS, else by the standards."""
         key = index, subindex
-        self.look(index, subindex)
+        await self.look(index, subindex)
         known = self._read.get(key)
         return 8 * (self._size(key) if known is None else len(self._own(key, known)))
 
-    def _encoded(self, key: Key, value: int) -> bytes:
+    async def _encoded(self, key: Key, value: int) -> bytes:
         """A value as it travels; SdoRefused where it is too long for the object."""
-        size = self.bits(*key) // 8
+        size = await self.bits(*key) // 8
         if not size or not -1 << 8 * size - 1 <= value < 1 << 8 * size:
             raise SdoRefused(
                 f"drive {self.name}: cannot write {shown(*key, value)} to {self._called(key)}: "
@@ -248,18 +143,26 @@ class Remote:
             )
         return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
 
-    def check(self, index: int, subindex: int, wanted: int) -> None:
-        """Read an object back; ConfigurationRefused if its value is not the wanted one."""
-        found = self.read(index, subindex)
-        if not same(index, subindex, found, wanted):
-            raise ConfigurationRefused(
-                self.name,
-                self.name_of((index, subindex)),
-                index,
-                subindex,
-                shown(index, subindex, wanted),
-                shown(index, subindex, found),
-            )
+    async def becomes(
+        self, key: Key, so: Callable[[int], bool], seconds: float | None = None
+    ) -> tuple[int | None, float]:
+        """Read an object until it is `so`, for so long [s] at most, or as long as an answer may take.
+
+        Returns what it holds, None where the drive does not tell, and how long was waited [s]. A drive may take what
+        is written at once and show it later.
+        """
+
+        async def read() -> int | None:
+            self._read.pop(key, None)
+            return await self.look(*key)
+
+        def so_or_untold(found: int | None) -> bool:
+            return found is None or so(found)
+
+        client = self.client
+        return await until(
+            read, so_or_untold, client.pause, client.clock, client.timeout if seconds is None else seconds
+        )
 
     def _value(self, key: Key, data: bytes) -> int:
         return int.from_bytes(self._own(key, data), "little", signed=signed(key))
@@ -302,6 +205,10 @@ class Remote:
             raise DriveError(f"drive {self.name}: {error}") from error
         except NoAnswerError as error:
             raise DriveTimeout(self.name, f"answer about {called}", self.client.timeout) from error
+        except BootedError as error:
+            raise DriveRestarted(
+                f"drive {self.name}: has restarted while it was set up; is its supply sound?"
+            ) from error
         except SdoCommunicationError as error:
             raise DriveError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
         except (can.CanError, OSError) as error:
@@ -323,28 +230,69 @@ class Rehearsal(Remote):
         self._read, self._missing, self._writable = remote._read, remote._missing, remote._writable
         self._written: dict[Key, bytes] = {}
 
-    def look(self, index: int, subindex: int = 0) -> int | None:
+    async def look(self, index: int, subindex: int = 0) -> int | None:
         """Value of an object, as it would be; None where the drive has none to tell."""
-        found = super().look(index, subindex)
+        found = await super().look(index, subindex)
         return found if found is None else self._would_be((index, subindex), found)
 
-    def read(self, index: int, subindex: int = 0) -> int:
+    async def read(self, index: int, subindex: int = 0) -> int:
         """Value of an object, as it would be; SdoRefused where the drive has none to tell."""
-        return self._would_be((index, subindex), super().read(index, subindex))
+        return self._would_be((index, subindex), await super().read(index, subindex))
 
-    def write(self, index: int, subindex: int, value: int) -> None:
+    async def write(self, index: int, subindex: int, value: int) -> None:
         """Ask the drive whether an object may be written; SdoRefused where it may not."""
         key = index, subindex
-        data = self._encoded(key, value)
+        data = await self._encoded(key, value)
         if self.asks:
-            self._try_to_write(f"write {shown(index, subindex, value)} to", key, len(data))
+            await self._try_to_write(f"write {shown(index, subindex, value)} to", key, len(data))
         self._written[key] = data
-        if key == MODE and self.bits(*MODE_DISPLAY) == self.bits(*MODE):
+        if key == MODE and await self.bits(*MODE_DISPLAY) == await self.bits(*MODE):
             self._written[MODE_DISPLAY] = data
+
+    async def becomes(
+        self,
+        key: Key,
+        so: Callable[[int], bool],  # noqa: ARG002  what is not written takes no time
+        seconds: float | None = None,  # noqa: ARG002
+    ) -> tuple[int | None, float]:
+        """What an object would hold at once."""
+        return await self.look(*key), 0.0
 
     def _would_be(self, key: Key, found: int) -> int:
         data = self._written.get(key)
         return found if data is None else int.from_bytes(data, "little", signed=signed(key))
+
+
+def together(
+    bus: can.BusABC,
+    clock: Clock,
+    remotes: Sequence[Remote],
+    doing: str,
+    conversations: Sequence[Coroutine[Any, Any, T]],
+) -> list[T | DriveError]:
+    """Lead a conversation with each drive, side by side, and log every second how far they are: see `side_by_side`."""
+    over: set[str] = set()
+
+    async def followed(remote: Remote, conversation: Coroutine[Any, Any, T]) -> T:
+        try:
+            return await conversation
+        finally:
+            over.add(remote.name)
+
+    def state(remote: Remote) -> str:
+        if remote.boots:
+            return "is waited for, to boot"
+        return f"{remote.client.answered} answers{', done' if remote.name in over else ''}"
+
+    def progress() -> str:
+        return f"set-up of the drives, {doing}: " + "; ".join(f"{each.name} {state(each)}" for each in remotes)
+
+    pairs = zip(remotes, conversations, strict=True)
+    try:
+        return side_by_side(bus, clock, [followed(*pair) for pair in pairs], progress)
+    finally:
+        for conversation in conversations:
+            conversation.close()
 
 
 def is_pdo(index: int) -> bool:

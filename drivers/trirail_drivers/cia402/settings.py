@@ -11,7 +11,7 @@ from trirail_drivers.cia402.objects import Key, title
 from trirail_drivers.cia402.sdo import SdoRefused, shown
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives, Homing
-from trirail_drivers.errors import DriveError
+from trirail_drivers.errors import ConfigurationRefused, DriveError
 
 PREFERRED_EXPONENT: Final = -3
 """Of 60C2h: milliseconds, which every drive takes; some take nothing else."""
@@ -52,12 +52,12 @@ def heartbeat_of(drives: Drives) -> int:
     return heartbeat
 
 
-def give_cycle(drive: Differences, period: float) -> None:
+async def give_cycle(drive: Differences, period: float) -> None:
     """Tell the drive the cycle's period [s]: 1005h, 1006h, 60C2h; and that SYNC is plain: 1007h, 1019h."""
     for key, wanted, bits in PLAIN_SYNC:
-        _give_plain(drive, key, wanted, bits)
-    drive.give(0x1006, 0, round(1e6 * period))
-    _give_interpolation(drive, interpolation_periods(period))
+        await _give_plain(drive, key, wanted, bits)
+    await drive.give(0x1006, 0, round(1e6 * period))
+    await _give_interpolation(drive, interpolation_periods(period))
 
 
 PLAIN_SYNC: Final = (
@@ -68,73 +68,87 @@ PLAIN_SYNC: Final = (
 """Objects by which another master may have changed what a SYNC is to a drive: what they must hold, in these bits."""
 
 
-def _give_plain(drive: Differences, key: Key, wanted: int, bits: int) -> None:
+async def _give_plain(drive: Differences, key: Key, wanted: int, bits: int) -> None:
     remote = drive.remote
-    found = remote.look(*key)
+    found = await remote.look(*key)
     if found is None or found & bits == wanted:
         return
-    if key == (0x1019, 0) and remote.look(0x1006):
+    if key == (0x1019, 0) and await remote.look(0x1006):
         with suppress(SdoRefused):
-            remote.write(0x1006, 0, 0)  # CiA 301: the counter changes only while the period is 0
-    drive.give(*key, wanted)
-    if (remote.look(*key) or 0) & bits != wanted:
+            await remote.write(0x1006, 0, 0)  # CiA 301: the counter changes only while the period is 0
+            await remote.becomes((0x1006, 0), lambda held: held == 0)
+    await drive.give(*key, wanted)
+    if (await remote.look(*key) or 0) & bits != wanted:
         raise DriveError(
             f"drive {remote.name}: {title(key)} is {shown(*key, found)} and stays; wanted {shown(*key, wanted)}"
         )
 
 
-def _give_interpolation(drive: Differences, periods: list[tuple[int, int]]) -> None:
+async def _give_interpolation(drive: Differences, periods: list[tuple[int, int]]) -> None:
     remote = drive.remote
-    if not (remote.has(0x60C2, 1) and remote.has(0x60C2, 2)):
+    if not (await remote.has(0x60C2, 1) and await remote.has(0x60C2, 2)):
         drive.lack((0x60C2, 1), "it has no such object")
         return
-    held = remote.look(0x60C2, 1), remote.look(0x60C2, 2)
+    held = await remote.look(0x60C2, 1), await remote.look(0x60C2, 2)
     if held in periods:
         return
-    refusal: SdoRefused | None = None
+    refusal: SdoRefused | ConfigurationRefused | None = None
     for value, exponent in periods:
         try:
-            if remote.look(0x60C2, 2) != exponent:
-                _write(drive, (0x60C2, 2), exponent)
-            if remote.look(0x60C2, 1) != value:
-                _write(drive, (0x60C2, 1), value)
-        except SdoRefused as error:
+            if await remote.look(0x60C2, 2) != exponent:
+                await _write(drive, (0x60C2, 2), exponent)
+            if await remote.look(0x60C2, 1) != value:
+                await _write(drive, (0x60C2, 1), value)
+        except (SdoRefused, ConfigurationRefused) as error:
             refusal = error
             continue
         return
     if refusal is not None:
+        refusal.args = (f"{refusal}{_rate_that_it_holds(*held)}",)
         raise refusal
 
 
-def _write(drive: Differences, key: tuple[int, int], value: int) -> None:
-    found = drive.remote.look(*key)
-    drive.remote.write(*key, value)
+def _rate_that_it_holds(value: int | None, exponent: int | None) -> str:
+    """The remedy where a drive keeps to an interpolation time of its own; "" where it tells none."""
+    if not value or exponent is None:
+        return ""
+    period = value * 10.0**exponent
+    return f"; it holds {1000 * period:g} ms: with loop.rate_hz = {1 / period:g} it need not be changed"
+
+
+async def _write(drive: Differences, key: tuple[int, int], value: int) -> None:
+    found = await drive.remote.look(*key)
+    await drive.remote.write(*key, value)
     drive.note(key, found, value)
-    drive.confirm(key, value)
+    await drive.confirm(key, value)
 
 
-def give_reactions(drive: Differences, drives: Drives, units: Units) -> None:
+async def give_reactions(drive: Differences, drives: Drives, units: Units) -> None:
     """Tell the drive what it does when something is wrong: 6007h, 605Ah, 605Eh, 6065h, 6085h."""
-    name, has = drive.remote.name, drive.remote.has
-    drive.give(0x6007, 0, 3, also=(2, 1))  # a drive that lost its master quick-stops; power off or a fault will do
-    drive.give(0x605A, 0, 2)  # quick stop: down the ramp 6085h, then without power
-    drive.give(0x605E, 0, 2, also=(1, 0))  # its own fault: down the same ramp; another, or none, is a stop as well
-    if has(0x6085):
+    name = drive.remote.name
+    await drive.give(
+        0x6007, 0, 3, also=(2, 1)
+    )  # a drive that lost its master quick-stops; power off or a fault will do
+    await drive.give(0x605A, 0, 2)  # quick stop: down the ramp 6085h, then without power
+    await drive.give(
+        0x605E, 0, 2, also=(1, 0)
+    )  # its own fault: down the same ramp; another, or none, is a stop as well
+    if await drive.remote.has(0x6085):
         ramp = units.acceleration(name, "quick_stop_deceleration", drives.quick_stop_deceleration)
-        drive.give(0x6085, 0, ramp)
+        await drive.give(0x6085, 0, ramp)
     else:
         drive.lack((0x6085, 0), "it has no such object")
-    drive.give(0x6065, 0, units.length(name, "following_error", drives.following_error))
+    await drive.give(0x6065, 0, units.length(name, "following_error", drives.following_error))
 
 
-def give_homing(drive: Differences, homing: Homing, units: Units) -> None:
+async def give_homing(drive: Differences, homing: Homing, units: Units) -> None:
     """Tell the drive how it finds its home: 6098h, 6099h, 609Ah, 607Ch."""
     name = drive.remote.name
-    drive.give(0x6098, 0, homing.method)
-    drive.give(0x6099, 1, units.speed(name, "homing.speed_switch", homing.speed_switch))
-    drive.give(0x6099, 2, units.speed(name, "homing.speed_zero", homing.speed_zero))
-    if drive.remote.has(0x609A):
-        drive.give(0x609A, 0, units.acceleration(name, "homing.acceleration", homing.acceleration))
+    await drive.give(0x6098, 0, homing.method)
+    await drive.give(0x6099, 1, units.speed(name, "homing.speed_switch", homing.speed_switch))
+    await drive.give(0x6099, 2, units.speed(name, "homing.speed_zero", homing.speed_zero))
+    if await drive.remote.has(0x609A):
+        await drive.give(0x609A, 0, units.acceleration(name, "homing.acceleration", homing.acceleration))
     else:
         drive.lack((0x609A, 0), "it has no such object")
-    drive.give(0x607C, 0, 0)  # makers differ in its sign; where home is, the drive's `offset` says
+    await drive.give(0x607C, 0, 0)  # makers differ in its sign; where home is, the drive's `offset` says

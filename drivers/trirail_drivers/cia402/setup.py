@@ -1,82 +1,21 @@
-"""Sets CiA 402 drives up over SDO before the cycle runs: reads first, writes the differences, reads them back."""
+"""Sets three CiA 402 drives up side by side before the cycle runs, and refuses what cannot be on one bus."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import can
 
-from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import eds, frames
-from trirail_drivers.cia402.differences import Difference, Differences
-from trirail_drivers.cia402.drive_units import read_units
-from trirail_drivers.cia402.guarding import give_watchdogs
-from trirail_drivers.cia402.modes import choose_mode, give_mode
-from trirail_drivers.cia402.objects import FOLLOWING_BIT
-from trirail_drivers.cia402.pdos import Pdos
-from trirail_drivers.cia402.sdo import Client, Rehearsal, Remote, SdoRefused
-from trirail_drivers.cia402.settings import (
-    check_nodes,
-    give_cycle,
-    give_homing,
-    give_reactions,
-    heartbeat_of,
-    interpolation_periods,
-)
-from trirail_drivers.cia402.units import Units
-from trirail_drivers.cia402.ways import Exchange
-from trirail_drivers.config import Drive, Drives
+from trirail_drivers.cia402.one_drive import OneDrive, SetUp, Start, bring, look_over, send, start
+from trirail_drivers.cia402.sdo import Remote, together
+from trirail_drivers.cia402.sdo_client import Client
+from trirail_drivers.cia402.settings import check_nodes, heartbeat_of, interpolation_periods
+from trirail_drivers.config import Drives
 from trirail_drivers.driver.scaling import Scale
-from trirail_drivers.errors import BusError, DriveError
-from trirail_drivers.interface import NAMES, Clock, PowerState
-
-HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
-"""States in which a drive may have current in its motor."""
-
-
-class Identity(NamedTuple):
-    """Who a drive says it is."""
-
-    device_type: int
-    """1000h."""
-    vendor: int | None
-    product: int | None
-    revision: int | None
-    serial: int | None
-    """1018h."""
-    modes: int | None
-    """6502h."""
-
-
-class SetUp(NamedTuple):
-    """What is known of a drive once it was looked at, or set up."""
-
-    name: str
-    node: int
-    identity: Identity
-    way: Exchange
-    units: Units
-    differences: tuple[Difference, ...]
-    """What was written, or would be."""
-    notes: tuple[str, ...]
-    """What is done otherwise than usual, and the protections that it lacks: lines for people."""
-    lacking: tuple[str, ...]
-    """Protections that it lacks, as `accept_without` names them."""
-    refused: str
-    """Why it is refused for those; "" where it is not."""
-
-
-class Start(NamedTuple):
-    """What a drive says of itself once it is set up."""
-
-    counts: int
-    """Actual position 6064h."""
-    statusword: int
-    """6041h."""
-    error_code: int
-    """603Fh if the drive is in fault, else 0."""
+from trirail_drivers.errors import LONGEST, DriveError, shortened
+from trirail_drivers.interface import NAMES, Clock
 
 
 def configure(
@@ -97,67 +36,68 @@ def configure(
     check_nodes(drives)
     heartbeat_of(drives)
     interpolation_periods(period)
-    asked = remotes(bus, drives, clock)
+    each = _drives(bus, drives, scales, period, clock)
     for drive in drives.each:
-        _send(bus, frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node))
-    for remote in asked:
-        _check_is_servo(remote)
-        _take_power_off(remote)
+        send(bus, frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node))
     # Everything is refused that can be told by reading, of every drive, before the first value is written.
-    rehearsed = [
-        _rehearse(remote, drive, drives, scale, period, asks=False)
-        for remote, drive, scale in zip(asked, drives.each, scales, strict=True)
-    ]
-    _check(rehearsed)
-    done = [
-        _bring(remote, drive, drives, scale, period)
-        for remote, drive, scale in zip(asked, drives.each, scales, strict=True)
-    ]
-    _check(done)
-    for made in done:
-        _check_velocity(made, fastest)
+    _accepted(together(bus, clock, [one.remote for one in each], "reading", [look_over(one) for one in each]))
+    done = _accepted(
+        together(bus, clock, [one.remote for one in each], "writing", [bring(one, one.remote) for one in each])
+    )
+    raise_all([found for found in (_velocity_refused(made, fastest) for made in done) if found is not None])
     for drive in drives.each:
-        _send(bus, frames.nmt(frames.NMT_START, drive.node))
-    return tuple((made, _start(remote)) for made, remote in zip(done, asked, strict=True))
+        send(bus, frames.nmt(frames.NMT_START, drive.node))
+    starts = together(bus, clock, [one.remote for one in each], "starting", [start(one.remote) for one in each])
+    raise_all([each for each in starts if isinstance(each, DriveError)])
+    return tuple((made, each) for made, each in zip(done, starts, strict=True) if isinstance(each, Start))
 
 
 def look(
     bus: can.BusABC,
-    name: str,
     drives: Drives,
-    scale: Scale,
+    scales: tuple[Scale, ...],
     period: float,
     clock: Clock,
     fastest: float | None = None,
-) -> SetUp:
-    """Read what the drive called `name` is and what its set-up would change; nothing is written, no state changes."""
-    at = NAMES.index(name)
-    made = _rehearse(remotes(bus, drives, clock)[at], drives.each[at], drives, scale, period, asks=True)
-    _check_velocity(made, fastest)
-    return made
+) -> list[SetUp | DriveError]:
+    """Read what the drives are and what their set-up would change; nothing is written, no state changes."""
+    each = _drives(bus, drives, scales, period, clock)
+    conversations = [look_over(one, asks=True) for one in each]
+    ends = together(bus, clock, [one.remote for one in each], "reading", conversations)
+    return [end if isinstance(end, DriveError) else _velocity_refused(end, fastest) or end for end in ends]
 
 
-def _rehearse(remote: Remote, drive: Drive, drives: Drives, scale: Scale, period: float, *, asks: bool) -> SetUp:
-    """Go through the whole set-up of a drive without writing; where it `asks`, the drive tells what it would take."""
-    rehearsal = Rehearsal(remote, asks=asks)
-    _check_is_servo(rehearsal)
-    _take_power_off(rehearsal)
-    made = _bring(rehearsal, drive, drives, scale, period)
-    _start(rehearsal)
-    return made
+def _drives(bus: can.BusABC, drives: Drives, scales: tuple[Scale, ...], period: float, clock: Clock) -> list[OneDrive]:
+    asked = remotes(bus, drives, clock)
+    each = zip(asked, drives.each, scales, strict=True)
+    return [OneDrive(remote, drive, drives, scale, period) for remote, drive, scale in each]
 
 
-def _check(made: Sequence[SetUp]) -> None:
-    for each in made:
-        if each.refused:
-            raise DriveError(each.refused)
-    check_identifiers(made)
+def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:
+    """Refuse drives that are, all in one, and those that cannot be on one bus."""
+    refused = [end if isinstance(end, DriveError) else DriveError(end.refused) if end.refused else None for end in ends]
+    raise_all([error for error in refused if error is not None])
+    accepted = [end for end in ends if not isinstance(end, DriveError)]
+    check_identifiers(accepted)
+    return accepted
 
 
-def _check_velocity(made: SetUp, fastest: float | None) -> None:
-    """Refuse a unit of velocities that is not known, or unfit. A drive may refuse to map any: then it is no matter."""
+def raise_all(errors: Sequence[DriveError]) -> None:
+    """Raise what was found of each drive, none of which hides another's."""
+    if len(errors) > 1:
+        raise DriveError("; ".join(shortened(str(error), LONGEST // len(errors) - 2) for error in errors))
+    for error in errors:
+        raise error
+
+
+def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:
+    """Why a unit of velocities is refused: not known, or unfit. A drive may refuse to map any: then it is no matter."""
     if made.way.setpoints.has_velocity:
-        made.units.check_velocity(made.name, fastest)
+        try:
+            made.units.check_velocity(made.name, fastest)
+        except DriveError as error:
+            return error
+    return None
 
 
 def check_identifiers(done: Sequence[SetUp]) -> None:
@@ -192,87 +132,3 @@ def remotes(bus: can.BusABC, drives: Drives, clock: Clock) -> list[Remote]:
         objects = eds.load(name, Path(drive.eds) if drive.eds else eds.SERVO, drive.node)
         made.append(Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock)))
     return made
-
-
-def _bring(remote: Remote, drive: Drive, drives: Drives, scale: Scale, period: float) -> SetUp:
-    """Bring one drive to what the cycle needs."""
-    differences = Differences(remote)
-    mode = choose_mode(remote, homes=drive.homing is not None)
-    units = read_units(differences, drive, scale)
-    give_cycle(differences, period)
-    watched = give_watchdogs(differences, drives, heartbeat_of(drives), drive.node)
-    give_reactions(differences, drives, units)
-    give_mode(differences, mode)
-    if drive.homing is not None:
-        give_homing(differences, drive.homing, units)
-    pdos = Pdos(differences, drive.node)
-    setpoints, controlword = pdos.setpoints(mode)
-    feedback, status, polled = pdos.feedback()
-    pdos.switch_off_others()
-    for key in ((0x603F, 0), (0x1001, 0)):
-        if not remote.has(*key):
-            differences.lack(key, "it has no such object")
-    if FOLLOWING_BIT in drive.accept_without:
-        differences.lacking[FOLLOWING_BIT] = "the configuration says so"
-    way = Exchange(
-        mode,
-        setpoints,
-        controlword,
-        feedback,
-        status,
-        polled,
-        watched.guarded,
-        watched.heard,
-        watched.emergency,
-        FOLLOWING_BIT not in drive.accept_without,
-    )
-    vendor, product, revision, serial = (remote.look(0x1018, subindex) for subindex in range(1, 5))
-    identity = Identity(remote.look(0x1000) or 0, vendor, product, revision, serial, remote.look(0x6502))
-    refused = differences.refusal(drive.accept_without)
-    return SetUp(
-        remote.name,
-        drive.node,
-        identity,
-        way,
-        units,
-        tuple(differences.found),
-        tuple(differences.notes),
-        tuple(differences.lacking),
-        refused,
-    )
-
-
-def _send(bus: can.BusABC, frame: Frame) -> None:
-    try:
-        bus.send(frame.message())
-    except (can.CanError, OSError) as error:
-        raise BusError(f"cannot send on {bus.channel_info}: {error}; is the interface up?") from error
-
-
-def _check_is_servo(remote: Remote) -> None:
-    """The node is there, and is a CiA 402 drive."""
-    device_type = remote.read(0x1000)
-    if device_type & 0xFFFF != 402:
-        raise DriveError(
-            f"drive {remote.name}: object 1000:00 (device type) is {device_type:08X}, of CiA profile "
-            f"{device_type & 0xFFFF}; wanted a drive, profile 402"
-        )
-
-
-def _take_power_off(remote: Remote) -> None:
-    remote.write(0x6040, 0, frames.DISABLE_VOLTAGE)
-    statusword = remote.read(0x6041)
-    if not remote.rehearsed and frames.power_state(statusword) in HAS_POWER:
-        raise DriveError(f"drive {remote.name}: keeps its power on when told off (statusword {statusword:04X})")
-
-
-def _start(remote: Remote) -> Start:
-    statusword = remote.read(0x6041)
-    in_fault = frames.power_state(statusword) in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
-    error_code = 0
-    if in_fault and remote.has(0x603F):
-        try:
-            error_code = remote.read(0x603F)
-        except SdoRefused:
-            error_code = 0
-    return Start(remote.read(0x6064), statusword, error_code)

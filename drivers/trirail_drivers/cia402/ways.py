@@ -120,6 +120,8 @@ class Exchange:
     """Identifier of its EMCY."""
     tells_following: bool = True
     """Bit 12 of its statusword is to say that it follows setpoints."""
+    mode_shown: bool = True
+    """6061h shows the mode also without power."""
 
     @property
     def name(self) -> str:
