@@ -82,6 +82,37 @@ class Homing(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("method 0 is no homing: leave the table out where the encoder is absolute")
 
 
+class ObjectWrite(Struct, frozen=True, forbid_unknown_fields=True):
+    """An object of the drive's maker that is given a value when the drive is set up, and read back: for what the set-up
+    does not do itself. Node id, bitrate and what stores are refused."""
+
+    object: Annotated[int, Meta(ge=0x1000, le=0xFFFF)]
+    """Its index, as 0x208E."""
+    value: Annotated[int, Meta(ge=-(2**31), le=2**32 - 1)]
+    """What it is to hold."""
+    type: Literal["u8", "u16", "u32", "i8", "i16", "i32"]
+    """Its type, as the maker's manual has it."""
+    why: Annotated[str, Meta(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+    """What for: `trirail drives` shows it."""
+    sub: Annotated[int, Meta(ge=0, le=255)] = 0
+    """Its subindex."""
+
+    def __post_init__(self) -> None:
+        low = -(1 << self.bits - 1) if self.signed else 0
+        if not low <= self.value < low + (1 << self.bits):
+            raise ValueError(f"value {self.value} is no {self.type}")
+
+    @property
+    def bits(self) -> int:
+        """Its length."""
+        return int(self.type[1:])
+
+    @property
+    def signed(self) -> bool:
+        """Whether it has a sign."""
+        return self.type[0] == "i"
+
+
 class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     """One drive: section [drives.A], [drives.B] or [drives.C]."""
 
@@ -110,6 +141,8 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     accept_without: tuple[ObjectName, ...] = ()
     """Protections that the drive may lack, each named by its object, as ["1006", "6007"]: those of the table in
     drivers/README.md; "6041" where bit 12 of its statusword says nothing."""
+    write: tuple[ObjectWrite, ...] = ()
+    """Objects of its maker's that it is to be given."""
 
 
 class Drives(Struct, frozen=True, forbid_unknown_fields=True):
@@ -134,7 +167,8 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     stop_timeout: Timeout = 1.0
     """How long a drive may take to lose its power, down the quick-stop ramp or when it is disabled [s]."""
     sdo_timeout: Timeout = 0.5
-    """How long a drive may take to answer a configuration request [s]."""
+    """How long a drive may take to answer a configuration request, and to have what was written [s]; CiA 402 drives ten
+    times that to boot."""
 
     @property
     def each(self) -> tuple[Drive, Drive, Drive]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from trirail_drivers.cia402 import settings, units
+from trirail_drivers.cia402 import makers_objects, settings, units
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.requirements import Requirements, check_resolution
 from trirail_drivers.driver.scaling import INT32_MAX, Scale, scale_of
@@ -18,6 +18,7 @@ def check(drives: Drives, required: Requirements) -> None:
         check_resolution(name, drive, drives, required, 1.0 / drive.counts_per_metre, _finer)
         _check_counts(name, drive, scale, required)
         units.check(name, drive)
+        makers_objects.check(name, drive)
         _check_velocity(name, drive, required)
         units.Units(scale, scale.counts_per_metre, 1.0).length(name, "following_error", drives.following_error)
     settings.heartbeat_of(drives)

@@ -94,7 +94,7 @@ USES: Final = {
     "60C1": Use(_N, "Interpolation data record", "setpoints of mode 7", "refused", "CiA 402-2, 60C1h"),
     "60C2": Use(_R, "Interpolation time period", "its interpolation", "the time from SYNC to SYNC", "CiA 402-2, 60C2h"),
     "60C4": Use(_R, "Interpolation data configuration", "an empty buffer", "its own", "CiA 402-2, 60C4h"),
-    "6502": Use(_R, "Supported drive modes", "mode 8 or 7", "mode 8 is tried", "CiA 402-2, 6502h"),
+    "6502": Use(_R, "Supported drive modes", "mode 8 or 7", "mode 8 is tried, then 7", "CiA 402-2, 6502h"),
 }
 """By index, or index and subindex. 605B (shutdown) and 605C (disable operation) are not used: power is taken off by
 "disable voltage" and "quick stop", which they do not bear on."""

@@ -12,6 +12,7 @@ from trirail_drivers.cia402.conversations import LOG
 from trirail_drivers.cia402.differences import Difference, Differences
 from trirail_drivers.cia402.drive_units import read_units
 from trirail_drivers.cia402.guarding import give_watchdogs
+from trirail_drivers.cia402.makers_objects import give_makers_objects
 from trirail_drivers.cia402.modes import choose_modes, give_mode
 from trirail_drivers.cia402.objects import FOLLOWING_BIT
 from trirail_drivers.cia402.pdos import Pdos
@@ -103,6 +104,7 @@ async def bring(one: OneDrive, remote: Remote) -> SetUp:
     drive, drives = one.drive, one.drives
     differences = Differences(remote)
     modes = await choose_modes(remote, homes=drive.homing is not None)
+    await give_makers_objects(differences, drive.write)
     units = await read_units(differences, drive, one.scale)
     await give_cycle(differences, one.period)
     watched = await give_watchdogs(differences, drives, heartbeat_of(drives), drive.node)

@@ -64,6 +64,11 @@ class Remote:
         self._read: dict[Key, bytes | None] = {}
         self._missing: set[Key] = set()
         self._writable: dict[Key, bool] = {}
+        self._described: dict[Key, tuple[int, bool]] = {}
+
+    def describe(self, key: Key, size: int, *, signed: bool) -> None:
+        """Say how many bytes an object has that no standard knows, and whether it has a sign."""
+        self._described[key] = size, signed
 
     async def look(self, index: int, subindex: int = 0) -> int | None:
         """Value of an object; None where the drive has none to tell: it lacks the object, or cannot read it."""
@@ -165,7 +170,10 @@ class Remote:
         )
 
     def _value(self, key: Key, data: bytes) -> int:
-        return int.from_bytes(self._own(key, data), "little", signed=signed(key))
+        return int.from_bytes(self._own(key, data), "little", signed=self._signed(key))
+
+    def _signed(self, key: Key) -> bool:
+        return self._described[key][1] if key in self._described else signed(key)
 
     def _own(self, key: Key, data: bytes) -> bytes:
         """The bytes of an answer that are the object's, by its EDS: some drives fill it up to four."""
@@ -175,7 +183,9 @@ class Remote:
         return data[: len(variable) // 8]
 
     def _size(self, key: Key) -> int:
-        """Bytes of an object that could not be read: by the drive's EDS, else by the standards."""
+        """Bytes of an object that could not be read: as it was described, else by its EDS, else by the standards."""
+        if key in self._described:
+            return self._described[key][0]
         variable = self.client.od.get_variable(*key)
         return len(variable) // 8 if variable is not None and variable.data_type in INTEGER_TYPES else width(key)
 
@@ -260,7 +270,7 @@ class Rehearsal(Remote):
 
     def _would_be(self, key: Key, found: int) -> int:
         data = self._written.get(key)
-        return found if data is None else int.from_bytes(data, "little", signed=signed(key))
+        return found if data is None else int.from_bytes(data, "little", signed=self._signed(key))
 
 
 def together(

@@ -113,7 +113,7 @@ def _rate_that_it_holds(value: int | None, exponent: int | None) -> str:
     if not value or exponent is None:
         return ""
     period = value * 10.0**exponent
-    return f"; it holds {1000 * period:g} ms: with loop.rate_hz = {1 / period:g} it need not be changed"
+    return f"; it holds {1000 * period:g} ms: say loop.rate_hz = {1 / period:g}"
 
 
 async def _write(drive: Differences, key: tuple[int, int], value: int) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Final
 
 import can
 
@@ -83,11 +85,24 @@ def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:
 
 
 def raise_all(errors: Sequence[DriveError]) -> None:
-    """Raise what was found of each drive, none of which hides another's."""
-    if len(errors) > 1:
-        raise DriveError("; ".join(shortened(str(error), LONGEST // len(errors) - 2) for error in errors))
+    """Raise what was found of each drive: none hides another's, and what is so of several is said once."""
+    if len(errors) == 1:
+        raise errors[0]
+    alike: dict[str, list[str]] = {}
     for error in errors:
-        raise error
+        alike.setdefault(_NAMED.sub(r"\1_", str(error)), []).append(str(error))
+    told = [first + "".join(f"; drive {_name(text)}: the same" for text in more) for first, *more in alike.values()]
+    if told:
+        raise DriveError("; ".join(shortened(text, LONGEST // len(told) - 2) for text in told))
+
+
+_NAMED: Final = re.compile(r"\b(drive |drives\.)([ABC])\b")
+
+
+def _name(text: str) -> str:
+    """Of which drive an error is."""
+    found = _NAMED.search(text)
+    return found[2] if found else ""
 
 
 def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:

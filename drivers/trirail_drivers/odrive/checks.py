@@ -36,6 +36,8 @@ def _check_canopen_only(name: str, drive: Drive) -> None:
         )
     if drive.eds is not None:
         raise DriveError(f"drives.{name}.eds = {drive.eds}: an ODrive has no object dictionary; leave it out")
+    if drive.write:
+        raise DriveError(f"drives.{name}.write: an ODrive has no object dictionary; leave it out")
 
 
 def _nearer(widest: float) -> str:

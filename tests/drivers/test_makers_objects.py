@@ -1,0 +1,143 @@
+"""What a configuration gives a drive of its maker's own objects, and what it may not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from drivers.foreign import Habits
+from drivers.test_foreign import PERIOD, Rig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trirail.config import SIM, load
+from trirail.errors import ConfigError
+from trirail_drivers.cia402 import inspection
+from trirail_drivers.cia402.objects import USES
+from trirail_drivers.config import ObjectWrite
+from trirail_drivers.errors import ConfigurationRefused, DriveError
+
+KINDS = {"i8": 0x02, "i16": 0x03, "i32": 0x04, "u8": 0x05, "u16": 0x06, "u32": 0x07}
+"""CiA 301 data types."""
+BRAKE = ObjectWrite(object=0x208E, value=0x100, type="u16", why="the brake opens late")
+ROWS = ((0x208E, 0, 6, "rw", 0, False), (0x2090, 1, 4, "rw", 7, False))
+
+
+@pytest.fixture
+def rigs() -> Iterator[list[Rig]]:
+    made: list[Rig] = []
+    yield made
+    for rig in made:
+        rig.drives.close()
+
+
+@settings(max_examples=20)
+@given(kind=st.sampled_from(sorted(KINDS)), data=st.data())
+def test_a_value_of_every_type_is_written_and_read_back(kind: str, data: st.DataObject) -> None:
+    bits = int(kind[1:])
+    low = -(1 << bits - 1) if kind[0] == "i" else 0
+    value = data.draw(st.integers(low, low + (1 << bits) - 1))
+    write = ObjectWrite(object=0x208E, value=value, type=kind, why="x")  # type: ignore[arg-type]
+    rig = Rig("elmo_gold", Habits(more=((0x208E, 0, KINDS[kind], "rw", 0, False),)), write=(write,))
+    try:
+        rig.drives.configure(PERIOD)
+        assert [node.value(0x208E) & (1 << bits) - 1 for node in rig.nodes] == [value & (1 << bits) - 1] * 3
+    finally:
+        rig.drives.close()
+
+
+def test_it_is_written_before_mapping_and_only_where_it_differs(rigs: list[Rig]) -> None:
+    rig = Rig("elmo_gold", Habits(more=ROWS), write=(BRAKE, ObjectWrite(0x2090, 7, "i32", "as it is", sub=1)))
+    rigs.append(rig)
+    rig.ready()
+    for node in rig.nodes:
+        written = [index for index, *_ in node.written]
+        assert written.index(0x208E) < min(written.index(index) for index in (0x1600, 0x1601, 0x1A01))
+        assert 0x2090 not in written
+
+
+def test_it_is_shown_with_its_reason(rigs: list[Rig]) -> None:
+    rig = Rig("elmo_gold", Habits(more=ROWS), write=(BRAKE,))
+    rigs.append(rig)
+    for each in inspection.inspect(rig.wires, rig.config, PERIOD, rig.clock, apply=False):
+        (shown,) = [found for found in each["differences"] if found["object"] == "208E:00"]
+        assert (shown["found"], shown["wanted"], shown["why"]) == ("0", "256", BRAKE.why)
+    assert not any(node.written for node in rig.nodes)
+
+
+@pytest.mark.parametrize(
+    ("habits", "write", "said"),
+    [
+        (Habits(), BRAKE, r"drives\.A\.write: object 208E:00: the drive has no such object"),
+        (
+            Habits(more=((0x208E, 0, 7, "rw", 0, False),)),
+            BRAKE,
+            r'drives\.A\.write: object 208E:00 has 32 bits, and type = "u16"',
+        ),
+        (Habits(more=((0x208E, 0, 6, "ro", 0, False),)), BRAKE, r"drive A: cannot write 256 to object 208E:00"),
+        (
+            Habits(more=((0x2000, 0, 5, "rw", 1, False),), values={(0x1018, 1): 0xFB}),
+            ObjectWrite(0x2000, 5, "u8", "another node id"),
+            r"drives\.A\.write: object 2000:00 changes node id or bitrate",
+        ),
+    ],
+)
+def test_what_the_drive_cannot_take_is_refused(rigs: list[Rig], habits: Habits, write: ObjectWrite, said: str) -> None:
+    rig = Rig("elmo_gold", habits, write=(write,))
+    rigs.append(rig)
+    with pytest.raises(DriveError, match=said):
+        rig.drives.configure(PERIOD)
+
+
+def test_a_value_that_does_not_stick_is_refused(rigs: list[Rig]) -> None:
+    rig = Rig("elmo_gold", Habits(more=ROWS), write=(BRAKE,))
+    rigs.append(rig)
+    keep: Any = rig.nodes[1].local.set_data
+
+    def set_data(index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:
+        keep(index, subindex, b"\1\0" if index == 0x208E else data, check_writable)
+
+    vars(rig.nodes[1].local).update(set_data=set_data)
+    with pytest.raises(ConfigurationRefused, match=r"drive B: object 208E:00 .*: wanted 256, found 1 after 0\.05"):
+        rig.drives.configure(PERIOD)
+
+
+def configured(folder: Path, lines: str, example: str = "elmo_gold") -> Path:
+    path = folder / "robot.toml"
+    path.write_text((SIM.parent / f"drives/{example}.toml").read_text() + f"\n[[drives.B.write]]\n{lines}\n")
+    return path
+
+
+WHY = 'why = "…"'
+OWNED = sorted({name[:4] for name in USES} | {"1010", "1011", "100B", "1600", "1A03", "60A9", "60AA"})
+
+
+@pytest.mark.parametrize("index", OWNED)
+def test_what_the_set_up_owns_and_what_stores_is_refused(tmp_path: Path, index: str) -> None:
+    path = configured(
+        tmp_path,
+        f'object = 0x{index}\nvalue = 1\ntype = "u8"\n{WHY}'
+        + "\nsub = 5" * (index[0] == "1" and index[:2] in ("14", "18")),
+    )
+    with pytest.raises(ConfigError, match=rf"drives\.B\.write: object {index}:0\d (is the set-up's own|would|changes)"):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("lines", "example", "said"),
+    [
+        (f'object = 0x208E\nvalue = 256\ntype = "u8"\n{WHY}', "elmo_gold", "value 256 is no u8"),
+        (f'object = 0x208E\nvalue = -1\ntype = "u8"\n{WHY}', "elmo_gold", "value -1 is no u8"),
+        ('object = 0x208E\nvalue = 1\ntype = "u8"', "elmo_gold", "why"),
+        (f'object = 0x208E\nvalue = 1\ntype = "u8"\n{WHY}', "odrive_s1", "has no object dictionary"),
+    ],
+)
+def test_what_is_no_object_is_refused_with_the_key(tmp_path: Path, lines: str, example: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load(configured(tmp_path, lines, example))
+
+
+def test_what_may_be_written_is_read(tmp_path: Path) -> None:
+    found = load(configured(tmp_path, f'object = 0x208E\nvalue = 0x100\ntype = "u16"\n{WHY}')).drives.B.write
+    assert found == (ObjectWrite(0x208E, 256, "u16", "…"),)
