@@ -17,6 +17,7 @@ from trirail.cli import units
 from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain, say, slowed
 from trirail.client.client import Jog, Robot
 from trirail.errors import ServiceError
+from trirail.wire.decoding import converted
 from trirail.wire.messages import GoalReply
 from trirail.wire.state import GoalState, Info, State
 from trirail.wire.vocabulary import Mode
@@ -95,7 +96,7 @@ def limits_of(info: Info) -> Limits:
     from trirail.config import Limits  # numba, with the kinematics
 
     try:
-        return msgspec.convert(info.limits, Limits)
+        return converted(info.limits, Limits)
     except msgspec.ValidationError as error:
         raise ServiceError(f"the service is of another version: its limits cannot be read: {error}") from error
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import msgspec
 from cyclopts import Parameter
 
+from trirail.wire.decoding import converted
 from trirail.wire.zenoh_session import DEFAULT_LOCATOR
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def _frames(context: CompletionContext, kind: Literal["tool", "work"]) -> list[s
     from trirail.config import FramesTable
 
     with _robot(context) as robot:
-        return list(getattr(msgspec.convert(robot.info().frames, FramesTable), kind))
+        return list(getattr(converted(robot.info().frames, FramesTable), kind))
 
 
 def _robot(context: CompletionContext) -> Robot:

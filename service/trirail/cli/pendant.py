@@ -16,7 +16,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Self
 
-import msgspec
 from rich.live import Live
 from rich.text import Text
 
@@ -28,6 +27,7 @@ from trirail.client.goal import Velocity
 from trirail.client.held_jog import SPEEDS, USUAL, HeldJog
 from trirail.config import Limits
 from trirail.errors import ServiceError, TrirailError
+from trirail.wire.decoding import converted
 from trirail.wire.state import State
 from trirail.wire.text import printable
 
@@ -143,7 +143,7 @@ def run(robot: Robot, pad: Pad | None = None) -> int:
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ServiceError("a jog by keys needs a terminal; without one: trirail jog VX VY W --seconds S")
-    top = msgspec.convert(robot.info().limits, Limits).platform.velocity
+    top = converted(robot.info().limits, Limits).platform.velocity
     pendant = Pendant(robot, top)
     if pad is not None:
         pendant.said = f"{pad.name}: {gamepad.HELP}"

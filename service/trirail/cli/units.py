@@ -15,9 +15,12 @@ from typing import Annotated, Any, Final, NamedTuple
 import msgspec
 from cyclopts import Parameter, Token
 
+from trirail.wire.decoding import converted, prepare
 from trirail.wire.messages import LOWEST_OVERRIDE, Override
 from trirail.wire.state import CorrectionTold
 from trirail.wire.text import NAME_RULE, NUMBER, is_name, quoted
+
+prepare(Override)
 
 _DEGREE: Final = Decimal("0.0174532925199432957692369076848861271344")
 """π / 180, to more digits than a float has."""
@@ -185,7 +188,7 @@ def percent(text: str) -> float:
     """Return an override [%], from a number or a percentage. Raises ValueError with what would be right."""
     try:
         value = quantity(text, PERCENTAGE)
-        msgspec.convert({"percent": value}, Override)
+        converted({"percent": value}, Override)
     except (ValueError, msgspec.ValidationError):
         raise ValueError(f"{quoted(text.strip())!r} is no override: 0, or {LOWEST_OVERRIDE:g} to 200 %") from None
     return value

@@ -10,12 +10,14 @@ import msgspec
 from trirail_drivers import files
 
 from trirail.errors import TrirailError
+from trirail.wire.decoding import decoded, prepare
 from trirail.wire.goals import TrajectoryPoint
 from trirail.wire.text import number, quoted
 
 COLUMNS = ("t", "x", "y", "phi")
 FEWEST = 2
 """Points of a trajectory: the first is where the robot stands."""
+prepare(list[TrajectoryPoint])
 VELOCITY, ACCELERATION = ("vx", "vy", "w"), ("ax", "ay", "e")
 
 
@@ -31,7 +33,7 @@ def _points(path: Path) -> list[TrajectoryPoint]:
     text = files.text(path)
     if path.suffix == ".json":
         try:
-            return msgspec.json.decode(text, type=list[TrajectoryPoint])
+            return decoded(text, list[TrajectoryPoint])
         except RecursionError as error:
             raise TrirailError(f"{path}: nested too deep; a list of points is wanted") from error
         except (msgspec.MsgspecError, ValueError) as error:

@@ -25,6 +25,7 @@ from trirail.errors import ConfigError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.correction import STEEPEST, Correction
 from trirail.kinematics.geometry import LEGS, Geometry, Room, travels
+from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import CorrectionTold
 
 RESERVE = (0.02, 0.02, 0.07)
@@ -62,6 +63,9 @@ class AsBuilt(Struct, frozen=True, forbid_unknown_fields=True):
     """Coefficients of uniform cubic B-splines, by x, y, phi, of what is added to a pose in x, y [m] and phi [rad]."""
 
 
+prepare(AsBuilt)
+
+
 def geometry_of(robot: Geometry) -> str:
     """Return eight digits that tell a geometry from others, to a nanometre and a nanoradian."""
     numbers = [np.round(np.hstack([*leg.anchor, leg.rail_angle, leg.home, *leg.edge_point, leg.edge_angle]), 9) + 0.0
@@ -90,7 +94,7 @@ def read(path: Path) -> AsBuilt:
 def parse(text: str) -> AsBuilt:
     """Read a map. Raises ConfigError."""
     try:
-        return msgspec.convert(tomllib.loads(text), AsBuilt)
+        return converted(tomllib.loads(text), AsBuilt)
     except RecursionError as error:
         raise ConfigError("its arrays are nested too deeply") from error
     except msgspec.ValidationError as error:

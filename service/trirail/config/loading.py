@@ -14,12 +14,14 @@ from trirail_drivers.interface import NAMES
 from trirail.config import as_built
 from trirail.config.checks import check
 from trirail.config.explained import explain, leaves
-from trirail.config.tables import Config
+from trirail.config.tables import Config, FramesTable, Limits
 from trirail.errors import ConfigError
+from trirail.wire.decoding import converted, prepare
 
 _PACKAGED = Path(__file__).parents[1] / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[3] / "configs") / "sim.toml"
 """The configuration that needs nothing: no hardware, no rights, no other program."""
+prepare(Config, Limits, FramesTable)
 
 
 def load(path: Path) -> Config:
@@ -56,7 +58,7 @@ def _parsed(text: str) -> Config:
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{key} = {value}: it must be a finite number")
     try:
-        return msgspec.convert(raw, Config)
+        return converted(raw, Config)
     except msgspec.ValidationError as error:
         raise ConfigError(explain(str(error), raw)) from error
 

@@ -17,6 +17,7 @@ from trirail.client.lease import Lease
 from trirail.errors import TrirailError
 from trirail.panel.feed import Feed, now
 from trirail.panel.messages import FromPage, GoTo, Hold, Release, Seen, SetOverride, Tell
+from trirail.wire.decoding import decoded, prepare
 from trirail.wire.vocabulary import Command
 
 AHEAD = 3
@@ -29,7 +30,7 @@ UNDER_WAY = 8
 UNSENT = 200
 """So many answers are kept for a tab that reads none; the eldest go."""
 
-_FROM_PAGE = msgspec.json.Decoder(FromPage)
+prepare(FromPage)
 
 
 class Tab:
@@ -68,7 +69,7 @@ class Tab:
 
     def _take(self, text: str | bytes) -> None:
         try:
-            said: FromPage = _FROM_PAGE.decode(text)
+            said: FromPage = decoded(text, FromPage)
         except msgspec.MsgspecError as error:
             self._say("refused", to="page", message=f"not a message of this page: {error}")
             return

@@ -13,6 +13,7 @@ import msgspec
 
 from trirail.processes.interpreter import CHILD, python
 from trirail.processes.process import COMPILING, HAPPENED, MEASURED
+from trirail.wire.decoding import converted
 from trirail.wire.messages import Event
 
 
@@ -56,7 +57,7 @@ class ChildProcess:
             if COMPILING in said:
                 self.compiling.append(said[COMPILING])
             elif HAPPENED in said:
-                self.happened.append(msgspec.convert(said[HAPPENED], Event))
+                self.happened.append(converted(said[HAPPENED], Event))
             elif MEASURED in said:
                 self.measured.append(said[MEASURED])
             else:

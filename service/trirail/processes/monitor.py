@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Any, Final
 
-import msgspec
-
 from trirail.config import Config
 from trirail.processes.health import Health, Running
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.measured import Measurements, RecorderMeasured, ServiceMeasured
+from trirail.wire.decoding import converted, prepare
 
 KINDS: Final = {"gateway": ServiceMeasured, "recorder": RecorderMeasured}
 """What each process measures."""
+prepare(*KINDS.values())
 
 
 class Monitor:
@@ -42,7 +42,7 @@ class Monitor:
 
     def take(self, process: str, content: dict[str, Any]) -> None:
         """Take what a process has measured."""
-        self.measured.take(process, msgspec.convert(content, KINDS[process]))
+        self.measured.take(process, converted(content, KINDS[process]))
 
     def end(self, processes: Mapping[str, Running]) -> None:
         """Look for the last time: the service is ending."""

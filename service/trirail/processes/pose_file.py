@@ -13,12 +13,14 @@ from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
 from trirail.errors import ServiceError
+from trirail.wire.decoding import decoded, prepare
 from trirail.wire.goals import Coordinates, PoseName
 
 NAME = "poses.json"
 
 Taught = dict[PoseName, Coordinates]
 """x, y [m] and phi [rad] of each pose by its name."""
+prepare(Taught)
 
 
 def state_directory(robot: str) -> Path:
@@ -39,7 +41,7 @@ class PoseFile:
     def read(self) -> Taught:
         """Return what was taught; nothing where there is no file yet."""
         try:
-            return msgspec.json.decode(files.text(self.path), type=Taught) if self.path.exists() else {}
+            return decoded(files.text(self.path), Taught) if self.path.exists() else {}
         except (FileError, OSError) as error:
             raise ServiceError(f"{error}; it has the taught poses") from error
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:

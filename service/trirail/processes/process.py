@@ -22,6 +22,7 @@ from trirail.errors import TrirailError
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.realtime import die_with_parent
 from trirail.wire import links
+from trirail.wire.decoding import decoded, prepare
 from trirail.wire.messages import Event
 from trirail.wire.planning import MAX_PLANNING
 
@@ -33,6 +34,8 @@ class Order(msgspec.Struct, frozen=True):
     record: str | None
     """Recording file to write, None for one named by the time."""
 
+
+prepare(Order)
 
 COMPILING = "compiling"
 """The key of what is said of a function that is being compiled."""
@@ -53,7 +56,7 @@ def _main(
     measured: Callable[[msgspec.Struct], None],
     sockets: list[int],
 ) -> int:
-    order = msgspec.json.decode(sys.stdin.buffer.read(), type=Order)
+    order = decoded(sys.stdin.buffer.read(), Order)
     config = order.config
     # Each process imports what it needs and no more: the loop must not load Zenoh or Rerun, the gateway no mathematics.
     if name != "gateway":

@@ -21,6 +21,7 @@ from trirail.errors import ConfigError, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import router_access_control
 from trirail.wire.credentials import Credentials, revoked, with_role
+from trirail.wire.decoding import converted, prepare
 from trirail.wire.messages import RoleReply
 
 
@@ -45,6 +46,9 @@ class RouterConfig(Struct, frozen=True, forbid_unknown_fields=True):
     def all_robots(self) -> list[str]:
         """Every robot, behind it or behind another router."""
         return [robot for robots in self.behind.values() for robot in robots]
+
+
+prepare(RouterConfig)
 
 
 def load(path: Path) -> RouterConfig:
@@ -75,7 +79,7 @@ def _parsed(text: str) -> RouterConfig:
     except ValueError as error:
         raise ConfigError(f"not TOML: {error}") from error
     try:
-        return msgspec.convert(raw, RouterConfig)
+        return converted(raw, RouterConfig)
     except msgspec.ValidationError as error:
         raise ConfigError(explain(str(error), raw, RouterConfig)) from error
 

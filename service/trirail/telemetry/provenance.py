@@ -14,6 +14,7 @@ import msgspec
 import trirail_drivers
 
 from trirail.config import Config, parse
+from trirail.wire.decoding import decoded, prepare
 
 CONFIGURATION, SOFTWARE = "/configuration", "/software"
 """Where a recording has what made it, as text documents: entity paths."""
@@ -32,6 +33,9 @@ class Software(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         return f"trirail {self.trirail}, source {self.source}, on {self.machine}"
+
+
+prepare(Software)
 
 
 @cache
@@ -60,7 +64,7 @@ def configuration(found: Mapping[str, str]) -> Config | None:
 def recorded_by(found: Mapping[str, str]) -> Software | None:
     """Return the software among a recording's texts, None where there is none, or it is written as no version here."""
     try:
-        return msgspec.json.decode(found.get(SOFTWARE, ""), type=Software)
+        return decoded(found.get(SOFTWARE, ""), Software)
     except msgspec.DecodeError:
         return None
 

@@ -32,6 +32,7 @@ from trirail.errors import EmptyRecordingError, ServiceError
 from trirail.telemetry.columns import FIELDS, RECORD, SECOND, structs
 from trirail.telemetry.journal import EVENTS, JSON, REQUESTS, WORDS
 from trirail.telemetry.provenance import SOFTWARE
+from trirail.wire.decoding import decoded, prepare
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE
@@ -49,6 +50,7 @@ _LEVEL = rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
 _KEPT = (RECORD, EVENTS, REQUESTS)
 T = TypeVar("T", bound=msgspec.Struct)
+prepare(ControlInput, Event)
 _LAYOUT = structs(np.zeros(1, DTYPE)).type.value_type
 """The records' fields, as they are in a file."""
 
@@ -239,7 +241,7 @@ def _texts(batch: pa.RecordBatch, component: str, path: Path, what: str) -> list
 
 def _decoded(row: str, kind: type[T], path: Path, what: str) -> T:
     try:
-        return msgspec.json.decode(row, type=kind)
+        return decoded(row, kind)
     except msgspec.DecodeError as error:
         raise ServiceError(f"{path}: written by another version: its {what} cannot be read: {error}") from error
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import msgspec
-
 from trirail import config
 from trirail.config import Config, FramesTable, Limits
 from trirail.kinematics.geometry import Geometry, Leg
+from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import Info
+
+prepare(Leg)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +37,8 @@ class ShownRobot:
     @classmethod
     def told(cls, info: Info) -> ShownRobot:
         """Take it from a service's answer. msgspec.ValidationError where that is of another version."""
-        first, second, third = (msgspec.convert(_leg(leg), Leg) for leg in info.geometry)
-        limits, frames = msgspec.convert(info.limits, Limits), msgspec.convert(info.frames, FramesTable)
+        first, second, third = (converted(_leg(leg), Leg) for leg in info.geometry)
+        limits, frames = converted(info.limits, Limits), converted(info.frames, FramesTable)
         return cls(info.robot, Geometry(legs=(first, second, third)), limits, info.rate_hz, frames)
 
 

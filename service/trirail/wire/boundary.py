@@ -5,7 +5,6 @@ Both ways: keys, goals and commands that come to the service; replies, states, e
 
 from __future__ import annotations
 
-import functools
 import json
 from collections import Counter
 from typing import Any
@@ -15,8 +14,12 @@ import numpy as np
 from trirail_drivers.interface import PowerState
 
 from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.decoding import decoder, prepare
+from trirail.wire.goals import Goal
+from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Event, GoalReply, NoContent, RoleReply
 from trirail.wire.records import SIZE, unpack
 from trirail.wire.sizes import MAX_MESSAGE
+from trirail.wire.state import Info, NamedPose, NamedPoses, RobotSummary, State
 from trirail.wire.text import NAME_RULE, QUANTITY_RULE, is_name, is_quantity, printable, quoted
 from trirail.wire.vocabulary import MODES
 
@@ -32,6 +35,9 @@ _READ_AS = {
 }
 
 _NULL = {JSON: b"null", MSGPACK: b"\xc0"}
+
+prepare(Goal, NoContent | None, *CONTENT.values(), GoalReply, CommandReply, RoleReply, ErrorReply)
+prepare(State, Event, Info, NamedPose, NamedPoses, RobotSummary)
 
 
 def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:
@@ -84,7 +90,7 @@ def decode(payload: bytes, kind: Any, what: str, encoded: str = JSON) -> Any:
     check_size(len(payload))
     read_as = encoding(encoded)
     try:
-        value = _decoder(kind, read_as).decode(payload or _NULL[read_as])
+        value = decoder(kind, packed=read_as == MSGPACK).decode(payload or _NULL[read_as])
         if read_as == JSON and payload:
             _KEYS.decode(payload.decode())
     except RecursionError as error:
@@ -119,11 +125,6 @@ def _refuse_twice(pairs: list[tuple[str, object]]) -> None:
 
 _KEYS = json.JSONDecoder(object_pairs_hook=_refuse_twice, parse_int=len, parse_float=len)
 """Looks at keys alone: no numbers are made. It takes as long as the decoder itself, 3 µs for a pose."""
-
-
-@functools.cache
-def _decoder(kind: Any, read_as: str) -> msgspec.json.Decoder[Any] | msgspec.msgpack.Decoder[Any]:
-    return msgspec.msgpack.Decoder(kind) if read_as == MSGPACK else msgspec.json.Decoder(kind)
 
 
 def _plain(error: Exception) -> str:

@@ -8,6 +8,7 @@ from msgspec import Struct, msgpack, structs
 from trirail_drivers.interface import Counts, MissingProtection, Triple
 
 from trirail.errors import RefusalCode
+from trirail.wire.decoding import decoder, prepare
 from trirail.wire.goals import Goal
 from trirail.wire.messages import Event, Level
 from trirail.wire.planning import PlanAnswer
@@ -205,10 +206,11 @@ class Unrecorded(Struct, frozen=True, tag=True):
 RecorderSaid = Remark | Unrecorded
 Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Status | ControlInput
 
+prepare(Request, Answer, RecorderSaid)
 encode = msgpack.Encoder().encode
-decode_request = msgpack.Decoder(Request).decode
-decode_answer = msgpack.Decoder(Answer).decode
-decode_recorder = msgpack.Decoder(RecorderSaid).decode
+decode_request = decoder(Request, packed=True).decode
+decode_answer = decoder(Answer, packed=True).decode
+decode_recorder = decoder(RecorderSaid, packed=True).decode
 
 
 def message(content: Request | Answer | RecorderSaid) -> bytes:

@@ -10,6 +10,7 @@ from msgspec import Struct, msgpack
 from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.decoding import decoder, prepare
 from trirail.wire.goals import PlannedGoal
 
 
@@ -113,6 +114,7 @@ PlanAnswer = Planned | Extended | NotPlanned
 MAX_PLANNING = 262_144
 """A request or an answer, as msgpack: the largest goal, and the longest motion under way, fit twice [bytes]."""
 
+prepare(PlanRequest, PlanAnswer)
 encode = msgpack.Encoder().encode
-decode_plan_request = msgpack.Decoder(PlanRequest).decode
-decode_plan_answer = msgpack.Decoder(PlanAnswer).decode
+decode_plan_request = decoder(PlanRequest, packed=True).decode
+decode_plan_answer = decoder(PlanAnswer, packed=True).decode
