@@ -22,9 +22,10 @@ from trirail.client.async_connection import AsyncConnection
 from trirail.client.async_goal import AsyncGoalHandle, AsyncJog
 from trirail.client.async_lease import AsyncLease
 from trirail.client.async_track import AsyncTrack
-from trirail.client.client import HOME_WITHIN, Robot, address, identity, message_of, result_of
+from trirail.client.client import HOME_WITHIN, Robot, address, identity, result_of
 from trirail.client.connection import REPLY_WITHIN
 from trirail.client.goal import GoalHandle
+from trirail.client.outgoing import content_message, goal_message, seconds
 from trirail.client.track import Taker
 from trirail.errors import RefusedError, ServiceError
 from trirail.wire import boundary
@@ -133,7 +134,7 @@ class AsyncRobot:
     override = _order(Robot.override)
     release = _order(Robot.release)
 
-    def jog(self, *, x: float = 0.0, y: float = 0.0, phi: float = 0.0, timeout: float = 0.2) -> AsyncJog:
+    def jog(self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2) -> AsyncJog:
         """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
 
         async with robot.jog(x=0.01):
@@ -149,19 +150,21 @@ class AsyncRobot:
                 await track.update(pose, velocity, time)
         """
 
-        def post(goal: Goal, take: Taker) -> None:
-            self._connection.post(("goal", self.user), GoalReply, msgspec.json.encode(goal), take)
+        goal_id = id or uuid.uuid4().hex[:12]
 
-        return AsyncTrack(self.send, post, id or uuid.uuid4().hex[:12], timeout)
+        def post(goal: Goal, take: Taker) -> None:
+            self._connection.post(("goal", self.user), GoalReply, goal_message(lambda _: goal, goal_id), take)
+
+        return AsyncTrack(self.send, post, goal_id, timeout)
 
     async def send(self, make: Callable[[str], Goal], id: str | None = None) -> AsyncGoalHandle:  # noqa: A002
         """Send the goal that `make` makes for an id, as Robot.send does."""
         goal_id = id or uuid.uuid4().hex[:12]
-        message = message_of(make, goal_id)
+        content = goal_message(make, goal_id)
         renews = goal_id in self._goals  # a jog: what it has is not forgotten or stopped for one renewal's sake
         goal = self._goals.setdefault(goal_id, AsyncGoalHandle(goal_id, self.command))
         try:
-            goal.reply = await self._connection.ask(("goal", self.user), GoalReply, message)
+            goal.reply = await self._connection.ask(("goal", self.user), GoalReply, content)
         except asyncio.CancelledError:
             if not renews:
                 self._goals.pop(goal_id, None)
@@ -189,7 +192,7 @@ class AsyncRobot:
 
     async def acquire(self, lease: AcquireLease | None = None) -> CommandReply:
         """Take the lease, or keep it by one sign of life; `lease` keeps it for as long as signs come."""
-        return await self.command(Command.ACQUIRE, msgspec.json.encode(lease) if lease is not None else None)
+        return await self.command(Command.ACQUIRE, content_message(Command.ACQUIRE, lambda: lease) if lease else None)
 
     async def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""
@@ -209,18 +212,18 @@ class AsyncRobot:
 
     async def state(self, timeout: float = 2.0) -> State:
         """Return the next state that is published. Raises ServiceError if none comes within `timeout` seconds."""
-        async with aclosing(self._connection.states(timeout)) as states:
+        async with aclosing(self.states(timeout)) as states:
             async for state in states:
                 return state
         raise await self._connection.nobody("state")
 
     def states(self, timeout: float | None = None) -> AsyncGenerator[State]:
         """Yield states as they come, the newest where this is too slow; end after `timeout` seconds without one."""
-        return self._connection.states(timeout)
+        return self._connection.states(seconds(timeout))
 
     def events(self, history: bool = False, timeout: float | None = None) -> AsyncGenerator[Event]:
         """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
-        return self._connection.events(history, timeout)
+        return self._connection.events(history, seconds(timeout))
 
     def records(self, take: Callable[[bytes], None]) -> AbstractContextManager[Any]:
         """Have every batch of records taken in the event loop, until the context ends, as Robot.records does."""

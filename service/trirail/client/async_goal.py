@@ -11,6 +11,7 @@ from typing import Self
 import msgspec
 
 from trirail.client.goal import LETTING_GO, STANDS_WITHIN, AcceptedGoal, Result, Velocity
+from trirail.client.outgoing import number, seconds
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, VelocityGoal
 from trirail.wire.messages import GoalReply, Stop
@@ -37,11 +38,12 @@ class AsyncGoalHandle(AcceptedGoal):
 
         Raises TimeoutError if that takes longer than `timeout` seconds; the goal itself goes on.
         """
+        within = seconds(timeout)
         try:
-            async with asyncio.timeout(timeout):
+            async with asyncio.timeout(within):
                 await self._ended.wait()
         except TimeoutError as error:
-            raise TimeoutError(f"goal {self.id} has not ended within {timeout:g} s") from error
+            raise TimeoutError(f"goal {self.id} has not ended within {within:g} s") from error
         assert self._result is not None
         return self._result
 
@@ -62,7 +64,7 @@ class AsyncJog:
     ) -> None:
         self._send_goal = send
         self._velocity = velocity
-        self._timeout = timeout
+        self._timeout = number(timeout, "timeout")
         self._id = uuid.uuid4().hex[:12]
         self._goal: AsyncGoalHandle | None = None
         self._over = asyncio.Event()

@@ -11,6 +11,7 @@ from typing import Self
 import msgspec
 
 from trirail.client.lease import SIGNS
+from trirail.client.outgoing import number, seconds
 from trirail.errors import TrirailError
 from trirail.wire.messages import AcquireLease, CommandReply, ReleaseLease
 from trirail.wire.vocabulary import Command, Mode
@@ -26,7 +27,7 @@ class AsyncLease:
         self, command: Callable[[Command, bytes], Awaitable[CommandReply]], *, force: bool, timeout: float
     ) -> None:
         self._command = command
-        self._sign = AcquireLease(uuid.uuid4().hex[:12], timeout)
+        self._sign = AcquireLease(uuid.uuid4().hex[:12], number(timeout, "timeout"))
         self._force = force
         self._over = asyncio.Event()
         self._keeping: asyncio.Task[None] | None = None
@@ -36,7 +37,7 @@ class AsyncLease:
     async def wait(self, timeout: float | None = None) -> bool:
         """Wait until it is lost, for so many seconds at most; whether it is."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout):
+            async with asyncio.timeout(seconds(timeout)):
                 await self._over.wait()
         return self._over.is_set()
 

@@ -12,18 +12,19 @@ import os
 import re
 import threading
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-import msgspec
 import zenoh
 
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import GoalHandle, Jog, Result
 from trirail.client.lease import Lease
+from trirail.client.outgoing import content_message, goal_message, number, seconds
 from trirail.client.track import Taker, Track
+from trirail.client.trajectory import Points, points_of
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.credentials import Credentials, credentials_for
@@ -37,7 +38,6 @@ from trirail.wire.goals import (
     SlidersGoal,
     Tool,
     TrajectoryGoal,
-    TrajectoryPoint,
 )
 from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, Override
 from trirail.wire.sizes import MAX_NAME
@@ -100,10 +100,10 @@ class Robot:
 
     def move_to(
         self,
-        *,
         x: float,
         y: float,
         phi: float,
+        *,
         speed: float = 1.0,
         limits: OwnLimits | None = None,
         blend: float | None = None,
@@ -141,10 +141,10 @@ class Robot:
 
     def move(
         self,
-        *,
         x: float = 0.0,
         y: float = 0.0,
         phi: float = 0.0,
+        *,
         frame: str = "base",
         tool: Tool | None = None,
         origin: Literal["commanded", "measured"] = "commanded",
@@ -222,7 +222,7 @@ class Robot:
 
     def follow(
         self,
-        points: Sequence[TrajectoryPoint],
+        points: Points,
         *,
         stretch: bool = False,
         settle: bool = True,
@@ -231,13 +231,15 @@ class Robot:
         """Send a timed trajectory that begins where the robot stands; return once it is accepted.
 
         A point is t [s], x, y [m] and phi [rad], and where it is known, velocity and acceleration of the three.
+        `points` may be rows of these four, as an array (N, 4), or the path of a CSV or JSON file.
         Quintic between the points; where they have no velocity it is that between their neighbours, zero at the ends.
         One that is too fast for a slider is refused, or slowed as a whole with `stretch`. With `settle` False it is
         done when its path has ended, whether or not the robot is measured to be there.
         """
-        return self.send(lambda name: TrajectoryGoal(tuple(points), stretch=stretch, settle=settle, id=name), id)
+        meant = points_of(points)
+        return self.send(lambda name: TrajectoryGoal(meant, stretch=stretch, settle=settle, id=name), id)
 
-    def jog(self, *, x: float = 0.0, y: float = 0.0, phi: float = 0.0, timeout: float = 0.2) -> Jog:
+    def jog(self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2) -> Jog:
         """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
 
         with robot.jog(x=0.01):
@@ -256,20 +258,22 @@ class Robot:
         when none has come for `timeout` seconds of real time. `id` as of move_to.
         """
 
-        def post(goal: Goal, take: Taker) -> None:
-            self._connection.post(("goal", self.user), GoalReply, msgspec.json.encode(goal), take)
+        goal_id = id or uuid.uuid4().hex[:12]
 
-        return Track(self.send, post, id or uuid.uuid4().hex[:12], timeout)
+        def post(goal: Goal, take: Taker) -> None:
+            self._connection.post(("goal", self.user), GoalReply, goal_message(lambda _: goal, goal_id), take)
+
+        return Track(self.send, post, goal_id, timeout)
 
     def send(self, make: Callable[[str], Goal], id: str | None = None) -> GoalHandle:  # noqa: A002
         """Send the goal that `make` makes for an id, a trirail.wire.goals.Goal; return once it is accepted."""
         goal_id = id or uuid.uuid4().hex[:12]
-        message = message_of(make, goal_id)
+        content = goal_message(make, goal_id)
         goal = GoalHandle(goal_id, self.command)
         with self._goals_lock:
             goal = self._goals.setdefault(goal_id, goal)
         try:
-            reply = self._connection.ask(("goal", self.user), GoalReply, message)
+            reply = self._connection.ask(("goal", self.user), GoalReply, content)
         except (RefusedError, ServiceError):
             with self._goals_lock:
                 self._goals.pop(goal_id, None)
@@ -311,11 +315,7 @@ class Robot:
 
     def override(self, percent: float) -> None:
         """Let this motion and those to come run at a share of full speed, 0 or 1 to 200 %, within the limits."""
-        try:
-            content = Override(percent)
-        except ValueError as error:
-            raise RefusedError(RefusalCode.MALFORMED, f"no override: {error}") from error
-        self.command(Command.OVERRIDE, msgspec.json.encode(content))
+        self.command(Command.OVERRIDE, content_message(Command.OVERRIDE, lambda: Override(number(percent, "override"))))
 
     def lease(self, *, force: bool = False, timeout: float = 1.0) -> Lease:
         """Have the robot for oneself while the context lasts: only this user's goals and commands move it.
@@ -332,7 +332,7 @@ class Robot:
 
     def acquire(self, lease: AcquireLease | None = None) -> CommandReply:
         """Take the lease, or keep it by one sign of life; `lease` keeps it for as long as signs come."""
-        return self.command(Command.ACQUIRE, msgspec.json.encode(lease) if lease is not None else None)
+        return self.command(Command.ACQUIRE, content_message(Command.ACQUIRE, lambda: lease) if lease else None)
 
     def release(self) -> None:
         """Give the lease back that this user holds, whichever of his clients keeps it; return when the robot stands."""
@@ -382,11 +382,11 @@ class Robot:
 
     def states(self, timeout: float | None = None) -> Iterator[State]:
         """Yield states as they come, the newest where this is too slow; end after `timeout` seconds without one."""
-        return self._connection.states(timeout)
+        return self._connection.states(seconds(timeout))
 
     def events(self, history: bool = False, timeout: float | None = None) -> Iterator[Event]:
         """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
-        return self._connection.events(history, timeout)
+        return self._connection.events(history, seconds(timeout))
 
     def records(self, take: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
         """Have every batch of records taken as it comes, until the context ends; wire.records.unpack reads them.
@@ -432,14 +432,6 @@ def result_of(event: Event) -> Result | None:
     if event.id is None or event.outcome is None:
         return None
     return Result(event.id, event.outcome, event.message, event.settle, event.residual, event.overshoot)
-
-
-def message_of(make: Callable[[str], Goal], goal_id: str) -> bytes:
-    """Return the goal that `make` makes for an id, as JSON. Raises RefusedError for one that cannot be."""
-    try:
-        return msgspec.json.encode(make(goal_id))
-    except ValueError as error:
-        raise RefusedError(RefusalCode.MALFORMED, f"not a goal: {error}") from error
 
 
 def _user() -> str:

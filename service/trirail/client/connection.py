@@ -44,9 +44,9 @@ class Connection:
         self.robot = robot
         self._connect = connect
         self._credentials = credentials
-        self._session = zenoh_session.open_client(connect, credentials)
+        self._opened = zenoh_session.open_client(connect, credentials)
         # Also at the end of a program that does not close it: Zenoh's threads must not outlive the interpreter.
-        self.close = weakref.finalize(self, zenoh_session.close, self._session)
+        self.close = weakref.finalize(self, zenoh_session.close, self._opened)
         """End it; calls after the first do nothing."""
         self._reader = SampleReader()
 
@@ -237,8 +237,14 @@ class Connection:
 
     @property
     def session(self) -> zenoh.Session:
-        """The session, for who does not wait for its answers in a thread."""
+        """The session, for who does not wait for its answers in a thread. Raises ServiceError once it is closed."""
         return self._session
+
+    @property
+    def _session(self) -> zenoh.Session:
+        if not self.close.alive:
+            raise ServiceError("the connection is closed: open a new one, as Robot(…)")
+        return self._opened
 
     def _key(self, *parts: str) -> str:
         return zenoh_session.key(self.robot, *parts)

@@ -10,6 +10,7 @@ from typing import NamedTuple, Self
 
 import msgspec
 
+from trirail.client.outgoing import number, seconds
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, VelocityGoal
 from trirail.wire.messages import GoalReply, Residual, Stop
@@ -92,8 +93,9 @@ class GoalHandle(AcceptedGoal):
 
         Raises TimeoutError if that takes longer than `timeout` seconds; the goal itself goes on.
         """
-        if not self._ended.wait(timeout) or self._result is None:
-            raise TimeoutError(f"goal {self.id} has not ended within {timeout:g} s")
+        within = seconds(timeout)
+        if not self._ended.wait(within) or self._result is None:
+            raise TimeoutError(f"goal {self.id} has not ended within {within:g} s")
         return self._result
 
     def end(self, result: Result) -> None:
@@ -123,7 +125,7 @@ class Jog:
     ) -> None:
         self._send_goal = send
         self._velocity = velocity
-        self._timeout = timeout
+        self._timeout = number(timeout, "timeout")
         self._id = uuid.uuid4().hex[:12]
         self._over = threading.Event()
         self._renewing = threading.Thread(target=self._renew, name="jog", daemon=True)

@@ -10,6 +10,7 @@ from typing import Self
 
 import msgspec
 
+from trirail.client.outgoing import number, seconds
 from trirail.errors import TrirailError
 from trirail.wire.messages import AcquireLease, CommandReply, ReleaseLease
 from trirail.wire.vocabulary import Command, Mode
@@ -28,7 +29,7 @@ class Lease:
 
     def __init__(self, command: Callable[[Command, bytes], CommandReply], *, force: bool, timeout: float) -> None:
         self._command = command
-        self._sign = AcquireLease(uuid.uuid4().hex[:12], timeout)
+        self._sign = AcquireLease(uuid.uuid4().hex[:12], number(timeout, "timeout"))
         self._force = force
         self._over = threading.Event()
         self._keeping = threading.Thread(target=self._keep, name="lease", daemon=True)
@@ -37,7 +38,7 @@ class Lease:
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until it is lost, for so many seconds at most; whether it is."""
-        return self._over.wait(timeout)
+        return self._over.wait(seconds(timeout))
 
     def __enter__(self) -> Self:
         asked = msgspec.structs.replace(self._sign, force=self._force)

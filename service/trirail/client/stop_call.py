@@ -20,6 +20,7 @@ import msgspec
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import tls, zenoh_session
 from trirail.wire.credentials import Credentials
+from trirail.wire.decoding import decoded
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.stop_door import MAX_LINE, StopAddress, StopAnswer, StopRequest, encode, stop_address
 
@@ -180,7 +181,7 @@ def _connect(address: StopAddress, within: float) -> socket.socket:
 def _read(line: bytes) -> CommandReply:
     """Return the reply of an answer's line. Raises RefusedError for a refusal, NoDoorError for what is no answer."""
     try:
-        answer = msgspec.json.decode(line, type=StopAnswer)
+        answer = decoded(line, StopAnswer)
     except (msgspec.MsgspecError, ValueError) as error:
         raise NoDoorError(f"somebody else answers at the door for stops: {error}") from error
     if answer.reply is not None:

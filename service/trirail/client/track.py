@@ -41,10 +41,10 @@ class FollowedTarget(Generic[Handle]):
         return self._goal.result if self._goal else None
 
     def _goal_of(self, pose: Sequence[float], velocity: Sequence[float], time: float) -> TrackGoal:
-        (x, y, phi), (vx, vy, w) = pose, velocity
         try:
+            (x, y, phi), (vx, vy, w) = pose, velocity
             return TrackGoal(x, y, phi, velocity=(vx, vy, w), time=time, id=self.id, timeout=self._timeout)
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise RefusedError(RefusalCode.MALFORMED, f"not a target: {error}") from error
 
     def _check(self) -> None:

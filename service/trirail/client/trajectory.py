@@ -1,24 +1,56 @@
-"""Timed trajectories from files: CSV or JSON."""
+"""Timed trajectories: from points, rows of numbers, or files of CSV or JSON."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+import itertools
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
+from msgspec import structs
 from trirail_drivers import files
 
-from trirail.errors import TrirailError
+from trirail.client.outgoing import number
+from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.decoding import decoded, prepare
 from trirail.wire.goals import TrajectoryPoint
-from trirail.wire.text import number, quoted
+from trirail.wire.text import number as number_in
+from trirail.wire.text import quoted
 
 COLUMNS = ("t", "x", "y", "phi")
+Points = str | os.PathLike[str] | Iterable[TrajectoryPoint | Iterable[float]]
+MEANT = "TrajectoryPoints, rows of t [s], x, y [m], phi [rad], as an array (N, 4), or the path of a CSV or JSON file"
 FEWEST = 2
 """Points of a trajectory: the first is where the robot stands."""
 prepare(list[TrajectoryPoint])
 VELOCITY, ACCELERATION = ("vx", "vy", "w"), ("ax", "ay", "e")
+
+
+def points_of(given: Points) -> tuple[TrajectoryPoint, ...]:
+    """Return the points that a program means: points, rows of t [s], x, y [m], phi [rad], or the path of a file.
+
+    Raises TrirailError where none of it can be meant.
+    """
+    if isinstance(given, str | os.PathLike):
+        return tuple(read(Path(given)))
+    try:
+        return tuple(itertools.starmap(_point_of, enumerate(given)))
+    except TypeError as error:
+        raise RefusedError(RefusalCode.MALFORMED, f"points: {quoted(repr(given))} is none of these: {MEANT}") from error
+
+
+def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint:
+    """Return a point, or that of a row. Raises TypeError for what is no row, RefusedError for one of other things."""
+    if isinstance(row, TrajectoryPoint):  # its goal computes with its time
+        return row if isinstance(row.t, float) else structs.replace(row, t=number(row.t, f"points: t of point {n}"))
+    values = [] if isinstance(row, str | bytes | Mapping) else list(row)
+    if len(values) != len(COLUMNS):
+        found = f"{len(values)} values" if values else quoted(repr(row))
+        raise RefusedError(RefusalCode.MALFORMED, f"points: row {n} is {found}; wanted are {MEANT}")
+    t, x, y, phi = (number(value, f"points: {name} of row {n}") for name, value in zip(COLUMNS, values, strict=True))
+    return TrajectoryPoint(t, x, y, phi)
 
 
 def read(path: Path) -> list[TrajectoryPoint]:
@@ -79,7 +111,7 @@ def _numbers(where: str, names: Sequence[str], row: Sequence[str]) -> dict[str, 
     values = {}
     for name, cell in zip(names, row, strict=True):
         try:
-            values[name] = number(cell)
+            values[name] = number_in(cell)
         except ValueError as error:
             what = f"{where}, column {name}: {error}; a CSV has bare metres, radians and seconds"
             raise TrirailError(what) from error

@@ -25,6 +25,7 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.descriptors import Reserve, limit
 from trirail.processes.stop_addresses import listen, source
 from trirail.wire import tls
+from trirail.wire.decoding import decoded
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.stop_door import MAX_LINE, StopAddress, StopRequest, answer_with
 from trirail.wire.text import quoted
@@ -239,7 +240,7 @@ class StopDoor:
         """Pass a request on."""
         answer = partial(self._answer, caller)
         try:
-            request = msgspec.json.decode(line, type=StopRequest)
+            request = decoded(line, StopRequest)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             answer(ErrorReply(RefusalCode.MALFORMED, quoted(f"not a stop: {error}")))
             return

@@ -57,8 +57,8 @@ def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:
 
 def check_name(name: str, whose: str) -> str:
     """Return what may name a robot or user. Raises RefusedError."""
-    if not is_name(name):
-        raise RefusedError(RefusalCode.BAD_NAME, f"{whose} {quoted(name)!r} cannot be in a key: {NAME_RULE} are taken")
+    if not isinstance(name, str) or not is_name(name):
+        raise RefusedError(RefusalCode.BAD_NAME, f"{whose} {quoted(str(name))!r} is no name: {NAME_RULE} are taken")
     return name
 
 

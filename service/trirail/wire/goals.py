@@ -36,7 +36,7 @@ def check_fields(message: Struct) -> None:
     """Refuse ids that cannot be shown, and numbers that are not finite, also in messages that were never decoded."""
     for name in message.__struct_fields__:
         value = getattr(message, name)
-        if name == "id" and value is not None and not is_id(value):
+        if name == "id" and isinstance(value, str) and not is_id(value):
             raise ValueError(f"id {quoted(value)!r} cannot be shown: {ID_RULE} are taken")
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, float) and not math.isfinite(number):

@@ -12,6 +12,7 @@ from msgspec import Struct
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
+from trirail.wire.decoding import prepare
 from trirail.wire.endpoints import LAST_PORT, ReachableBy, reach, socket_file, tcp_address
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.vocabulary import Command
@@ -42,6 +43,9 @@ class StopAnswer(Struct, frozen=True, omit_defaults=True):
 
     reply: CommandReply | None = None
     error: ErrorReply | None = None
+
+
+prepare(StopRequest, StopAnswer)
 
 
 class StopAddress(NamedTuple):

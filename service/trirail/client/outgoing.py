@@ -1,0 +1,88 @@
+"""What a program hands to a client becomes a message: any library's numbers and arrays, checked as the service does.
+
+A number is what has `__float__` or `__index__`, as numpy's and fractions have; truth values and texts are none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import operator
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from trirail.errors import RefusalCode, RefusedError
+from trirail.wire import boundary
+from trirail.wire.goals import Goal
+from trirail.wire.messages import CONTENT
+from trirail.wire.text import quoted
+from trirail.wire.vocabulary import Command
+
+
+def message(make: Callable[[], msgspec.Struct], kind: Any, what: str) -> bytes:
+    """Return what `make` makes, of a kind, as JSON that the service can read. Raises RefusedError, with `what`."""
+    try:
+        payload = _ENCODER.encode(make())
+    except (TypeError, ValueError, ArithmeticError) as error:
+        raise RefusedError(RefusalCode.MALFORMED, f"{what}: {quoted(str(error))}") from error
+    boundary.decode(payload, kind, what)
+    return payload
+
+
+def goal_message(make: Callable[[str], Goal], goal_id: str) -> bytes:
+    """Return the goal that `make` makes for an id, as JSON. Raises RefusedError for one that cannot be."""
+    return message(lambda: make(goal_id), Goal, "not a goal")
+
+
+def content_message(command: Command, make: Callable[[], msgspec.Struct]) -> bytes:
+    """Return what a command carries, as JSON. Raises RefusedError for what it cannot."""
+    return message(make, CONTENT[command], f"not for {command}")
+
+
+def number(value: object, what: str) -> float:
+    """Return a number as Python's own. Raises RefusedError, with `what` it is."""
+    try:
+        plain = value if isinstance(value, bool) else _plain(value)
+        if isinstance(plain, (int, float)) and not isinstance(plain, bool):
+            return _finite(float(plain))
+    except (TypeError, ValueError, ArithmeticError):
+        pass
+    raise RefusedError(RefusalCode.MALFORMED, f"{what} is {quoted(repr(value))}: a finite number is wanted")
+
+
+def seconds(value: object) -> float | None:
+    """Return a time-out [s], None for none and for one that is longer than can be waited. Raises RefusedError."""
+    if value is None or (isinstance(value, float) and value == math.inf):
+        return None
+    wait = number(value, "timeout")
+    if wait < 0.0:
+        raise RefusedError(RefusalCode.MALFORMED, f"timeout is {wait:g} s: 0 or more is wanted, or None for no end")
+    return wait if wait < threading.TIMEOUT_MAX else None
+
+
+def _plain(value: Any) -> Any:
+    """Return what a message has for it. Raises TypeError where it has nothing, ValueError for no finite one."""
+    if isinstance(value, np.ndarray | np.generic):
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            raise ValueError(f"{value!r} is not finite")
+        value = value.tolist()  # Python's own numbers, truth values and texts
+        if isinstance(value, list | str | bool):
+            return value
+    for name, convert in (("__index__", operator.index), ("__float__", float)):
+        if hasattr(type(value), name):  # float() takes texts as well
+            with contextlib.suppress(TypeError):
+                return _finite(convert(value))
+    raise TypeError(f"{value!r}, of type {type(value).__name__}, is no number")
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is no finite number")
+    return value
+
+
+_ENCODER = msgspec.json.Encoder(enc_hook=_plain, decimal_format="number")
