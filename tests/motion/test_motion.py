@@ -81,7 +81,8 @@ def bare(start: tuple[float, float, float], end: tuple[float, float, float]) -> 
     limits = CONFIG.limits.platform
     request, trajectory = InputParameter(3), Trajectory(3)
     request.current_position, request.target_position = list(start), list(end)
-    request.max_velocity, request.max_acceleration = list(limits.velocity), [0.98 * a for a in limits.acceleration]
+    request.max_velocity = [0.995 * v for v in limits.velocity]
+    request.max_acceleration = [0.98 * a for a in limits.acceleration]
     request.max_jerk = [0.957 * j for j in limits.jerk]
     request.synchronization = Synchronization.Phase
     Ruckig(3).calculate(request, trajectory)

@@ -21,11 +21,13 @@ from trirail.motion.time_scaling import SHARES, TimeScaling
 PERIOD = CONFIG.period
 LIMITS = CONFIG.limits
 SCALING = TimeScaling(ROBOT, Checker(ROBOT, LIMITS, Bounds(LIMITS, PERIOD), PERIOD), PERIOD)
-_, OF_ACCELERATION, OF_JERK = PLATFORM_LAWS
-CHANGE = OF_ACCELERATION * min(
-    a / v for a, v in zip(LIMITS.platform.acceleration, LIMITS.platform.velocity, strict=True)
+OF_VELOCITY, OF_ACCELERATION, OF_JERK = PLATFORM_LAWS
+CHANGE = (
+    OF_ACCELERATION
+    / OF_VELOCITY
+    * min(a / v for a, v in zip(LIMITS.platform.acceleration, LIMITS.platform.velocity, strict=True))
 )
-JERK = OF_JERK * min(j / v for j, v in zip(LIMITS.platform.jerk, LIMITS.platform.velocity, strict=True))
+JERK = OF_JERK / OF_VELOCITY * min(j / v for j, v in zip(LIMITS.platform.jerk, LIMITS.platform.velocity, strict=True))
 """What brakes a motion at full speed within the platform's limits of acceleration and jerk [1/s, 1/s²]."""
 RATE = st.sampled_from([0.0, 0.3, 1.0, 2.0])
 SHARE = st.floats(0.01, 1.0)
@@ -70,8 +72,12 @@ def test_the_coordinate_that_can_brake_least_decides(coordinate: int, quantity: 
     scaling = TimeScaling(ROBOT, Checker(ROBOT, limits, Bounds(limits, PERIOD), PERIOD), PERIOD)
     law = scaling.ramp(Rate(0.0, 1.0, 0.0), 0.0, 1.0)
     assert law is not None
-    most = OF_ACCELERATION * min(a / v for a, v in zip(platform.acceleration, platform.velocity, strict=True))
-    jerk = OF_JERK * min(j / v for j, v in zip(platform.jerk, platform.velocity, strict=True))
+    most = (
+        OF_ACCELERATION
+        / OF_VELOCITY
+        * min(a / v for a, v in zip(platform.acceleration, platform.velocity, strict=True))
+    )
+    jerk = OF_JERK / OF_VELOCITY * min(j / v for j, v in zip(platform.jerk, platform.velocity, strict=True))
     assert (most < CHANGE) or (jerk < JERK)
     assert float(law.knots[-2]) == pytest.approx(braking(1.0, most, jerk), abs=1e-6)
 

@@ -24,10 +24,10 @@ PLANNED = (0.98, 0.98, 0.93)
 between the moments that are looked at, where jerk varies most."""
 LAWS = (0.99, 0.99, 0.98)
 """Share of the same that changes of a path's rate make use of, on top of what the path itself does."""
-PLATFORM_PLANNED = (1.0, 0.98, 0.957)
+PLATFORM_PLANNED = (0.995, 0.98, 0.957)
 """Share of the platform's limits of velocity, acceleration and jerk that plans make use of: between what is looked at
-the platform's rates vary little, and a change of rate adds no velocity."""
-PLATFORM_LAWS = (1.0, 0.99, 0.985)
+its rates vary less than the sliders' do, and a change of rate adds no velocity."""
+PLATFORM_LAWS = (0.997, 0.99, 0.985)
 """Share of the same that changes of a path's rate make use of: the room in which a robot at its limits can brake."""
 ROUNDED = 1.0 + 1e-6
 """How many times more than its share a path or law may take, by rounding."""
