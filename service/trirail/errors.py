@@ -119,7 +119,7 @@ class RefusalCode(StrEnum):
         "the robot is singular there, or its sliders belong to no pose",
         "choose another path; move the sliders",
     )
-    ABOVE_LIMIT = "above_limit", "a limit of the goal's own is above the robot's", "lower it"
+    ABOVE_LIMIT = "above_limit", "a jog, or a limit of the goal's own, is above the robot's limit", "lower it"
     TOO_FAST = (
         "too_fast",
         "too fast for a slider or the platform",

@@ -192,9 +192,9 @@ def test_a_new_goal_preempts_smoothly(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("pose", "code", "said"),
     [
-        ((0.5, 0.0, 0.0), "out_of_workspace", "platform x: position 0.5 m is beyond its limit 0.15 m"),
-        ((0.0, -0.2, 0.0), "out_of_workspace", "platform y: position -0.2 m is beyond its limit -0.15 m"),
-        ((0.0, 0.0, 0.9), "out_of_workspace", "platform phi: position 0.9 rad is beyond its limit 0.85 rad"),
+        ((0.5, 0.0, 0.0), "out_of_workspace", "platform x: position 500 mm is beyond its limit 150 mm"),
+        ((0.0, -0.2, 0.0), "out_of_workspace", "platform y: position -200 mm is beyond its limit -150 mm"),
+        ((0.0, 0.0, 0.9), "out_of_workspace", "platform phi: position 51.5662° is beyond its limit 48.7014°"),
         ((0.14, 0.14, -0.9), "out_of_workspace", "the path leads out of the workspace after"),
     ],
 )
@@ -465,7 +465,7 @@ def test_the_last_gate_knows_the_platforms_limits(rig: Rig) -> None:
     rig.cycle()
     rig.go_on_with(rest((0.1502, 0.0, 0.0)))
     rig.cycle()
-    assert "setpoint refused: platform x: position 0.1502 m is beyond its limit 0.15 m" in (rig.control.fault or "")
+    assert "setpoint refused: platform x: position 150.2 mm is beyond its limit 150 mm" in (rig.control.fault or "")
     assert quick_stops(rig) == {1, 2, 3}
 
 

@@ -165,7 +165,7 @@ def test_a_target_beyond_the_border_is_waited_for_there(rig: Rig) -> None:
     assert rig.mode is Mode.MOVING
     assert rig.control.commanded.pose == pytest.approx((0.15, 0.03, 0.0), abs=1e-6)
     said = [notice.message for notice in rig.notices if notice.level == "warning"]
-    assert said == ["the target of goal t1 is beyond the limit of platform x (position 0.15 m): the robot waits there"]
+    assert said == ["the target of goal t1 is beyond the limit of platform x (position 150 mm): the robot waits there"]
     track(rig, lambda _: ((0.1, 0.03, 0.0), STILL), regular(50.0, 1.0))
     assert rig.control.commanded.pose == pytest.approx((0.1, 0.03, 0.0), abs=1e-6)
     assert_within_limits(rig)

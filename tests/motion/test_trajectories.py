@@ -25,9 +25,9 @@ def line(first: tuple[float, float, float] | None, last: tuple[float, float, flo
 @pytest.mark.parametrize(
     ("goal", "code", "said"),
     [
-        (line((0.1, 0.0, 0.0), None), "wrong_start", "the trajectory begins with 0.1 m/s in x: let it begin"),
-        (line(None, (0.1, 0.0, 0.0)), "wrong_end", "the trajectory ends with 0.1 m/s in x: let it end at rest"),
-        (line(None, (0.0, 0.0, -0.2)), "wrong_end", "the trajectory ends with -0.2 rad/s in phi: let it end at rest"),
+        (line((0.1, 0.0, 0.0), None), "wrong_start", "the trajectory begins with 100 mm/s in x: let it begin"),
+        (line(None, (0.1, 0.0, 0.0)), "wrong_end", "the trajectory ends with 100 mm/s in x: let it end at rest"),
+        (line(None, (0.0, 0.0, -0.2)), "wrong_end", "the trajectory ends with -11.4592°/s in phi: let it end at rest"),
     ],
 )
 def test_an_end_that_moves_is_refused(rig: Rig, goal: TrajectoryGoal, code: str, said: str, stretch: bool) -> None:

@@ -118,7 +118,7 @@ def test_a_taught_pose_that_the_robot_cannot_reach_any_more_is_refused_where_it_
     (place.state / "demo/poses.json").write_text('{"far": [0.3, 0.0, 0.0]}', encoding="utf-8")
     with place.service(), Robot("demo", place.locator) as robot:
         robot.enable()
-        with pytest.raises(RefusedError, match=r"platform x: position 0\.3 m is beyond its limit 0.15 m") as refused:
+        with pytest.raises(RefusedError, match=r"platform x: position 300 mm is beyond its limit 150 mm") as refused:
             robot.move_to_named("far")
         assert refused.value.code is RefusalCode.OUT_OF_WORKSPACE
 

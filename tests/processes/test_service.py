@@ -267,7 +267,7 @@ def test_the_commands(service: Service) -> None:
     assert "holding" in call("status").stdout
     out = call("goto", 0.5, 0, 0)
     assert out.returncode == 1
-    assert "platform x: position 0.5 m is beyond its limit 0.15 m" in out.stderr
+    assert "platform x: position 500 mm is beyond its limit 150 mm" in out.stderr
     assert call("reset").returncode == 1
     assert call("goto", "nan", 0, 0).returncode == 2
     assert call("goto", 1, 2).returncode == 2
@@ -422,7 +422,7 @@ def test_every_kind_of_goal(shared: tuple[Service, Robot, zenoh.Session], tmp_pa
     assert json.loads(followed.stdout)["outcome"] == "done"
     refused = trirail("follow", path, locator=service.locator)
     assert refused.returncode == 1
-    assert "the trajectory begins at x = -0.03" in refused.stderr
+    assert "the trajectory begins at x = -30 mm" in refused.stderr
 
 
 def test_a_flood_of_goals_ends_one_by_one_and_a_stop_overtakes_it(service: Service) -> None:

@@ -14,11 +14,10 @@ from rich.table import Table
 from trirail_drivers.interface import NAMES, MissingProtection
 
 from trirail.cli import units
-from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain, say, slowed
+from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain, say
 from trirail.client.client import Jog, Robot
 from trirail.errors import ServiceError
 from trirail.wire.decoding import converted
-from trirail.wire.messages import GoalReply
 from trirail.wire.state import GoalState, Info, State
 from trirail.wire.vocabulary import Mode
 
@@ -76,19 +75,6 @@ def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True)
             if time.monotonic() >= ends or jog.error is not None or jog.result is not None:
                 return
     raise ServiceError("the service has gone silent")
-
-
-def slowed_jog(robot: Robot, reply: GoalReply | None, velocity: Sequence[float]) -> str:
-    """Say how much a jog is slowed, and which velocity [m/s, m/s, rad/s] is most beyond the platform's limit."""
-    if reply is None or not slowed(reply):
-        return ""
-    limits = limits_of(robot.info()).platform.velocity
-    axis = max(range(3), key=lambda axis: abs(velocity[axis]) / limits[axis])
-    if abs(velocity[axis]) <= limits[axis]:
-        return slowed(reply)
-    unit = ("m/s", "m/s", "rad/s")[axis]
-    beyond = f"{abs(velocity[axis]):g} {unit} is beyond the platform's limit {limits[axis]:g} {unit}"
-    return slowed(reply, beyond)
 
 
 def limits_of(info: Info) -> Limits:

@@ -208,7 +208,7 @@ def jog(
         try:
             with robot.jog(x=vx, y=vy, phi=w) as jogging:
                 taken = jogging.reply
-                if not service.json and (words := live.slowed_jog(robot, taken, (vx, vy, w))):
+                if not service.json and taken is not None and (words := terminal.slowed(taken)):
                     terminal.complain(words)
                 live.jogging(robot, jogging, seconds, show=not service.json)
         except KeyboardInterrupt:

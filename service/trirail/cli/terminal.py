@@ -111,9 +111,9 @@ SLOWED = 1.001
 """A goal that is slowed by less is as asked."""
 
 
-def slowed(reply: GoalReply, why: str = "it would be beyond the limits") -> str:
+def slowed(reply: GoalReply) -> str:
     """Say how much slower an accepted goal is than was asked for; nothing where it is not."""
-    return f"slowed {reply.slowed:.4g} times: {why}" if reply.slowed > SLOWED else ""
+    return f"slowed {reply.slowed:.4g} times: it would be beyond the limits" if reply.slowed > SLOWED else ""
 
 
 def notes(reply: GoalReply) -> str:

@@ -11,8 +11,8 @@ from ruckig import InputParameter, Ruckig, Trajectory
 from trirail.config import Config, SliderLimits, geometry
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.robot import forward, inverse
-from trirail.motion.limits import beyond
 from trirail.motion.ruckig_call import solved
+from trirail.quantities import beyond
 
 DISTANCE = 0.001
 """How far a slider, or the platform along a side of the square, is moved [m]."""
@@ -78,16 +78,16 @@ def square(config: Config, sliders: tuple[float, float, float]) -> tuple[SlowMov
     motion = inverse(robot, path, np.concatenate(rates))
     platform, slider = config.limits.platform, config.limits.slider
     for name, unit, values, (low, high) in (
-        ("platform x", "mm", path[:, 0] * 1e3, np.array(platform.x) * 1e3),
-        ("platform y", "mm", path[:, 1] * 1e3, np.array(platform.y) * 1e3),
-        ("platform φ", "°", np.degrees(path[:, 2]), np.degrees(platform.phi)),
-        ("a slider", "mm", motion.position * 1e3, np.array(slider.position) * 1e3),
-        ("a passive joint", "mm", motion.passive_position * 1e3, np.array(slider.passive) * 1e3),
+        ("platform x", "m", path[:, 0], platform.x),
+        ("platform y", "m", path[:, 1], platform.y),
+        ("platform φ", "rad", path[:, 2], platform.phi),
+        ("a slider", "m", motion.position, slider.position),
+        ("a passive joint", "m", motion.passive_position, slider.passive),
     ):
         for value, limit, outside in (
             (values.min(), low, values.min() < low),
             (values.max(), high, values.max() > high),
         ):
             if outside:
-                raise ValueError(beyond(name, float(value), float(limit), unit))
+                raise ValueError(beyond(name, float(value), limit, unit))
     return SlowMove(motion.position - np.array(sliders), motion.velocity), path

@@ -121,8 +121,8 @@ class Ledger:
         self.answers.append(Accepted(request.ticket, request.id, math.inf, 1.0, stops_first=False, queued=False))
 
     def keep_alive(self, request: GoalRequest, until: float) -> None:
-        """Let the goal under way go on until a cycle, if this renews it."""
-        if self.renewed_by(request):
+        """Let the goal under way go on until a cycle, if this renews it and it is not to end."""
+        if self.renewed_by(request) and self.goals[0].alive_until > -math.inf:
             self.goals[0] = self.goals[0]._replace(alive_until=until)
 
     def release(self, cycle: int) -> ActiveGoal | None:
@@ -223,6 +223,8 @@ class Ledger:
             outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
             if self.renewed_by(request):
                 self.tell("refused", "warning", text, user=request.user)
+                if isinstance(request.goal, VelocityGoal):  # whoever asked for that is not to have the old one either
+                    self.keep_alive(request, -math.inf)
             else:
                 self._ending(request.id, request.user, _renewed(request), outcome, text)
 

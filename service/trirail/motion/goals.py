@@ -129,6 +129,8 @@ class Goals:
             self._limits(goal)
         elif isinstance(goal, SlidersGoal):
             self._planner.check_sliders(goal.position)
+        elif isinstance(goal, VelocityGoal):
+            self._planner.check_velocity((goal.x, goal.y, goal.phi))
 
     def _set_out(self, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
         """Plan from the commanded motion."""

@@ -14,6 +14,7 @@ from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import LEGS
 from trirail.motion.paths import ROUNDING
+from trirail.quantities import beyond, worded
 
 COORDINATES = ("x", "y", "phi")
 UNITS = ("m", "m", "rad")
@@ -73,22 +74,7 @@ class Violation(NamedTuple):
     @property
     def bound(self) -> str:
         """The bound alone, in words."""
-        return f"{self.subject} ({self.quantity} {self.limit:.6g} {self.unit})"
-
-
-def beyond(what: str, value: float, limit: float, unit: str) -> str:
-    """Say that a value is beyond its limit, with as many digits as it takes to tell the two apart."""
-    shown, bound = told_apart(value, limit)
-    return f"{what} {shown} {unit} is beyond its limit {bound} {unit}"
-
-
-def told_apart(value: float, other: float) -> tuple[str, str]:
-    """Return two numbers with six significant digits, or as many more as it takes to tell them apart."""
-    for digits in range(6, 18):
-        shown = f"{value + 0.0:.{digits}g}", f"{other + 0.0:.{digits}g}"  # 0 and -0 are one number
-        if shown[0] != shown[1]:
-            break
-    return shown
+        return f"{self.subject} ({self.quantity} {worded(self.limit, self.unit)})"
 
 
 _BOUNDS, _ROWS, _ROW = from_dtype(BOUNDS)[::1], f8[:, ::1], f8[::1]

@@ -13,12 +13,13 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
 from trirail.motion.feasibility import Checker, excess, fastest
-from trirail.motion.limits import COORDINATES, Bounds, beyond, told_apart
+from trirail.motion.limits import COORDINATES, UNITS, Bounds
 from trirail.motion.paths import Path, constant
 from trirail.motion.quintic import Point, check_ends, quintic
 from trirail.motion.ruckig_call import Kinodynamic, Solver
 from trirail.motion.runs import NO_TOOL, STILL, MotionState, joined, of_centre, of_tool, rest, stretched
 from trirail.motion.straight_lines import time_optimal
+from trirail.quantities import apart, beyond, worded
 
 GENTLEST = 0.1
 """Share of any limit below which no plan from motion is tried."""
@@ -34,6 +35,8 @@ FASTEST_OVERRIDE = 2.0
 """At how many times its nominal rate the time along a path may be told to run."""
 A_HAIR_MORE = 1.0 + 1e-6
 """What rounding may lose."""
+MEANT = {"m": 1e-3, "rad": math.pi / 180.0}
+RATES = "/s", "/s²", "/s³"
 TOO_FAST_IN_MOTION = RefusedError(
     RefusalCode.TOO_FAST, "from its present motion the robot cannot take this path within its sliders' limits"
 )
@@ -99,17 +102,26 @@ class Planner:
                 text = beyond(f"slider {name}: position", position, limit, "m")
                 raise RefusedError(RefusalCode.OUT_OF_WORKSPACE, text, slider=name, value=position, limit=limit)
 
+    def check_velocity(self, velocity: Sequence[float]) -> None:
+        """Raise RefusedError, with value and limit, if a jog is above the platform's limits."""
+        for name, unit, value, limit in zip(COORDINATES, UNITS, velocity, self._most.velocity, strict=True):
+            if abs(value) > limit * A_HAIR_MORE:
+                most = math.copysign(limit, value)
+                asked, allowed = apart(value, most, f"{unit}/s")
+                meant = _meant(value, most, unit)
+                text = f"the jog's velocity {asked} in {name} is above the limit of {allowed}{meant}"
+                raise RefusedError(RefusalCode.ABOVE_LIMIT, text, value=value, limit=most)
+
     def lowered(
         self, velocity: Sequence[float] | None, acceleration: Sequence[float] | None, jerk: Sequence[float] | None
     ) -> Kinodynamic:
         """Return the platform's limits with a goal's own in their place. RefusedError where these are not lower."""
         asked = velocity, acceleration, jerk
-        for name, own, limits in zip(Kinodynamic._fields, asked, self._most, strict=True):
-            for coordinate, value, limit in zip(COORDINATES, own or limits, limits, strict=True):
+        for name, per, own, limits in zip(Kinodynamic._fields, RATES, asked, self._most, strict=True):
+            for coordinate, unit, value, limit in zip(COORDINATES, UNITS, own or limits, limits, strict=True):
                 if value > limit:
-                    text = "limits.{} of {} is {}: the robot's limit is {}".format(
-                        name, coordinate, *told_apart(value, limit)
-                    )
+                    shown = apart(value, limit, unit + per)
+                    text = "limits.{} of {} is {}: the robot's limit is {}".format(name, coordinate, *shown)
                     raise RefusedError(RefusalCode.ABOVE_LIMIT, text, value=value, limit=limit)
         return Kinodynamic(
             *(np.minimum(own or planned, planned).tolist() for own, planned in zip(asked, self._platform, strict=True))
@@ -276,3 +288,9 @@ class Planner:
         end = [value + hold * rate for value, rate in zip(pose, velocity, strict=True)]
         brake = self.to_velocity(MotionState(end, velocity, STILL), STILL)
         return ramp.duration, brake.duration, joined([ramp, Path(np.array([0.0, hold]), held), brake])
+
+
+def _meant(value: float, limit: float, unit: str) -> str:
+    """Return what a bare number may have meant that is above a limit: millimetres or degrees."""
+    meant = value * MEANT[unit]
+    return f": did you mean {worded(meant, f'{unit}/s')}?" if abs(meant) <= abs(limit) else ""

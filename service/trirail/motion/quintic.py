@@ -9,9 +9,10 @@ import numpy as np
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.arrays import Array
-from trirail.motion.limits import COORDINATES, told_apart
+from trirail.motion.limits import COORDINATES, UNITS
 from trirail.motion.paths import Path
 from trirail.motion.runs import STILL, MotionState
+from trirail.quantities import apart, worded
 
 START = 1e-4
 """How far a trajectory may begin from where the robot stands [m, rad]."""
@@ -79,10 +80,10 @@ def check_ends(points: Sequence[Point], start: MotionState) -> None:
     """
     if not start.at_rest:
         raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it stands")
-    for name, given, stands in zip(COORDINATES, points[0].pose, start.pose, strict=True):
+    for name, unit, given, stands in zip(COORDINATES, UNITS, points[0].pose, start.pose, strict=True):
         if abs(given - stands) > START:
             text = "the trajectory begins at {} = {}, the robot is at {}: go there first".format(
-                name, *told_apart(given, stands)
+                name, *apart(given, stands, unit)
             )
             raise RefusedError(RefusalCode.WRONG_START, text, value=given, limit=stands)
     ends = (
@@ -92,5 +93,5 @@ def check_ends(points: Sequence[Point], start: MotionState) -> None:
     for code, does, remedy, point in ends:
         for name, unit, value in zip(COORDINATES, ("m/s", "m/s", "rad/s"), point.velocity or STILL, strict=True):
             if abs(value) > STANDS:
-                text = f"the trajectory {does} with {value:.6g} {unit} in {name}: {remedy}"
+                text = f"the trajectory {does} with {worded(value, unit)} in {name}: {remedy}"
                 raise RefusedError(code, text, value=value, limit=0.0)
