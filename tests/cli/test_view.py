@@ -22,6 +22,7 @@ import screenshot
 from chromium import chromium, needs_chromium
 from PIL import Image
 from rerun.chunk import Chunk, RrdReader
+from trirail.cli import view
 from trirail.config import SIM, load
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
@@ -178,3 +179,10 @@ def test_a_frozen_viewer_is_skipped_counted_and_does_not_stop_the_file(tmp_path:
     said = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == "/events"]
     texts = [text for batch in said for (text,) in batch.column("TextLog:text").to_pylist()]
     assert any(f"0 batches in the file, {skipped} in the live view" in text for text in texts), texts
+
+
+def test_reruns_programs_are_told_to_send_no_analytics() -> None:
+    with view._settings() as environment:
+        asked = [sys.executable, "-m", "rerun_cli", "analytics", "config"]
+        told = subprocess.run(asked, env=environment, capture_output=True, check=True)
+        assert msgspec.json.decode(told.stdout)["analytics_enabled"] is False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import socket
@@ -124,8 +125,8 @@ def _rerun(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
     Raises ServiceError if it has failed by itself.
     """
     command = python("-m", "rerun_cli", "--bind", HOST, "--hide-welcome-screen", *arguments)
-    with tempfile.TemporaryFile() as log:
-        viewer = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+    with tempfile.TemporaryFile() as log, _settings() as environment:
+        viewer = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=environment)
         try:
             yield viewer
             log.seek(0)
@@ -137,6 +138,22 @@ def _rerun(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(viewer.pid, signal.SIGTERM)  # `python -m rerun_cli` does not pass signals on
             viewer.wait()
+
+
+@contextlib.contextmanager
+def _settings() -> Iterator[dict[str, str]]:
+    """Yield an environment in which Rerun's programs send no analytics: 0.41 reads that in a file, and no variable."""
+    with tempfile.TemporaryDirectory(prefix="trirail-view-") as folder:
+        file = Path(folder) / "rerun" / "analytics.json"
+        file.parent.mkdir()
+        settings = {
+            "analytics_enabled": False,
+            "analytics_id": "",
+            "config_file_path": str(file),
+            "data_dir_path": str(file.parent),
+        }
+        file.write_text(json.dumps(settings))
+        yield os.environ | {"XDG_CONFIG_HOME": folder}
 
 
 def _web_port() -> int:
