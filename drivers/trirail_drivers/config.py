@@ -95,7 +95,7 @@ class ObjectWrite(Struct, frozen=True, forbid_unknown_fields=True):
     why: Annotated[str, Meta(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
     """What for: `trirail drives` shows it."""
     sub: Annotated[int, Meta(ge=0, le=255)] = 0
-    """Its subindex."""
+    """Its subindex, 0 where it has none."""
 
     def __post_init__(self) -> None:
         low = -(1 << self.bits - 1) if self.signed else 0

@@ -52,6 +52,10 @@ CANOPEN: dict[str, dict[str, object]] = {
         "STATUSWORD_UPLOADED": bytes.fromhex("4b416000"),
         "CONTROLWORD_DOWNLOAD": bytes.fromhex("2b406000"),
     },
+    "CiA 301, 7.2.4 SDO: expedited with one byte; CiA 402-2 modes of operation display 6061h": {
+        "MODE_DISPLAY_UPLOAD": bytes.fromhex("4061600000000000"),
+        "MODE_DISPLAY_UPLOADED": bytes.fromhex("4f616000"),
+    },
     "CiA 301, 7.2.4 SDO: expedited with one byte; 7.5.2 error register 1001h": {
         "ERROR_REGISTER_UPLOAD": bytes.fromhex("4001100000000000"),
         "ERROR_REGISTER_UPLOADED": bytes.fromhex("4f011000"),

@@ -71,6 +71,7 @@ def test_every_key_of_a_file_that_is_shipped_is_in_the_reference() -> None:
                 "drives.A.homing",
                 "drives.B.homing",
                 "drives.C.homing",
+                *(f"drives.{name}.write" for name in "ABC"),
                 "zenoh.tls",
                 "correction.as_built",
             }

@@ -16,7 +16,8 @@ from trirail_drivers.cia402.makers_objects import give_makers_objects
 from trirail_drivers.cia402.modes import choose_modes, give_mode
 from trirail_drivers.cia402.objects import FOLLOWING_BIT
 from trirail_drivers.cia402.pdos import Pdos
-from trirail_drivers.cia402.sdo import DriveRestarted, Rehearsal, Remote, SdoRefused
+from trirail_drivers.cia402.rehearsal import Rehearsal
+from trirail_drivers.cia402.sdo import Remote, RestartedError, SdoRefused
 from trirail_drivers.cia402.settings import give_cycle, give_homing, give_reactions, heartbeat_of
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.cia402.ways import Exchange
@@ -177,7 +178,7 @@ async def _greet(remote: Remote, node: int, *, wakes: bool) -> None:
             if not remote.boots:
                 LOG.warning("waiting for drive %s to boot", remote.name)
             remote.boots = True
-        except DriveRestarted:
+        except RestartedError:
             if wakes:
                 send(client.bus, frames.nmt(frames.NMT_PRE_OPERATIONAL, node))
     remote.boots = False
