@@ -177,7 +177,7 @@ def test_a_path_that_is_hardly_too_fast_is_slowed(quantity: str, by: float) -> N
         return float(np.abs(rig.setpoints()[:, 1 + row]).max())
 
     planned = used(CONFIG) / by ** (1 + row)
-    assert used(slower(CONFIG, **{quantity: planned / 0.98})) <= planned * (1.0 + 1e-3)
+    assert used(slower(CONFIG, **{quantity: planned / 0.98})) <= planned * (1.0 + 2e-3)  # between two looks
 
 
 def test_slowed_is_said(rig: Rig) -> None:

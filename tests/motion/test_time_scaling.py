@@ -110,7 +110,7 @@ def test_a_path_runs_at_the_rate_at_which_it_meets_a_limit_and_no_faster(slower:
 
 @pytest.mark.parametrize("over", [0.45, 0.5, 0.55])
 def test_the_first_stop_that_fits_is_taken_and_ends_at_rest(over: float) -> None:
-    run = run_of(way((0.1, 0.0, 0.0)))
+    run = run_of(stretched(way((0.1, 0.0, 0.0)), PLATFORM_PLANNED[2] ** (-1 / 3)))  # it takes what plans may
     run.time = over * run.path.duration
     quickest = SCALING.ramp(run.at, 0.0, 1.0)
     law = SCALING.stop(run, HERE, (1.0, 0.5, 0.25))
