@@ -15,6 +15,7 @@ from processes.test_tls_service import Served
 from trirail.client.client import Robot
 from trirail.client.new_stop import NewStop
 from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.wire.stop_door import FARTHER
 
 pytestmark = pytest.mark.slow
 
@@ -56,7 +57,7 @@ def held(served: Served) -> Iterator[str]:
     """Hold both ports; the locator is the service's own."""
     with contextlib.ExitStack() as connections:
         for _ in range(HELD):
-            for number in (port(served.locator), port(served.locator) + 1):
+            for number in (port(served.locator), port(served.locator) + FARTHER):
                 connections.enter_context(socket.create_connection(("127.0.0.1", number)))
         yield served.locator
 
@@ -68,7 +69,7 @@ def without_zenoh(served: Served) -> Iterator[str]:
     with (
         contextlib.ExitStack() as opened,
         socket.create_server(("127.0.0.1", number)),
-        socket.create_server(("127.0.0.1", number + 1)) as door,
+        socket.create_server(("127.0.0.1", number + FARTHER)) as door,
     ):
 
         def serve() -> None:
@@ -77,7 +78,7 @@ def without_zenoh(served: Served) -> Iterator[str]:
                 for ready in select.select([door, *other], [], [], 0.02)[0]:
                     if ready is door:
                         client = opened.enter_context(door.accept()[0])
-                        service = socket.create_connection(("127.0.0.1", port(served.locator) + 1))
+                        service = socket.create_connection(("127.0.0.1", port(served.locator) + FARTHER))
                         other |= {client: opened.enter_context(service), service: client}
                     elif heard := ready.recv(4096):
                         other[ready].sendall(heard)
