@@ -10,6 +10,7 @@ import pytest
 from conftest import CONFIG
 from control.sessions import Session, assert_within_limits
 from trirail.config import corrected_geometry
+from trirail.control.modes import ModeEvent
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
 from trirail.motion.paths import constant
@@ -119,6 +120,26 @@ def test_raising_a_rate_that_is_still_falling_goes_on_along_the_path(lower: floa
     x = session.records["commanded_pose"][:, 0]
     assert (np.diff(x) >= -1e-12).all()
     assert_within_limits(session.config, session.records)
+
+
+@pytest.mark.parametrize("then", ["stop", "disable", "lost"])
+@pytest.mark.parametrize("later", [0, 3, 40])
+def test_a_queue_that_is_paused_and_then_stopped_has_no_goal_to_pass_on_to(then: str, later: int) -> None:
+    """A robot that brakes for a pause is stopped while it does, before it comes by where the next goal begins."""
+    for instant in range(100, 420, 20):
+        session = Session()
+        session.send("g0", PoseGoal(0.1, 0.0, 0.0, blend=0.03))
+        session.send("g1", PoseGoal(0.1, 0.05, 0.0))
+        session.cycles(instant)
+        session.order(Command.PAUSE)
+        session.cycles(later)
+        if then == "lost":
+            session.control.modes.happen(ModeEvent.GATEWAY_LOST, "gone")
+        else:
+            session.order(Command(then))
+        session.until(lambda: session.mode in STANDS, 3000)  # noqa: B023 - called at once
+        assert session.control.fault is None
+        assert_within_limits(session.config, session.records)
 
 
 def test_the_last_gate_refuses_a_time_along_the_path_that_falls() -> None:

@@ -86,6 +86,7 @@ class Transitions:
         if goal is not None or not self.state.has_goal:
             self._measured.settling.leave()
         if not self.state.has_goal:
+            self._schedule.stop_on_path()  # also where it brakes already: no goal begins on the way
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = "released" if before.released else "arrived"
             self._ledger.end(outcome, arrived if outcome == "done" else reason)
