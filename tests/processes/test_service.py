@@ -533,7 +533,7 @@ def test_goals_wait_blend_and_are_cancelled(service: Service) -> None:
         assert slow.wait(1.0).outcome == "stopped"
         with pytest.raises(RefusedError, match="not under way"):
             slow.cancel()
-        with pytest.raises(RefusedError, match=r"limits\.velocity of x is 1: the robot's limit is 0\.25"):
+        with pytest.raises(RefusedError, match=r"limits\.velocity of x is 1000 mm/s: the robot's limit is 250 mm/s"):
             robot.move_to(x=0.0, y=0.0, phi=0.0, limits=OwnLimits(velocity=(1.0, 0.1, 0.1)))
     blended = trirail("goto", 0.0, 0.0, 0.0, "--blend", 0.01, locator=service.locator)
     assert (blended.returncode, blended.stderr) == (0, "")
