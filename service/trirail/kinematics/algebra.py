@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from trirail.kinematics.arrays import Matrix, Vector
-from trirail.kinematics.compiled import compiled
+from trirail.kinematics.compiled import inlined
 
 __all__ = [
     "add",
@@ -21,61 +21,61 @@ __all__ = [
 ]
 
 
-@compiled()
+@inlined
 def add(x: Vector, y: Vector) -> Vector:
     """Return x + y."""
     return x[0] + y[0], x[1] + y[1], x[2] + y[2]
 
 
-@compiled()
+@inlined
 def subtract(x: Vector, y: Vector) -> Vector:
     """Return x - y."""
     return x[0] - y[0], x[1] - y[1], x[2] - y[2]
 
 
-@compiled()
+@inlined
 def scale(s: float, x: Vector) -> Vector:
     """Return s x."""
     return s * x[0], s * x[1], s * x[2]
 
 
-@compiled()
+@inlined
 def plus_u3(x: Vector, s: float) -> Vector:
     """Return x + s u3, where u3 is the unit vector of the z axis."""
     return x[0], x[1], x[2] + s
 
 
-@compiled()
+@inlined
 def dot(x: Vector, y: Vector) -> float:
     """Return xᵀ y."""
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
 
 
-@compiled()
+@inlined
 def cross(x: Vector, y: Vector) -> Vector:
     """Return x̃ y, where x̃ is the skew-symmetric matrix associated to x."""
     return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
 
 
-@compiled()
+@inlined
 def times(q: Matrix, x: Vector) -> Vector:
     """Return q x."""
     return dot(q[0], x), dot(q[1], x), dot(q[2], x)
 
 
-@compiled()
+@inlined
 def transposed_times(q: Matrix, x: Vector) -> Vector:
     """Return qᵀ x."""
     return add(add(scale(x[0], q[0]), scale(x[1], q[1])), scale(x[2], q[2]))
 
 
-@compiled()
+@inlined
 def product(a: Matrix, q: Matrix) -> Matrix:
     """Return a q."""
     return transposed_times(q, a[0]), transposed_times(q, a[1]), transposed_times(q, a[2])
 
 
-@compiled()
+@inlined
 def turned(phi: float, q: Matrix) -> Matrix:
     """Return q^phi q, with q^phi of (3): on to a frame that is turned by phi [rad] about the z axis."""
     c, s = math.cos(phi), math.sin(phi)

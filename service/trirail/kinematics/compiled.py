@@ -1,4 +1,4 @@
-"""Functions compiled by numba: plain IEEE arithmetic, inlined, kept on disk, never stale."""
+"""Functions compiled by numba: plain IEEE arithmetic, kept on disk, never stale."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from numba import njit
 
-__all__ = ["compiled", "tell_of_compiling"]
+__all__ = ["compile_no_more", "compiled", "inlined", "tell_of_compiling"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -33,12 +33,20 @@ FINGERPRINT = hashlib.sha256(_sources()).hexdigest()
 FUNCTIONS = len(re.findall(rb"^@compiled\((?!\))", _sources(), re.MULTILINE))
 """How many functions are compiled ahead of their first call, in all rooms."""
 
-_listeners: list[Callable[[str], None]] = []
+_listener: list[Callable[[str], None]] = []
+_functions: list[Any] = []
+
+
+def compile_no_more() -> None:
+    """Drop what is needed of the compiled functions to compile others that call them: 16 MB."""
+    for function in _functions:
+        for overload in function.overloads.values():
+            overload.library._shared_module = None
 
 
 def tell_of_compiling(listener: Callable[[str], None]) -> None:
-    """Have `listener` called with the name of each function that is not kept, before it is compiled."""
-    _listeners.append(listener)
+    """Have `listener`, and no other, called with the name of each function that is not kept, before it is compiled."""
+    _listener[:] = [listener]
 
 
 @contextlib.contextmanager
@@ -52,6 +60,27 @@ def _alone(folder: Path) -> Iterator[None]:
         yield
 
 
+def _kept(dispatcher: Any) -> Any:
+    """Have what is kept of a function compiled anew after every edit of any of the sources.
+
+    To see whether it is out of date numba looks at the file of the function alone; what is called from there would live
+    on after an edit elsewhere. The version is read before anything else is unpickled: of older code that may name
+    classes that are no more.
+    """
+    kept = dispatcher._cache._cache_file
+    kept._version = (kept._version, FINGERPRINT)
+    _functions.append(dispatcher)
+    return dispatcher
+
+
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate the arithmetic of a few lines to stand, compiled, wherever a compiled function calls it.
+
+    Everything so would take three times as long to compile, and run no faster.
+    """
+    return _kept(njit(function, error_model="numpy", forceinline=True, cache=True))  # type: ignore[no-any-return]
+
+
 def compiled(*signatures: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorate a function to run compiled: now, for these signatures; without any, at its first call.
 
@@ -60,17 +89,13 @@ def compiled(*signatures: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        dispatcher: Any = njit(function, error_model="numpy", forceinline=True, cache=True)
-        # To see whether kept code is out of date numba looks at the file of the function alone; what was
-        # inlined into it from other files would live on after an edit there. The version is read before
-        # anything else is unpickled: of older code that may name classes that are no more.
+        dispatcher = _kept(njit(function, error_model="numpy", cache=True))
         kept = dispatcher._cache._cache_file
-        kept._version = (kept._version, FINGERPRINT)
         if signatures:
             # Processes that start together compile each function once: who comes second loads what the first has kept.
             with _alone(Path(kept._cache_path)):
                 if not kept._load_index():
-                    for listener in _listeners:
+                    for listener in _listener:
                         listener(function.__qualname__)
                 for signature in signatures:
                     dispatcher.compile(signature)

@@ -34,7 +34,7 @@ from trirail.kinematics.algebra import (
     turned,
 )
 from trirail.kinematics.arrays import Array, Matrix, Vector
-from trirail.kinematics.compiled import compiled
+from trirail.kinematics.compiled import inlined
 
 __all__ = [
     "AT_REST",
@@ -76,18 +76,18 @@ BASE = Link(False, IDENTITY, ZERO, IDENTITY, ZERO)
 AT_REST = LinkMotion(ZERO, ZERO, ZERO, ZERO)
 
 
-@compiled()
+@inlined
 def _constant_vector(leg: Array, k: int) -> Vector:
     return leg[k, 1], leg[k, 2], leg[k, 3]
 
 
-@compiled()
+@inlined
 def _constant_matrix(leg: Array, k: int) -> Matrix:
     row = leg[k]
     return (row[4], row[5], row[6]), (row[7], row[8], row[9]), (row[10], row[11], row[12])
 
 
-@compiled()
+@inlined
 def link(base: Link, leg: Array, k: int, variable: float) -> Link:
     """Return the link that row k of a leg joins to `base`, with the joint at `variable` [m or rad]."""
     revolute = leg[k, 0] != 0.0
@@ -102,19 +102,19 @@ def link(base: Link, leg: Array, k: int, variable: float) -> Link:
     return Link(revolute, a, r, q, p)
 
 
-@compiled()
+@inlined
 def platform_centre(leg: Array, last: Link) -> Vector:
     """Return G in T_0: the whole left side of (9)."""
     return add(last.p, transposed_times(last.q, _constant_vector(leg, len(leg) - 1)))
 
 
-@compiled()
+@inlined
 def _spin(omega: Vector, epsilon: Vector, r: Vector) -> Vector:
     """Return (ω̃ ω̃ + ε̃) r."""
     return add(cross(omega, cross(omega, r)), cross(epsilon, r))
 
 
-@compiled()
+@inlined
 def link_motion(base: LinkMotion, link: Link, rate: float, acceleration: float) -> LinkMotion:
     """Return how a link moves on its moving base, for a rate and an acceleration of its joint."""
     omega_k, v_k = (rate, 0.0) if link.revolute else (0.0, rate)
@@ -135,7 +135,7 @@ def link_motion(base: LinkMotion, link: Link, rate: float, acceleration: float) 
     return LinkMotion(omega, v, epsilon, gamma)
 
 
-@compiled()
+@inlined
 def platform_motion(leg: Array, last: Link, motion: LinkMotion) -> tuple[Vector, Vector]:
     """Return velocity and acceleration (x, y, phi) of the platform that the last link of a leg carries."""
     r = _constant_vector(leg, len(leg) - 1)
@@ -146,7 +146,7 @@ def platform_motion(leg: Array, last: Link, motion: LinkMotion) -> tuple[Vector,
     return (vx, vy, omega), (ax, ay, epsilon)
 
 
-@compiled()
+@inlined
 def follow(leg: Array, joints: Array) -> tuple[Link, LinkMotion]:
     """Return place and motion of link T_k from rows (variable, rate, acceleration) for joints 1 to k."""
     place, motion = BASE, AT_REST
@@ -156,7 +156,7 @@ def follow(leg: Array, joints: Array) -> tuple[Link, LinkMotion]:
     return place, motion
 
 
-@compiled()
+@inlined
 def _unit_velocity(link: Link, centre: Vector) -> Vector:
     """Return the platform velocity (x, y, phi) that a unit rate of this joint gives: its factors in (15)."""
     axis = link.q[2]  # q_k0ᵀ u3
@@ -166,7 +166,7 @@ def _unit_velocity(link: Link, centre: Vector) -> Vector:
     return axis[0], axis[1], 0.0
 
 
-@compiled()
+@inlined
 def joint_motion(leg: Array, variables: Vector, velocity: Vector, acceleration: Vector) -> tuple[Vector, Vector]:
     """Return rates and accelerations of a leg's three joints from the motion of its platform: (15) and (19).
 
