@@ -15,14 +15,15 @@ from trirail.config import SIM, Limits, load
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import Geometry, Leg, singular_angles
 from trirail.kinematics.robot import inverse, jacobians
+from trirail.workspace.aspect import range_of_j1
 from trirail.workspace.singularity import (
     characteristic_length,
     conditioning,
     distance_to_singularity,
-    range_of_j1,
     sensitivity,
 )
-from trirail.workspace.workspace import area, extent, permitted, reachable, violations
+from trirail.workspace.violations import violations
+from trirail.workspace.workspace import area, extent, permitted, reachable
 
 Array = NDArray[np.float64]
 

@@ -118,7 +118,7 @@ def robot_of(offline: Offline) -> tuple[Config, Geometry]:
 
 def _check_reach(config: Config, robot: Geometry, pose: Array) -> None:
     """Raise KinematicsError if the robot itself cannot be at a pose; it says all that is wrong."""
-    from trirail.workspace.workspace import violations
+    from trirail.workspace.violations import violations
 
     found = violations(robot, config.limits, pose)
     if found:

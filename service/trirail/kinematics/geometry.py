@@ -21,7 +21,7 @@ from trirail.kinematics.arrays import Array
 from trirail.kinematics.correction import Correction
 from trirail.kinematics.joints import Joint, serial_leg
 
-__all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "Room", "gains", "singular_angles", "travels"]
+__all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "Room", "det_j2", "gains", "singular_angles", "travels"]
 
 LEGS = ("A", "B", "C")
 PARALLEL = 1e-9  # |sin| of the angle between an edge and its rail up to which the leg counts as singular
@@ -119,7 +119,7 @@ def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)
     for low, high in zip(of_j1, [*of_j1[1:], of_j1[0] + 2.0 * math.pi], strict=True):
         # det J2 is smooth between two singular angles of J1. Zeros crowd at the ends, so the samples do too.
         phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, 257)[1:-1])
-        negative = _det_j2(geometry, centre, phi) < 0.0
+        negative = det_j2(geometry, centre, phi) < 0.0
         changes = np.flatnonzero(negative[1:] != negative[:-1]).tolist()
         found.extend(_bisect(geometry, centre, float(phi[k]), float(phi[k + 1])) for k in changes)
     return tuple(sorted(_wrapped(phi) for phi in found))
@@ -191,7 +191,7 @@ def _singular_angles_of_j1(geometry: Geometry) -> list[float]:
     return [phi for k, phi in enumerate(angles) if k == 0 or phi - angles[k - 1] > PARALLEL]
 
 
-def _det_j2(geometry: Geometry, centre: tuple[float, float], phi: Array) -> Array:
+def det_j2(geometry: Geometry, centre: tuple[float, float], phi: Array) -> Array:
     """Return det J2 [m] for poses with G at `centre` and any angles `phi`.
 
     Only the third column of J2 depends on G, and its cofactors w, the sines between the edges, are constant:
@@ -212,9 +212,9 @@ def _det_j2(geometry: Geometry, centre: tuple[float, float], phi: Array) -> Arra
 
 def _bisect(geometry: Geometry, centre: tuple[float, float], low: float, high: float) -> float:
     """Return the phi between `low` and `high`, where det J2 differs in sign, at which it is zero."""
-    negative = _det_j2(geometry, centre, np.array([low]))[0] < 0.0
+    negative = det_j2(geometry, centre, np.array([low]))[0] < 0.0
     while low < (middle := (low + high) / 2.0) < high:
-        if (_det_j2(geometry, centre, np.array([middle]))[0] < 0.0) == negative:
+        if (det_j2(geometry, centre, np.array([middle]))[0] < 0.0) == negative:
             low = middle
         else:
             high = middle
@@ -235,7 +235,7 @@ def _check(geometry: Geometry) -> None:
                 value=leg.edge_angle,
                 limit=leg.rail_angle,
             )
-    determinant = float(_det_j2(geometry, (0.0, 0.0), np.zeros(1))[0])
+    determinant = float(det_j2(geometry, (0.0, 0.0), np.zeros(1))[0])
     size = max(math.hypot(*leg.anchor) + abs(leg.home) + math.hypot(*leg.edge_point) for leg in geometry.legs)
     if abs(determinant) <= PARALLEL * size:
         raise KinematicsError(

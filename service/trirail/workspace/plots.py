@@ -18,8 +18,9 @@ from matplotlib.patches import Patch, Polygon
 from trirail.config import Limits
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
+from trirail.workspace.aspect import range_of_j1
 from trirail.workspace.mechanism import Mechanism
-from trirail.workspace.singularity import conditioning, range_of_j1
+from trirail.workspace.singularity import conditioning
 from trirail.workspace.workspace import Extent, area, permitted, reachable
 
 __all__ = ["draw"]

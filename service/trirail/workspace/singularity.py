@@ -15,13 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import jacobians
+from trirail.workspace.aspect import det_j2_rows, parallel_angles
 
 __all__ = [
     "characteristic_length",
     "conditioning",
-    "det_j2_rows",
     "distance_to_singularity",
-    "range_of_j1",
     "sensitivity",
 ]
 
@@ -63,24 +62,6 @@ def conditioning(geometry: Geometry, pose: ArrayLike, length: float | None = Non
     return np.asarray(values[..., -1] / values[..., 0], dtype=np.float64)
 
 
-def range_of_j1(geometry: Geometry) -> tuple[float, float]:
-    """Return the angles phi [rad] on either side of zero at which the edge of some leg is parallel to its rail."""
-    ahead = _parallel(geometry) % math.pi
-    return float(ahead.max()) - math.pi, float(ahead.min())
-
-
-def det_j2_rows(geometry: Geometry, phi: Array) -> Array:
-    """Return rows d, (K, 3), for angles phi, (K,): at these det J2 = d @ (1, x, y), in metres.
-
-    Only the third column of J2, (18), depends on G, and at one phi it does so linearly.
-    """
-    centres = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    poses = np.column_stack([np.tile(centres, (len(phi), 1)), np.repeat(phi, 3)])
-    d = _det_j2(geometry, poses).reshape(-1, 3)
-    d[:, 1:] -= d[:, :1]
-    return d
-
-
 def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.float64]:
     """Return by what angle [rad] the platform can turn either way before it is singular, shape () or (N,).
 
@@ -96,7 +77,7 @@ def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.f
     poses = np.array(pose, dtype=np.float64).reshape(-1, 3)
     turn = 2.0 * math.pi
     poses[:, 2] -= turn * np.round(poses[:, 2] / turn)
-    of_j1 = np.sort(np.concatenate([_parallel(geometry) % math.pi + k * math.pi for k in (-2, -1, 0, 1)]))
+    of_j1 = np.sort(np.concatenate([parallel_angles(geometry) % math.pi + k * math.pi for k in (-2, -1, 0, 1)]))
     above = np.searchsorted(of_j1, poses[:, 2])
     distance = np.minimum(poses[:, 2] - of_j1[above - 1], of_j1[above] - poses[:, 2])
     for k in np.unique(above):  # beyond the neighbours of J1 there is nothing nearer
@@ -126,8 +107,3 @@ def _zeros_of_det_j2(geometry: Geometry, poses: Array, low: float, high: float) 
 
 def _det_j2(geometry: Geometry, poses: Array) -> Array:
     return np.asarray(np.linalg.det(jacobians(geometry, poses)[1]), dtype=np.float64)
-
-
-def _parallel(geometry: Geometry) -> Array:
-    """Return for each leg an angle phi [rad] at which its edge is parallel to its rail; others are pi apart."""
-    return np.array([leg.rail_angle - leg.edge_angle for leg in geometry.legs])

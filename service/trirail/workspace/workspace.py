@@ -12,22 +12,20 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from trirail.config import Limits, Range
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.geometry import LEGS, Geometry
-from trirail.kinematics.robot import inverse
-from trirail.motion.limits import Violation
-from trirail.workspace.singularity import det_j2_rows, distance_to_singularity, range_of_j1
+from trirail.kinematics.geometry import Geometry, travels
+from trirail.workspace.aspect import det_j2_rows, range_of_j1
 
-__all__ = ["Extent", "area", "extent", "permitted", "reachable", "violations"]
+__all__ = ["Extent", "area", "extent", "permitted", "reachable"]
 
 NOTHING = np.empty((0, 2))
 TOUCHING = 1e-13  # a vertex nearer than this to the edge of a half-plane is on it [m]
 TURNS = np.linspace(-1.0, 1.0, 129)  # where between the two ends of the singularity margin det J2 is looked at
 NEAR = 1e-4  # nearer than this to an angle of J1, rounding begins to hide the sign of det J2 [rad]
+SMALL = 1e-4  # steps of the centre over which as-built errors count as linear [m]
 SLICES = 721  # for the integral over phi
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
@@ -89,27 +87,6 @@ def area(polygon: Array) -> float:
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2.0
 
 
-def violations(geometry: Geometry, limits: Limits, pose: ArrayLike) -> list[Violation]:
-    """Return every limit of the robot's own reach that a pose (3,) exceeds, and by its value how far.
-
-    They are those of `reachable`; which of a slider's and an edge's two ends is meant, the limit tells.
-    KinematicsError as from inverse.
-    """
-    motion = inverse(geometry, pose)
-    found = []
-    for quantity, values, (low, high) in (
-        ("position", motion.position, limits.slider.position),
-        ("passive position", motion.passive_position, limits.slider.passive),
-    ):
-        for leg, value in zip(LEGS, values.tolist(), strict=True):
-            if not low <= value <= high:
-                found.append(Violation(leg, quantity, value, low if value < low else high, "m"))
-    distance = float(distance_to_singularity(geometry, pose))
-    if distance < limits.singularity_margin:
-        found.append(Violation("phi", "distance to singularity", distance, limits.singularity_margin, "rad"))
-    return found
-
-
 def extent(geometry: Geometry, limits: Limits, section: Callable[[Geometry, Limits, float], Array]) -> Extent:
     """Measure `reachable` or `permitted` over all phi.
 
@@ -153,10 +130,10 @@ def extent(geometry: Geometry, limits: Limits, section: Callable[[Geometry, Limi
 
 def _joints(geometry: Geometry, phi: float) -> Array:
     """Return rows, (6, 3): lambda_10 of legs A, B, C, then lambda_32, each as row @ (1, x, y) [m]."""
-    motion = inverse(geometry, [[0.0, 0.0, phi]] * 2, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    at_zero = np.concatenate([motion.position[0], motion.passive_position[0]])
-    slopes = np.concatenate([motion.velocity, motion.passive_velocity], axis=1)
-    return np.column_stack([at_zero, slopes.T])
+    step = 1.0 if geometry.correction is None else SMALL
+    at_zero, *beside = travels(geometry, [[0.0, 0.0, phi], [step, 0.0, phi], [0.0, step, phi]]).swapaxes(0, 1)
+    slopes = [(there - at_zero) / step for there in beside]
+    return np.stack([at_zero, *slopes], axis=-1).reshape(6, 3)
 
 
 def _parallelogram(joints: Array, position: Range, passive: Range) -> Array:

@@ -1,0 +1,34 @@
+"""Which limits of the robot's own reach a pose exceeds, and by how much."""
+
+from __future__ import annotations
+
+from numpy.typing import ArrayLike
+
+from trirail.config import Limits
+from trirail.kinematics.geometry import LEGS, Geometry
+from trirail.kinematics.robot import inverse
+from trirail.motion.limits import Violation
+from trirail.workspace.singularity import distance_to_singularity
+
+__all__ = ["violations"]
+
+
+def violations(geometry: Geometry, limits: Limits, pose: ArrayLike) -> list[Violation]:
+    """Return every limit of the robot's own reach that a pose (3,) exceeds, and by its value how far.
+
+    They are those that bound `reachable`; which of a slider's and an edge's two ends is meant, the limit tells.
+    KinematicsError as from inverse.
+    """
+    motion = inverse(geometry, pose)
+    found = []
+    for quantity, values, (low, high) in (
+        ("position", motion.position, limits.slider.position),
+        ("passive position", motion.passive_position, limits.slider.passive),
+    ):
+        for leg, value in zip(LEGS, values.tolist(), strict=True):
+            if not low <= value <= high:
+                found.append(Violation(leg, quantity, value, low if value < low else high, "m"))
+    distance = float(distance_to_singularity(geometry, pose))
+    if distance < limits.singularity_margin:
+        found.append(Violation("phi", "distance to singularity", distance, limits.singularity_margin, "rad"))
+    return found
