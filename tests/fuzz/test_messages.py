@@ -21,7 +21,7 @@ from trirail.errors import RefusedError
 from trirail.processes.gateway import Gateway
 from trirail.processes.guard import Guard
 from trirail.processes.incoming import Incoming, Kind
-from trirail.wire import boundary, links, packets, text, zenoh_session
+from trirail.wire import boundary, links, packets, records, text, zenoh_session
 from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal
 from trirail.wire.goals import TrajectoryPoint as Point
 from trirail.wire.links import Port, TooLarge
@@ -148,16 +148,16 @@ def test_whatever_is_printed_is_shown_and_not_obeyed(words: str) -> None:
 @given(payload=st.binary(max_size=2 * SIZE) | st.binary(min_size=SIZE, max_size=SIZE))
 def test_any_bytes_are_records_or_refused(payload: bytes) -> None:
     with contextlib.suppress(RefusedError):
-        assert len(boundary.batch(payload)) % SIZE == 0
+        assert len(records.checked(payload)) % SIZE == 0
 
 
 def test_records_are_taken_as_records() -> None:
     rows = np.zeros(3, DTYPE)
     rows["cycle"] = 5, 6, 7
-    assert boundary.batch(rows.tobytes()) == rows.tobytes()
+    assert records.checked(rows.tobytes()) == rows.tobytes()
     rows["cycle"] = 5, 7, 8
     with pytest.raises(RefusedError):
-        boundary.batch(rows.tobytes())
+        records.checked(rows.tobytes())
 
 
 # ---------------------------------------------------------------------- the gateway

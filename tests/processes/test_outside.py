@@ -21,7 +21,7 @@ import zenoh
 from processes.test_service import Service, trirail, until
 from trirail.client.client import Robot
 from trirail.errors import RefusedError
-from trirail.wire import boundary
+from trirail.wire import boundary, records
 from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
 from trirail.wire.messages import Event
 from trirail.wire.sizes import MAX_MESSAGE, MAX_POINTS, MAX_TRANSPORT
@@ -346,7 +346,7 @@ def test_clients_skip_what_is_no_message(shared: tuple[Service, Robot, zenoh.Ses
         assert len(ran.stderr.splitlines()) <= 1
     assert robot.skipped > 0
     assert heard
-    assert all(boundary.batch(batch) for batch in heard)
+    assert all(records.checked(batch) for batch in heard)
     assert seen.seq == 10**6
 
 

@@ -7,10 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire import boundary
+from trirail.wire import boundary, records
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.records import DTYPE
 from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME
+from trirail.wire.text import check_new_pose
 from trirail.wire.vocabulary import MODES
 from trirail_drivers.interface import PowerState
 
@@ -38,8 +39,8 @@ def test_a_key_whose_user_no_name_can_be_is_refused(user: str) -> None:
 
 @pytest.mark.parametrize("name", ["5mm", "10", "a b", "../../etc"])
 def test_a_pose_is_not_taught_by_what_is_no_name_or_a_quantity(name: str) -> None:
-    assert refused(lambda: boundary.check_new_pose(name)) is RefusalCode.BAD_NAME
-    assert boundary.check_new_pose("p5mm") == "p5mm"
+    assert refused(lambda: check_new_pose(name)) is RefusalCode.BAD_NAME
+    assert check_new_pose("p5mm") == "p5mm"
 
 
 def test_a_message_is_decoded_up_to_its_size_and_not_a_byte_beyond() -> None:
@@ -95,7 +96,7 @@ def test_the_same_key_in_several_objects_and_strings_that_look_like_keys_are_tak
 def test_records_are_of_cycles_one_after_the_other(cycles: list[int], taken: bool) -> None:
     rows = np.zeros(len(cycles), DTYPE)
     rows["cycle"] = cycles
-    assert refused(lambda: boundary.batch(rows.tobytes())) is (None if taken else RefusalCode.MALFORMED)
+    assert refused(lambda: records.checked(rows.tobytes())) is (None if taken else RefusalCode.MALFORMED)
 
 
 @pytest.mark.parametrize(("field", "known"), [("mode", len(MODES)), ("drive_state", len(PowerState))])
@@ -107,4 +108,4 @@ def test_records_have_modes_and_states_that_there_are(field: str, known: int, ro
     numbers = rows[field].reshape(2, -1)
     for number, taken in ((known - 1, True), (known, False), (255, False)):
         numbers[row, -1] = number
-        assert refused(lambda: boundary.batch(rows.tobytes())) is (None if taken else RefusalCode.MALFORMED)
+        assert refused(lambda: records.checked(rows.tobytes())) is (None if taken else RefusalCode.MALFORMED)

@@ -6,6 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import msgspec
 from rich.live import Live
@@ -13,8 +14,10 @@ from rich.table import Table
 
 from trirail.cli import terminal
 from trirail.cli.options import HERE, Service
-from trirail.client.fleet import Attention, Fleet, Member
 from trirail.wire.text import wall_clock
+
+if TYPE_CHECKING:
+    from trirail.client.fleet import Fleet, Member
 
 LOOK = 2.5
 """How long it is listened before what was heard is printed with --json [s]: each robot says something once a second."""
@@ -29,6 +32,8 @@ def fleet(*, service: Service = HERE) -> int:
     has changed. With --json, one look of 2.5 s.
     """
     never = threading.Event()
+    from trirail.client.fleet import Fleet
+
     with Fleet(service.connect, service.robot, service.tls) as seen:
         if service.json:
             never.wait(LOOK)
@@ -56,6 +61,8 @@ def _say_changes(seen: Fleet, never: threading.Event) -> None:
 
 
 def _line(member: Member, now: float) -> str:
+    from trirail.client.fleet import Attention
+
     said, need = member.summary, member.need(now)
     if need is Attention.SILENT:
         return f"{member.robot}  silent"
@@ -70,6 +77,8 @@ def _described(member: Member, now: float) -> dict[str, object]:
 
 def table(members: Sequence[Member], now: float) -> Table:
     """Draw the robots, a line each."""
+    from trirail.client.fleet import Attention
+
     drawn = Table("robot", "mode", "needs", "goal", "lateness p99.9", "missed", "version", box=None, pad_edge=False)
     for member in members:
         said, need = member.summary, member.need(now)

@@ -11,9 +11,8 @@ from cyclopts import App, Parameter
 
 from trirail.cli import terminal
 from trirail.cli.options import Flag
-from trirail.wire.boundary import check_name
 from trirail.wire.endpoints import is_host
-from trirail.wire.text import quoted
+from trirail.wire.text import check_name, quoted
 from trirail.wire.vocabulary import Role
 
 app = App(name="keys", help="Make, list, renew and revoke the certificates of a robot and its users, for zenoh.tls.")

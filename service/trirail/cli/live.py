@@ -15,13 +15,13 @@ from trirail_drivers.interface import NAMES, MissingProtection
 
 from trirail.cli import units
 from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain, say
-from trirail.client.client import Jog, Robot
 from trirail.errors import ServiceError
 from trirail.wire.decoding import converted
 from trirail.wire.state import GoalState, Info, State
 from trirail.wire.vocabulary import Mode
 
 if TYPE_CHECKING:
+    from trirail.client.client import Jog, Robot
     from trirail.config import Limits
 
 NEAR = 0.05

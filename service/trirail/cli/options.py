@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from trirail.wire.decoding import converted
-from trirail.wire.zenoh_session import DEFAULT_LOCATOR
+from trirail.wire.endpoints import DEFAULT_LOCATOR
 
 if TYPE_CHECKING:
     from cyclopts.completion._engine import CompletionContext

@@ -14,8 +14,8 @@ from cyclopts import CycloptsError, Parameter
 from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
 from trirail.cli.options import poses as poses_of_robot
-from trirail.wire.boundary import check_name, check_new_pose
 from trirail.wire.messages import LONGEST_LEASE, SHORTEST_LEASE, CommandReply
+from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.vocabulary import Command
 
 if TYPE_CHECKING:

@@ -17,7 +17,6 @@ from trirail_drivers.bus import load
 from trirail_drivers.errors import shortened
 
 from trirail.cli.options import HERE
-from trirail.client.client import GoalHandle, Result, Robot
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.telemetry import palette
 from trirail.wire.messages import Event, GoalReply
@@ -27,6 +26,7 @@ from trirail.wire.vocabulary import Mode
 
 if TYPE_CHECKING:
     from trirail.cli.doctor import Check
+    from trirail.client.client import GoalHandle, Result, Robot
     from trirail.config import Config
 
 out = Console(highlight=False, emoji=False)

@@ -28,11 +28,11 @@ from trirail.client.goal import GoalHandle
 from trirail.client.outgoing import content_message, goal_message, seconds
 from trirail.client.track import Taker
 from trirail.errors import RefusedError, ServiceError
-from trirail.wire import boundary
 from trirail.wire.goals import Goal
 from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, Stop
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.stop_door import STOPS
+from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.vocabulary import Command
 
 P = ParamSpec("P")
@@ -91,7 +91,7 @@ class AsyncRobot:
         tls: Path | str | None = None,
     ) -> None:
         name, connect, tls = address(name, connect, tls)
-        self.name = boundary.check_name(name, "robot")
+        self.name = check_name(name, "robot")
         self.user, self._credentials = identity(self.name, connect, user, tls)
         self._connect = connect
         self._opened = AsyncExitStack()
@@ -204,11 +204,11 @@ class AsyncRobot:
 
     async def teach(self, name: str) -> NamedPose:
         """Keep where the robot is measured to stand as the pose of a name, as Robot.teach does."""
-        return await self._connection.ask(("teach", self.user, boundary.check_new_pose(name)), NamedPose)
+        return await self._connection.ask(("teach", self.user, check_new_pose(name)), NamedPose)
 
     async def forget(self, name: str) -> NamedPose:
         """Remove a taught pose, as Robot.forget does."""
-        return await self._connection.ask(("forget", self.user, boundary.check_name(name, "pose")), NamedPose)
+        return await self._connection.ask(("forget", self.user, check_name(name, "pose")), NamedPose)
 
     async def state(self, timeout: float = 2.0) -> State:
         """Return the next state that is published. Raises ServiceError if none comes within `timeout` seconds."""

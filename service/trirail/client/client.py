@@ -26,9 +26,8 @@ from trirail.client.outgoing import content_message, goal_message, number, secon
 from trirail.client.track import Taker, Track
 from trirail.client.trajectory import Points, points_of
 from trirail.errors import RefusalCode, RefusedError, ServiceError
-from trirail.wire import boundary, zenoh_session
 from trirail.wire.credentials import Credentials, credentials_for
-from trirail.wire.endpoints import ReachableBy, reach
+from trirail.wire.endpoints import DEFAULT_LOCATOR, ReachableBy, reach
 from trirail.wire.goals import (
     Goal,
     MoveGoal,
@@ -43,7 +42,7 @@ from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, 
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.stop_door import STOPS
-from trirail.wire.text import quoted
+from trirail.wire.text import check_name, check_new_pose, quoted
 from trirail.wire.vocabulary import Command
 
 __all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot", "Track"]
@@ -72,7 +71,7 @@ class Robot:
         tls: Path | str | None = None,
     ) -> None:
         name, connect, tls = address(name, connect, tls)
-        self.name = boundary.check_name(name, "robot")
+        self.name = check_name(name, "robot")
         self.user, credentials = identity(self.name, connect, user, tls)
         self._connection = Connection(self.name, connect, credentials)
         self._goals: dict[str, GoalHandle] = {}
@@ -193,7 +192,7 @@ class Robot:
         """
         return self.send(
             lambda goal_id: NamedGoal(
-                name=boundary.check_name(name, "pose"),
+                name=check_name(name, "pose"),
                 id=goal_id,
                 speed=speed,
                 valid_for=valid_for,
@@ -363,11 +362,11 @@ class Robot:
         The service keeps it for good: when this returns it is on its disk. A taught pose of that name is replaced.
         Raises RefusedError where the robot moves, is in fault or has not been homed, and for names of [poses].
         """
-        return self._connection.ask(("teach", self.user, boundary.check_new_pose(name)), NamedPose)
+        return self._connection.ask(("teach", self.user, check_new_pose(name)), NamedPose)
 
     def forget(self, name: str) -> NamedPose:
         """Remove a taught pose; return what it was. Raises RefusedError where none of that name was taught."""
-        return self._connection.ask(("forget", self.user, boundary.check_name(name, "pose")), NamedPose)
+        return self._connection.ask(("forget", self.user, check_name(name, "pose")), NamedPose)
 
     # ------------------------------------------------------------------ what the service tells
 
@@ -409,7 +408,7 @@ class Robot:
 def address(robot: str | None, connect: str | None, tls: Path | str | None) -> tuple[str, str, Path | str | None]:
     """Return which robot, where, and with whose folder: what is not given as the environment has it, as in a shell."""
     robot = robot or os.environ.get("TRIRAIL_ROBOT") or "demo"
-    connect = connect or os.environ.get("TRIRAIL_CONNECT") or zenoh_session.DEFAULT_LOCATOR
+    connect = connect or os.environ.get("TRIRAIL_CONNECT") or DEFAULT_LOCATOR
     if tls is None and reach(connect) is ReachableBy.CERTIFICATE:
         tls = os.environ.get("TRIRAIL_TLS") or None
     return robot, connect, tls
@@ -419,7 +418,7 @@ def identity(robot: str, connect: str, user: str | None, tls: Path | str | None)
     """Return as whom a client speaks to a robot, and with which credentials. Raises RefusedError, ServiceError."""
     credentials = credentials_for(robot, connect, tls)
     known_as = credentials.name if credentials is not None else ""
-    name = boundary.check_name(user or known_as or _user(), "user")
+    name = check_name(user or known_as or _user(), "user")
     if credentials is not None and known_as != name:
         whose = f"in the name of {quoted(known_as)}" if known_as else "without a common name"
         problem = f"the certificate in {credentials.folder} is {whose}: {name} cannot send with it"

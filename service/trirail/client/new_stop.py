@@ -10,9 +10,9 @@ from trirail.client.client import address, identity
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.stop_call import Outcome, Outcomes, StopOrder
 from trirail.errors import ServiceError, TrirailError
-from trirail.wire import boundary
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply
+from trirail.wire.text import check_name
 
 
 class NewStop:
@@ -25,7 +25,7 @@ class NewStop:
         self, name: str, robot: str | None = None, connect: str | None = None, tls: Path | str | None = None
     ) -> None:
         robot, connect, tls = address(robot, connect, tls)
-        user, credentials = identity(boundary.check_name(robot, "robot"), connect, None, tls)
+        user, credentials = identity(check_name(robot, "robot"), connect, None, tls)
         stop = StopOrder.of(robot, user, name, None, REPLY_WITHIN)
         self._came: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
         at_door = stop.at_door(connect, credentials, self._came.put)

@@ -8,12 +8,12 @@ from __future__ import annotations
 import contextlib
 import math
 import operator
+import sys
 import threading
 from collections.abc import Callable
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
@@ -66,8 +66,9 @@ def seconds(value: object) -> float | None:
 
 def _plain(value: Any) -> Any:
     """Return what a message has for it. Raises TypeError where it has nothing, ValueError for no finite one."""
-    if isinstance(value, np.ndarray | np.generic):
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
+    numpy = sys.modules.get("numpy")  # who hands over its numbers has imported it
+    if numpy is not None and isinstance(value, (numpy.ndarray, numpy.generic)):
+        if value.dtype.kind == "f" and not numpy.isfinite(value).all():
             raise ValueError(f"{value!r} is not finite")
         value = value.tolist()  # Python's own numbers, truth values and texts
         if isinstance(value, list | str | bool):

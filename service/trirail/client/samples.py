@@ -42,7 +42,9 @@ class SampleReader:
 
     def batches(self, take: Callable[[bytes], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
         """Return what hands over batches of records, likewise: whole ones, packed as wire.records has them."""
-        return self._handler(lambda sample: boundary.batch(sample.payload.to_bytes()), take)
+        from trirail.wire import records  # with numpy, which most commands do without
+
+        return self._handler(lambda sample: records.checked(sample.payload.to_bytes()), take)
 
     def _handler(
         self, read: Callable[[zenoh.Sample], T | bytes], take: Callable[..., None]

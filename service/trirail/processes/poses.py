@@ -25,6 +25,7 @@ from trirail.wire.goals import Coordinates, Goal, NamedGoal, PoseGoal
 from trirail.wire.messages import ErrorReply, NoContent
 from trirail.wire.packets import PoseChanged
 from trirail.wire.state import NamedPose, NamedPoses
+from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.vocabulary import MODES, Mode
 
 MOST = 1000
@@ -97,7 +98,7 @@ class Poses:
         """Take a query on …/teach or …/forget. Raises RefusedError."""
         kind = incoming.kind
         user, name = boundary.names(incoming.key, zenoh_session.key(self._robot, kind), ("user", "pose"))
-        boundary.check_name(name, "pose")
+        check_name(name, "pose")
         incoming.content(NoContent | None, f"{kind} takes no content")
         if self._under_way >= UNDER_WAY:
             raise RefusedError(RefusalCode.BUSY, f"{self._under_way} poses are being taught already: send fewer")
@@ -105,7 +106,7 @@ class Poses:
             self._check_known(name)
             self._write(_Change(incoming, user, name, None))
             return
-        boundary.check_new_pose(name)
+        check_new_pose(name)
         if name in self._configured:
             raise RefusedError(
                 RefusalCode.CONFIGURED_POSE, f"{name} is in [poses]: teach another name, or change it there"
@@ -156,7 +157,7 @@ class Poses:
     def _check_known(self, name: str) -> None:
         if name in self._taught:
             return
-        boundary.check_new_pose(name)
+        check_new_pose(name)
         if name in self._configured:
             raise RefusedError(RefusalCode.CONFIGURED_POSE, f"{name} is in [poses]: remove it there")
         there_are = ", ".join(sorted(self._taught)) or "none"

@@ -10,18 +10,14 @@ from collections import Counter
 from typing import Any
 
 import msgspec
-import numpy as np
-from trirail_drivers.interface import PowerState
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.decoding import decoder, prepare
 from trirail.wire.goals import Goal
 from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Event, GoalReply, NoContent, RoleReply
-from trirail.wire.records import SIZE, unpack
 from trirail.wire.sizes import MAX_MESSAGE
 from trirail.wire.state import Info, NamedPose, NamedPoses, RobotSummary, State
-from trirail.wire.text import NAME_RULE, QUANTITY_RULE, is_name, is_quantity, printable, quoted
-from trirail.wire.vocabulary import MODES
+from trirail.wire.text import check_name, printable, quoted
 
 JSON, MSGPACK, BINARY = "application/json", "application/msgpack", "application/octet-stream"
 _READ_AS = {
@@ -53,21 +49,6 @@ def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:
         raise RefusedError(RefusalCode.UNKNOWN_KEY, f"{quoted(key)}: no such key; there is {form}")
     check_name(parts[0], "user")
     return parts
-
-
-def check_name(name: str, whose: str) -> str:
-    """Return what may name a robot or user. Raises RefusedError."""
-    if not isinstance(name, str) or not is_name(name):
-        raise RefusedError(RefusalCode.BAD_NAME, f"{whose} {quoted(str(name))!r} is no name: {NAME_RULE} are taken")
-    return name
-
-
-def check_new_pose(name: str) -> str:
-    """Return what may name a pose that is taught: a name that goto takes for no quantity. Raises RefusedError."""
-    check_name(name, "pose")
-    if is_quantity(name):
-        raise RefusedError(RefusalCode.BAD_NAME, f"pose {name!r} {QUANTITY_RULE}")
-    return name
 
 
 def check_size(size: int) -> None:
@@ -103,17 +84,6 @@ def decode(payload: bytes, kind: Any, what: str, encoded: str = JSON) -> Any:
 def encode(content: msgspec.Struct, encoded: str = JSON) -> bytes:
     """Write a message as JSON, or as msgpack where that is named."""
     return msgspec.msgpack.encode(content) if encoded == MSGPACK else msgspec.json.encode(content)
-
-
-def batch(payload: bytes) -> bytes:
-    """Return packed records: at least one, all whole, of cycles that follow each other. Raises RefusedError."""
-    if not payload or len(payload) % SIZE:
-        raise RefusedError(RefusalCode.MALFORMED, f"not records: {len(payload)} bytes, and each record has {SIZE}")
-    rows = unpack(payload)
-    known = np.all(rows["mode"] < len(MODES)) and np.all(rows["drive_state"] < len(PowerState))
-    if not known or rows["cycle"][0] < 0 or np.any(np.diff(rows["cycle"]) != 1):
-        raise RefusedError(RefusalCode.MALFORMED, "not records: modes, states or cycles that there are not")
-    return payload
 
 
 def _refuse_twice(pairs: list[tuple[str, object]]) -> None:

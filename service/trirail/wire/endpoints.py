@@ -7,6 +7,8 @@ import re
 from enum import StrEnum
 from pathlib import Path
 
+DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
+"""Where a service is, if nothing else is said."""
 LIKE = "an endpoint is protocol/address, as tcp/127.0.0.1:7447"
 _WITH_PORT = frozenset({"tcp", "tls", "udp", "quic", "ws"})
 LAST_PORT = 65535

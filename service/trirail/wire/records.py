@@ -12,6 +12,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from trirail_drivers.interface import PowerState
+
+from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.vocabulary import MODES
 
 
 class Part(IntEnum):
@@ -79,3 +83,14 @@ def last_cycle(batch: bytes) -> int:
 def unpack(batch: bytes | memoryview) -> NDArray[np.void]:
     """View a batch of packed records as an array with the fields of DTYPE, shape (n,)."""
     return np.frombuffer(batch, DTYPE)
+
+
+def checked(payload: bytes) -> bytes:
+    """Return packed records: at least one, all whole, of cycles that follow each other. Raises RefusedError."""
+    if not payload or len(payload) % SIZE:
+        raise RefusedError(RefusalCode.MALFORMED, f"not records: {len(payload)} bytes, and each record has {SIZE}")
+    rows = unpack(payload)
+    known = np.all(rows["mode"] < len(MODES)) and np.all(rows["drive_state"] < len(PowerState))
+    if not known or rows["cycle"][0] < 0 or np.any(np.diff(rows["cycle"]) != 1):
+        raise RefusedError(RefusalCode.MALFORMED, "not records: modes, states or cycles that there are not")
+    return payload

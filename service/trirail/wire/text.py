@@ -8,6 +8,7 @@ import re
 import unicodedata
 from datetime import datetime
 
+from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.sizes import MAX_NAME, MAX_TEXT
 
 _HIDDEN = frozenset({"Cc", "Cf", "Cs", "Co", "Zl", "Zp"})
@@ -73,3 +74,18 @@ def _is_hidden(character: str) -> bool:
 
 def _escaped(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
+
+
+def check_name(name: str, whose: str) -> str:
+    """Return what may name a robot or user. Raises RefusedError."""
+    if not isinstance(name, str) or not is_name(name):
+        raise RefusedError(RefusalCode.BAD_NAME, f"{whose} {quoted(str(name))!r} is no name: {NAME_RULE} are taken")
+    return name
+
+
+def check_new_pose(name: str) -> str:
+    """Return what may name a pose that is taught: a name that goto takes for no quantity. Raises RefusedError."""
+    check_name(name, "pose")
+    if is_quantity(name):
+        raise RefusedError(RefusalCode.BAD_NAME, f"pose {name!r} {QUANTITY_RULE}")
+    return name

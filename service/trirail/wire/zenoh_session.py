@@ -12,10 +12,9 @@ import zenoh
 from trirail.errors import ServiceError
 from trirail.wire.credentials import Credentials
 from trirail.wire.dialling import why_not
-from trirail.wire.endpoints import leads_to
+from trirail.wire.endpoints import DEFAULT_LOCATOR, leads_to
 from trirail.wire.sizes import MAX_TRANSPORT
 
-DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
 SESSIONS = 512
 """Clients that may be connected to a service at once; a router is one."""
 GIVEN_UP_AFTER = 2.0
