@@ -53,6 +53,8 @@ class Case(NamedTuple):
     @property
     def ends_the_service(self) -> bool:
         """Whether the service ends by it."""
+        if self.victim == "fork-server":
+            return self.harm == "KILL"
         return self.victim == "loop" or (self.victim == "supervisor" and self.harm in ("KILL", "TERM"))
 
     @property
@@ -65,10 +67,11 @@ class Case(NamedTuple):
         """What the service may exit with in the end."""
         if self.victim == "supervisor":
             return (0,) if self.harm not in {"KILL", "STOP"} else (-signal.SIGKILL,)
-        if self.victim == "loop":
+        if self.victim == "loop" or (self.victim, self.harm) == ("fork-server", "KILL"):
             return (1,)
-        # A recorder that is frozen as the service ends is killed: what it had is lost, which is a failure.
-        return (0, 1) if (self.victim, self.harm) == ("recorder", "STOP") else (0,)
+        # A recorder that is frozen as the service ends is killed: what it had is lost, which is a failure. A frozen
+        # fork server does not say how the others have ended, which may have been one.
+        return (0, 1) if self.victim in ("recorder", "fork-server") and self.harm == "STOP" else (0,)
 
     def __str__(self) -> str:
         return "/".join(self)
@@ -106,6 +109,7 @@ def run(rig: Rig, case: Case) -> None:
     """Let a case happen to a service that is up and disabled, and check what becomes of it. Raises Failed."""
     heard: list[str] = []
     victim = rig.process(case.victim)
+    faults = rig.major_faults()
     number, seconds = HARM[case.harm]
     with rig.robot() as robot, open_client(rig.locator) as session:
         bring_to(case.mode, rig, robot, lambda name: session.get(key("demo", "cmd", "chaos", name)))
@@ -119,6 +123,8 @@ def run(rig: Rig, case: Case) -> None:
         _wait_end(rig)
     else:
         heard = _go_on(rig, case)
+        if waited := rig.major_faults() - faults:
+            raise Failed(f"the loop has waited for {waited} pages from the disk: they should have been in memory")
         if case.victim == "supervisor" and case.harm == "STOP":
             rig.service.kill()
         else:

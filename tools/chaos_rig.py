@@ -30,7 +30,7 @@ from trirail_drivers.cia402 import frames
 ROOT = Path(__file__).parents[1]
 PATIENCE = 20.0
 """How long anything may take that has to come [s]."""
-PROCESSES = ("supervisor", "gateway", "loop", "planner", "recorder")
+PROCESSES = ("supervisor", "fork-server", "gateway", "loop", "planner", "recorder")
 NODES = (1, 2, 3)
 # Three processes share what may be a slow machine: a rate and watchdogs that leave them time.
 CHANGES = {
@@ -143,6 +143,10 @@ class Rig:
         """Process id of one of PROCESSES."""
         return self.service.pid if name == "supervisor" else child(self.service.pid, name)
 
+    def major_faults(self) -> int:
+        """Pages that the loop has had to wait for a disk for."""
+        return int(Path(f"/proc/{self.process('loop')}/stat").read_text().rpartition(")")[2].split()[9])
+
     def fault(self, line: str) -> None:
         """Tell the drives of a fault: trirail_drivers.simulated.faultlines."""
         if self._drives.stdin is not None:
@@ -151,12 +155,13 @@ class Rig:
 
     def remains(self) -> list[int]:
         """Process ids of the service's processes that are still there."""
-        mark, found = str(self.folder).encode(), []
-        for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        found = []
+        for entry in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
-                command = entry.read_bytes()
-                if mark in command and b"virtual_drives" not in command:
-                    found.append(int(entry.parent.name))
+                # Forked processes have neither arguments nor, for sure, an environment of their own.
+                speaks_to = (entry / "fd" / "1").readlink()
+                if speaks_to.is_relative_to(self.folder) and b"virtual_drives" not in (entry / "cmdline").read_bytes():
+                    found.append(int(entry.name))
         return found
 
     def clean_up(self) -> None:

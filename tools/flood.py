@@ -35,7 +35,7 @@ import zenoh
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import RefusedError, ServiceError, TrirailError
-from trirail.processes.interpreter import python
+from trirail.processes.interpreter import processes, python
 from trirail.telemetry.sinks import free_port
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE
@@ -184,15 +184,6 @@ def _flood(locator: str, ports: tuple[int, ...], rate: float, seconds: float, de
         time.sleep(seconds)
     said.send((flood.sent, flood.answered))
     os._exit(0)
-
-
-def processes(supervisor: int) -> dict[str, int]:
-    """Return a service's processes by their names."""
-    found = {"supervisor": supervisor}
-    for entry in Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split():
-        words = Path(f"/proc/{entry}/cmdline").read_text().split("\0")
-        found[words[words.index("trirail.processes.process") + 1]] = int(entry)
-    return found
 
 
 def memory(pids: dict[str, int]) -> dict[str, float]:

@@ -134,14 +134,18 @@ def test_sigterm_to_the_gateway_alone_is_told_as_what_it_is(service: Service) ->
         assert robot.state().mode == "holding"
 
 
-def test_a_killed_supervisor_leaves_a_complete_recording(service: Service) -> None:
+@pytest.mark.parametrize("name", ["supervisor", "fork-server"])
+def test_a_killed_parent_leaves_nobody_and_a_complete_recording(name: str, service: Service) -> None:
     """The loop stops the robot; the recorder outlives it, to have what it said of that."""
     with service.robot() as robot:
         in_motion(robot)
-        children = [service.child(name) for name in ("loop", "gateway", "planner", "recorder")]
-        service.process.kill()
-        for child in children:
-            wait_gone(child)
+        processes = service.processes()
+        os.kill(processes.pop(name), signal.SIGKILL)
+        for process in processes.values():
+            wait_gone(process)
+    if name == "fork-server":
+        assert service.process.wait(END_WITHIN) == 1
+        assert "the process that forks the others has died (killed by SIGKILL)" in service.log.read_text()
     assert_stopped_smoothly(service.frames())
     recorded = recording(service)
     assert outcomes(recorded) == [("long", "stopped")]

@@ -30,7 +30,7 @@ from trirail.cli.remote_view import RemoteView
 from trirail.client.client import Robot
 from trirail.config import SIM, load
 from trirail.errors import RefusedError, ServiceError
-from trirail.processes.interpreter import child, python
+from trirail.processes.interpreter import child, processes, python
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import read
 from trirail.wire.goals import OwnLimits
@@ -89,6 +89,10 @@ class Service:
             if self.process.poll() is not None or time.monotonic() > deadline:
                 raise AssertionError(self.log.read_text())
             wait_readable(self.process, 0.1)
+
+    def processes(self) -> dict[str, int]:
+        """Process ids of all its processes, by their names."""
+        return processes(self.process.pid)
 
     def child(self, name: str) -> int:
         """Process id of one of its children."""

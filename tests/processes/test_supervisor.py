@@ -8,42 +8,44 @@ from pathlib import Path
 import pytest
 from trirail.config import SIM, load
 from trirail.kinematics.compiled import FUNCTIONS
-from trirail.processes import child_process, supervisor
+from trirail.processes import supervisor, warm_parent
 
-CHILD = """
-import os, sys, time
+SERVER = """
+import os, signal, sys, time
 from pathlib import Path
-from trirail.processes.heartbeats import Heartbeats
+
+from trirail.processes import compiling, fork_server
 
 folder = Path({folder!r})
-_, name, runtime, ready_on, beats, *sockets = sys.argv
-heartbeats = Heartbeats(int(beats))
-sys.stdin.read()
-number = len(list(folder.glob(f"{{name}}-*.begun"))) + 1
-(folder / f"{{name}}-{{number}}.begun").touch()
-
-def ready():
-    os.write(int(ready_on), b"{{}}\\n")
+compiling.load = lambda: True
 
 def begun(other):
     return (folder / f"{{other}}.begun").exists()
 
-def beat_until(condition):
-    while not condition():
-        heartbeats.of(name).beat()
-        time.sleep(0.01)
-
 def never():
-    return os.getppid() == 1
+    return False
 
 def freeze():
     while not never():
         time.sleep(0.1)
 
-def loop_gone():
-    return heartbeats.of("loop").count == 0
+def work(child):
+    name, heartbeats, ready = child.name, child.heartbeats, lambda: child.ready({{}})
+    number = len(list(folder.glob(f"{{name}}-*.begun"))) + 1
+    (folder / f"{{name}}-{{number}}.begun").touch()
 
-exec((folder / f"{{name}}-{{number}}").read_text())
+    def beat_until(condition):
+        while not condition():
+            heartbeats.of(name).beat()
+            time.sleep(0.01)
+
+    def loop_gone():
+        return heartbeats.of("loop").count == 0
+
+    exec((folder / f"{{name}}-{{number}}").read_text(), globals() | locals())
+    return 0
+
+sys.exit(fork_server.main(work))
 """
 TURNING = "ready(); beat_until(never)"
 RECORDING = "ready(); freeze()"
@@ -53,9 +55,9 @@ SERVING = "ready(); beat_until(lambda: heartbeats.of('loop').count); beat_until(
 @pytest.fixture
 def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What the supervisor says. Its children do what is written in files of their name and number."""
-    script = tmp_path / "child.py"
-    script.write_text(CHILD.format(folder=str(tmp_path)))
-    monkeypatch.setattr(child_process, "python", lambda *arguments: [sys.executable, str(script), *arguments[2:]])
+    script = tmp_path / "server.py"
+    script.write_text(SERVER.format(folder=str(tmp_path)))
+    monkeypatch.setattr(warm_parent, "python", lambda *arguments: [sys.executable, str(script), *arguments[2:]])
     monkeypatch.setattr(supervisor, "END_WITHIN", 0.5)
     return []
 
@@ -91,7 +93,7 @@ def test_a_gateway_that_hangs_in_its_start_is_killed(
         told,
         tmp_path,
         loop_1="ready(); beat_until(lambda: begun('gateway-3')); heartbeats.of('loop').rest()",
-        gateway_1="ready(); beat_until(lambda: begun('recorder-1'))",
+        gateway_1="ready(); beat_until(lambda: begun('planner-1')); time.sleep(1.0)",
         gateway_2="freeze()",
         gateway_3="ready()",
         recorder_1=RECORDING,
@@ -166,7 +168,7 @@ def test_a_first_start_is_waited_for_as_long_as_it_compiles(
     monkeypatch.setattr(supervisor, "START_WITHIN", 3.0)
     compiling = f"""
 for number in range({FUNCTIONS}):
-    os.write(int(ready_on), b'{{"compiling": "f%d"}}\\n' % number)
+    child.compiling(f"f{{number}}")
     time.sleep(4.0 / {FUNCTIONS})
 """
     end = "ready(); beat_until(lambda: begun('gateway-1')); heartbeats.of('loop').rest()"
@@ -180,7 +182,7 @@ def test_the_terminals_interrupt_reaches_no_child_not_even_one_that_is_still_imp
     told: list[str], tmp_path: Path
 ) -> None:
     """Ctrl-C goes to all of the terminal's processes: the supervisor alone acts on it."""
-    interrupted = "import signal; os.kill(os.getpid(), signal.SIGINT); ready(); "
-    turning = "beat_until(lambda: begun('gateway-1') and begun('recorder-1')); heartbeats.of('loop').rest()"
+    interrupted = "os.kill(os.getpid(), signal.SIGINT); ready(); "
+    turning = "beat_until(lambda: begun('planner-1')); time.sleep(1.0); heartbeats.of('loop').rest()"
     run(told, tmp_path, loop_1=interrupted + turning, gateway_1=interrupted + "freeze()", recorder_1=RECORDING)
     assert told[0] == "up"

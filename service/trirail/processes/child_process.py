@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import time
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from trirail.processes.interpreter import CHILD, python
 from trirail.processes.process import COMPILING, HAPPENED, MEASURED
+from trirail.processes.warm_parent import WarmParent, how_ended
 from trirail.wire.decoding import converted
 from trirail.wire.messages import Event
 
@@ -20,7 +18,7 @@ from trirail.wire.messages import Event
 class ChildProcess:
     """A child process, and a pipe on which it says that it is ready and whose end is its end."""
 
-    def __init__(self, name: str, order: bytes, runtime: Path, beats: int, sockets: list[int]) -> None:
+    def __init__(self, parent: WarmParent, name: str, record: str | None) -> None:
         self.name = name
         self.began = time.monotonic()
         self.compiling: list[str] = []
@@ -30,20 +28,9 @@ class ChildProcess:
         self.ready_with: dict[str, Any] | None = None
         self._hung_for = 0.0
         self.pipe, write = os.pipe()
-        arguments = [name, str(runtime), str(write), str(beats), *map(str, sockets)]
-        # The terminal sends it to all, and the supervisor alone acts on it: also while the child is still importing.
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-        try:
-            self.process = subprocess.Popen(
-                python("-m", CHILD, *arguments), stdin=subprocess.PIPE, pass_fds=[write, beats, *sockets]
-            )
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        os.close(write)
         os.set_blocking(self.pipe, False)
-        if self.process.stdin is not None:
-            self.process.stdin.write(order)
-            self.process.stdin.close()
+        self.process = parent.fork(name, record, write)
+        os.close(write)
 
     def listen(self) -> bool:
         """Read what the child says; False once it has ended."""
@@ -64,14 +51,6 @@ class ChildProcess:
                 self.ready_with = said
         return bool(content)
 
-    def wait(self, deadline: float) -> bool:
-        """Wait for its end until a time of the monotonic clock."""
-        try:
-            self.process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            return False
-        return True
-
     def kill_hung(self, silent: float) -> None:
         """Kill it for having given no sign of life for so long [s]; SIGTERM would wait, if it is stopped."""
         self._hung_for = silent
@@ -83,6 +62,4 @@ class ChildProcess:
         code = self.process.returncode
         if self._hung_for and code == -signal.SIGKILL:
             return f"no sign of life for {self._hung_for:g} s, so it was killed"
-        if code == 0:
-            return "another process sent it SIGTERM"
-        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        return how_ended(code) if code else "another process sent it SIGTERM"

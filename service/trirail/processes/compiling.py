@@ -8,8 +8,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from trirail.processes.memory import give_back
 from trirail.processes.systemd import notify
 
+LOADED = "trirail.processes.rehearsal"
+"""The module that is imported last, once all compiled rooms are."""
 QUARTERS = 4
 """So many parts of the work are told of."""
 
@@ -37,14 +40,46 @@ class Progress:
         notify(f"STATUS=compiling, once: {words}\nEXTEND_TIMEOUT_USEC={self._patience * 1e6:.0f}")
 
 
-def main() -> int:
-    """Compile what is not kept yet."""
+class NotKeptError(Exception):
+    """A function would have to be compiled."""
+
+
+def load() -> bool:
+    """Import the compiled rooms for good, which takes a second; False where something would have to be compiled."""
+    if LOADED in sys.modules:
+        return True
+    # numba imports it where it is installed, 0.15 s and 10 MB, for linear algebra that nothing compiled here asks for.
+    sys.modules.setdefault("scipy", None)  # type: ignore[arg-type]
+    from trirail.kinematics.compiled import compile_no_more, tell_of_compiling
+
+    def refuse(function: str) -> None:
+        raise NotKeptError(function)
+
+    tell_of_compiling(refuse)
+    try:
+        _import_rooms()
+    except NotKeptError:
+        return False
+    compile_no_more()
+    give_back()
+    return True
+
+
+def compile_all(begin: Callable[[str], None]) -> None:
+    """Compile what is not kept yet; `begin` is called with the name of each function before it is compiled."""
     from trirail.kinematics.compiled import tell_of_compiling
 
-    tell_of_compiling(Progress(lambda words: print(f"trirail: {words}", flush=True), 0.0).begin)  # noqa: T201
-    from trirail.control import cycle  # noqa: F401 - importing compiles
-    from trirail.motion import planner  # noqa: F401
+    tell_of_compiling(begin)
+    _import_rooms()
 
+
+def _import_rooms() -> None:
+    from trirail.processes import planner, rehearsal  # noqa: F401 - importing compiles
+
+
+def main() -> int:
+    """Compile what is not kept yet."""
+    compile_all(Progress(lambda words: print(f"trirail: {words}", flush=True), 0.0).begin)  # noqa: T201
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from pathlib import Path
 
@@ -16,14 +17,37 @@ def python(*arguments: str) -> list[str]:
     return [sys.executable, "-P", *arguments]
 
 
-CHILD = "trirail.processes.process"
-"""The module that each of the service's child processes runs; its first argument is the process's name."""
+TITLE = "trirail: "
+"""What `ps` and its like show of one of the service's processes, before its name."""
+FORK_SERVER = "trirail.processes.fork_server"
+"""The module that the parent of the service's other processes runs."""
+
+
+def processes(service: int) -> dict[str, int]:
+    """Return the process ids of a service's processes by their names; `service` is the supervisor's."""
+    found = {"supervisor": service}
+    for pid in [grandchild for parent in _children(service) for grandchild in (parent, *_children(parent))]:
+        with contextlib.suppress(OSError):
+            called = Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0").decode()
+            if called.startswith(TITLE):
+                found[called.removeprefix(TITLE)] = pid
+    return found
 
 
 def child(service: int, name: str) -> int:
-    """Return the process id of one of a service's child processes. Raises ServiceError where there is none."""
-    for entry in Path(f"/proc/{service}/task/{service}/children").read_text(encoding="ascii").split():
-        command = Path(f"/proc/{entry}/cmdline").read_bytes().split(b"\0")
-        if [CHILD.encode(), name.encode()] in [command[place : place + 2] for place in range(len(command))]:
-            return int(entry)
-    raise ServiceError(f"the service has no process {name}")
+    """Return the process id of one of a service's processes. Raises ServiceError where there is none."""
+    try:
+        return processes(service)[name]
+    except KeyError:
+        raise ServiceError(f"the service has no process {name}") from None
+
+
+def title(name: str) -> str:
+    """Return what one of the service's processes is called by `ps` and its like."""
+    return TITLE + name
+
+
+def _children(process: int) -> list[int]:
+    with contextlib.suppress(OSError):
+        return [int(pid) for pid in Path(f"/proc/{process}/task/{process}/children").read_text("ascii").split()]
+    return []

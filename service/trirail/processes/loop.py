@@ -181,17 +181,27 @@ class Loop:
         self._reports.flush()
 
 
-def main(config: Config, ports: Ports, heartbeats: Heartbeats, ready: Callable[[object], None]) -> int:
-    """Run the loop's process; `ready` is called with what the loop runs without once it turns."""
+def main(
+    config: Config,
+    ports: Ports,
+    heartbeats: Heartbeats,
+    ready: Callable[[object], None],
+    rehearse: Callable[[Config], tuple[str, ...]],
+) -> int:
+    """Run the loop's process; `ready` is called with what the loop runs without once it turns.
+
+    `rehearse` runs what must come without delay, before the drives are touched, and returns what kept it from that.
+    """
     drives: DriveGroup | None = None
     ended_as_told = False
     try:
         warm_up()
+        unrehearsed = rehearse(config)
         ports.planner.await_peer(PLANNER_WITHIN)
         capture = Capture() if config.telemetry.capture_can else None
         drives = connect(config.can, config.drives, capture=capture)
         drives.configure(config.period, config.limits.slider.velocity)
-        lacking = realtime.acquire(config.loop)
+        lacking = (*realtime.acquire(config.loop), *unrehearsed)
         loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)
 
         def end(_signal: int, _frame: FrameType | None) -> None:

@@ -8,10 +8,13 @@ import os
 import struct
 from collections.abc import Callable
 
+from setproctitle import setproctitle
+
 from trirail.config import LoopTable
 from trirail.errors import ServiceError
+from trirail.processes.interpreter import title
 
-_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
 
 BELOW = 10
@@ -31,12 +34,18 @@ def die_with_parent(signal_number: int) -> None:
     _call("prctl", _PR_SET_PDEATHSIG, signal_number)
 
 
+def name_process(name: str) -> None:
+    """Give this process a name of its own for `ps` and its like: a forked one has its parent's."""
+    setproctitle(title(name))
+
+
 def _fifo(loop: LoopTable) -> None:
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(loop.priority))
 
 
 def _lock_memory(_: LoopTable) -> None:
-    _call("mlockall", _MCL_CURRENT | _MCL_FUTURE)
+    """Lock what is touched, now or later: mlockall(2). All that is mapped would be five times as much."""
+    _call("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
 
 
 def _processor(loop: LoopTable) -> int:

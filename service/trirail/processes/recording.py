@@ -18,6 +18,7 @@ from trirail.config import Config
 from trirail.processes.heartbeats import Heart
 from trirail.processes.last_words import LastWords
 from trirail.processes.measured import TOLD_EVERY, RecorderMeasured
+from trirail.processes.memory import give_back
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
@@ -147,6 +148,7 @@ def main(
     """Record until the loop has gone or the process is told to end; tell `measured` of gaps, if there are metrics."""
     os.umask(NOT_FOR_OTHERS | os.umask(NOT_FOR_OTHERS))
     intake = Intake(config, record, link, ready)
+    give_back()
     ending = False
 
     def end(_signal: int, _frame: object) -> None:

@@ -11,9 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
-from msgspec import structs
-
 from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.processes.child_process import ChildProcess
@@ -25,10 +22,12 @@ from trirail.processes.monitor import Monitor
 from trirail.processes.process import Order
 from trirail.processes.signals import Signals
 from trirail.processes.systemd import Watchdog, notify
+from trirail.processes.warm_parent import WarmParent
 from trirail.wire import links
 from trirail.wire.messages import Event, Level
 
-CHILDREN = ("loop", "planner", "gateway", "recorder")
+CHILDREN = ("gateway", "recorder", "loop", "planner")
+"""In the order of their start: the first two need no mathematics, and come up while that is being imported."""
 PORTS = ("gateway", "recorder", "planner")
 """Where the others connect to the loop, in the order of trirail.processes.loop.Ports."""
 WATCHED_BY_SYSTEMD = ("loop", "gateway")
@@ -67,8 +66,8 @@ class Supervisor:
         say: Callable[[str, Level], None],
         tell: Callable[[Event], None] = lambda _: None,
     ) -> None:
-        self._orders = dict.fromkeys(CHILDREN, Order(config, None))
-        self._orders["recorder"] = Order(config, str(record) if record else None)
+        self._order = Order(config, str(record) if record else None)
+        self._record = self._order.record
         self._say = say
         self._tell = tell
         self._children: dict[str, ChildProcess] = {}
@@ -107,23 +106,25 @@ class Supervisor:
             self._runtime = Path(folder)
             self._listening = [links.listen(self._runtime / name) for name in PORTS]
             self._selector.register(signals.reader, selectors.EVENT_READ, None)
+            sockets = [listening.fileno() for listening in self._listening]
+            self._parent = WarmParent(self._order, self._runtime, self._heartbeats.descriptor, sockets)
+            self._selector.register(self._parent, selectors.EVENT_READ, self._parent)
             try:
                 for name in CHILDREN:
                     self._start(name)
                 self._watch(up, signals)
             finally:
                 self._end()
+                self._parent.close()
                 for listening in self._listening:
                     listening.close()
         return 1 if self._failed else 0
 
     def _start(self, name: str) -> None:
-        sockets = [listening.fileno() for listening in self._listening] if name == "loop" else []
         if name in PROCESSES:
             self._heartbeats.of(name).rest()
-        beats = self._heartbeats.descriptor
         self._started[name] += 1
-        child = ChildProcess(name, msgspec.json.encode(self._orders[name]), self._runtime, beats, sockets)
+        child = ChildProcess(self._parent, name, self._record if name == "recorder" else None)
         self._children[name] = child
         self._selector.register(child.pipe, selectors.EVENT_READ, child)
 
@@ -132,9 +133,12 @@ class Supervisor:
         began = time.monotonic()
         is_up = False
         while not self._ending:
-            heard: list[ChildProcess | None] = [key.data for key, _ in self._selector.select(TURN)]
+            heard: list[ChildProcess | WarmParent | None] = [key.data for key, _ in self._selector.select(TURN)]
             # The loop first: the others end because it has ended, and not by themselves.
             for child in sorted(heard, key=lambda child: child is not self._children.get("loop")):
+                if isinstance(child, WarmParent):
+                    self._hear_parent()
+                    continue
                 if child is None:
                     self._say(f"{signals.take().name}: stopping the robot and disabling the drives", "info")
                     self._ending = True
@@ -169,6 +173,8 @@ class Supervisor:
         self._next_turn = now + TURN
         for child in self._children.values():
             if child.ready_with is None and now - max(child.began, self._went_on) > START_WITHIN:
+                if child.process.pid is None:
+                    self._parent.kill()
                 child.kill_hung(START_WITHIN)
         self._monitor.look({name: self._running(name) for name in CHILDREN})
         for name, watch in self._watches.items():
@@ -184,7 +190,7 @@ class Supervisor:
     def _on_end(self, child: ChildProcess) -> None:
         """Decide what the end of a process means."""
         self._forget(child)
-        child.process.wait()
+        child.process.wait(time.monotonic() + END_WITHIN)
         if child.name != "loop" and self._loop_is_ending():
             return  # so it has ended as well, as it should
         said_why = child.process.returncode == os.EX_CONFIG
@@ -210,7 +216,8 @@ class Supervisor:
             return
         when = f" in {wait:g} s" if wait else ""
         self._say(f"the {name} has died ({child.how}): {CONSEQUENCES[name]}; starting it again{when}", "warning")
-        self._orders[name] = structs.replace(self._orders[name], record=None)  # never over the first recording
+        if name == "recorder":
+            self._record = None  # never over the first recording
         self._due[name] = now + wait
 
     def _loop_is_ending(self) -> bool:
@@ -228,6 +235,14 @@ class Supervisor:
         self._failed = self._ending = True
         if reason:
             self._say(reason, "error")
+
+    def _hear_parent(self) -> None:
+        """Take what the parent of the others says; without it there is no service."""
+        self._parent.hear()
+        if self._parent.gone:
+            self._selector.unregister(self._parent)
+            how = f"the process that forks the others has died ({self._parent.how()})"
+            self._fail(f"{how}: the loop stops the robot and disables the drives; ending")
 
     def _pass_on(self, child: ChildProcess) -> None:
         while child.happened:
@@ -247,29 +262,34 @@ class Supervisor:
         """End the loop first, so that the others can tell of it; then those. The planner has nothing to tell."""
         notify("STOPPING=1")
         self._monitor.end({name: self._running(name) for name in CHILDREN})
+        for child in self._children.values():
+            if child.process.pid is None:
+                child.process.kill()
         if loop := self._children.get("loop"):
             loop.process.send_signal(signal.SIGTERM)
-            if not loop.wait(time.monotonic() + END_WITHIN):
-                self._kill(loop)
+            if not loop.process.wait(time.monotonic() + END_WITHIN):
+                self._kill_unwilling(loop)
             self._turned = self._turned or loop.ready_with is not None
         if planner := self._children.get("planner"):  # it keeps nothing, and may be frozen or in its start
-            planner.process.kill()
-            planner.process.wait()
+            self._kill(planner)
             self._forget(planner)
         # The others end by themselves once the loop has gone and what it said is published and on disk; one that has
         # never turned has said nothing.
         by_itself = time.monotonic() + (END_WITHIN if self._turned else 0.0)
         asked = by_itself + END_WITHIN
         for child in list(self._children.values()):
-            if not child.wait(by_itself):
+            if not child.process.wait(by_itself):
                 child.process.send_signal(signal.SIGTERM)
         for child in list(self._children.values()):
-            if not child.wait(asked):
-                self._kill(child)
+            if not child.process.wait(asked):
+                self._kill_unwilling(child)
             self._failed = self._failed or child.process.returncode != 0
             self._forget(child)
 
-    def _kill(self, child: ChildProcess) -> None:
+    def _kill_unwilling(self, child: ChildProcess) -> None:
         self._say(f"the {child.name} does not end: killing it", "warning")
+        self._kill(child)
+
+    def _kill(self, child: ChildProcess) -> None:
         child.process.kill()
-        child.process.wait()
+        child.process.wait(time.monotonic() + END_WITHIN)

@@ -1,0 +1,216 @@
+"""The warm parent: imports what the service's processes need, once, and forks them from itself.
+
+`python -m trirail.processes.fork_server RUNTIME CONTROL BEATS SOCKETS…`, its order on standard input. On CONTROL, a
+SEQPACKET socket, it takes requests to fork (`Fork`, with the descriptor on which the child speaks) and says what it has
+forked (`Forked`, with a pidfd) and how that ended (`Ended`). It has no thread, so that a fork is a whole process: Zenoh
+and Rerun, which have, are imported by the child that needs them. It compiles nothing: what is not kept, a child does.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import select
+import signal
+import socket
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, NamedTuple, NoReturn
+
+import msgspec
+from msgspec import structs
+
+from trirail.processes import compiling
+from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.process import Child, Order, run
+from trirail.processes.realtime import die_with_parent, name_process
+from trirail.wire.decoding import decoded, prepare
+
+MATHEMATICS = ("loop", "planner")
+"""Those that need the compiled rooms; the others are forked before these are imported."""
+WITH_PARENT: Final = {"loop": signal.SIGTERM, "planner": signal.SIGKILL}
+"""What ends a child when this process ends, however that ends. Gateway and recorder end by themselves once the loop has
+gone, so that what it says of its end is published and on disk."""
+LARGEST = 4096
+"""Bytes of a packet on CONTROL."""
+
+
+class Fork(msgspec.Struct, frozen=True):
+    """A request to fork the child `name`; `number` is the supervisor's, and tells it from all others."""
+
+    number: int
+    name: str
+    record: str | None = None
+
+
+class Forked(msgspec.Struct, frozen=True, tag=True):
+    """The child of request `number` is process `pid`; its pidfd comes with the packet."""
+
+    number: int
+    pid: int
+
+
+class Ended(msgspec.Struct, frozen=True, tag=True):
+    """The child of request `number` has ended: its exit code, or the negative number of the signal that killed it."""
+
+    number: int
+    code: int
+
+
+prepare(Fork)
+
+
+class _Request(NamedTuple):
+    fork: Fork
+    voice: int
+    """The descriptor on which the child is to speak."""
+
+
+class ForkServer:
+    """Forks on request until the supervisor has gone; `work` is what a child does, and returns its exit code."""
+
+    def __init__(
+        self, control: socket.socket, order: Order, runtime: Path, heartbeats: Heartbeats, sockets: list[int]
+    ) -> None:
+        self._control = control
+        self._order = order
+        self._runtime = runtime
+        self._heartbeats = heartbeats
+        self._sockets = sockets
+        self._requests: list[_Request] = []
+        """Those whose child has not been forked yet."""
+        self._children: dict[int, int] = {}
+        """The number of each child's request, by its pidfd."""
+        self._compiler: tuple[int, _Request] | None = None
+        """Its pidfd while there is one, and the request for which it compiles."""
+        self._kept = True
+        """False where what is compiled cannot be kept: then each that needs it compiles for itself."""
+        self._poll = select.poll()
+        self._poll.register(control, select.POLLIN)
+
+    def serve(self, work: Callable[[Child], int]) -> None:
+        """Serve until the supervisor has gone."""
+        while True:
+            for descriptor, _ in self._poll.poll():
+                if descriptor != self._control.fileno():
+                    self._reap(descriptor)
+                elif not self._receive():
+                    return
+            for request in filter(self._can_be_met, list(self._requests)):
+                pidfd, pid = self._fork(request, work, WITH_PARENT.get(request.fork.name))
+                self._children[pidfd] = request.fork.number
+                self._say(Forked(request.fork.number, pid), pidfd)
+                self._done(request)
+
+    def _receive(self) -> bool:
+        """Take a request; False where there will be no more."""
+        try:
+            packet, descriptors, _, _ = socket.recv_fds(self._control, LARGEST, 1)
+        except ConnectionError:
+            return False
+        if packet:
+            self._requests.append(_Request(decoded(packet, Fork), *descriptors))
+        return bool(packet)
+
+    def _can_be_met(self, request: _Request) -> bool:
+        """Whether the child can be forked now: who needs the compiled rooms waits while these are being compiled."""
+        if request.fork.name not in MATHEMATICS or not self._kept:
+            return True
+        if self._compiler is None and not compiling.load():
+            pidfd, _ = self._fork(request, _compile, signal.SIGKILL)
+            self._compiler = pidfd, request
+        return self._compiler is None
+
+    def _done(self, request: _Request) -> None:
+        self._requests.remove(request)
+        os.close(request.voice)
+
+    def _fork(
+        self, request: _Request, work: Callable[[Child], int], with_parent: signal.Signals | None
+    ) -> tuple[int, int]:
+        """Return pidfd and process id of a new child; `with_parent` is sent to it at the end of this process."""
+        parent = os.getpid()
+        gc.freeze()  # a child's collector would touch, and so copy, what it shares with this process
+        pid = os.fork()
+        if pid == 0:
+            if with_parent is not None:
+                die_with_parent(with_parent)
+            if os.getppid() != parent:
+                os._exit(0)
+            self._become(request, work)
+        pidfd = os.pidfd_open(pid)
+        self._poll.register(pidfd, select.POLLIN)
+        return pidfd, pid
+
+    def _become(self, request: _Request, work: Callable[[Child], int]) -> NoReturn:
+        """Be the child, with its own descriptors alone."""
+        code = 1
+        try:
+            name = request.fork.name
+            name_process(name if work is not _compile else "compiler")
+            self._control.close()
+            others = [waiting.voice for waiting in self._requests if waiting is not request]
+            for descriptor in (*self._children, *others, *([] if name == "loop" else self._sockets)):
+                os.close(descriptor)
+            gc.enable()
+            signal.pthread_sigmask(signal.SIG_SETMASK, [])
+            order = structs.replace(self._order, record=request.fork.record)
+            code = work(Child(name, order, self._runtime, self._heartbeats, self._sockets, request.voice))
+        except BaseException:  # noqa: BLE001 - nothing of this process may return into that of the parent
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+
+    def _reap(self, pidfd: int) -> None:
+        """Take in that a child has ended."""
+        ended = os.waitid(os.P_PIDFD, pidfd, os.WEXITED)
+        code = 0 if ended is None else ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status
+        self._poll.unregister(pidfd)
+        os.close(pidfd)
+        if self._compiler is None or pidfd != self._compiler[0]:
+            self._say(Ended(self._children.pop(pidfd), code))
+            return
+        (_, request), self._compiler = self._compiler, None
+        if code == 0:
+            self._kept = compiling.load()
+        else:
+            self._say(Ended(request.fork.number, code))
+            self._done(request)
+
+    def _say(self, what: Forked | Ended, *descriptors: int) -> None:
+        try:
+            socket.send_fds(self._control, [msgspec.json.encode(what)], descriptors)
+        except ConnectionError:
+            return  # the supervisor has gone, as the next look at the socket finds
+
+
+def _compile(child: Child) -> int:
+    compiling.compile_all(child.compiling)
+    return 0
+
+
+def main(work: Callable[[Child], int] = run) -> int:
+    """Run the fork server; return its exit code."""
+    runtime, control, beats, *sockets = sys.argv[1:]
+    name_process("fork-server")
+    die_with_parent(signal.SIGKILL)
+    # The terminal sends it to all, and the supervisor alone acts on it; SIGTERM waits for the child that unblocks it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_SETMASK, [signal.SIGTERM])
+    gc.disable()
+    order = decoded(sys.stdin.buffer.read(), Order)
+    with socket.socket(fileno=int(control)) as connected:
+        server = ForkServer(
+            connected, order, Path(runtime), Heartbeats(int(beats)), [int(number) for number in sockets]
+        )
+        server.serve(work)
+    return 0
+
+
+if __name__ == "__main__":
+    code = main()
+    os._exit(code)

@@ -1,0 +1,171 @@
+"""A rehearsal of what must come without delay: stop, quick stop, a fault, a lost gateway, the end.
+
+The loop runs them once, on simulated drives of the configured kind, before the first cycle on the real ones: what they
+need is then in memory, and locked there.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from msgspec import structs
+from trirail_drivers.connection.opening import simulated_bus
+from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import NAMES
+from trirail_drivers.protocols import PROTOCOLS
+
+from trirail.config import Config
+from trirail.motion.planning import MotionPlanner
+from trirail.processes.clock import Ticker
+from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.loop import Loop, Ports
+from trirail.wire import links
+from trirail.wire.goals import VelocityGoal
+from trirail.wire.links import PacketLink, Port
+from trirail.wire.packets import CommandRequest, GoalRequest, Request, message
+from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
+from trirail.wire.vocabulary import Command, Mode
+
+WITHIN = 500
+"""Cycles after which the next step comes, whatever has become of the one before."""
+IN_MOTION = 20
+"""Cycles of a jog before what ends it."""
+SLOW = 0.1
+"""Share of the platform's velocity along x at which it jogs."""
+
+
+class _Clock:
+    """The monotonic clock, with the time of the cycles that are run without waiting."""
+
+    def __init__(self) -> None:
+        self._ahead = 0.0
+
+    def __call__(self) -> float:
+        return time.monotonic() + self._ahead
+
+    def advance(self, seconds: float) -> None:
+        self._ahead += seconds
+
+
+class _Rehearsal:
+    """Ticks as fast as it can, and does what gateway, planner and drives would."""
+
+    def __init__(self, config: Config, folder: Path) -> None:
+        self._config = config
+        self._folder = folder
+        self._clock = _Clock()
+        self._bus = simulated_bus(config.can, config.drives, self._clock)
+        driver = PROTOCOLS[config.drives.protocol].driver
+        self._drives = driver(self._bus, config.can.bitrate, config.drives, self._clock)
+        listening = [links.listen(folder / name) for name in Ports._fields]
+        gateway, recorder, planner = listening
+        self._ports = Ports(Port(gateway), Port(recorder), Port(planner, MAX_PLANNING))
+        self._heartbeats = Heartbeats.create()
+        self._loop = Loop(config, self._drives, self._ports, self._heartbeats)
+        self._asked = links.connect(folder / "planner", MAX_PLANNING)
+        self._planner = MotionPlanner(config)
+        self._gateway: PacketLink | None = None
+        self._now_ns = round(self._clock() * 1e9)
+        self._tickets = 0
+        self._steps = self._script()
+
+    def run(self) -> None:
+        """Run all of it."""
+        try:
+            self._drives.configure(self._config.period, self._config.limits.slider.velocity)
+            self._loop.run(Ticker(round(self._config.period * 1e9), lambda: self._now_ns, self._pass))
+        finally:
+            self._drives.close()
+            self._hang_up()
+            self._asked.close()
+            os.close(self._heartbeats.descriptor)
+            for port in self._ports:
+                port.close()
+
+    def _pass(self, deadline_ns: int) -> None:
+        """Let a period pass, and the others do what they have to."""
+        self._clock.advance(self._config.period)
+        self._now_ns = deadline_ns
+        while (packet := self._asked.receive()) is not None:
+            self._asked.send(encode(self._planner.plan(decode_plan_request(packet))))
+        next(self._steps, None)
+
+    def _script(self) -> Iterator[None]:
+        yield from self._jog()
+        self._order(Command.STOP)
+        yield from self._until(lambda: self._mode is Mode.HOLDING)
+        yield from self._jog()
+        self._order(Command.QUICK_STOP)
+        yield from self._until(lambda: self._mode is Mode.FAULT)
+        yield from self._reset()
+        yield from self._jog()
+        self._bus.faults.add("A fault 2310")
+        yield from self._until(lambda: self._mode is Mode.FAULT)
+        yield from self._reset()
+        yield from self._jog()
+        self._hang_up()
+        yield from self._until(lambda: self._mode is Mode.HOLDING)
+        self._loop.ending = True
+
+    def _reset(self) -> Iterator[None]:
+        """Leave the fault once the robot stands."""
+        yield from self._until(lambda: not self._loop.control.measured.powered)
+        self._order(Command.RESET)
+        yield from self._until(lambda: self._mode is Mode.DISABLED)
+
+    def _jog(self) -> Iterator[None]:
+        """Have the robot in motion, with power and a gateway."""
+        if self._gateway is None:
+            self._gateway = links.connect(self._folder / "gateway")
+            yield from self._until(lambda: self._ports.gateway.connected)
+        if self._mode is not Mode.HOLDING:
+            self._order(Command.ENABLE)
+            yield from self._until(lambda: self._mode is Mode.HOLDING)
+        velocity = VelocityGoal(SLOW * self._config.limits.platform.velocity[0], 0.0, 0.0, timeout=10.0)
+        self._tickets += 1
+        self._send(GoalRequest(self._tickets, "", f"{self._tickets}", velocity, self._now_ns))
+        yield from self._until(lambda: self._mode is Mode.MOVING)
+        yield from self._until(lambda: False, IN_MOTION)
+
+    @property
+    def _mode(self) -> Mode:
+        return self._loop.control.state.mode
+
+    def _until(self, condition: Callable[[], bool], within: int = WITHIN) -> Iterator[None]:
+        """Let cycles pass until something holds, so many at most."""
+        for _ in range(within):
+            yield
+            if self._gateway is not None:
+                while self._gateway.receive() is not None:
+                    pass
+            if condition():
+                return
+
+    def _order(self, name: Command) -> None:
+        self._tickets += 1
+        self._send(CommandRequest(self._tickets, "", name))
+
+    def _send(self, request: Request) -> None:
+        if self._gateway is not None:
+            self._gateway.send(message(request))
+
+    def _hang_up(self) -> None:
+        if self._gateway is not None:
+            self._gateway.close()
+            self._gateway = None
+
+
+def rehearse(config: Config) -> tuple[str, ...]:
+    """Run what must come without delay, once; return why that was not possible, if it was not."""
+    each = {name: structs.replace(drive, homing=None) for name, drive in zip(NAMES, config.drives.each, strict=True)}
+    config = structs.replace(config, drives=structs.replace(config.drives, **each))
+    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+        try:
+            _Rehearsal(config, Path(folder)).run()
+        except DriveError as error:
+            return (f"rehearsed stops: {error}",)
+    return ()

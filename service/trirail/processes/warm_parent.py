@@ -1,0 +1,169 @@
+"""The fork server as the supervisor sees it, and the processes that it has forked."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import subprocess
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+
+from trirail.processes.fork_server import LARGEST, Ended, Fork, Forked
+from trirail.processes.interpreter import FORK_SERVER, python
+from trirail.processes.process import Order
+from trirail.wire.decoding import decoded, prepare
+
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""For numpy's libraries: a fork carries no threads over, and the service's matrices are small."""
+
+TELLS_WITHIN = 1.0
+"""So long after the end of a child the fork server may take to say how it ended [s]."""
+
+prepare(Forked | Ended)
+
+
+class WarmParent:
+    """Starts the fork server, asks it for children, and hears how they end."""
+
+    def __init__(self, order: Order, runtime: Path, beats: int, sockets: list[int]) -> None:
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._control.setblocking(False)
+        arguments = [str(runtime), str(theirs.fileno()), str(beats), *map(str, sockets)]
+        # The terminal sends it to all, and the supervisor alone acts on it: also while the server is still importing.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            self._process = subprocess.Popen(
+                python("-m", FORK_SERVER, *arguments),
+                stdin=subprocess.PIPE,
+                pass_fds=[theirs.fileno(), beats, *sockets],
+                env=os.environ | ONE_THREAD,
+            )
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+            theirs.close()
+        if self._process.stdin is not None:
+            self._process.stdin.write(msgspec.json.encode(order))
+            self._process.stdin.close()
+        self._asked: dict[int, ForkedProcess] = {}
+        self._numbers = 0
+        self.gone = False
+        """Whether it has ended: then the loop has been told to end as well."""
+
+    def fileno(self) -> int:
+        """For select and its like."""
+        return self._control.fileno()
+
+    def fork(self, name: str, record: str | None, voice: int) -> ForkedProcess:
+        """Ask for a child that speaks on the descriptor `voice`."""
+        self._numbers += 1
+        process = self._asked[self._numbers] = ForkedProcess(self)
+        try:
+            socket.send_fds(self._control, [msgspec.json.encode(Fork(self._numbers, name, record))], [voice])
+        except OSError:
+            self._lost()
+        return process
+
+    def hear(self) -> None:
+        """Take what it says, or that it has ended, if there is something."""
+        try:
+            packet, descriptors, _, _ = socket.recv_fds(self._control, LARGEST, 1)
+        except BlockingIOError:
+            return
+        except OSError:
+            packet = b""
+        if not packet:
+            self._lost()
+            return
+        said: Forked | Ended = decoded(packet, Forked | Ended)
+        if isinstance(said, Forked):
+            self._asked[said.number].begun(said.pid, *descriptors)
+        else:
+            self._asked.pop(said.number).over(said.code)
+
+    def how(self) -> str:
+        """How it ended, for people."""
+        return how_ended(self._process.wait())
+
+    def kill(self) -> None:
+        """Kill it: the loop, if there is one, stops the robot and ends."""
+        self._process.kill()
+
+    def close(self) -> None:
+        """End it: it has nothing to keep."""
+        self.kill()
+        self._process.wait()
+        self._control.close()
+
+    def _lost(self) -> None:
+        self.gone = True
+        for process in self._asked.values():
+            process.orphaned()
+
+
+class ForkedProcess:
+    """A child of the fork server: what Popen is for one's own child."""
+
+    def __init__(self, parent: WarmParent) -> None:
+        self._parent = parent
+        self._pidfd: int | None = None
+        self._killed = False
+        """Whether it is not to be."""
+        self.pid: int | None = None
+        """None before it has been forked."""
+        self.returncode: int | None = None
+        """None before its end; as Popen has it."""
+
+    def begun(self, pid: int, pidfd: int) -> None:
+        """It has been forked."""
+        self.pid, self._pidfd = pid, pidfd
+        if self._killed:
+            self.send_signal(signal.SIGKILL)
+
+    def over(self, code: int) -> None:
+        """It has ended."""
+        self.returncode = code
+        if self._pidfd is not None:
+            os.close(self._pidfd)
+            self._pidfd = None
+
+    def orphaned(self) -> None:
+        """Its parent has ended before it, and nobody will tell how it does."""
+        if self.pid is None and self.returncode is None:
+            self.over(os.EX_UNAVAILABLE)
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal."""
+        if self._pidfd is not None:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._pidfd, number)
+
+    def kill(self) -> None:
+        """Kill it; one that has not been forked yet counts as ended, and is killed when it is."""
+        self.send_signal(signal.SIGKILL)
+        self._killed = True
+        if self.pid is None:
+            self.returncode = 0
+
+    def wait(self, deadline: float) -> bool:
+        """Wait for its end until a time of the monotonic clock; False where it has not ended by then."""
+        while self.returncode is None:
+            watched = [] if self._parent.gone else [self._parent.fileno()]
+            watched += [] if self._pidfd is None else [self._pidfd]
+            ready, _, _ = select.select(watched, [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                return False
+            if self._parent.fileno() in ready:
+                self._parent.hear()
+            elif self._parent.gone or not select.select([self._parent], [], [], TELLS_WITHIN)[0]:
+                self.over(os.EX_UNAVAILABLE)  # it has ended, and its parent, gone or frozen, does not say how
+        return True
+
+
+def how_ended(code: int) -> str:
+    """Return how a process ended, for people, by its exit code as Popen has it."""
+    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

@@ -1,0 +1,217 @@
+"""The warm parent: what a child has of it, what is compiled where, and who ends with whom."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from trirail.config import SIM, load
+from trirail.processes import warm_parent
+from trirail.processes.child_process import ChildProcess
+from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.process import Order
+from trirail.processes.warm_parent import WarmParent
+from trirail.wire import links
+
+SERVER = """
+import json, os, signal, sys, threading, time
+from pathlib import Path
+from typing import Any
+from trirail.processes import compiling, fork_server
+
+folder = Path({folder!r})
+
+def load():
+    return (folder / "kept").exists()
+
+def compile_all(begin):
+    begin("first")
+    begin("second")
+    exec((folder / "compiler").read_text())
+
+def target(entry):
+    try:
+        return os.readlink(f"/proc/self/fd/{{entry}}")
+    except OSError:
+        return "/proc/"  # that of the listing itself
+
+def work(child):
+    child.ready({{
+        "named": Path("/proc/self/cmdline").read_bytes().strip(b"\\0").decode(),
+        "record": child.order.record,
+        "descriptors": {{entry: target(entry) for entry in os.listdir("/proc/self/fd")}},
+        "threads": threading.active_count() + len(os.listdir(f"/proc/{{os.getppid()}}/task")) - 1,
+        "blocked": [int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, [])],
+        "handled": signal.getsignal(signal.SIGTERM) is signal.SIG_DFL,
+    }})
+    while True:
+        time.sleep(0.05)
+        if (folder / child.name).exists():
+            exec((folder / child.name).read_text())
+
+compiling.load, compiling.compile_all = load, compile_all
+sys.exit(fork_server.main(work))
+"""
+WITHIN = 30.0
+
+
+class Parent:
+    """A fork server whose children say what they see, and do what is then written in a file of their name."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.listening = [links.listen(folder / f"port-{number}") for number in range(3)]
+        self.heartbeats = Heartbeats.create()
+        sockets = [listening.fileno() for listening in self.listening]
+        self.warm = WarmParent(Order(load(SIM), None), folder, self.heartbeats.descriptor, sockets)
+
+    def child(self, name: str, record: str | None = None) -> ChildProcess:
+        return ChildProcess(self.warm, name, record)
+
+    def until_said(self, child: ChildProcess) -> dict[str, object]:
+        """Wait until a child is up, and return what it said."""
+        watched: list[Any] = [child.pipe, self.warm]
+        deadline = time.monotonic() + WITHIN
+        while child.ready_with is None:
+            heard, _, _ = select.select(watched, [], [], deadline - time.monotonic())
+            assert heard
+            self.warm.hear()
+            if child.pipe in heard and not child.listen():
+                break
+        assert child.ready_with is not None
+        return child.ready_with
+
+    def until_over(self, child: ChildProcess) -> str:
+        """Wait until a child has ended, and return how."""
+        assert child.process.wait(time.monotonic() + WITHIN)
+        return child.how
+
+
+@pytest.fixture
+def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Parent]:
+    script = tmp_path / "server.py"
+    script.write_text(SERVER.format(folder=str(tmp_path)))
+    (tmp_path / "kept").touch()
+    monkeypatch.setattr(warm_parent, "python", lambda *arguments: [sys.executable, str(script), *arguments[2:]])
+    made = Parent(tmp_path)
+    try:
+        yield made
+    finally:
+        made.warm.close()
+        for listening in made.listening:
+            listening.close()
+
+
+def test_a_child_has_its_own_descriptors_its_name_and_no_signal_blocked(parent: Parent) -> None:
+    """Whoever held another's end of a pipe would keep its end from being seen."""
+    children = {
+        name: parent.child(name, "a.rrd" if name == "recorder" else None)
+        for name in ("gateway", "recorder", "loop", "planner")
+    }
+    ports = {os.readlink(f"/proc/self/fd/{listening.fileno()}") for listening in parent.listening}
+    shared = os.readlink(f"/proc/self/fd/{parent.heartbeats.descriptor}")
+    for name, child in children.items():
+        said = parent.until_said(child)
+        descriptors = {str(what) for number, what in said["descriptors"].items() if int(number) > 2}  # type: ignore[attr-defined]
+        own = os.readlink(f"/proc/self/fd/{child.pipe}")
+        allowed = {own, shared} | (ports if name == "loop" else set())
+        assert {what for what in descriptors if not what.startswith("/proc/")} == allowed
+        assert said["named"] == f"trirail: {name}"
+        assert said["record"] == ("a.rrd" if name == "recorder" else None)
+        assert (said["threads"], said["blocked"], said["handled"]) == (1, [], True)
+
+
+@pytest.mark.parametrize(
+    ("does", "how"),
+    [
+        ("os._exit(7)", "exit code 7"),
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "killed by SIGSEGV"),
+        ("1 / 0", "exit code 1"),
+    ],
+)
+def test_how_a_child_ends_is_told_and_another_takes_its_place(does: str, how: str, parent: Parent) -> None:
+    first = parent.child("gateway")
+    parent.until_said(first)
+    (parent.folder / "gateway").write_text(does)
+    assert parent.until_over(first) == how
+    (parent.folder / "gateway").unlink()
+    second = parent.child("gateway")
+    parent.until_said(second)
+    assert second.process.pid != first.process.pid
+
+
+def test_a_signal_that_comes_before_a_child_handles_it_is_not_lost(parent: Parent) -> None:
+    child = parent.child("gateway")
+    while child.process.pid is None:
+        select.select([parent.warm], [], [], WITHIN)
+        parent.warm.hear()
+    child.process.send_signal(signal.SIGTERM)
+    assert parent.until_over(child) == "killed by SIGTERM"
+
+
+def test_a_child_that_has_not_been_forked_can_be_killed(parent: Parent) -> None:
+    child = parent.child("loop")
+    child.process.kill()
+    assert child.process.wait(time.monotonic())
+    assert child.process.returncode == 0
+    other = parent.child("gateway")
+    parent.until_said(other)  # so the loop has been forked, and been killed
+    assert child.process.pid is not None
+
+
+def test_what_is_not_kept_is_compiled_by_a_child_before_who_needs_it_is_forked(parent: Parent) -> None:
+    (parent.folder / "kept").unlink()
+    (parent.folder / "compiler").write_text(
+        "while not (folder / 'go').exists(): time.sleep(0.01)\n(folder / 'kept').touch()"
+    )
+    loop, planner, gateway = (parent.child(name) for name in ("loop", "planner", "gateway"))
+    parent.until_said(gateway)  # who needs nothing compiled does not wait
+    (parent.folder / "go").touch()
+    parent.until_said(loop)
+    parent.until_said(planner)
+    assert (loop.compiling, planner.compiling) == (["first", "second"], [])
+
+
+def test_where_nothing_can_be_kept_each_compiles_for_itself(parent: Parent) -> None:
+    (parent.folder / "kept").unlink()
+    (parent.folder / "compiler").write_text("")
+    loop, planner = parent.child("loop"), parent.child("planner")
+    parent.until_said(loop)
+    parent.until_said(planner)
+
+
+def test_a_compiler_that_dies_is_the_end_of_who_needs_it(parent: Parent) -> None:
+    (parent.folder / "kept").unlink()
+    (parent.folder / "compiler").write_text("os.kill(os.getpid(), signal.SIGKILL)")
+    loop = parent.child("loop")
+    assert parent.until_over(loop) == "killed by SIGKILL"
+    assert loop.ready_with is None
+
+
+@pytest.mark.parametrize("name", ["loop", "planner"])
+def test_loop_and_planner_end_with_their_parent(name: str, parent: Parent) -> None:
+    child = parent.child(name)
+    parent.until_said(child)
+    assert child.process.pid is not None
+    pidfd = os.pidfd_open(child.process.pid)
+    parent.warm.close()
+    ended, _, _ = select.select([pidfd], [], [], WITHIN)
+    os.close(pidfd)
+    assert ended
+
+
+def test_a_dead_parent_is_told_and_so_are_its_children(parent: Parent) -> None:
+    child = parent.child("planner")
+    parent.until_said(child)
+    (parent.folder / "planner").write_text("os.kill(os.getppid(), signal.SIGKILL)")
+    assert parent.until_over(child) == f"exit code {os.EX_UNAVAILABLE}"
+    assert parent.warm.gone
+    assert parent.warm.how() == "killed by SIGKILL"
+    assert parent.child("gateway").process.returncode == os.EX_UNAVAILABLE

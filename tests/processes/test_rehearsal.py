@@ -1,0 +1,53 @@
+"""The rehearsal goes through what must come without delay, whatever the drives are, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import gc
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from trirail.config import SIM, load
+from trirail.control.control import Control
+from trirail.processes.rehearsal import rehearse
+from trirail.wire.vocabulary import Mode
+
+CONFIGS = sorted(file for file in (SIM, *(SIM.parent / "drives").glob("*.toml")))
+
+
+@pytest.fixture
+def modes(monkeypatch: pytest.MonkeyPatch) -> list[Mode]:
+    """The modes that a control goes through, in their order."""
+    seen: list[Mode] = []
+    cycle = Control.cycle
+
+    def watched(control: Control, *arguments: Any, **options: Any) -> None:
+        cycle(control, *arguments, **options)
+        if not seen or seen[-1] is not control.state.mode:
+            seen.append(control.state.mode)
+
+    monkeypatch.setattr(Control, "cycle", watched)
+    return seen
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_stop_quick_stop_fault_and_a_lost_gateway_are_rehearsed(path: Path, modes: list[Mode]) -> None:
+    before = os.listdir("/proc/self/fd")
+    assert rehearse(load(path)) == ()
+    up = [Mode.ENABLING, Mode.HOLDING, Mode.MOVING]
+    stopped, faulted = [Mode.STOPPING, Mode.HOLDING, Mode.MOVING], [Mode.FAULT, Mode.DISABLED]
+    assert modes == [
+        Mode.DISABLED,
+        *up,
+        *stopped,
+        *faulted,
+        *up,
+        *faulted,
+        *up,
+        Mode.STOPPING,
+        Mode.HOLDING,
+        Mode.DISABLED,
+    ]
+    gc.collect()
+    assert len(os.listdir("/proc/self/fd")) == len(before)
