@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,15 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import rerun as rr
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from trirail.config import SIM, load
 from trirail.errors import EmptyRecordingError, ServiceError
 from trirail.telemetry import journal, reading
 from trirail.telemetry.columns import FIELDS, RECORD, Column, Timelines, chunks, structs
-from trirail.telemetry.reading import read
+from trirail.telemetry.reading import OlderRecordingWarning, read
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.scene import Scene
 from trirail.telemetry.shown_robot import ShownRobot
@@ -203,7 +206,6 @@ def test_a_recording_of_others_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("layout", "differs"),
     [
-        ([(name, DTYPE[name]) for name in DTYPE.names or () if name != "pose"], "pose"),
         ([*((name, DTYPE[name]) for name in DTYPE.names or ()), ("stance", "<f8")], "stance"),
         ([(name, "<f8" if name == "mode" else DTYPE[name]) for name in DTYPE.names or ()], "mode"),
         ([(name, ("<f8", (6,)) if name == "velocity" else DTYPE[name]) for name in DTYPE.names or ()], "velocity"),
@@ -217,6 +219,33 @@ def test_records_of_another_version_are_refused_by_field(tmp_path: Path, layout:
     stream.disconnect()
     with pytest.raises(ServiceError, match=rf"a\.rrd: written by another version: its records differ in {differs}$"):
         read(path)
+
+
+@given(lacking=st.sets(st.sampled_from(DTYPE.names or ()), min_size=1))
+@settings(max_examples=15)
+def test_fields_that_an_older_version_did_not_write_read_as_nothing(lacking: set[str]) -> None:
+    sent = made.records(0.05)
+    there = [name for name in DTYPE.names or () if name not in lacking]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.rrd"
+        stream = rr.RecordingStream("trirail")
+        stream.save(path)
+        columns = [Column(RECORD, FIELDS, structs(sent[there]))] if there else []
+        stream.send_chunks(chunks(Timelines(1000, 0).of(sent), columns))
+        stream.disconnect()
+        if "cycle" in lacking:
+            with pytest.raises(ServiceError):
+                read(path)
+            return
+        with pytest.warns(OlderRecordingWarning, match="older version") as said:
+            records = read(path).records
+    assert len(said) == 1
+    assert all(name in str(said[0].message) for name in lacking)
+    for name in there:
+        np.testing.assert_array_equal(records[name], sent[name])
+    for name in lacking:
+        floats = np.issubdtype(DTYPE[name].base, np.floating)
+        assert (np.isnan(records[name]) if floats else records[name] == 0).all()
 
 
 @pytest.mark.parametrize("log", ["events", "requests"])

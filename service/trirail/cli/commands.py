@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -192,6 +193,7 @@ help_pages.arrange(app)
 def main() -> None:
     """Run a command and exit as it says."""
     words = sys.argv[1:]
+    warnings.showwarning = lambda message, *_, **__: terminal.complain(str(message))
     try:
         code = app(units.numbers(words), exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:

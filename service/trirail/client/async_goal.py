@@ -39,12 +39,11 @@ class AsyncGoalHandle(AcceptedGoal):
         Raises TimeoutError if that takes longer than `timeout` seconds; the goal itself goes on.
         """
         within = seconds(timeout)
-        try:
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within):
                 await self._ended.wait()
-        except TimeoutError as error:
-            raise TimeoutError(f"goal {self.id} has not ended within {within:g} s") from error
-        assert self._result is not None
+        if self._result is None:
+            raise TimeoutError(f"goal {self.id} has not ended within {within:g} s")
         return self._result
 
     def end(self, result: Result) -> None:

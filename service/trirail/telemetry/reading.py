@@ -48,11 +48,17 @@ _END = 0
 
 _LEVEL = rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
+BY_CYCLE = "cycle"
+"""The field by which records are put in order."""
 _KEPT = (RECORD, EVENTS, REQUESTS)
 T = TypeVar("T", bound=msgspec.Struct)
 prepare(ControlInput, Event)
 _LAYOUT = structs(np.zeros(1, DTYPE)).type.value_type
 """The records' fields, as they are in a file."""
+
+
+class OlderRecordingWarning(UserWarning):
+    """A recording was written before its records had all the fields that they have now."""
 
 
 class Line(NamedTuple):
@@ -92,8 +98,9 @@ def read(path: Path) -> Recording:
 
     Rerun's own format (.rrd); the file is not changed. Fields, units and frames of the records are those of
     trirail.wire.records.FIELDS: SI units and radians, sliders in the order A, B, C, poses in the base frame.
-    Raises ServiceError if the file cannot be read, is not a recording, or is of another version, and of its kinds
-    EmptyRecordingError if it holds no records.
+    Fields that an older version did not write are NaN, or 0 where they are no floats, and an OlderRecordingWarning says
+    so once. Raises ServiceError if the file cannot be read, is not a recording, or is of another version, and of its
+    kinds EmptyRecordingError if it holds no records.
     """
     size = path.stat().st_size if path.is_file() else 0
     try:
@@ -200,11 +207,23 @@ def _records(chunks: list[Chunk], path: Path) -> tuple[NDArray[np.void], NDArray
     if not any(batch.num_rows for batch in batches):
         raise ServiceError(f"{path}: holds no records of cycles (entity {RECORD}): was it made by trirail?")
     rows = pa.concat_arrays([batch.column(FIELDS.component).flatten() for batch in batches])
-    if odd := set(rows.type) ^ set(_LAYOUT):
+    if odd := set(rows.type) - set(_LAYOUT):
         names = ", ".join(sorted({field.name for field in odd}))
         raise ServiceError(f"{path}: written by another version: its records differ in {names}")
     records = np.zeros(len(rows), DTYPE)
-    for name in DTYPE.names or ():
+    there = [field.name for field in rows.type]
+    if missing := [name for name in DTYPE.names or () if name not in there]:
+        if BY_CYCLE in missing:
+            raise ServiceError(f"{path}: written by another version: its records have no {BY_CYCLE}")
+        for name in missing:
+            records[name] = np.nan if np.issubdtype(DTYPE[name].base, np.floating) else 0
+        warnings.warn(
+            f"{path}: written by an older version: its records have no {', '.join(missing)}; read as NaN, or 0 where "
+            "that is none",
+            OlderRecordingWarning,
+            stacklevel=3,
+        )
+    for name in there:
         values = rows.field(name)
         flat = values.flatten() if records[name].ndim > 1 else values
         records[name] = flat.to_numpy().reshape(records[name].shape)
