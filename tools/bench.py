@@ -114,6 +114,14 @@ def scrape(*, seconds: float = 120.0, json: bool = False) -> None:
     bench_scrape.main(seconds, json)
 
 
+@app.command
+def start(*, json: bool = False) -> None:
+    """Time the start of a service on simulated drives, and weigh its processes."""
+    import bench_start
+
+    bench_start.main(json)
+
+
 @app.command(name="all")
 def everything(*, brief: bool = False, json: bool = False) -> None:
     """Run all of these, under ten minutes, and end with one table against the aims; `brief` only for a look."""

@@ -23,6 +23,7 @@ COMMANDS = {
     "peers": ("--seconds", "5"),
     "recorder": ("--seconds", "15"),
     "settle": ("--goals", "40"),
+    "start": (),
 }
 """The measurements, with what they take: together under ten minutes."""
 BRIEF = {
@@ -68,6 +69,12 @@ def _planner(results: Results) -> tuple[float, ...]:
 
 
 AIMS = (
+    Aim(
+        "memory [MB]; up [s], of processor [s]",
+        "915; 5; 6 to 9",
+        (260.0, 2.5, 3.0),
+        lambda results: tuple(results["start"][what] for what in ("megabytes", "up", "processor")),
+    ),
     Aim(
         "whole cycle at 1 kHz, goals without pause, p50 / p99 / p99.9 [µs]",
         "100 / 230 / 850",

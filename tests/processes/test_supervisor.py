@@ -173,7 +173,7 @@ for number in range({FUNCTIONS}):
 """
     end = "ready(); beat_until(lambda: begun('gateway-1')); heartbeats.of('loop').rest()"
     assert run(told, tmp_path, loop_1=compiling + end, gateway_1=SERVING, recorder_1=RECORDING) == 1
-    assert told[0] == f"the first start compiles the mathematics, {FUNCTIONS} functions; once, a minute or two"
+    assert told[0] == f"the first start compiles the mathematics, {FUNCTIONS} functions; once, half a minute or more"
     assert told[1:4] == [f"compiling: {-(-FUNCTIONS * part // 4)} of {FUNCTIONS} functions" for part in (1, 2, 3)]
     assert told[4:6] == [f"compiling: {FUNCTIONS} of {FUNCTIONS} functions", "up"]
 

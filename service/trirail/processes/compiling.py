@@ -34,7 +34,7 @@ class Progress:
         now = len(self._begun)
         words = f"{now} of {FUNCTIONS} functions"
         if not before:
-            self._say(f"the first start compiles the mathematics, {FUNCTIONS} functions; once, a minute or two")
+            self._say(f"the first start compiles the mathematics, {FUNCTIONS} functions; once, half a minute or more")
         elif now * QUARTERS // FUNCTIONS > before * QUARTERS // FUNCTIONS:
             self._say(f"compiling: {words}")
         notify(f"STATUS=compiling, once: {words}\nEXTEND_TIMEOUT_USEC={self._patience * 1e6:.0f}")

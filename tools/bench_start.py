@@ -1,0 +1,70 @@
+"""What a start costs: seconds and processor seconds until the service is up, then each process's memory."""
+
+from __future__ import annotations
+
+import json as json_format
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from trirail.client import own_service
+from trirail.processes.interpreter import processes
+from trirail.telemetry.sinks import free_port
+
+TICK = os.sysconf("SC_CLK_TCK")
+REST = 3.0
+"""Seconds after which nothing of the start goes on."""
+WATCHED = 5.0
+"""Seconds over which a service at rest is watched."""
+
+
+def measure() -> dict[str, Any]:
+    """Start a service on simulated drives twice, and look at the second, which compiles nothing."""
+    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+        for place in (Path(folder, "first"), Path(folder, "second")):
+            place.mkdir()
+            found = _start(place)
+    return found
+
+
+def _start(folder: Path) -> dict[str, Any]:
+    config, _ = own_service.private(folder, free_port())
+    began = time.monotonic()
+    with own_service.service(config, folder / "bench.rrd") as service:
+        up = time.monotonic() - began
+        pids = processes(service.pid)
+        until_up = sum(_processor(pid) for pid in pids.values())
+        time.sleep(REST)
+        before = {name: _processor(pid) for name, pid in pids.items()}
+        time.sleep(WATCHED)
+        each = {
+            name: {"megabytes": _memory(pid), "share": (_processor(pid) - before[name]) / WATCHED}
+            for name, pid in pids.items()
+        }
+    total = sum(one["megabytes"] for one in each.values())
+    return {"up": up, "processor": until_up, "processes": each, "megabytes": total}
+
+
+def _processor(pid: int) -> float:
+    """Return the processor time of a process and of its children that are over [s]."""
+    spent = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[11:15]
+    return sum(map(int, spent)) / TICK
+
+
+def _memory(pid: int) -> float:
+    """Return the memory of a process, with its share of what it has in common with others (PSS) [1e6 bytes]."""
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="utf-8").splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("Pss:")) * 1024e-6
+
+
+def main(json: bool = False) -> None:
+    """Measure, and print it."""
+    found = measure()
+    if json:
+        print(json_format.dumps(found))
+        return
+    print(f"up after {found['up']:.2f} s, {found['processor']:.2f} s of processor; memory {found['megabytes']:.0f} MB")
+    for name, one in found["processes"].items():
+        print(f"  {name:12} {one['megabytes']:6.0f} MB   at rest {one['share']:5.1%} of a processor")
