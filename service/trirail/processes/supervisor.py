@@ -108,7 +108,7 @@ class Supervisor:
             self._selector.register(signals.reader, selectors.EVENT_READ, None)
             sockets = [listening.fileno() for listening in self._listening]
             self._parent = WarmParent(self._order, self._runtime, self._heartbeats.descriptor, sockets)
-            self._selector.register(self._parent, selectors.EVENT_READ, self._parent)
+            self._selector.register(self._parent, selectors.EVENT_READ)
             try:
                 for name in CHILDREN:
                     self._start(name)
@@ -133,12 +133,11 @@ class Supervisor:
         began = time.monotonic()
         is_up = False
         while not self._ending:
-            heard: list[ChildProcess | WarmParent | None] = [key.data for key, _ in self._selector.select(TURN)]
+            keys = [key for key, _ in self._selector.select(TURN)]
+            self._hear_parent()
+            heard: list[ChildProcess | None] = [key.data for key in keys if key.fileobj is not self._parent]
             # The loop first: the others end because it has ended, and not by themselves.
             for child in sorted(heard, key=lambda child: child is not self._children.get("loop")):
-                if isinstance(child, WarmParent):
-                    self._hear_parent()
-                    continue
                 if child is None:
                     self._say(f"{signals.take().name}: stopping the robot and disabling the drives", "info")
                     self._ending = True
@@ -239,10 +238,11 @@ class Supervisor:
     def _hear_parent(self) -> None:
         """Take what the parent of the others says; without it there is no service."""
         self._parent.hear()
-        if self._parent.gone:
-            self._selector.unregister(self._parent)
-            how = f"the process that forks the others has died ({self._parent.how()})"
-            self._fail(f"{how}: the loop stops the robot and disables the drives; ending")
+        if self._parent.gone and not self._ending:
+            loop = self._children.get("loop")
+            turns = loop is not None and loop.ready_with is not None
+            consequence = "the loop stops the robot and disables the drives" if turns else "the loop had not begun"
+            self._fail(f"the process that forks the others has died ({self._parent.how()}): {consequence}; ending")
 
     def _pass_on(self, child: ChildProcess) -> None:
         while child.happened:
