@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from trirail.cli.commands import app
 from trirail.config import SIM
-from trirail_drivers.errors import DriveError
+from trirail_drivers.errors import DriveError, FileError
+from trirail_drivers.simulated import SimulatedDrive
 
 
 def run(*words: str) -> int:
@@ -44,3 +45,55 @@ def test_drives_that_tell_nothing(tmp_path: Path) -> None:
     (tmp_path / "odrive.toml").write_text(text)
     with pytest.raises(DriveError, match="have no objects to be shown"):
         run("drives", str(tmp_path / "odrive.toml"))
+    with pytest.raises(DriveError, match="protocol odrive have no object dictionary to be saved"):
+        run("drives", "save", str(tmp_path), "--config", str(tmp_path / "odrive.toml"))
+
+
+def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("drives", "save", str(tmp_path)) == 0
+    assert "drive C, node 3: 67 parameters in" in capsys.readouterr().out
+    a, b = (tmp_path / f"drive-{name}.toml" for name in "AB")
+    assert run("drives", "compare", str(a)) == 0
+    assert "0 of 67 parameters differ" in capsys.readouterr().out
+    a.write_text(
+        a.read_text().replace('"6066:00" = { type = "u16", value = 0', '"6066:00" = { type = "u16", value = 77')
+    )
+    assert run("drives", "compare", str(a), "--json") == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["ok"], told["other"]) == (False, "drive A")
+    assert told["differences"] == [{"object": "6066:00", "name": "Following error time out", "one": 77, "other": 0}]
+    assert run("drives", "compare", str(a), str(b)) == 1
+    words = capsys.readouterr().out
+    assert "serial: 00000001h and 00000002h" in words
+    assert "6066:00" in words
+    assert run("drives", "restore", str(a), "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["ok"], told["written"], told["left"], told["stored"]) == (True, ["6066:00"], [], False)
+    assert run("drives", "restore", str(b), "--drive", "A", "--replace", "--store") == 1, "these drives store nothing"
+    assert "not stored: Object does not exist" in capsys.readouterr().out
+    with pytest.raises(DriveError, match="drive A has serial 00000001h"):
+        run("drives", "restore", str(b), "--drive", "A")
+
+
+def test_the_drives_that_answer_are_saved_and_the_others_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        SimulatedDrive, "silent", property(lambda drive: drive.node == 2, lambda *_: None), raising=False
+    )
+    text = SIM.read_text().replace("[drives]\n", "[drives]\nsdo_timeout = 0.01\n")
+    (tmp_path / "robot.toml").write_text(text)
+    assert run("drives", "save", str(tmp_path), "--config", str(tmp_path / "robot.toml"), "--json") == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (sorted(told["drives"]), sorted(told["failed"])) == (["A", "C"], ["B"])
+    assert sorted(path.name for path in tmp_path.glob("drive-*")) == ["drive-A.toml", "drive-C.toml"]
+
+
+def test_a_file_is_never_written_over(tmp_path: Path) -> None:
+    assert run("drives", "save", str(tmp_path), "--drive", "B") == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["drive-B.toml"]
+    with pytest.raises(FileError, match=r"drive-B\.toml exists already"):
+        run("drives", "save", str(tmp_path))
+    with pytest.raises(FileError, match="nowhere: no such folder"):
+        run("drives", "save", str(tmp_path / "nowhere"))
+    assert [path.name for path in tmp_path.iterdir()] == ["drive-B.toml"]

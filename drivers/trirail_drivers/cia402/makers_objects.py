@@ -7,6 +7,7 @@ from typing import Final
 
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.objects import Key, use
+from trirail_drivers.cia402.parameters import named
 from trirail_drivers.cia402.sdo import is_pdo
 from trirail_drivers.config import Drive, ObjectWrite
 from trirail_drivers.errors import DriveError
@@ -29,15 +30,22 @@ def check(name: str, drive: Drive) -> None:
     seen: set[Key] = set()
     for each in drive.write:
         key = each.object, each.sub
-        owned = use(key)
-        why = _NEVER.get(each.object, "")
-        if owned is not None or is_pdo(each.object) or each.object in _UNITS:
-            why = f"is the set-up's own{f', for {owned[1].purpose}' if owned else ''}"
-        elif key in seen:
-            why = "is there twice"
-        if why:
-            raise DriveError(f"drives.{name}.write: object {_named(key)} {why}")
+        if why := owned(key) or ("is there twice" if key in seen else ""):
+            raise DriveError(f"drives.{name}.write: object {named(key)} {why}")
         seen.add(key)
+
+
+def owned(key: Key) -> str:
+    """Why an object is not for others to write: the set-up gives it, it stores, or is the drive's address; else ""."""
+    used = use(key)
+    if used is not None or is_pdo(key[0]) or key[0] in _UNITS:
+        return f"is the set-up's own{f', for {used[1].purpose}' if used else ''}"
+    return _NEVER.get(key[0], "")
+
+
+def address(key: Key, name: str, vendor: int | None) -> str:
+    """Why an object is not to be written that its maker or its name says to be node id or bitrate; "" for others."""
+    return _ADDRESS if key[0] in _ADDRESSES.get(vendor or 0, ()) or _NAMED_SO.search(name) else ""
 
 
 async def give_makers_objects(drive: Differences, writes: tuple[ObjectWrite, ...]) -> None:
@@ -46,10 +54,9 @@ async def give_makers_objects(drive: Differences, writes: tuple[ObjectWrite, ...
     for each in writes:
         key = each.object, each.sub
         remote.describe(key, each.bits // 8, signed=each.signed)
-        where = f"drives.{remote.name}.write: object {_named(key)}"
-        of_maker = each.object in _ADDRESSES.get(await remote.look(0x1018, 1) or 0, ())
-        if of_maker or _NAMED_SO.search(remote.name_of(key)):
-            raise DriveError(f"{where} {_ADDRESS}")
+        where = f"drives.{remote.name}.write: object {named(key)}"
+        if why := address(key, remote.name_of(key), await remote.look(0x1018, 1)):
+            raise DriveError(f"{where} {why}")
         if not await remote.has(*key):
             raise DriveError(f"{where}: the drive has no such object")
         if (bits := await remote.bits(*key)) != each.bits:
@@ -59,7 +66,3 @@ async def give_makers_objects(drive: Differences, writes: tuple[ObjectWrite, ...
             await remote.write(*key, each.value)
             drive.note(key, found, each.value, each.why)
             await drive.confirm(key, each.value)
-
-
-def _named(key: Key) -> str:
-    return f"{key[0]:04X}:{key[1]:02X}"

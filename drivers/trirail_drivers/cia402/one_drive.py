@@ -92,7 +92,7 @@ async def look_over(one: OneDrive, *, asks: bool = False) -> SetUp:
 
     Where it `asks`, not even that is done: the drive tells what it would take.
     """
-    await _greet(one.remote, one.drive.node, wakes=not asks)
+    await greet(one.remote, one.drive.node, wakes=not asks)
     rehearsal = Rehearsal(one.remote, asks=asks)
     await _take_power_off(rehearsal if asks else one.remote, one.drives.stop_timeout)
     made = await bring(one, rehearsal)
@@ -160,7 +160,7 @@ def send(bus: can.BusABC, frame: Frame) -> None:
         raise BusError(f"cannot send on {bus.channel_info}: {error}; is the interface up?") from error
 
 
-async def _greet(remote: Remote, node: int, *, wakes: bool) -> None:
+async def greet(remote: Remote, node: int, *, wakes: bool) -> None:
     """Wait until the node answers, as long as it may take to boot, and see that it is a CiA 402 drive.
 
     It is asked again once its boot-up message comes, and where it `wakes`, brought to NMT pre-operational then.

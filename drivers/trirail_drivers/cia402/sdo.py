@@ -93,17 +93,24 @@ class Remote:
     async def read(self, index: int, subindex: int = 0) -> int:
         """Value of an object, as it is now; SdoRefused where the drive has none to tell."""
         key = index, subindex
+        return self._value(key, await self.content(key))
+
+    async def content(self, key: Key) -> bytes:
+        """Bytes of an object, as they are now; SdoRefused where the drive has none to tell."""
         with self._told("read", key):
-            data = self._read[key] = await self.client.upload(index, subindex)
-        return self._value(key, data)
+            data = self._read[key] = await self.client.upload(*key)
+        return self._own(key, data)
 
     async def write(self, index: int, subindex: int, value: int) -> None:
         """Give an object a value; SdoRefused where the drive does not take it."""
         key = index, subindex
-        data = await self._encoded(key, value)
+        await self.put(key, await self._encoded(key, value), shown(index, subindex, value))
+
+    async def put(self, key: Key, data: bytes, value: str) -> None:
+        """Give an object these bytes, a `value` for people; SdoRefused where the drive does not take them."""
         self._read.pop(key, None)
-        with self._told(f"write {shown(index, subindex, value)} to", key):
-            await self.client.download(index, subindex, data)
+        with self._told(f"write {value} to", key):
+            await self.client.download(*key, data)
 
     async def may_be_written(self, index: int, subindex: int = 0) -> bool:
         """Whether the drive lets an object be written, as far as it says so before it is."""
@@ -207,9 +214,8 @@ class Remote:
         try:
             yield
         except SdoAbortedError as error:
-            reason = error.CODES.get(error.code, "for a reason of its own")
             raise SdoRefused(
-                f"drive {self.name}: cannot {attempt} {called}: {reason} (SDO abort {error.code:08X})", error.code
+                f"drive {self.name}: cannot {attempt} {called}: {reason(error.code)}", error.code
             ) from error
         except TwoNodesError as error:
             raise DriveError(f"drive {self.name}: {error}") from error
@@ -255,6 +261,11 @@ def together(
     finally:
         for conversation in conversations:
             conversation.close()
+
+
+def reason(code: int) -> str:
+    """What an SDO abort code means."""
+    return f"{SdoAbortedError.CODES.get(code, 'for a reason of its own')} (SDO abort {code:08X})"
 
 
 def is_pdo(index: int) -> bool:

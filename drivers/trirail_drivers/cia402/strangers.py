@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+import can
+
 from trirail_drivers.bus.wire import Handler, Wire
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.axis import Cia402Axis
+from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import DriveFault
 
 _COMMANDS: Final = {
@@ -65,3 +68,39 @@ class Strangers:
     def _on_heartbeat(self, data: bytearray, now: float) -> None:  # noqa: ARG002
         frames.NMT_STATE.unpack(data)
         self._told(f"has this service's node id {self._master_node}")
+
+
+class NoOtherMaster(can.BusABC):
+    """A bus that is used as long as nobody else commands its drives: what a master sends ends it with DriveError.
+
+    It is left open when this is closed.
+    """
+
+    def __init__(self, bus: can.BusABC, nodes: Sequence[int], master_node: int) -> None:
+        self.inner = bus
+        self.channel_info = bus.channel_info
+        bases = {frames.SDO_REQUEST: "asks drives by SDO", frames.RPDO1: "sends PDOs", frames.RPDO2: "sends PDOs"}
+        self._masters = {base + node: text for base, text in bases.items() for node in nodes}
+        self._masters |= {frames.NMT: "commands by NMT", frames.SYNC: "sends SYNC"}
+        self._masters[frames.HEARTBEAT + master_node] = f"sends the heartbeat of node {master_node}"
+        self._guarded = {frames.HEARTBEAT + node for node in nodes}
+        super().__init__(channel=bus.channel_info)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send a frame."""
+        self.inner.send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Receive a frame; DriveError where it is another master's."""
+        frame = self.inner.recv(timeout)
+        if frame is None or frame.is_error_frame or frame.is_extended_id:
+            return frame
+        text = self._masters.get(frame.arbitration_id, "")
+        if frame.is_remote_frame and frame.arbitration_id in self._guarded:
+            text = "asks drives by node guarding"
+        if text:
+            raise DriveError(
+                f"another master is on the bus: it {text} (identifier {frame.arbitration_id:03X}); "
+                "stop the service, trirail run, or what else it is"
+            )
+        return frame

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from trirail_drivers import config
 from trirail_drivers.cia402 import checks, frames, units
+from trirail_drivers.cia402.backup import restore, save
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.inspection import inputs, inspect
 from trirail_drivers.cia402.objects import PROTECTIONS, means
@@ -55,6 +56,8 @@ CIA402 = Protocol(
     simulated_drive=_simulated_drive,
     inspect=inspect,
     inputs=inputs,
+    save=save,
+    restore=restore,
     protections={name: means(name) for name in PROTECTIONS},
     fault_frames={
         "nmt": Frames(True, frames.NMT),

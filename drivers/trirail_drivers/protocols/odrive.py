@@ -39,6 +39,8 @@ ODRIVE = Protocol(
     simulated_drive=_simulated_drive,
     inspect=None,
     inputs=None,
+    save=None,
+    restore=None,
     protections={},
     fault_frames={  # named as in the manual
         "set_axis_state": Frames(True, frames.SET_AXIS_STATE, _NODE),

@@ -10,7 +10,10 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.bus.load import Traffic
+from trirail_drivers.cia402.backup import Restored
+from trirail_drivers.cia402.parameter_file import Saved
 from trirail_drivers.driver.requirements import Requirements
+from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import Clock, DriveGroup
 from trirail_drivers.simulated import Frames, SimulatedDevice
 
@@ -32,6 +35,11 @@ class Protocol:
     inspect: Callable[..., list[dict[str, Any]]] | None
     """Tells what each drive is and what its set-up would change, from the bus, section [drives], the period [s],
     the clock and the sliders' limit of velocity [m/s], and whether to `apply` that; None where they tell nothing."""
+    save: Callable[..., dict[str, Saved | DriveError]] | None
+    """Reads the parameters of drives, from the bus, section [drives], the clock and the drives' names; None where they
+    have no object dictionary."""
+    restore: Callable[..., Restored] | None
+    """Gives a drive its parameters back, from the same, its name and what was saved."""
     protections: Mapping[str, str]
     """What `accept_without` may name, and what each means, for people."""
     inputs: Callable[[can.BusABC, config.Drives, Clock], Callable[[str], int | None]] | None

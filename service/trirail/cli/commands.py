@@ -151,7 +151,7 @@ def view(
 
 app.command(router_command.router)
 app.command(fleet_command.fleet)
-app.command(drives_command.drives)
+app.command(drives_command.app)
 app.command(commission.commission)
 app.command(panel_command.panel)
 for command in robot_commands.COMMANDS:

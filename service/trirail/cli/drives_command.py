@@ -6,10 +6,17 @@ import time
 from pathlib import Path
 from typing import Annotated
 
-from trirail.cli import terminal
+from cyclopts import App
+
+from trirail.cli import drive_parameters, terminal
 from trirail.cli.options import Flag
 
+app = App(name="drives", help="Show the drives on the bus; save, compare and restore their parameters.")
+for command in drive_parameters.COMMANDS:
+    app.command(command)
 
+
+@app.default
 def drives(
     config: Path | None = None, /, *, apply: Annotated[bool, Flag] = False, json: Annotated[bool, Flag] = False
 ) -> int:

@@ -14,7 +14,13 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "demo": ("trirail demo", "trirail demo --stay"),
         "doctor": ("trirail doctor", "trirail doctor robot.toml"),
         "config": ("trirail config", "trirail config copy socketcan robot.toml", "trirail config show robot.toml"),
-        "drives": ("trirail drives robot.toml", "trirail drives robot.toml --apply"),
+        "drives": (
+            "trirail drives robot.toml",
+            "trirail drives robot.toml --apply",
+            "trirail drives save backup --config robot.toml",
+            "trirail drives compare backup/drive-A.toml --config robot.toml",
+            "trirail drives restore backup/drive-A.toml --config robot.toml",
+        ),
         "commission": ("trirail commission robot.toml", "trirail commission robot.toml --yes --fault 'A reversed'"),
         "run": ("trirail run", "trirail run robot.toml", "trirail run robot.toml --record session.rrd"),
         "keys": (

@@ -1,0 +1,259 @@
+"""`trirail drives save`, `compare` and `restore`: all parameters of drives, in files."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from cyclopts import Parameter
+from trirail_drivers.errors import DriveError, FileError
+
+from trirail.cli import terminal
+from trirail.cli.options import Flag
+
+if TYPE_CHECKING:
+    from trirail_drivers.cia402.backup import Left
+    from trirail_drivers.cia402.parameter_file import Different, Saved
+    from trirail_drivers.cia402.parameters import Parameter as Held
+    from trirail_drivers.protocols import Protocol
+
+    from trirail.config import Config
+
+Axis = Literal["A", "B", "C"]
+_MOST_NAMED: Final = 8
+"""So many objects are named in a line; --json and the file have all."""
+
+
+def save(
+    folder: Path = Path(),
+    /,
+    *,
+    config: Path | None = None,
+    drive: Annotated[tuple[Axis, ...], Parameter(negative="", consume_multiple=False)] = ("A", "B", "C"),
+    json: Annotated[bool, Flag] = False,
+) -> int:
+    """Read every parameter of the drives into a file each, drive-A.toml and so on. Never over one that exists.
+
+    Left out is what no drive keeps: what is read-only, controlwords, targets, actual values, commands.
+
+    Parameters
+    ----------
+    folder
+        Where to write; the folder one is in, if absent.
+    config
+        Configuration file; the simulated robot if absent.
+    drive
+        Which drive; may be repeated. All three if absent.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail_drivers.cia402 import parameter_file
+
+    settings, protocol = _loaded(config)
+    paths: dict[str, Path] = {name: folder / f"drive-{name}.toml" for name in sorted(set(drive))}
+    for path in paths.values():
+        if path.exists():
+            raise FileError(f"{path} exists already: name another folder")
+    if not folder.is_dir():
+        raise FileError(f"{folder}: no such folder")
+    ends = _read(settings, protocol, sorted(paths))
+    read = {name: end for name, end in ends.items() if not isinstance(end, DriveError)}
+    for name, saved in read.items():
+        parameter_file.write(paths[name], saved)
+    failed = {name: str(end) for name, end in ends.items() if isinstance(end, DriveError)}
+    if json:
+        files = {
+            name: {
+                "file": str(paths[name]),
+                "parameters": len(saved.parameters),
+                "unread": {_named(key): why for key, why in saved.unread.items()},
+            }
+            for name, saved in read.items()
+        }
+        terminal.json({"ok": not failed, "drives": files, "failed": failed})
+        return 1 if failed else 0
+    for name, saved in read.items():
+        terminal.say(f"drive {name}, node {saved.origin.node}: {len(saved.parameters)} parameters in {paths[name]}")
+        reasons: dict[str, list[str]] = {}
+        for key, why in saved.unread.items():
+            reasons.setdefault(why, []).append(_named(key))
+        for why, objects in reasons.items():
+            terminal.say(f"  {len(objects)} could not be read: {_some(objects)}: {why}")
+        if getattr(settings.drives, name).eds is None:
+            terminal.say(f"  named by {saved.origin.dictionary}: its maker's own objects need drives.{name}.eds")
+    for words in failed.values():
+        terminal.complain(words)
+    return 1 if failed else 0
+
+
+def compare(
+    file: Path,
+    other: Path | None = None,
+    /,
+    *,
+    config: Path | None = None,
+    drive: Axis | None = None,
+    json: Annotated[bool, Flag] = False,
+) -> int:
+    """Show which parameters two files, or a file and the drive, do not have alike; exit 0 if none, 1 if any.
+
+    Parameters
+    ----------
+    file
+        File of trirail drives save.
+    other
+        Another one; the drive itself if absent.
+    config
+        Configuration file; the simulated robot if absent.
+    drive
+        Which drive; the one that the file names if absent.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail_drivers.cia402 import parameter_file
+
+    one = parameter_file.read(file)
+    if other is not None:
+        two, heading = parameter_file.read(other), str(other)
+    else:
+        name = drive or one.origin.axis
+        (end,) = _read(*_loaded(config), [name]).values()
+        if isinstance(end, DriveError):
+            raise end
+        two, heading = end, f"drive {name}"
+    found = parameter_file.compare(one, two)
+    if json:
+        terminal.json({"ok": not found, "one": str(file), "other": heading, "differences": [_told(e) for e in found]})
+        return 1 if found else 0
+    for field in ("vendor", "product", "revision", "serial"):
+        mine, theirs = getattr(one.origin, field), getattr(two.origin, field)
+        if mine != theirs:
+            terminal.say(f"{field}: {_origin(mine)} and {_origin(theirs)}")
+    if found:
+        _table(str(file), heading, [(each, "") for each in found])
+    terminal.say(f"{len(found)} of {len({*one.parameters, *two.parameters})} parameters differ")
+    return 1 if found else 0
+
+
+def restore(
+    file: Path,
+    /,
+    *,
+    config: Path | None = None,
+    drive: Axis | None = None,
+    replace: Annotated[bool, Flag] = False,
+    store: Annotated[bool, Flag] = False,
+    json: Annotated[bool, Flag] = False,
+) -> int:
+    """Write what differs from a file to the drive, read it back, and say what differs still: then exit 1.
+
+    Only without power and with no service or other master on the bus; what the set-up gives, node id and bitrate are
+    left as they are. A file of another product is refused.
+
+    Parameters
+    ----------
+    file
+        File of trirail drives save.
+    config
+        Configuration file; the simulated robot if absent.
+    drive
+        Which drive; the one that the file names if absent.
+    replace
+        Also where the drive has another revision or serial number, as one that takes a broken one's place.
+    store
+        Have the drive keep them without supply (object 1010h), once all of them are there.
+    json
+        Print one JSON object instead of words.
+    """
+    from trirail_drivers.cia402 import parameter_file
+    from trirail_drivers.connection.opening import open_bus
+
+    saved = parameter_file.read(file)
+    settings, protocol = _loaded(config)
+    name = drive or saved.origin.axis
+    if protocol.restore is None:
+        raise _nothing(protocol)
+    with open_bus(settings.can, settings.drives) as bus:
+        done = protocol.restore(bus, settings.drives, time.monotonic, name, saved, replace=replace, store=store)
+    if json:
+        left = [_told(each.different) | {"why": each.why, "meant": each.meant} for each in done.left]
+        written = [_named(key) for key in done.written]
+        said = {"ok": done.ok, "drive": name, "written": written, "left": left, "stored": done.stored}
+        terminal.json(said | ({"not_stored": done.not_stored} if done.not_stored else {}))
+        return 0 if done.ok else 1
+    terminal.say(f"drive {name}: {len(done.written)} parameters written and read back")
+    _left(str(file), name, done.left)
+    if store:
+        terminal.say(f"  not stored: {done.not_stored}" if done.not_stored else "  stored in the drive")
+    return 0 if done.ok else 1
+
+
+COMMANDS: Final = (save, compare, restore)
+
+
+def _loaded(config: Path | None) -> tuple[Config, Protocol]:
+    from trirail_drivers.protocols import PROTOCOLS
+
+    from trirail.config import SIM, load
+
+    settings = load(config or SIM)
+    return settings, PROTOCOLS[settings.drives.protocol]
+
+
+def _read(settings: Config, protocol: Protocol, names: Sequence[str]) -> dict[str, Saved | DriveError]:
+    """Return what drives hold, or why one could not be read."""
+    from trirail_drivers.connection.opening import open_bus
+
+    if protocol.save is None:
+        raise _nothing(protocol)
+    with open_bus(settings.can, settings.drives) as bus:
+        return protocol.save(bus, settings.drives, time.monotonic, names)
+
+
+def _nothing(protocol: Protocol) -> DriveError:
+    return DriveError(
+        f"drives of protocol {protocol.name} have no object dictionary to be saved: use their maker's tool"
+    )
+
+
+def _left(file: str, name: str, left: Iterable[Left]) -> None:
+    meant = [_named(each.different.key) for each in left if each.meant]
+    if meant:
+        terminal.say(f"  {len(meant)} left as they are, the set-up's own, node id or bitrate: {_some(meant)}")
+    if others := [(each.different, each.why) for each in left if not each.meant]:
+        terminal.say(f"  {len(others)} differ still:")
+        _table(file, f"drive {name}", others)
+
+
+def _table(one: str, other: str, rows: Iterable[tuple[Different, str]]) -> None:
+    table = terminal.table("object", "", one, other, "")
+    for each, why in rows:
+        values = (_value(each.one), _value(each.other))
+        table.add_row(_named(each.key), *map(terminal.plain, (each.name, *values, why)))
+    terminal.out.print(table)
+
+
+def _told(each: Different) -> dict[str, Any]:
+    one, other = (None if held is None else held.value for held in (each.one, each.other))
+    return {"object": _named(each.key), "name": each.name, "one": one, "other": other}
+
+
+def _value(held: Held | None) -> str:
+    return "–" if held is None else str(held.value)
+
+
+def _origin(value: int | None) -> str:
+    return "not told" if value is None else f"{value:08X}h"
+
+
+def _some(objects: Sequence[str]) -> str:
+    more = len(objects) - _MOST_NAMED
+    return ", ".join(objects[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _named(key: tuple[int, int]) -> str:
+    from trirail_drivers.cia402.parameters import named
+
+    return named(key)

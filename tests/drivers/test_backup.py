@@ -1,0 +1,494 @@
+"""All parameters of a drive, saved, compared and given back: dictionaries of real drives, and generated ones."""
+
+from __future__ import annotations
+
+import random
+import string
+import struct
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import can
+import msgspec
+import pytest
+from drivers.foreign import DISABLED, ENABLED, FITTED, QUICK_STOP, ForeignDrive, Habits, Truth, Wires, three
+from drivers.slow import Slowness, three_slow
+from edsfiles import MAKES, Row, eds, make_eds, rows
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rigs import Bus, Clock, ideal_servo
+from trirail_drivers.cia402 import backup, parameter_file
+from trirail_drivers.cia402.backup import Restored
+from trirail_drivers.cia402.eds import SERVO
+from trirail_drivers.cia402.objects import USES, Key
+from trirail_drivers.cia402.parameter_file import Saved
+from trirail_drivers.cia402.parameters import named, of_kind
+from trirail_drivers.config import Drive, Drives
+from trirail_drivers.errors import DriveError, FileError
+from trirail_drivers.protocols import CIA402
+from trirail_drivers.simulated import SimulatedDrive
+from trirail_drivers.simulated.dictionary import Dictionary, ObjectEntry
+
+UNSIGNED = {0x05: 1, 0x06: 2, 0x16: 3, 0x07: 4, 0x18: 5, 0x1A: 7, 0x1B: 8}
+SIGNED = {0x02: 1, 0x03: 2, 0x10: 3, 0x04: 4, 0x14: 7, 0x15: 8}
+OCTETS = {0x08: 4, 0x11: 8, 0x0C: 6}
+TEXT, OCTET_STRING, DOMAIN = 0x09, 0x0A, 0x0F
+"""CiA 301 data types."""
+VOLATILE = {0x1003, 0x1010, 0x1011, 0x1013, 0x1023, 0x1F50, 0x1F51, 0x6040, 0x6042, 0x6060, 0x6071, 0x607A, 0x60B0,
+            0x60B1, 0x60B2, 0x60B8, 0x60C1, 0x60FF}  # fmt: skip
+"""What these dictionaries let be written that no drive keeps: targets, offsets, controlwords, commands."""
+OWNED = {int(name[:4], 16) for name in USES} | {0x60A9, 0x60AA}
+
+
+def set_ups(key: Key) -> bool:
+    """Whether set-up gives an object."""
+    return 0x1400 <= key[0] < 0x1C00 or key[0] in OWNED
+
+
+class Line:
+    """Drive A of a dictionary, two others, and the bus between."""
+
+    def __init__(self, path: Path) -> None:
+        a = Drive(node=1, counts_per_metre=1e6, eds=str(path))
+        b, c = (Drive(node=node, counts_per_metre=1e6) for node in (2, 3))
+        self.drives = Drives("cia402", a, b, c, sdo_timeout=0.01)
+        self.clock = Clock()
+        devices = [
+            SimulatedDrive(each.node, ideal_servo(each, 0), eds=path if each is a else SERVO)
+            for each in self.drives.each
+        ]
+        self.bus = Bus(devices, self.clock, CIA402.fault_frames)
+        self.objects: Dictionary = devices[0].objects
+
+    def save(self) -> Saved:
+        found = backup.save(self.bus, self.drives, self.clock, ["A"])["A"]
+        assert isinstance(found, Saved), found
+        return found
+
+    def restore(self, saved: Saved, **options: bool) -> Restored:
+        return backup.restore(self.bus, self.drives, self.clock, "A", saved, **options)
+
+    def __enter__(self) -> Line:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bus.shutdown()
+
+
+def other(entry: ObjectEntry, chance: random.Random) -> None:
+    """Have the device itself hold something else."""
+    was = entry.value, entry.content
+    while (entry.value, entry.content) == was:
+        if entry.integer:
+            bits = 8 * (entry.size or 0)
+            signed = entry.format.islower() and not entry.format.endswith("s")
+            entry.value = chance.randrange(-(1 << bits - 1) if signed else 0, 1 << bits - signed)
+        elif entry.size:
+            entry.content = chance.randbytes(entry.size)
+        else:
+            entry.content = chance.randbytes(chance.randrange(1, 12))
+
+
+def own() -> Saved:
+    """The parameters of the simulated drive's own dictionary."""
+    with Line(SERVO) as line:
+        return line.save()
+
+
+def kept(facts: Iterable[Row]) -> list[Key]:
+    """What of a dictionary a drive keeps: by hand, for it was written by others."""
+    return [
+        (index, subindex)
+        for index, subindex, kind, access, *_ in facts
+        if access.startswith("rw") and index not in VOLATILE and kind != DOMAIN and (index, subindex) != (0x60FE, 1)
+    ]
+
+
+@pytest.mark.generated(0, 1, 2)
+@pytest.mark.parametrize("make", MAKES)
+def test_what_was_altered_is_named_and_comes_back(make: str, seed: int, tmp_path: Path) -> None:
+    chance, path = random.Random(seed), tmp_path / "drive.toml"
+    with Line(make_eds(tmp_path, make)) as line:
+        alter_and_restore(make, line, chance, path)
+
+
+def alter_and_restore(make: str, line: Line, chance: random.Random, path: Path) -> None:
+    saved = line.save()
+    assert not saved.unread
+    mappings = {key for key in saved.parameters if 0x1400 <= key[0] < 0x1C00}
+    assert set(saved.parameters) == set(kept(rows(make))) | mappings
+    parameter_file.write(path, saved)
+    assert parameter_file.read(path) == saved
+    altered = set(chance.sample(sorted(set(saved.parameters) - mappings), 12))
+    for key in altered:
+        other(line.objects[key], chance)
+    assert {each.key for each in parameter_file.compare(saved, line.save())} == altered
+    done = line.restore(parameter_file.read(path))
+    assert set(done.written) == {key for key in altered if not set_ups(key)}
+    assert {each.different.key for each in done.left} == {key for key in altered if set_ups(key)}
+    assert all(each.meant for each in done.left)
+    assert done.ok
+    assert {each.key for each in parameter_file.compare(saved, line.save())} == {key for key in altered if set_ups(key)}
+
+
+KINDS = st.sampled_from([*UNSIGNED, *SIGNED, *OCTETS, TEXT, OCTET_STRING, DOMAIN])
+ROWS = st.dictionaries(
+    st.tuples(st.integers(0x2000, 0x2010), st.integers(1, 4)),
+    st.tuples(KINDS, st.sampled_from(["rw", "rww", "rwr", "ro", "wo", "const"]), st.booleans()),
+    max_size=20,
+)
+
+
+def made(found: dict[Key, tuple[int, str, bool]]) -> list[Row]:
+    heads = {index for index, _ in found}
+    facts: list[Row] = [(index, 0, 0x05, "const", 4, False) for index in heads]
+    return facts + [(*key, kind, access, None, mappable) for key, (kind, access, mappable) in found.items()]
+
+
+BASE = [row for row in rows("elmo_gold") if row[0] < 0x1400 or row[0] in (0x6040, 0x6041)]
+
+
+@settings(max_examples=40)
+@given(ROWS, st.randoms(use_true_random=False), st.data())
+def test_a_dictionary_of_any_kind(
+    tmp_path_factory: pytest.TempPathFactory, found: dict[Key, tuple[int, str, bool]], chance: random.Random, data: Any
+) -> None:
+    folder = tmp_path_factory.mktemp("eds")
+    (folder / "any.eds").write_text(eds([*BASE, *made(found)]))
+    with Line(folder / "any.eds") as line:
+        alter_any(found, line, chance, data, folder / "a.toml")
+
+
+def alter_any(
+    found: dict[Key, tuple[int, str, bool]], line: Line, chance: random.Random, data: Any, path: Path
+) -> None:
+    wanted = {
+        key
+        for key, (kind, access, mappable) in found.items()
+        if access in ("rw", "rww") or (access == "rwr" and not mappable)
+        if kind != DOMAIN
+    }
+    for key in wanted:
+        other(line.objects[key], chance)
+    saved = line.save()
+    assert {key for key in saved.parameters if key[0] >= 0x2000} == wanted
+    parameter_file.write(path, saved)
+    assert parameter_file.read(path) == saved
+    altered = data.draw(st.sets(st.sampled_from(sorted(wanted)))) if wanted else set()
+    before = {key: line.objects[key].encode() for key in wanted}
+    for key in altered:
+        other(line.objects[key], chance)
+    assert [each.key for each in parameter_file.compare(saved, line.save())] == sorted(altered)
+    done = line.restore(parameter_file.read(path))
+    assert (sorted(done.written), done.left) == (sorted(altered), ())
+    assert {key: line.objects[key].encode() for key in wanted} == before
+
+
+@given(st.text(string.printable, max_size=20), st.floats(), st.integers(0, 2**64 - 1), st.binary(max_size=9))
+def test_a_file_has_every_value_to_the_last_bit(
+    tmp_path_factory: pytest.TempPathFactory, text: str, number: float, large: int, octets: bytes
+) -> None:
+    path = tmp_path_factory.mktemp("file") / "a.toml"
+    parameters = {
+        (0x2000, 0): of_kind("text", text.encode(), 'a "name"\n\x7f'),
+        (0x2001, 0): of_kind("f64", struct.pack("<d", number), ""),
+        (0x2002, 0): of_kind("u64", large.to_bytes(8, "little"), "é"),
+        (0x2003, 0): of_kind("text", octets, ""),
+        (0x2004, 0): of_kind("i32", octets, ""),
+    }
+    origin = parameter_file.Origin("A", 1, 402, "now", "a.eds", serial=0xFFFF_FFFF)
+    saved = Saved(origin, parameters, {(0x2005, 0): "for a “reason”"})
+    parameter_file.write(path, saved)
+    assert parameter_file.read(path) == saved
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("[drive]", "[other]", "other"),
+        ('axis = "A"', 'axis = "D"', "drive.axis"),
+        ('"6065:00"', '"6065"', '"6065" is no object'),
+        ('type = "u32", value = 4294967295', 'type = "u16", value = 4294967295', "4294967295 is no u16"),
+        ('type = "u32"', 'type = "u33"', 'type "u33" is unknown'),
+        ("value = 4294967295", "value = 1.5", "1.5 is no u32"),
+        ("[parameters]", "[parameters", "Expected"),
+    ],
+)
+def test_what_is_no_file_of_parameters_is_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
+    path = tmp_path / "a.toml"
+    parameter_file.write(path, own())
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(DriveError, match=f"(?s)a.toml is no file of a drive's parameters.*{said}"):
+        parameter_file.read(path)
+
+
+def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(FileError):
+        parameter_file.write(tmp_path / "nowhere" / "a.toml", own())
+    assert not list(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------------- drives that others made
+
+SPEED, LOW, HIGH, NODE_ID = (0x6081, 0), (0x607D, 1), (0x607D, 2), (0x2000, 0)
+
+
+class Foreign:
+    """Three drives of a make, and what a restore of A came to."""
+
+    def __init__(self, folder: Path, make: str = "maxon_epos4_compact50_5", habits: Habits | None = None) -> None:
+        habits = habits or Habits()
+        habits.values = {(0x1018, at): at for at in range(1, 5)} | habits.values
+        self.wires, self.clock = three(make, dict.fromkeys((1, 2, 3), Truth()), habits=habits)
+        path = folder / "make.eds"
+        path.write_text(eds([*rows(make), *habits.more], FITTED[make]))
+        self.drives = drives(path)
+
+    @property
+    def a(self) -> ForeignDrive:
+        return self.wires.nodes[0]
+
+    def save(self) -> Saved:
+        found = backup.save(self.wires, self.drives, self.clock, ["A"])["A"]
+        assert isinstance(found, Saved), found
+        return found
+
+    def restore(self, saved: Saved, **options: bool) -> Restored:
+        return backup.restore(self.wires, self.drives, self.clock, "A", saved, **options)
+
+
+def drives(path: Path) -> Drives:
+    a, b, c = (Drive(node=node, counts_per_metre=1e6, eds=str(path)) for node in (1, 2, 3))
+    return Drives("cia402", a, b, c, sdo_timeout=0.05)
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_the_parameters_of_a_foreign_drive(make: str, tmp_path: Path) -> None:
+    rig = Foreign(tmp_path, make)
+    saved = rig.save()
+    assert saved.origin.serial == 4 or (0x1018, 4) not in {row[:2] for row in rows(make)}
+    assert set(saved.parameters) | set(saved.unread) == set(kept(rows(make)))
+    assert not rig.a.written
+    index, subindex = chosen = next(key for key in saved.parameters if key[0] >= 0x2000 and not set_ups(key))
+    rig.a.local.data_store[index] = {subindex: bytes(b ^ 1 for b in saved.parameters[chosen].data)}
+    assert [each.key for each in parameter_file.compare(saved, rig.save())] == [chosen]
+    done = rig.restore(saved)
+    assert done == Restored((chosen,), (), False, "")
+    assert rig.a.written == [(index, subindex, saved.parameters[chosen].data)]
+    rig.wires.shutdown()
+
+
+@pytest.mark.parametrize("state", [ENABLED, QUICK_STOP, 0x23, 0x6F])
+def test_nothing_is_written_to_a_drive_with_power(state: int, tmp_path: Path) -> None:
+    rig = Foreign(tmp_path)
+    saved = rig.save()
+    rig.a.put(0x6081, 5)
+    rig.a.state = state
+    with pytest.raises(DriveError, match="drive A: parameters are restored without power only; its state is"):
+        rig.restore(saved)
+    assert not rig.a.written
+    rig.wires.shutdown()
+
+
+def test_nothing_more_is_written_once_a_drive_has_power(tmp_path: Path) -> None:
+    rig = Foreign(tmp_path)
+    saved = rig.save()
+    rig.a.put(0x6081, 5)
+    rig.a.put(0x6083, 5)
+
+    def enabled(index: int, **_: Any) -> None:
+        rig.a.state = ENABLED
+
+    rig.a.local.add_write_callback(enabled)  # type: ignore[no-untyped-call]
+    with pytest.raises(DriveError, match="operation enabled"):
+        rig.restore(saved)
+    assert len(rig.a.written) == 1
+    rig.wires.shutdown()
+
+
+MASTERS: list[tuple[int, bytes, bool]] = [
+    (0x000, b"\x01\x00", False),
+    (0x080, b"", False),
+    (0x201, b"\x0f\x00", False),
+    (0x302, bytes(8), False),
+    (0x603, bytes(8), False),
+    (0x77E, b"\x05", False),
+    (0x701, b"", True),
+]
+
+
+class Overheard(Wires):
+    """A bus on which another master speaks at a time."""
+
+    speaks: tuple[float, can.Message] | None = None
+
+    def pump(self) -> None:
+        if self.speaks is not None and self.turn.now >= self.speaks[0]:
+            message, self.speaks = self.speaks[1], None
+            self.nodes[2].bus.send(message)
+        super().pump()
+
+
+@pytest.mark.parametrize(("identifier", "data", "remote"), MASTERS)
+@pytest.mark.parametrize("doing", ["save", "restore"])
+def test_no_other_master_may_be_on_the_bus(
+    doing: str, identifier: int, data: bytes, remote: bool, tmp_path: Path
+) -> None:
+    rig = Foreign(tmp_path)
+    saved = rig.save()
+    rig.a.put(0x6081, 5)
+    message = can.Message(arbitration_id=identifier, data=data, is_remote_frame=remote, is_extended_id=False)
+    rig.wires.__class__ = Overheard
+    assert isinstance(rig.wires, Overheard)
+    rig.wires.speaks = (rig.clock.now + 0.3, message)
+    sent = len(rig.wires.sent)
+    with pytest.raises(DriveError, match=rf"another master is on the bus: it .*\(identifier {identifier:03X}\)"):
+        rig.save() if doing == "save" else rig.restore(saved)
+    assert len(rig.wires.sent) == sent
+    rig.wires.shutdown()
+
+
+def test_another_master_ends_it_on_the_way(tmp_path: Path) -> None:
+    rig = Foreign(tmp_path)
+    saved = rig.save()
+    rig.a.put(0x6081, 5)
+    rig.a.put(0x6083, 5)
+    sync = can.Message(arbitration_id=0x80, is_extended_id=False)
+    rig.a.local.add_write_callback(lambda **_: rig.a.bus.send(sync))  # type: ignore[no-untyped-call]
+    with pytest.raises(DriveError, match="another master is on the bus: it sends SYNC"):
+        rig.restore(saved)
+    assert len(rig.a.written) == 1
+    rig.wires.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("changes", "refused", "replaceable"),
+    [
+        ({"product": 9}, "product is 00000002h, the file's 00000009h: another product", False),
+        ({"vendor": None}, "vendor is 00000001h, the file's not told: another product", False),
+        ({"device_type": 401}, "device_type is .*: another product", False),
+        ({"serial": 9}, r"drive A has serial 00000004h \(the file's 00000009h\).*--replace", True),
+        ({"revision": None}, r"drive A has revision 00000003h \(the file's not told\).*--replace", True),
+    ],
+)
+def test_a_file_of_another_drive(changes: dict[str, int], refused: str, replaceable: bool, tmp_path: Path) -> None:
+    rig = Foreign(tmp_path)
+    saved = rig.save()
+    saved = replace(saved, origin=msgspec.structs.replace(saved.origin, **changes))
+    rig.a.put(0x6081, 5)
+    with pytest.raises(DriveError, match=refused):
+        rig.restore(saved)
+    assert not rig.a.written
+    if replaceable:
+        assert rig.restore(saved, replace=True).written == (SPEED,)
+    else:
+        with pytest.raises(DriveError, match=refused):
+            rig.restore(saved, replace=True)
+    rig.wires.shutdown()
+
+
+def test_what_is_in_the_way_of_another_is_written_first(tmp_path: Path) -> None:
+    rig = Foreign(tmp_path)
+    rig.a.put(0x607D, -100, 1)
+    rig.a.put(0x607D, 100, 2)
+    saved = rig.save()
+    rig.a.put(0x607D, -900, 1)
+    rig.a.put(0x607D, -800, 2)
+    rig.a.habits.refuses = {
+        LOW: lambda value: value >= rig.a.value(*HIGH),
+        HIGH: lambda value: value <= rig.a.value(*LOW),
+    }
+    assert rig.restore(saved) == Restored((HIGH, LOW), (), False, "")
+    rig.wires.shutdown()
+
+
+def test_what_a_drive_changes_with_another_is_given_back_too(tmp_path: Path) -> None:
+    rig = Foreign(tmp_path)
+    saved = rig.save()
+    first, second = (key for key in sorted(saved.parameters) if key in (SPEED, (0x6083, 0)))
+
+    def resets(index: int, **_: Any) -> None:
+        if index == second[0]:
+            rig.a.put(first[0], 77)
+
+    rig.a.put(second[0], 5)
+    rig.a.local.add_write_callback(resets)  # type: ignore[no-untyped-call]
+    done = rig.restore(saved)
+    assert (set(done.written), done.left) == ({first, second}, ())
+    rig.wires.shutdown()
+
+
+@pytest.mark.parametrize("store", [False, True])
+@pytest.mark.parametrize("kept_back", [False, True])
+def test_what_differs_still_is_told_and_not_stored(store: bool, kept_back: bool, tmp_path: Path) -> None:
+    rig = Foreign(tmp_path)
+    saved = rig.save()
+    rig.a.put(0x6081, 5)
+    rig.a.put(0x6083, 5)
+    if kept_back:
+        rig.a.habits.refuses = {SPEED: lambda _value: True}
+    done = rig.restore(saved, store=store)
+    assert ([each.different.key for each in done.left] == [SPEED]) is kept_back
+    assert all("(SDO abort 06090030)" in each.why and not each.meant for each in done.left)
+    assert done.stored is (store and not kept_back)
+    assert ((0x1010, 1, b"save") in rig.a.written) is done.stored
+    assert done.ok is not kept_back
+    rig.wires.shutdown()
+
+
+def test_node_id_and_bitrate_are_left_as_they_are(tmp_path: Path) -> None:
+    more = ((0x2000, 0, 5, "rw", 1, False), (0x2001, 0, 5, "rw", 0, False))
+    rig = Foreign(tmp_path, habits=Habits(values={(0x1018, 1): 0xFB, (0x1018, 2): 2}, more=more))
+    saved = rig.save()
+    rig.a.put(0x2000, 5)
+    done = rig.restore(saved)
+    assert [(each.different.key, each.meant) for each in done.left] == [(NODE_ID, True)]
+    assert (done.written, done.ok) == ((), True)
+    rig.wires.shutdown()
+
+
+@pytest.mark.parametrize(("effect", "held"), [(0.03, True), (60.0, False)])
+def test_what_is_written_has_a_time_to_be_held(effect: float, held: bool, tmp_path: Path) -> None:
+    make = "elmo_gold"
+    wires, clock = three_slow(make, Truth(), lambda _node: Slowness(answer=lambda: 0.01, effect=lambda: effect))
+    config = drives(make_eds(tmp_path, make, FITTED[make]))
+    saved = backup.save(wires, config, clock, ["A"])["A"]
+    assert isinstance(saved, Saved)
+    wires.nodes[0].put(0x6081, 5)
+    done = backup.restore(wires, config, clock, "A", saved)
+    assert [each.why.partition(",")[0] for each in done.left] == ([] if held else ["it keeps another value"])
+    wires.shutdown()
+
+
+@pytest.mark.parametrize("answers", [0, 40])
+def test_a_drive_that_falls_silent(answers: int, tmp_path: Path) -> None:
+    rig = Foreign(tmp_path)
+    serve: Callable[..., None] = rig.a.local.sdo.on_request
+    left = [answers]
+
+    def served(*request: Any) -> None:
+        left[0] -= 1
+        if left[0] >= 0:
+            serve(*request)
+
+    vars(rig.a.local.sdo).update(on_request=served)
+    ends = backup.save(rig.wires, rig.drives, rig.clock)
+    assert isinstance(ends["A"], DriveError)
+    assert "no answer about object" in str(ends["A"])
+    assert isinstance(ends["B"], Saved)
+    assert isinstance(ends["C"], Saved)
+    rig.wires.shutdown()
+
+
+def test_what_a_drive_does_not_tell_is_said_with_the_reason(tmp_path: Path) -> None:
+    rig = Foreign(tmp_path)
+    vars(rig.a.local.object_dictionary[0x6081]).update(access_type="wo")
+    saved = rig.save()
+    assert saved.unread == {SPEED: "Attempt to read a write only object (SDO abort 06010001)"}
+    assert named(SPEED) not in {named(key) for key in saved.parameters}
+    assert rig.a.state == DISABLED
+    rig.wires.shutdown()
