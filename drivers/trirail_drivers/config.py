@@ -27,6 +27,20 @@ NodeId = Annotated[int, Meta(ge=0, le=127)]
 """CANopen has 1 to 127, ODrive 0 to 62; the driver refuses the rest."""
 
 
+CountsPerMetre = Annotated[float, Meta(ge=1e-3, le=1e12)]
+
+
+class Built(Struct, frozen=True, forbid_unknown_fields=True):
+    """What moves a simulated slider, whatever [drives] says of it."""
+
+    node: NodeId
+    """The drive's node id."""
+    counts_per_metre: CountsPerMetre
+    """What its encoder counts."""
+    direction: Literal[1, -1] = 1
+    """-1 where counts fall as the slider position rises."""
+
+
 class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
     """How the simulated drives behave; used only with interface = "simulated"."""
 
@@ -42,6 +56,9 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
     """So many SYNCs missed in a row make a CiA 402 drive stop by itself; an ODrive has its watchdog."""
     start: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     """Slider positions at power-on [m]."""
+    built: tuple[Built, Built, Built] | None = None
+    """How the simulated sliders A, B, C are built and wired, for `trirail commission` to find out where [drives] says
+    otherwise; faults on demand start from it. As [drives] says, if absent."""
 
 
 OptionNumber = Annotated[int, Meta(ge=-(10**12), le=10**12)] | Annotated[float, Meta(ge=-1e12, le=1e12)]
@@ -118,7 +135,7 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
 
     node: NodeId
     """The drive's node id: 1 to 127 on CANopen, 0 to 62 of an ODrive."""
-    counts_per_metre: Annotated[float, Meta(ge=1e-3, le=1e12)]
+    counts_per_metre: CountsPerMetre
     """The drive's own unit of position, per metre of the slider: counts of a CiA 402 drive, turns of an ODrive."""
     direction: Literal[1, -1] = 1
     """-1 where counts fall as the slider position rises."""

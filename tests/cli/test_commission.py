@@ -18,7 +18,7 @@ from trirail.errors import ConfigError
 from trirail_drivers.errors import FileError
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
 
-PUSH = ["", "0.01", "0", "10"]
+PUSH = ["", "0.01", "0", "10", "0"]
 """Answers to the step of the first slider by hand."""
 
 

@@ -9,7 +9,8 @@ import pytest
 from conftest import CONFIG
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from trirail.commissioning.coupling import COARSE, SCALE, MoveSeen, PushSeen, judge_move, judge_push, merged
+from trirail.commissioning.coupling import COARSE, SCALE, MoveSeen, PushSeen, judge_move, judge_push
+from trirail.commissioning.exchange import merged
 from trirail.commissioning.judgement import Judged, judge_square, judge_switches, judge_watchdog
 from trirail.commissioning.moves import DISTANCE
 from trirail_drivers.config import Drives
@@ -29,8 +30,9 @@ def drives(direction: int = 1, counts: float = 1e6) -> Drives:
 
 
 def moved(name: str = "A", **keys: object) -> MoveSeen:
-    usual = MoveSeen(name, DISTANCE, DISTANCE, 1e-5, "", name, DISTANCE, 0.0, 1e-5, 1e-7)
-    return usual._replace(**keys)  # type: ignore[arg-type]
+    usual = MoveSeen(name, DISTANCE, DISTANCE, -DISTANCE, 1e-5, "", name, DISTANCE, 0.0, 1e-5, 1e-7)
+    seen = usual._replace(**keys)  # type: ignore[arg-type]
+    return seen if "back" in keys else seen._replace(back=-seen.out)
 
 
 def said(judged: Judged) -> str:
@@ -73,7 +75,7 @@ def test_the_configuration_that_comes_of_it_measures_what_the_rule_reads(
     counted = [0.0, 0.0, 0.0]
     counted[NAMES.index(drive)] = way
     a, b, c = counted
-    judged = judge_push(PushSeen(slider, sign * rule, (a, b, c), 1e-5, 1e-6), before)
+    judged = judge_push(PushSeen(slider, sign * rule, (a, b, c), -sign * rule, (-a, -b, -c), 1e-5, 1e-6), before)
     after = getattr(before, slider)
     for key, value in judged.changes.items():
         _, name, field = key.split(".")
@@ -109,6 +111,61 @@ def test_one_that_comes_back_elsewhere_slips(name: str, lost: float, sign: float
     judged = judge_move(seen, drives())
     assert (judged.verdict, judged.changes) == ("wrong", {})
     assert "slip" in said(judged)
+
+
+readings = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3)
+
+
+@given(
+    name=sliders,
+    way=st.floats(5e-4, 0.02),
+    sign=signs,
+    share=st.floats(0.0, 1.0),
+    noise=readings,
+    read_to=st.sampled_from((1e-6, 1e-5, 1e-4, 5e-4)),
+    power=st.booleans(),
+)
+def test_a_slip_is_never_told_as_a_scale(
+    name: str, way: float, sign: float, share: float, noise: list[float], read_to: float, power: bool
+) -> None:
+    """Whatever share is lost, there or back, however long the way and however badly the rule is read."""
+    there, back = (1.0 - share, 1.0) if sign > 0.0 else (1.0, 1.0 - share)
+    rules = [place + read_to * error for place, error in zip((0.0, sign * way, 0.0), noise, strict=True)]
+    rule, rule_back = rules[1] - rules[0], rules[2] - rules[1]
+    counted, counted_back = there * sign * way, -back * sign * way
+    if power:
+        seen = moved(name, asked=counted, out=counted, back=counted_back, rule_out=rule, rule_back=rule + rule_back)
+        assume(counted)
+        judged = judge_move(seen._replace(read_to=read_to), drives())
+    else:
+        judged = judge_push(pushed(name, rule, counted, rule_back, counted_back, read_to), drives())
+    assert not [key for key in judged.changes if key.endswith("counts_per_metre")]
+    unread = 4.0 * (read_to + 1e-7) / min(abs(rule), abs(rule_back))
+    told = "slipping" in said(judged) or "loose" in said(judged)
+    if judged.verdict != "failed" and share > 0.1 + 2.0 * unread:
+        assert told, judged
+    if share == 0.0:
+        assert not told
+
+
+@given(name=sliders, way=st.floats(5e-3, 0.02), sign=signs, ratio=st.floats(0.05, 20.0), noise=readings)
+def test_a_scale_is_never_told_as_a_slip(name: str, way: float, sign: float, ratio: float, noise: list[float]) -> None:
+    read_to = 1e-5
+    rules = [place + read_to * error for place, error in zip((0.0, sign * way, 0.0), noise, strict=True)]
+    rule, rule_back = rules[1] - rules[0], rules[2] - rules[1]
+    seen = pushed(name, rule, ratio * sign * way, rule_back, -ratio * sign * way, read_to)
+    judged = judge_push(seen, drives())
+    assert "slip" not in said(judged)
+    if abs(ratio - 1.0) > 1.5 * SCALE:
+        assert judged.changes[f"drives.{name}.counts_per_metre"] == pytest.approx(1e6 * ratio, rel=0.01)
+
+
+def pushed(name: str, rule: float, way: float, rule_back: float, way_back: float, read_to: float) -> PushSeen:
+    """Slider and drive of one name; the others stood still."""
+    ways, ways_back = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    ways[NAMES.index(name)], ways_back[NAMES.index(name)] = way, way_back
+    (a, b, c), (d, e, f) = ways, ways_back
+    return PushSeen(name, rule, (a, b, c), rule_back, (d, e, f), read_to, 1e-7)
 
 
 @given(name=sliders, away=st.floats(0.06, 5.0), sign=signs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import Clock, DriveGroup
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus
+from trirail_drivers.simulated.carriages import Mounted
 from trirail_drivers.simulated.faults import Faults
 
 # What python-can would say of a failure is in the BusError; standard error is for that one line.
@@ -81,7 +83,16 @@ def simulated_bus(section: config.Can, drives: config.Drives, clock: Clock = tim
     starts = zip(drives.each, section.simulated.start, strict=True)
     devices = [protocol.simulated_drive(section.simulated, drives, drive, start) for drive, start in starts]
     scales = [drive.direction * drive.counts_per_metre for drive in drives.each]
-    return SimulatedBus(devices, clock, Faults(devices, scales, protocol.fault_frames))
+    mounted = [_mounted(section.simulated.built, index, drive) for index, drive in enumerate(drives.each)]
+    return SimulatedBus(devices, clock, Faults(devices, scales, protocol.fault_frames, mounted=mounted))
+
+
+def _mounted(built: Sequence[config.Built] | None, index: int, drive: config.Drive) -> Mounted:
+    """What a simulated drive really moves: by its node id, or what is configured where nobody says."""
+    for slider, each in enumerate(built or ()):
+        if each.node == drive.node:
+            return Mounted(slider, each.direction * each.counts_per_metre)
+    return Mounted(index, drive.direction * drive.counts_per_metre)
 
 
 def _explained(section: config.Can, error: Exception) -> str:

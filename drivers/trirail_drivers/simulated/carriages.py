@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from trirail_drivers.simulated.servo import Servo
+
+
+class Mounted(NamedTuple):
+    """What a drive really moves, whatever its configuration says."""
+
+    slider: int
+    """Index of the slider."""
+    counts_per_metre: float
+    """Of that slider; below 0 where counts fall as it rises."""
 
 
 class Carriages:
     """The three sliders and what moves them: each drive one slider, unless its wiring or mechanics is wrong."""
 
     def __init__(self, servos: Sequence[Servo], counts_per_metre: Sequence[float]) -> None:
-        """`counts_per_metre` as configured: negative where counts fall as the slider rises."""
+        """`counts_per_metre`: negative where counts fall as the slider rises."""
         self._servos = tuple(servos)
         self._scales = tuple(counts_per_metre)
         self._moves = [(index, 1.0) for index in range(len(self._servos))]
@@ -19,7 +29,7 @@ class Carriages:
         self._places = [0.0] * len(self._servos)
 
     def couple(self, index: int, slider: int, ratio: float) -> None:
-        """From now on a drive moves that slider, `ratio` times as far as is configured; below 0 the other way."""
+        """From now on a drive moves that slider, `ratio` times as far as it counts; below 0 the other way."""
         self.read()
         self._moves[index] = slider, ratio
 

@@ -33,13 +33,16 @@ faults of a drive:
 faults of its mechanics and wiring, as a rule beside the rail shows them:
   reversed          the slider goes the other way         scale RATIO    it goes RATIO times as far as counted
   swapped DRIVE     it moves that drive's slider          loose          its encoder does not turn with it
+  node ID           DRIVE's slider is moved by the drive of that node id, whatever is configured
+  counts NUMBER     what moves DRIVE's slider counts that per metre, below 0 where they fall as it rises, likewise
   slips SHARE       its encoder misses that share of the way while the slider's position rises
   against           its encoder counts against its motor: with power it runs away
   play METRES       between drive and slider: backlash
 faults of the bus (no DRIVE):
   bus-off           the master's controller leaves the bus        error-passive   ... is about to
   babble ID         a node sends this identifier without pause; what has a higher one does not get through
-DRIVE is A, B, C or all. CONDITION is enabled, moving, stopping or fault; DRIVE before it may be any.
+DRIVE is A, B, C or all, by the sliders of [can.simulated] built, where that is there.
+CONDITION is enabled, moving, stopping or fault; DRIVE before it may be any.
 at     seconds after the line is read        for   how long; else until clear (emcy, fault, reboot: at once over)
 with   chance for each frame; for faults of a drive or the bus, for each second
 Commands: list · clear (ends all faults) · help"""
@@ -122,6 +125,13 @@ def _ratio(word: str) -> float:
     return value
 
 
+def _counts(word: str) -> float:
+    value = _decimal(word)
+    if value == 0.0:
+        raise ValueError
+    return value
+
+
 def _share(word: str) -> float:
     value = _decimal(word)
     if not 0.0 <= value <= 1.0:
@@ -172,11 +182,15 @@ _OF_DRIVES: Final = {
     "reversed": _Kind(),
     "scale": _Kind("a ratio above 0", _ratio, "0.5"),
     "swapped": _Kind("a drive, A, B or C", _drive, "B"),
+    "counts": _Kind("counts per metre, below 0 or above", _counts, "-1e7"),
+    "node": _Kind("a node id, 0 to 127", _between(0, 127, 10), "2"),
     "loose": _Kind(),
     "slips": _Kind("a share from 0 to 1", _share, "0.3"),
     "against": _Kind(),
     "play": _Kind("metres", _not_negative, "0.00005"),
 }
+OF_SLIDERS: Final = ("node", "counts")
+"""Faults whose DRIVE is a slider, and that say what it has whatever is configured."""
 _OF_BUS: Final = {
     "bus-off": _Kind(),
     "error-passive": _Kind(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 import itertools
 import random
@@ -15,10 +16,10 @@ from trirail_drivers import files
 from trirail_drivers.bus import canerrors
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES, Clock, PowerState
-from trirail_drivers.simulated.carriages import Carriages
+from trirail_drivers.simulated.carriages import Carriages, Mounted
 from trirail_drivers.simulated.devices import SimulatedDevice
 from trirail_drivers.simulated.emergency import Emergencies
-from trirail_drivers.simulated.faultlines import Condition, Fault, FaultSyntaxError, Frames, parse
+from trirail_drivers.simulated.faultlines import OF_SLIDERS, Condition, Fault, FaultSyntaxError, Frames, parse
 from trirail_drivers.simulated.servo import SOUND
 
 MOVING: Final = 1e-3
@@ -68,14 +69,20 @@ class Faults:
         frames: Mapping[str, Frames],
         seed: int = 0,
         tell: Callable[[str], None] = _to_nobody,
+        mounted: Sequence[Mounted] | None = None,
     ) -> None:
         """`counts_per_metre`: negative where counts fall as the slider rises. `frames`: those that lines can name.
 
-        `tell`: hears what begins and ends.
+        `tell`: hears what begins and ends. `mounted`: what each drive really moves, where that is not its own slider
+        by those counts; a line names a drive by that slider.
         """
         self.tell = tell
-        self.carriages = Carriages([drive.servo for drive in drives], counts_per_metre)
+        self._mounted = [Mounted(*each) for each in enumerate(counts_per_metre)] if mounted is None else list(mounted)
+        self._drive_of = {each.slider: index for index, each in enumerate(self._mounted)}
+        self.carriages = Carriages([drive.servo for drive in drives], [each.counts_per_metre for each in self._mounted])
         """Where the sliders really are."""
+        for index, each in enumerate(self._mounted):
+            self.carriages.couple(index, each.slider, 1.0)
         self._drives = drives
         self._frames = frames
         self._scales = counts_per_metre
@@ -108,7 +115,7 @@ class Faults:
 
     def add(self, line: str) -> None:
         """Take up a line. Raises FaultSyntaxError."""
-        fault = parse(line, self._frames)
+        fault = self._of_drives(parse(line, self._frames))
         if fault.name == "emcy":
             for index in fault.drives:
                 if self._drives[index].emergencies is None:
@@ -116,6 +123,15 @@ class Faults:
         if self.idle:
             self._now = self._clock()
         self._active.append(_Active(fault, self._now))
+
+    def _of_drives(self, fault: Fault) -> Fault:
+        """A fault of drives as they are configured, from one of drives by the sliders that they were mounted on."""
+        condition, drives = fault.condition, fault.drives
+        if fault.name not in OF_SLIDERS:
+            drives = tuple(self._drive_of.get(index, index) for index in drives)
+        if condition is not None and condition.drive is not None:
+            condition = condition._replace(drive=self._drive_of.get(condition.drive, condition.drive))
+        return dataclasses.replace(fault, drives=drives, condition=condition)
 
     def load(self, path: Path) -> None:
         """Take up a file, one fault a line; # begins a comment. Raises DriveError with file and line."""
@@ -266,22 +282,31 @@ class Faults:
 
     def _break_drives(self) -> None:
         """Make every drive as sound or defect as the faults now in force have it."""
+        begun = [active.fault for active in self._active if active.begun]
+        wired = {round(each.value): slider for each in begun if each.name == "node" for slider in each.drives}
+        counted = {slider: each.value for each in begun if each.name == "counts" for slider in each.drives}
         for index, (drive, scale) in enumerate(zip(self._drives, self._scales, strict=True)):
-            fault = {a.fault.name: a.fault for a in self._active if a.begun and index in a.fault.drives}
+            fault = {each.name: each for each in begun if index in each.drives}
             drive.silent = "silent" in fault or "reboot" in fault
             drive.servo.lag = fault["lag"].value if "lag" in fault else None
             drive.servo.forced_velocity = fault["runaway"].value * scale if "runaway" in fault else None
             if "stuck" in fault:
                 drive.servo.forced_velocity = 0.0
-            drive.servo.encoder = self._encoder(fault, scale)
+            slider, counts = self._mounted[index]
+            slider = wired.get(drive.node, round(fault["swapped"].value) if "swapped" in fault else slider)
+            ratio = (fault["scale"].value if "scale" in fault else 1.0) * (-1.0 if "reversed" in fault else 1.0)
+            if slider in counted:
+                ratio = counts / counted[slider]
+            drive.servo.encoder = self._encoder(fault, counts * ratio)
             drive.servo.play = fault["play"].value * scale if "play" in fault else 0.0
-            slider = round(fault["swapped"].value) if "swapped" in fault else index
-            ratio = fault["scale"].value if "scale" in fault else 1.0
-            self.carriages.couple(index, slider, -ratio if "reversed" in fault else ratio)
+            self.carriages.couple(index, slider, ratio)
 
     @staticmethod
-    def _encoder(fault: Mapping[str, Fault], scale: float) -> tuple[float, float]:
-        """The shares of its travel that a drive's encoder counts, as its counts rise and as they fall."""
+    def _encoder(fault: Mapping[str, Fault], rising: float) -> tuple[float, float]:
+        """The shares of its travel that a drive's encoder counts, as its counts rise and as they fall.
+
+        `rising` is below 0 where they fall as the slider rises.
+        """
         if "loose" in fault:
             return 0.0, 0.0
         if "against" in fault:
@@ -289,7 +314,7 @@ class Faults:
         if "slips" not in fault:
             return SOUND
         held = 1.0 - fault["slips"].value  # while the slider's position rises
-        return (held, 1.0) if scale > 0.0 else (1.0, held)
+        return (held, 1.0) if rising > 0.0 else (1.0, held)
 
     def _emergencies(self, fault: Fault) -> list[Emergencies]:
         struck = (self._drives[index].emergencies for index in fault.drives)

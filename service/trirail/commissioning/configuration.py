@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import tomlkit
 from tomlkit.items import Table
+from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES
 
 from trirail.config import Config, parse
@@ -43,6 +44,24 @@ def with_changes(config: Config, changes: Mapping[str, int | float]) -> Config:
         drive = msgspec.structs.replace(getattr(drives, name), **{key: value})
         drives = msgspec.structs.replace(drives, **{name: drive})
     return msgspec.structs.replace(config, drives=drives)
+
+
+def with_built(text: str, drives: Drives) -> str:
+    """Return a configuration's text that says how its simulated sliders are built: as `drives` say.
+
+    So faults on demand stay what they were, whatever is corrected in [drives].
+    """
+    document = tomlkit.parse(text)
+    rows = tomlkit.array().multiline(True)
+    for drive in drives.each:
+        row = tomlkit.inline_table()
+        row.update({"node": drive.node, "counts_per_metre": drive.counts_per_metre, "direction": drive.direction})
+        rows.append(row)
+    can = document["can"]
+    if "simulated" not in can:
+        can["simulated"] = tomlkit.table()
+    can["simulated"]["built"] = rows
+    return tomlkit.dumps(document)
 
 
 def with_whole_paths(text: str, folder: Path) -> str:

@@ -15,7 +15,9 @@ SCALE: Final = 0.02
 COARSE: Final = 0.5
 """Share of a way that a rule leaves open beyond which it tells nothing of the scale."""
 PLAY: Final = 0.1
-"""Share of a way that a slider may come back short by: play in its screw or belt."""
+"""Share of 1 mm by which slider and drive may differ for play in screw or belt: less is no wrong scale there."""
+BACKLASH: Final = 0.0004
+"""So much less than counted [m] a slider may go both ways for play: over 1 mm that looks like a wrong scale."""
 FOLLOWS: Final = 0.2
 """Share of a way that an encoder has to count for it to have moved at all."""
 NOTHING: Final = 0.02
@@ -32,6 +34,8 @@ class MoveSeen(NamedTuple):
     asked: float
     out: float
     """By its encoder."""
+    back: float
+    """By its encoder, on the way back."""
     following: float
     """Its greatest following error [m]."""
     stopped: str
@@ -48,13 +52,28 @@ class MoveSeen(NamedTuple):
     """How fine the encoder's counts are [m]."""
 
 
+class _Stroke(NamedTuple):
+    """A way in one direction [m]."""
+
+    counted: float
+    rule: float
+
+    @property
+    def ratio(self) -> float:
+        """How many times as far the encoder counts as the slider goes."""
+        return abs(self.counted / self.rule)
+
+
 class PushSeen(NamedTuple):
-    """A slider was pushed by hand, nothing had power. Ways are signed [m]."""
+    """A slider was pushed there and back by hand, nothing had power. Ways are signed [m]."""
 
     slider: str
     rule: float
     ways: tuple[float, float, float]
     """By the encoders of drives A, B, C."""
+    rule_back: float
+    """When it was pushed back, to about where it was."""
+    ways_back: tuple[float, float, float]
     read_to: float
     step: float
 
@@ -98,30 +117,31 @@ def judge_move(seen: MoveSeen, drives: Drives) -> Judged:
             (by_encoder, by_rule, seen.stopped),
             "if the slider moves freely, tune the drive's position loop with its maker's tool, then repeat this step",
         )
-    if abs(seen.rule_back) > max(2.0 * seen.read_to, PLAY * abs(seen.rule_out)):
+    out, back = _Stroke(seen.out, seen.rule_out), _Stroke(seen.back, seen.rule_back - seen.rule_out)
+    lost = [abs(stroke.counted) - abs(stroke.rule) for stroke in (out, back)]
+    readable = 2.0 * (seen.read_to + seen.step) <= COARSE * min(abs(out.rule), abs(back.rule))
+    if slider == name and readable and PLAY * abs(seen.out) < min(lost) and max(lost) <= BACKLASH:
         return Judged(
             "wrong",
-            (
-                by_encoder,
-                by_rule,
-                f"back where drive {name} began by its own counts, the rule shows {in_mm(seen.rule_back)}",
-                "slipping encoder or coupling: counts are lost on the way, or there is as much play",
-            ),
-            f"fasten encoder and coupling of drive {name} on their shafts, look for play, then repeat this step",
+            (by_encoder, by_rule, f"it went {in_mm(lost[0])} less than counted there and {in_mm(lost[1])} back: play"),
+            f"look for play in the coupling, screw or belt of slider {name}; where there is none, it is a wrong scale, "
+            "which the step by hand finds over 10 mm",
         )
-    return _coupled(name, slider, seen.out, seen.rule_out, seen.read_to, seen.step, drives, (by_encoder, by_rule))
+    return _coupled(name, slider, out, back, seen.read_to, seen.step, drives, (by_encoder, by_rule), PLAY)
 
 
 def judge_push(seen: PushSeen, drives: Drives) -> Judged:
     """Judge which drive's encoder is on the slider that was pushed, which way and how finely it counts."""
     at = NAMES.index(seen.slider)
-    sizes = [abs(way) for way in seen.ways]
+    sizes = [max(abs(way), abs(back)) for way, back in zip(seen.ways, seen.ways_back, strict=True)]
     most = sizes.index(max(sizes))
     counted = ", ".join(f"{name} {in_mm(way)}" for name, way in zip(NAMES, seen.ways, strict=True))
     words = (f"slider {seen.slider} was pushed {in_mm(seen.rule)} by the rule; the drives counted {counted}",)
-    if abs(seen.rule) < 5.0 * seen.read_to:
+    if min(abs(seen.rule), abs(seen.rule_back)) < 5.0 * seen.read_to:
         return Judged(
-            "failed", (*words, "that is too little to be judged"), "push it further: 10 mm, or as far as it goes"
+            "failed",
+            (*words, "there or back is too little to be judged"),
+            "push it further: 10 mm, or as far as it goes, and back",
         )
     if max(sizes) < NOTHING * abs(seen.rule):
         return Judged(
@@ -130,48 +150,69 @@ def judge_push(seen: PushSeen, drives: Drives) -> Judged:
             LOOSE.format(seen.slider),
         )
     drive = seen.slider if sizes[at] >= FOLLOWS * sizes[most] else NAMES[most]
-    way = seen.ways[NAMES.index(drive)]
-    return _coupled(drive, seen.slider, way, seen.rule, seen.read_to, seen.step, drives, words)
+    index = NAMES.index(drive)
+    out, back = _Stroke(seen.ways[index], seen.rule), _Stroke(seen.ways_back[index], seen.rule_back)
+    return _coupled(drive, seen.slider, out, back, seen.read_to, seen.step, drives, words, SCALE)
 
 
 def _coupled(
     name: str,
     slider: str,
-    way: float,
-    rule: float,
+    out: _Stroke,
+    back: _Stroke,
     read_to: float,
     step: float,
     drives: Drives,
     words: tuple[str, ...],
+    tolerance: float,
 ) -> Judged:
-    """Judge a drive, whose encoder has counted a `way`, by the slider that went with it, and the rule beside that."""
+    """Judge a drive, whose encoder has counted two strokes, by the slider that went with it, and the rule beside that.
+
+    A wrong scale is the same factor both ways, a slip or play is not: strokes are to differ by less than `tolerance`,
+    or by what the rule leaves open.
+    """
     drive, configured = _of(drives, name), _of(drives, slider)
     found = [*words]
     if slider != name:
         found.append(f"swapped nodes: drive {name}, node {drive.node}, has slider {slider}")
-    if abs(rule) <= 2.0 * read_to:
+    if min(abs(out.rule), abs(back.rule)) <= 2.0 * read_to:
         found.append(f"the rule, read to {read_to * 1e3:g} mm, shows neither direction nor scale")
         if slider == name:
             return Judged("failed", tuple(found), "read it more finely, or push the slider further")
         return _changed(slider, configured, {"node": drive.node}, found)
+    unread = [2.0 * (read_to + step) / abs(stroke.rule) for stroke in (out, back)]
+    ratios = out.ratio, back.ratio
+    if abs(ratios[0] - ratios[1]) > max(ratios) * max(tolerance, sum(unread)):
+        found += [
+            f"of the slider's way drive {name} counts {ratios[0]:.1%} there and {ratios[1]:.1%} back",
+            "slipping encoder or coupling: counts are lost on the way, or there is as much play",
+        ]
+        remedy = f"fasten encoder and coupling of drive {name} on their shafts, look for play, then repeat this step"
+        return Judged("wrong", tuple(found), remedy, _node(slider, configured, drive))
     direction, counts = drive.direction, drive.counts_per_metre
-    if way * rule < 0.0:
+    if out.counted * out.rule < 0.0:
         direction = -drive.direction
         found.append(f"wrong direction: by the counts of drive {name} slider {slider} goes the other way")
-    unread = 2.0 * (read_to + step) / abs(rule)
-    ratio = abs(way / rule)
-    if unread > COARSE:
+    open_share = max(unread)
+    if open_share > COARSE:
         found.append(
             f"a rule read to {read_to * 1e3:g} mm does not tell the scale over so short a way; push it further"
         )
-    elif abs(ratio - 1.0) > max(SCALE, unread):
-        counts = _rounded(drive.counts_per_metre * ratio, unread)
+    elif all(abs(ratio - 1.0) > max(tolerance, left) for ratio, left in zip(ratios, unread, strict=True)):
+        ratio = (abs(out.counted) + abs(back.counted)) / (abs(out.rule) + abs(back.rule))
+        counts = _rounded(drive.counts_per_metre * ratio, open_share)
         found.append(
-            f"wrong scale: drive {name} counts {ratio:.3g} times as far as the slider goes, read to {unread:.1%}"
+            f"wrong scale: drive {name} counts {ratio:.3g} times as far as the slider goes, there and back, "
+            f"read to {open_share:.1%}"
         )
     elif slider == name and direction == drive.direction:
-        found.append(f"direction is right, and counts per metre as far as can be read: to {unread:.1%}")
+        readable = max(tolerance, open_share)
+        found.append(f"direction is right, and counts per metre as far as can be told: to {readable:.1%}")
     return _changed(slider, configured, {"node": drive.node, "direction": direction, "counts_per_metre": counts}, found)
+
+
+def _node(slider: str, configured: Drive, drive: Drive) -> Changes:
+    return {} if drive.node == configured.node else {f"drives.{slider}.node": drive.node}
 
 
 def _changed(slider: str, configured: Drive, wanted: Mapping[str, int | float], found: Sequence[str]) -> Judged:
@@ -182,30 +223,6 @@ def _changed(slider: str, configured: Drive, wanted: Mapping[str, int | float], 
     told = (f"drives.{slider}.{key} = {value:g}, not {getattr(configured, key):g}" for key, value in different.items())
     remedy = f"in the configuration {', '.join(told)}; then begin again with it"
     return Judged("wrong", tuple(found), remedy, {f"drives.{slider}.{key}": value for key, value in different.items()})
-
-
-def merged(found: Sequence[Changes], drives: Drives) -> tuple[dict[str, int | float], str]:
-    """Put together what the steps would change; why the nodes cannot be exchanged, "" where they can.
-
-    A node that moves to another slider leaves its own without one: the two are exchanged where nothing else was seen.
-    """
-    changes = {key: value for each in found for key, value in each.items()}
-    nodes = {name: _of(drives, name).node for name in NAMES}
-    moved = {name: int(changes[f"drives.{name}.node"]) for name in NAMES if f"drives.{name}.node" in changes}
-    after = {**nodes, **moved}
-    left = [node for node in nodes.values() if node not in after.values()]
-    for name in NAMES:
-        doubled = name not in moved and after[name] in moved.values()
-        if doubled and left:
-            after[name] = left.pop(0)
-    if len(set(after.values())) < len(NAMES):
-        kept = {key: value for key, value in changes.items() if not key.endswith(".node")}
-        return kept, "two drives were seen to move one slider: look at the cables, and repeat those steps"
-    for name, node in after.items():
-        changes.pop(f"drives.{name}.node", None)
-        if node != nodes[name]:
-            changes[f"drives.{name}.node"] = node
-    return dict(sorted(changes.items())), ""
 
 
 def _of(drives: Drives, name: str) -> Drive:

@@ -11,7 +11,7 @@ from trirail_drivers.interface import NAMES
 
 from trirail.commissioning import configuration
 from trirail.commissioning.bench import INTERRUPTED
-from trirail.commissioning.coupling import merged
+from trirail.commissioning.exchange import merged
 from trirail.commissioning.judgement import Judged
 from trirail.commissioning.person import Person, Question, choose
 from trirail.commissioning.report import Keeper
@@ -186,6 +186,8 @@ class Guide:
         if changes:
             written = out or configuration.free_name(self._path)
             text = configuration.changed(self._path.read_text(encoding="utf-8"), changes)
+            if self._keeper.report.simulated and self._config.can.simulated.built is None:
+                text = configuration.with_built(text, self._config.drives)
             if written.parent.resolve() != self._path.parent.resolve():
                 text = configuration.with_whole_paths(text, self._path.parent)
             configuration.write(written, text)

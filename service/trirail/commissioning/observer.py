@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from trirail_drivers.interface import NAMES
+from trirail_drivers.interface import NAMES, Triple
 from trirail_drivers.simulated import Carriages
 
 from trirail.commissioning.bench import FOLLOWING
@@ -18,6 +18,16 @@ SEEN = 0.00005
 
 Rules = tuple[float, ...]
 """What rules beside the sliders A, B, C read [m]."""
+
+
+Reading = tuple[float, Triple]
+"""What the rule reads at a slider, and where the drives say that theirs are [m]."""
+
+
+def apart(one: Reading, other: Reading) -> Reading:
+    """Return how far it is from one reading to another."""
+    a, b, c = (now - was for now, was in zip(other[1], one[1], strict=True))
+    return other[0] - one[0], (a, b, c)
 
 
 class Observer:
@@ -52,6 +62,14 @@ class Observer:
         """Return a length that is asked for in mm [m]."""
         default = None if simulated is None else f"{simulated * 1e3 + 0.0:.2f}"
         return number(self._person, self._idle, Question(text, default)) / 1e3
+
+    def gone(self, name: str, slider: str, before: float, was: Rules | None, now: Rules | None, verb: str) -> float:
+        """Return how far a slider went [m]: its drive's own since the rule read `before`, another one's as is told."""
+        index = NAMES.index(slider)
+        if slider == name:
+            return self.reading(index) - before
+        text = f"How far did slider {slider} {verb}, in mm, above 0 in its positive direction?"
+        return self.number(text, now[index] - was[index] if now and was else None)
 
     def which(self, before: Rules | None, now: Rules | None) -> str | None:
         """Ask which slider has moved, from what rules read before to what they read now."""

@@ -19,7 +19,7 @@ from trirail.commissioning.judgement import (
     judge_switches,
     judge_watchdog,
 )
-from trirail.commissioning.observer import Observer
+from trirail.commissioning.observer import Observer, Reading, apart
 from trirail.commissioning.person import Question, choose
 from trirail.commissioning.report import Number
 from trirail.commissioning.session import Done, Session
@@ -48,24 +48,33 @@ class Steps:
     # Without power.
 
     def push(self, name: str) -> Done:
-        """Have a slider pushed by hand, without power."""
+        """Have a slider pushed there and back by hand, without power."""
         bench, index = self.session.bench(), NAMES.index(name)
         read_to = self._see.read_to()
         angle = np.degrees(geometry(self._config.geometry).legs[index].rail_angle)
         self._person.tell(
             f"  Put the rule along rail {name}, its numbers rising towards {angle:.0f}° (0° is x, 90° is y)."
         )
-        before, counted = self._see.reading(index), bench.position
+        before = self._see.reading(index), bench.position
+        there = self._pushed(index, PUSH, f"Push slider {name} by {PUSH * 1e3:g} mm or more, that way, and let it go.")
+        back = self._pushed(index, -PUSH, f"Push slider {name} back to about where it was, and let it go.")
+        (rule, ways), (rule_back, ways_back) = apart(before, there), apart(there, back)
+        seen = PushSeen(name, rule, ways, rule_back, ways_back, read_to, self._step(name))
+        measured: dict[str, Number] = {"rule": rule, "rule_back": rule_back, "read_to": read_to}
+        measured |= dict(zip(NAMES, ways, strict=True))
+        measured |= {f"{each}_back": way for each, way in zip(NAMES, ways_back, strict=True)}
+        return judge_push(seen, self._config.drives), measured
+
+    def _pushed(self, index: int, by: float, text: str) -> Reading:
+        """Have a slider pushed; where the rule and the drives then say that it is."""
+        bench = self.session.bench()
         if self._place.rules is None:
-            self._person.tell(f"  Push slider {name} by {PUSH * 1e3:g} mm or more, that way, and let it go.")
+            self._person.tell(f"  {text}")
         else:
-            self._place.rules.push(index, PUSH)
+            self._place.rules.push(index, by)
             bench.wait(HOLD / 10.0)
-            self._person.tell(f"  A simulated hand has pushed slider {name} that way.")
-        after = self._see.reading(index)
-        a, b, c = (now - was for now, was in zip(bench.position, counted, strict=True))
-        seen = PushSeen(name, after - before, (a, b, c), read_to, self._step(name))
-        return judge_push(seen, self._config.drives), {"rule": seen.rule, "A": a, "B": b, "C": c, "read_to": read_to}
+            self._person.tell(f"  A simulated hand has pushed slider {NAMES[index]} {by * 1e3:+g} mm that way.")
+        return self._see.reading(index), bench.position
 
     def switches(self, name: str) -> Done:
         """Have the switches of a slider pressed by hand, without power."""
@@ -119,23 +128,24 @@ class Steps:
         there = self._moved(index, asked)
         rules = self._see.rules()
         slider = self._see.which(before_all, rules)
-        measured: dict[str, Number] = {"asked": asked, "out": there.way, "following": there.following, "slider": slider}
-        if slider in (None, name):
-            rule_out = self._see.reading(index) - before if slider else 0.0
-        else:
-            other = NAMES.index(slider)
-            away = f"How far did slider {slider} go, in mm, above 0 in its positive direction?"
-            rule_out = self._see.number(away, rules[other] - before_all[other] if rules and before_all else None)
-        rule_back = 0.0
+        measured: dict[str, Number] = {"asked": asked, "out": there.way, "slider": slider}
+        rule_out = rule_back = back_way = 0.0
+        if slider is not None:
+            rule_out = self._see.gone(name, slider, before, before_all, rules, "go")
         if slider is not None and not there.stopped:
             back = self._moved(index, -asked)
+            back_way = back.way
             there = there._replace(stopped=back.stopped, following=max(there.following, back.following))
+            now = self._see.rules()
             if slider == name:
-                rule_back = self._see.reading(index) - before
+                rule_back = self._see.gone(name, slider, before, before_all, now, "go")
+            else:
+                rule_back = rule_out + self._see.gone(name, slider, before, rules, now, "go back")
         seen = MoveSeen(
             name,
             asked,
             there.way,
+            back_way,
             there.following,
             there.stopped,
             slider,
@@ -144,7 +154,8 @@ class Steps:
             read_to,
             self._step(name),
         )
-        measured |= {"rule_out": rule_out, "rule_back": rule_back, "stopped": there.stopped, "read_to": read_to}
+        measured |= {"back": back_way, "following": there.following, "stopped": there.stopped}
+        measured |= {"rule_out": rule_out, "rule_back": rule_back, "read_to": read_to}
         return judge_move(seen, drives), measured
 
     def home(self, name: str) -> Done:
