@@ -72,7 +72,7 @@ def _section(name: str, row: Row, values: Mapping[tuple[int, int], int]) -> str:
 def _default(index: int, subindex: int, value: int | float | str) -> str:
     """An identifier that follows the node id, or a plain value."""
     identifier = (index, subindex) == (0x1014, 0) or (
-        subindex in (1, 2) and (0x1200 <= index < 0x1280 or (subindex == 1 and index & 0xFA00 in (0x1400, 0x1800)))
+        subindex in (1, 2) and (0x1200 <= index < 0x1280 or (subindex == 1 and index & 0xFE00 in (0x1400, 0x1800)))
     )
     if identifier and isinstance(value, int) and (value & 0x7FF) - 1 in _BY_NODE:
         return f"$NODEID+0x{value - 1:X}"

@@ -240,7 +240,7 @@ class ForeignDrive:
                 raise SdoAbortedError(0x0609_0030)  # CiA 301: not while it is valid
         if index & 0x200 and 0x1600 <= index < 0x1C00:
             self._mapped(index, subindex, value)
-        if index & 0xFA00 == 0x1800 and subindex == 3 and not self.value(index, 1) & 1 << 31:
+        if index & 0xFE00 == 0x1800 and subindex == 3 and not self.value(index, 1) & 1 << 31:
             raise SdoAbortedError(0x0609_0030)  # CiA 301: the inhibit time only while it is invalid
         if index == 0x1019 and self.value(0x1006):
             raise SdoAbortedError(0x0800_0022)  # CiA 301: the counter changes only while the period is 0

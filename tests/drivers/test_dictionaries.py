@@ -109,7 +109,7 @@ def test_power_on_values_are_the_dictionarys(make: str, tmp_path: Path) -> None:
         found = int.from_bytes(client.upload(index, subindex), "little", signed=kind in SIGNED)
         assert isinstance(default, int)
         by_node = (
-            index == 0x1014 or (subindex and index == 0x1200) or (subindex == 1 and index & 0xFA00 in (0x1400, 0x1800))
+            index == 0x1014 or (subindex and index == 0x1200) or (subindex == 1 and index & 0xFE00 in (0x1400, 0x1800))
         )
         own = by_node and default & 0x7F == 1
         assert found == default + (NODE - 1 if own else 0), f"{index:04X}:{subindex:02X}"
