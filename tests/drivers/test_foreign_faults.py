@@ -154,7 +154,9 @@ def test_a_second_node_with_the_same_id_is_noticed(rig: Rig, apart: int) -> None
             if feedback.fault is not None:
                 break
     assert feedback.fault is not None
-    assert feedback.fault.message == "drive C: two nodes answer as node 3: each SYNC has two positions"
+    assert feedback.fault.message == (
+        "drive C: a second node with id 3 on the bus: each SYNC has two positions; give each its own node id"
+    )
 
 
 def test_a_second_node_with_the_same_id_is_refused_by_the_set_up() -> None:
@@ -163,9 +165,60 @@ def test_a_second_node_with_the_same_id_is_refused_by_the_set_up() -> None:
     first = rig.nodes[2]
     channel = can.Bus(first.bus.channel_info.removeprefix("Virtual bus channel "), interface="virtual")
     rig.wires.nodes.append(ForeignDrive("elmo_gold", first.node, channel, rig.clock, first.truth))
-    with pytest.raises(DriveError, match="drive C: two nodes answer as node 3"):
+    with pytest.raises(DriveError, match="drive C: a second node with id 3 on the bus"):
         rig.ready()
     rig.drives.close()
+
+
+@pytest.mark.parametrize("frame", [b"\x00", b"\x7f"])
+@pytest.mark.parametrize("after", [0, 7])
+def test_a_second_node_that_is_plugged_in_is_named(rig: Rig, frame: bytes, after: int) -> None:
+    """It boots, or sends heartbeats of its own, while the drive goes on: all stop at once, and soon it is known why."""
+    for _ in range(after):
+        rig.cycle(rig.commanded)
+    with stranger(rig) as bus:
+        bus.send(can.Message(arbitration_id=0x702, data=frame, is_extended_id=False))
+        assert stopped_within(rig, 1).startswith("drive B: ")
+        for _ in range(6):
+            feedback = rig.cycle()
+    assert feedback.fault is not None
+    assert feedback.fault.message.startswith("drive B: a second node with id 2 on the bus: one has booted, or is not")
+    rig.drives.reset()
+    for _ in range(100):
+        feedback = rig.cycle()
+    assert feedback.fault is None, "it has gone"
+
+
+def test_a_second_drive_that_is_plugged_in_is_named(rig: Rig) -> None:
+    first = rig.nodes[1]
+    channel = can.Bus(first.bus.channel_info.removeprefix("Virtual bus channel "), interface="virtual")
+    second = ForeignDrive("elmo_gold", first.node, channel, rig.clock, first.truth, 0.2)
+    rig.wires.nodes.append(second)
+    second.boot()
+    said = rig.cycle(rig.commanded).fault
+    assert said is not None
+    assert "drive B: has restarted" in said.message
+    for _ in range(6):
+        feedback = rig.cycle()
+    assert feedback.fault is not None
+    assert feedback.fault.message.startswith("drive B: a second node with id 2 on the bus")
+
+
+@pytest.mark.parametrize("in_flight", [False, True])
+def test_a_drive_that_has_left_operational_is_no_second_one(rig: Rig, in_flight: bool) -> None:
+    node, way = rig.nodes[1], rig.drives._axes[1].way
+    pdo = next(index for index in node._pdos(0x1800) if node.value(index, 1) & 0x7FF == way.feedback.identifier)
+    position = can.Message(arbitration_id=way.feedback.identifier, data=node._packed(pdo), is_extended_id=False)
+    deaf(node, PRE_OPERATIONAL)
+    with stranger(rig) as bus:
+        bus.send(can.Message(arbitration_id=0x702, data=b"\x7f", is_extended_id=False))
+        if in_flight:
+            bus.send(position)
+        assert "left NMT operational" in stopped_within(rig, 1)
+        for _ in range(20):
+            feedback = rig.cycle()
+    assert feedback.fault is not None
+    assert "left NMT operational" in feedback.fault.message
 
 
 def test_a_restart_is_noticed(rig: Rig) -> None:

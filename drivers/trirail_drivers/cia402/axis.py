@@ -6,7 +6,7 @@ import math
 
 from trirail_drivers.cia402 import frames, ways
 from trirail_drivers.cia402.codes import words
-from trirail_drivers.cia402.second_node import AnswersPerSync
+from trirail_drivers.cia402.second_node import AnswersAfter, AnswersPerSync, told
 from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives
@@ -38,6 +38,7 @@ class Cia402Axis(Axis):
     """One drive's newest feedback; the `on_` methods take a frame's data or raise struct.error."""
 
     __slots__ = (
+        "_answers_after",
         "_answers_per_sync",
         "_followed",
         "_operational",
@@ -122,7 +123,7 @@ class Cia402Axis(Axis):
         """Its error register 1001h is to be asked for."""
         self._operational = self._restarted = self._followed = self.stopped = False
         self._unfollowed_since: float | None = None
-        self._answers_per_sync = AnswersPerSync(scale.counts_per_metre)
+        self._answers_per_sync, self._answers_after = AnswersPerSync(scale.counts_per_metre), AnswersAfter()
         self._stands_at, self._stands_since = 0, math.inf
 
     def on_position(self, data: bytes | bytearray, now: float) -> None:
@@ -203,10 +204,19 @@ class Cia402Axis(Axis):
             self.reset_until = -math.inf
         self.state = state
 
-    def cycle_over(self) -> None:
-        """Note that the frames of a cycle are in: a node answers a SYNC once."""
+    def cycle_over(self) -> DriveFault | None:
+        """Note that the frames of a cycle are in: a node answers a SYNC once, and only while it is operational.
+
+        Returns what this drive was said to have done, and another node of its id has: `event` says so from now on.
+        """
+        mistaken = self._answers_after.of_another(came=self._answers_per_sync.came)
         if self._answers_per_sync.from_two_nodes():
-            self.tell("frame", 0, f"two nodes answer as node {self.node}: each SYNC has two positions")
+            self.tell("frame", 0, told(self.node, "each SYNC has two positions"))
+        if mistaken is not None:
+            self._restarted = self.left_operational = self.mute = False
+            by = "one has booted, or is not operational, and the other goes on"
+            self.event = self.made("frame", 0, told(self.node, by))
+        return mistaken
 
     @property
     def shown_state(self) -> PowerState:
@@ -238,9 +248,11 @@ class Cia402Axis(Axis):
             self.state = PowerState.NOT_READY_TO_SWITCH_ON
             # Takes the place of an earlier event, for it is the one that a reset cannot help.
             self.event = self.made("state", 0, "has restarted and lost its set-up; restart the service")
+            self._answers_after.begin(self.event)
         elif self._operational:  # before that, it is a heartbeat from before the drive was started
             self.leave_operational()
             self.tell("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
+            self._answers_after.begin(self.event)
         self.mute = self.left_operational and state != frames.OPERATIONAL
 
     def leave_operational(self) -> None:
@@ -256,6 +268,7 @@ class Cia402Axis(Axis):
 
     def forgive(self, now: float) -> None:
         """Forget what happened, but not what lasts, and allow time for a fault reset."""
+        self._answers_after.forget()
         if not self._restarted:
             self.event = None
         if self.state is PowerState.FAULT or self.left_operational:  # not operational, it did not tell of a fault

@@ -111,7 +111,9 @@ class Cia402(Driver[Cia402Axis]):
         a, b, c = self._axes
         for axis in self._axes:
             axis.answers.read_over()
-            axis.cycle_over()
+            mistaken = axis.cycle_over()
+            if mistaken is not None and self._wire.fault is mistaken:
+                self._wire.fault = axis.event
             fault = axis.fault(now, _asked_of(axis, self._wanted)) if self._wire.fault is None else None
             if fault is not None:
                 self._wire.fail(fault)

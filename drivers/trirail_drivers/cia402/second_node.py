@@ -1,8 +1,13 @@
-"""Whether two nodes have one node id, which CiA 301 has no means against: then each SYNC has two positions."""
+"""Whether two nodes have one node id, which CiA 301 has no means against.
+
+Then each SYNC has two positions; or one node boots, or is not operational, and the other goes on with its positions.
+"""
 
 from __future__ import annotations
 
 from typing import Final
+
+from trirail_drivers.interface import DriveFault
 
 FAR: Final = 0.005
 """Positions that answer one SYNC and are so far apart [m] are those of two sliders."""
@@ -12,6 +17,44 @@ COUNTED: Final = 20
 """SYNCs over which those with two positions are counted, however near these are."""
 MOST: Final = 15
 """Of them one node's may be so many: where every other answer comes a cycle late, every other SYNC has two."""
+ANSWERS_AFTER: Final = 3
+"""So many SYNCs that are answered after a node was heard to be not operational are answered by another: the PDOs of the
+one have ended, but for one that was on its way."""
+
+
+def told(node: int, by: str) -> str:
+    """What people are to know of it."""
+    return f"a second node with id {node} on the bus: {by}; give each its own node id"
+
+
+class AnswersAfter:
+    """Whether positions go on after a boot-up message, or a heartbeat of a node that sends none (CiA 301, NMT)."""
+
+    __slots__ = ("_answers", "_said")
+
+    def __init__(self) -> None:
+        self._said: DriveFault | None = None
+        self._answers = 0
+
+    def begin(self, said: DriveFault | None) -> None:
+        """Count from now on; `said` is what was told of the node."""
+        if self._said is None:
+            self._said, self._answers = said, 0
+
+    def forget(self) -> None:
+        """Look no more: the node may be started again."""
+        self._said = None
+
+    def of_another(self, *, came: bool) -> DriveFault | None:
+        """After a cycle in which a position came or not: what was told of a node, where another one has gone on."""
+        said = self._said
+        if said is None:
+            return None
+        self._answers += came
+        if self._answers < ANSWERS_AFTER:
+            return None
+        self._said = None
+        return said
 
 
 class AnswersPerSync:
@@ -28,6 +71,11 @@ class AnswersPerSync:
         self._newest = self._step = 0
         self._came = self._two = self._far = False
         self._far_in_a_row = self._cycles = self._with_two = 0
+
+    @property
+    def came(self) -> bool:
+        """Whether a position has come in this cycle."""
+        return self._came
 
     def come(self, counts: int) -> None:
         """A position has come."""
