@@ -13,9 +13,10 @@ import msgspec
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from trirail.cli import doctor, probes
-from trirail.cli.doctor import Check, Machine, Passed
+from trirail.cli import doctor, doctor_network, probes
+from trirail.cli.machine import Machine, Passed
 from trirail.config import SIM, Config, Tls, load
+from trirail.diagnosis import Check, drives
 from trirail.errors import ServiceError
 from trirail.processes.clock import Tick
 from trirail_drivers.bus.frames import bits_of, frame_bits
@@ -208,7 +209,7 @@ def test_protections_that_drives_may_lack_are_listed_once_each_with_their_drives
 )
 def test_bus_load(bitrate: int, rate: int, verdict: str) -> None:
     config = changed(changed(REAL, "can", bitrate=bitrate), "loop", rate_hz=rate)
-    assert doctor.load(config).verdict == verdict
+    assert next(drives.load(config)).verdict == verdict
 
 
 RATES = st.sampled_from([1, 10, 50, 100, 125, 200, 250, 400, 500, 800, 1000, 1250, 2000, 4000])
@@ -229,7 +230,7 @@ def test_the_bus_load_is_judged_as_the_driver_does(protocol: str, rate: int, bit
     clock = count(1000.0, 1e-6)
     bus = simulated_bus(config.can, config.drives, lambda: next(clock))
     driver = PROTOCOLS[protocol].driver(bus, bitrate, config.drives, lambda: next(clock))
-    check = doctor.load(config)
+    check = next(drives.load(config))
     refused = ""
     try:
         driver.configure(config.period)
@@ -291,13 +292,13 @@ def test_the_command(json_wanted: bool) -> None:
 )
 def test_who_can_read_the_metrics_is_told(address: str, tls: bool, verdict: str, by: str) -> None:
     config = changed(SIMULATED, "telemetry", metrics_port=9464, metrics_address=address)
-    (check,) = doctor.metrics(changed(config, "zenoh", tls=Tls() if tls else None))
+    (check,) = doctor_network.metrics(changed(config, "zenoh", tls=Tls() if tls else None))
     assert (check.verdict, check.found) == (verdict, f"tcp/{address}:9464: {by} can read them")
-    assert doctor.metrics(SIMULATED) == []
+    assert doctor_network.metrics(SIMULATED) == []
 
 
 def test_whether_the_routers_answer_is_told() -> None:
-    good, bad = doctor.routers([("tls/192.0.2.9:7447", ""), ("tls/192.0.2.8:7447", "connection refused")])
+    good, bad = doctor_network.routers([("tls/192.0.2.9:7447", ""), ("tls/192.0.2.8:7447", "connection refused")])
     assert (good.verdict, good.found) == ("ok", "tls/192.0.2.9:7447 answers")
     assert (bad.verdict, bad.found) == ("warning", "tls/192.0.2.8:7447: connection refused")
     assert bad.remedy

@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 from certificates import tls_config, user
 from conftest import CONFIG
-from trirail.cli import doctor, terminal
+from trirail.cli import doctor_network, terminal
 from trirail.cli.key_folder import KeyFolder
+from trirail.cli.machine import Machine
 from trirail.client.client import Robot
 from trirail.config import Config, Tls, Zenoh
 from trirail.errors import RefusalCode, RefusedError, ServiceError
@@ -308,8 +309,8 @@ def test_a_socket_lets_its_owner_and_group_in_and_nobody_else(tmp_path: Path) ->
 def test_the_doctor_tells_who_can_reach_it(served: Served, tmp_path: Path) -> None:
     def said(zenoh: Zenoh, guard: Guard | str | None = None) -> list[tuple[str, str, str]]:
         config = msgspec.structs.replace(CONFIG, zenoh=zenoh)
-        machine = doctor.Machine("", True, True, (), None, 0.0, 0, None, (), None, (), guard=guard)
-        return [(check.name, check.verdict, check.found) for check in doctor.network(config, machine)]
+        machine = Machine("", True, True, (), None, 0.0, 0, None, (), None, (), guard=guard)
+        return [(check.name, check.verdict, check.found) for check in doctor_network.network(config, machine)]
 
     reached = "tcp/127.0.0.1:7447: every user of this machine can command"
     assert said(Zenoh()) == [("network", "ok", reached)]

@@ -2,27 +2,58 @@
 
 from __future__ import annotations
 
-from trirail_drivers.cia402 import makers_objects, settings, units
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+from trirail_drivers.cia402 import eds, makers_objects, settings, units
 from trirail_drivers.config import Drive, Drives
-from trirail_drivers.driver.requirements import Requirements, check_resolution
-from trirail_drivers.driver.scaling import INT32_MAX, Scale, scale_of
+from trirail_drivers.driver.requirements import Requirements, Rule, resolution
+from trirail_drivers.driver.scaling import INT32_MAX, scale_of
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
 
 
-def check(drives: Drives, required: Requirements) -> None:
-    """Refuse what a drive cannot be told, take or resolve. Raises DriveError with the key."""
-    settings.check_nodes(drives)
+def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
+    """Yield what refuses settings that a drive cannot be told, take or resolve."""
+    nodes = tuple(f"drives.{name}.node" for name in NAMES)
+    yield Rule("drives.master_node", nodes, partial(settings.check_nodes, drives))
     for name, drive in zip(NAMES, drives.each, strict=True):
-        scale = scale_of(name, drive)
-        check_resolution(name, drive, drives, required, 1.0 / drive.counts_per_metre, _finer)
-        _check_counts(name, drive, scale, required)
-        units.check(name, drive)
-        makers_objects.check(name, drive)
-        _check_velocity(name, drive, required)
-        units.Units(scale, scale.counts_per_metre, 1.0).length(name, "following_error", drives.following_error)
-    settings.heartbeat_of(drives)
-    settings.interpolation_periods(required.period)
+        table = f"drives.{name}"
+        counts, scale = f"{table}.counts_per_metre", (f"{table}.offset", f"{table}.direction")
+        yield Rule(counts, scale, partial(scale_of, name, drive))
+        yield from resolution(name, drive, drives, required, 1.0 / drive.counts_per_metre, _finer)
+        limits = "limits.slider", "can.simulated.start"
+        yield Rule(counts, (*scale, *limits), partial(_check_counts, name, drive, required))
+        for key in ("velocity_unit", "acceleration_unit"):
+            yield Rule(f"{table}.{key}", (), partial(units.check, name, drive, key))
+        for number in range(len(drive.write)):
+            yield Rule(f"{table}.write[{number}]", (), partial(makers_objects.check, name, drive, number))
+        reads = counts, f"{table}.revolutions_per_metre", "limits.slider.velocity"
+        yield Rule(f"{table}.velocity_unit", reads, partial(_check_velocity, name, drive, required))
+        yield Rule("drives.following_error", (counts, *scale), partial(_check_window, name, drive, drives))
+    yield Rule("drives.heartbeat", (), partial(settings.heartbeat_of, drives))
+    yield Rule("loop.rate_hz", (), partial(settings.interpolation_periods, required.period))
+
+
+def files(drives: Drives) -> Iterator[Rule]:
+    """Yield what refuses an EDS that is not there, or is none."""
+    for name, drive in zip(NAMES, drives.each, strict=True):
+        if drive.eds is not None:
+            yield Rule(f"drives.{name}.eds", (), partial(_check_eds, name, drive))
+
+
+def _check_eds(name: str, drive: Drive) -> None:
+    try:
+        eds.load(name, Path(drive.eds or ""), drive.node)
+    except DriveError as error:
+        raise DriveError(f"drives.{name}.eds = {drive.eds!r}: {error}; correct the name, or leave it out") from error
+
+
+def _check_window(name: str, drive: Drive, drives: Drives) -> None:
+    """The drive's own following error window is a 32-bit number."""
+    scale = scale_of(name, drive)
+    units.Units(scale, scale.counts_per_metre, 1.0).length(name, "following_error", drives.following_error)
 
 
 def _check_velocity(name: str, drive: Drive, required: Requirements) -> None:
@@ -38,8 +69,9 @@ def _finer(widest: float) -> str:
     return f"wanted counts_per_metre of at least {1.0 / widest:g}"
 
 
-def _check_counts(name: str, drive: Drive, scale: Scale, required: Requirements) -> None:
+def _check_counts(name: str, drive: Drive, required: Requirements) -> None:
     """Setpoints, positions and feed-forward are 32-bit integers."""
+    scale = scale_of(name, drive)
     reach = max(abs(scale.exact(required.low)), abs(scale.exact(required.high)))
     # A position may be a following error beyond the travel, and a velocity a little beyond its limit.
     if reach + drive.counts_per_metre * required.following_error >= INT32_MAX:

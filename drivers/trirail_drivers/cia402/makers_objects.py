@@ -25,14 +25,13 @@ _ADDRESSES: Final = {
 _NAMED_SO: Final = re.compile(r"node.?id|bit.?rate|baud", re.IGNORECASE)
 
 
-def check(name: str, drive: Drive) -> None:
-    """Refuse with DriveError what a configuration may not write to the drive called `name`."""
-    seen: set[Key] = set()
-    for each in drive.write:
-        key = each.object, each.sub
-        if why := owned(key) or ("is there twice" if key in seen else ""):
-            raise DriveError(f"drives.{name}.write: object {named(key)} {why}")
-        seen.add(key)
+def check(name: str, drive: Drive, number: int) -> None:
+    """Refuse with DriveError what a configuration may not write to the drive called `name`: entry `number` of it."""
+    each = drive.write[number]
+    key = each.object, each.sub
+    twice = key in [(other.object, other.sub) for other in drive.write[:number]]
+    if why := owned(key) or ("is there twice" if twice else ""):
+        raise DriveError(f"drives.{name}.write: object {named(key)} {why}")
 
 
 def owned(key: Key) -> str:

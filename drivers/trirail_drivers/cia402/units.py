@@ -18,7 +18,7 @@ import math
 import re
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Final, Literal
 
 from trirail_drivers.config import Drive
 from trirail_drivers.driver.scaling import INT32_MAX, UINT32_MAX, Scale
@@ -148,14 +148,11 @@ def written(key: str, text: str, power: int) -> Unit:
     raise DriveError(f'{key} = "{text}" is no unit of {kind}; wanted one as {shown}')
 
 
-def check(name: str, drive: Drive) -> None:
-    """Refuse with DriveError what the configuration of the drive called `name` says of units and is none."""
-    for key, text, power in (
-        ("velocity_unit", drive.velocity_unit, 1),
-        ("acceleration_unit", drive.acceleration_unit, 2),
-    ):
-        if text is not None:
-            written(f"drives.{name}.{key}", text, power)
+def check(name: str, drive: Drive, key: Literal["velocity_unit", "acceleration_unit"]) -> None:
+    """Refuse with DriveError what the configuration of the drive called `name` says of a unit and is none."""
+    text: str | None = getattr(drive, key)
+    if text is not None:
+        written(f"drives.{name}.{key}", text, 1 if key == "velocity_unit" else 2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import partial
+
 from trirail_drivers.config import Can, Drives
-from trirail_drivers.driver.requirements import Requirements
+from trirail_drivers.driver.requirements import Requirements, Rule
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
@@ -16,31 +19,54 @@ _CLASSICAL = 1_000_000
 """The highest bitrate of classical CAN (ISO 11898-2) [bit/s]."""
 
 
-def check_bus(section: Can) -> None:
-    """Refuse a bitrate that no wire has, and options that python-can cannot take. Raises DriveError with the key."""
+def bus_rules(section: Can) -> Iterator[Rule]:
+    """Yield what refuses a bitrate that no wire has, and options that python-can cannot take."""
+    yield Rule("can.bitrate", ("can.interface",), partial(_check_bitrate, section))
+    for name in section.options:
+        yield Rule(f"can.options.{name}", ("can.interface",), partial(_check_option, section, name))
+
+
+def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
+    """Yield what refuses settings that a drive cannot be told, take or resolve."""
+    yield Rule("drives.heartbeat", ("loop.rate_hz",), partial(_check_heartbeat, drives, required))
+    for name, drive in zip(NAMES, drives.each, strict=True):
+        for protection in drive.accept_without:
+            key = f"drives.{name}.accept_without"
+            yield Rule(key, ("drives.protocol",), partial(_check_protection, key, protection, drives.protocol))
+    for rule in PROTOCOLS[drives.protocol].rules(drives, required):
+        yield rule._replace(reads=("drives.protocol", *rule.reads))
+
+
+def files(drives: Drives) -> Iterator[Rule]:
+    """Yield what refuses files that the settings name, by reading them."""
+    return PROTOCOLS[drives.protocol].files(drives)
+
+
+def _check_bitrate(section: Can) -> None:
     if section.bitrate > _CLASSICAL and section.interface not in _OWN:
         raise DriveError(
             f"can.bitrate = {section.bitrate}: classical CAN ends at {_CLASSICAL} bit/s; "
             f"only {' and '.join(_OWN)}, which have no wire, go beyond"
         )
-    for name in section.options:
-        if section.interface in _OWN:
-            raise DriveError(f'can.options.{name}: "{section.interface}" has no options, python-can\'s interfaces have')
-        if name in _ELSEWHERE:
-            raise DriveError(f"can.options.{name}: interface, channel and bitrate stand in [can]; the rest is fixed")
 
 
-def check(drives: Drives, required: Requirements) -> None:
-    """Refuse what a drive cannot be told, take or resolve. Raises DriveError with the key."""
+def _check_option(section: Can, name: str) -> None:
+    if section.interface in _OWN:
+        raise DriveError(f'can.options.{name}: "{section.interface}" has no options, python-can\'s interfaces have')
+    if name in _ELSEWHERE:
+        raise DriveError(f"can.options.{name}: interface, channel and bitrate stand in [can]; the rest is fixed")
+
+
+def _check_heartbeat(drives: Drives, required: Requirements) -> None:
     if drives.heartbeat < required.period:
         raise DriveError(
             f"drives.heartbeat = {drives.heartbeat:g}: heartbeats go out with the cycle; "
             f"wanted at least its period, {required.period:g} s"
         )
-    protocol = PROTOCOLS[drives.protocol]
-    known = ", ".join(protocol.protections) or "none"
-    for name, drive in zip(NAMES, drives.each, strict=True):
-        for protection in drive.accept_without:
-            if protection not in protocol.protections:
-                raise DriveError(f'drives.{name}.accept_without: "{protection}" is no protection; there are {known}')
-    protocol.check(drives, required)
+
+
+def _check_protection(key: str, protection: str, protocol: str) -> None:
+    protections = PROTOCOLS[protocol].protections
+    if protection not in protections:
+        known = ", ".join(protections) or "none"
+        raise DriveError(f'{key}: "{protection}" is no protection; there are {known}')

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import partial
 from typing import Final
 
 from trirail_drivers.config import Drive, Drives
-from trirail_drivers.driver.requirements import Requirements, check_resolution
+from trirail_drivers.driver.requirements import Requirements, Rule, resolution
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
@@ -16,28 +18,37 @@ _FLOAT_DIGITS: Final = 23
 """Binary digits of an ODrive's position after the first, a 32-bit float."""
 
 
-def check(drives: Drives, required: Requirements) -> None:
-    """Refuse what a drive has not, cannot be told or cannot resolve. Raises DriveError with the key."""
+_CANOPEN_ONLY: Final = {
+    "homing": "homing is CiA 402's, an ODrive must know its position at power-on; leave the table out",
+    "eds": "an ODrive has no object dictionary; leave it out",
+    "write": "an ODrive has no object dictionary; leave it out",
+}
+
+
+def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
+    """Yield what refuses settings that a drive has not, cannot be told or cannot resolve."""
     for name, drive in zip(NAMES, drives.each, strict=True):
-        _check_canopen_only(name, drive)
-    setup.check_nodes(drives)
+        for key in _CANOPEN_ONLY:
+            yield Rule(f"drives.{name}.{key}", (), partial(_check_canopen_only, name, drive, key))
+    yield Rule("drives", tuple(f"drives.{name}.node" for name in NAMES), partial(setup.check_nodes, drives))
     for name, drive in zip(NAMES, drives.each, strict=True):
-        scale_of(name, drive)
+        counts, scale = f"drives.{name}.counts_per_metre", (f"drives.{name}.offset", f"drives.{name}.direction")
+        yield Rule(counts, scale, partial(scale_of, name, drive))
         farthest = max(abs(required.low - drive.offset), abs(required.high - drive.offset))
-        check_resolution(name, drive, drives, required, farthest * 2.0**-_FLOAT_DIGITS, _nearer)
-        _check_feed_forward(name, drive, required)
+        yield from resolution(name, drive, drives, required, farthest * 2.0**-_FLOAT_DIGITS, _nearer)
+        yield Rule("limits.slider.velocity", (counts,), partial(_check_feed_forward, name, drive, required))
 
 
-def _check_canopen_only(name: str, drive: Drive) -> None:
-    if drive.homing is not None:
-        raise DriveError(
-            f"drives.{name}.homing: homing is CiA 402's, an ODrive must know its position at power-on; "
-            "leave the table out"
-        )
-    if drive.eds is not None:
-        raise DriveError(f"drives.{name}.eds = {drive.eds}: an ODrive has no object dictionary; leave it out")
-    if drive.write:
-        raise DriveError(f"drives.{name}.write: an ODrive has no object dictionary; leave it out")
+def files(drives: Drives) -> Iterator[Rule]:  # noqa: ARG001  one signature for all
+    """Yield nothing: no file is named."""
+    return iter(())
+
+
+def _check_canopen_only(name: str, drive: Drive, key: str) -> None:
+    value = getattr(drive, key)
+    if value:
+        said = f" = {value}" if isinstance(value, str) else ""
+        raise DriveError(f"drives.{name}.{key}{said}: {_CANOPEN_ONLY[key]}")
 
 
 def _nearer(widest: float) -> str:

@@ -51,7 +51,8 @@ def mechanics_of(drive: config.Drive) -> Mechanics:
 CIA402 = Protocol(
     name="cia402",
     driver=Cia402,
-    check=checks.check,
+    rules=checks.rules,
+    files=checks.files,
     traffic=frames.TRAFFIC,
     simulated_drive=_simulated_drive,
     inspect=inspect,

@@ -34,7 +34,8 @@ def _simulated_drive(
 ODRIVE = Protocol(
     name="odrive",
     driver=Odrive,
-    check=checks.check,
+    rules=checks.rules,
+    files=checks.files,
     traffic=frames.TRAFFIC,
     simulated_drive=_simulated_drive,
     inspect=None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from trirail_drivers import config
 from trirail_drivers.bus.load import Traffic
 from trirail_drivers.cia402.backup import Restored
 from trirail_drivers.cia402.parameter_file import Saved
-from trirail_drivers.driver.requirements import Requirements
+from trirail_drivers.driver.requirements import Requirements, Rule
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import Clock, DriveGroup
 from trirail_drivers.simulated import Frames, SimulatedDevice
@@ -26,8 +26,10 @@ class Protocol:
     """As `drives.protocol` of the configuration names it."""
     driver: Callable[[can.BusABC, int, config.Drives, Clock], DriveGroup]
     """Makes the driver of three drives, from the bus, its bitrate, section [drives] and the clock."""
-    check: Callable[[config.Drives, Requirements], None]
-    """Refuses with DriveError what the drives could not carry out."""
+    rules: Callable[[config.Drives, Requirements], Iterator[Rule]]
+    """Yields what refuses settings that the drives could not carry out."""
+    files: Callable[[config.Drives], Iterator[Rule]]
+    """Yields what refuses files that the settings name, by reading them."""
     traffic: Traffic
     """What drives and service put on the bus."""
     simulated_drive: Callable[[config.Simulated, config.Drives, config.Drive, float], SimulatedDevice]

@@ -104,17 +104,23 @@ def doctor(config: Path | None = None, /, *, json: Annotated[bool, Flag] = False
     json
         Print one JSON object instead of words.
     """
-    from trirail.cli import probes
+    from trirail.cli import probes, rail_drawing
     from trirail.cli.doctor import examine
-    from trirail.config import SIM, load
+    from trirail.config import SIM, everything
+    from trirail.diagnosis import examined, stops
 
-    settings = load(config or SIM)
-    checks = examine(settings, probes.machine(settings))
+    path = config or SIM
+    found = everything(path)
+    right = None if found.mistakes else found.config
+    checks = examined(path, found) if right is None else examine(right, probes.machine(right))
     fit = all(check.verdict != "failure" for check in checks)
+    way = None if right is None else stops(right)
     if json:
-        terminal.json({"ok": fit, "checks": msgspec.to_builtins(checks)})
-    else:
-        terminal.checks(checks)
+        terminal.json({"ok": fit, "checks": msgspec.to_builtins(checks), "stops": msgspec.to_builtins(way)})
+        return 0 if fit else 1
+    terminal.checks(checks)
+    if way is not None:
+        rail_drawing.show(way)
     return 0 if fit else 1
 
 

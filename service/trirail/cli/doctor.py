@@ -1,25 +1,20 @@
-"""Judges a machine and a configuration: each check is a function of what was read, see trirail.cli.probes."""
+"""Judges a machine for a configuration: each check is a function of what was read, see trirail.cli.probes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Any
 
-from msgspec import Struct
 from trirail_drivers.bus.frames import bits_of
 from trirail_drivers.bus.load import HIGH
-from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.cli import units
-from trirail.cli.key_folder import Issued
+from trirail.cli.doctor_network import metrics, network, routers
+from trirail.cli.machine import Machine, Passed
 from trirail.config import Config, as_built
+from trirail.diagnosis import Check, Verdict, diagnose
 from trirail.processes.clock import Tick
-from trirail.processes.guard import Guard
-from trirail.wire.endpoints import ReachableBy, endpoint_of, reach
-from trirail.wire.vocabulary import Role
-
-Verdict = Literal["ok", "warning", "failure"]
 
 RELIABLE_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "riscv_clocksource")
 """Clock sources that are read without leaving the processor, or its virtual machine."""
@@ -27,56 +22,6 @@ COARSE = 1e-6
 """A clock of a coarser resolution cannot wake anybody in time [s]."""
 LATE = 0.1
 """Share of the period by which one tick in a thousand may be late."""
-
-
-class Check(Struct, frozen=True):
-    """What was looked at, what is so, and what to do about it."""
-
-    name: str
-    verdict: Verdict
-    found: str
-    remedy: str = ""
-
-
-class Passed(Struct, frozen=True):
-    """What the kernel counted on a network interface."""
-
-    seconds: float
-    """For how long [s]."""
-    frames: int
-    """Sent and received, whoever listens."""
-    data: int
-    """Bytes in them."""
-
-
-class Machine(Struct, frozen=True):
-    """What was read of the machine; None where it does not say."""
-
-    release: str
-    preempt_rt: bool
-    af_can: bool
-    lacking: tuple[str, ...]
-    """Real-time rights that the loop would lack, each with its remedy: trirail.processes.realtime.acquire."""
-    clock_source: str | None
-    resolution: float
-    """Of the monotonic clock [s]."""
-    cpu: int
-    """The processor that the loop would stay on."""
-    governor: str | None
-    isolated: tuple[int, ...]
-    link: dict[str, Any] | None
-    """The CAN interface as `ip -details -json link` has it."""
-    ticks: tuple[Tick, ...]
-    passed: Passed | None = None
-    """What passed on the CAN interface meanwhile."""
-    adapter: str = ""
-    """What python-can's interface would lack, with the remedy; "" for nothing."""
-    guard: Guard | str | None = None
-    """Who may do what over the network, or why its certificates cannot be used."""
-    routers: tuple[tuple[str, str], ...] = ()
-    """Each endpoint of zenoh.connect with why it cannot be reached, "" where it can."""
-    issued: tuple[Issued, ...] | None = None
-    """The certificates of the authority whose folder is that of [zenoh.tls]; None where it is elsewhere."""
 
 
 def examine(config: Config, machine: Machine) -> list[Check]:
@@ -89,10 +34,8 @@ def examine(config: Config, machine: Machine) -> list[Check]:
         governor(machine.cpu, machine.governor),
         isolation(machine.cpu, machine.isolated, simulated=simulated),
         *can_interface(config, machine),
-        *protections(config),
         *corrected(config),
-        *windows(config),
-        load(config),
+        *diagnose(config),
         *network(config, machine),
         *routers(machine.routers),
         *metrics(config),
@@ -159,16 +102,6 @@ def corrected(config: Config) -> list[Check]:
     section = config.correction
     told = as_built.told(section.map, section.as_built, section.backlash)
     return [] if told is None else [Check("correction", "ok", units.correction(told))]
-
-
-def windows(config: Config) -> list[Check]:
-    """Who notices a following error first: the service, which then stops all three, or one drive, by its own fault."""
-    ours, theirs = config.limits.slider.following_error, config.drives.following_error
-    if theirs > ours:
-        return []
-    found = f"drives.following_error = {theirs:g} m is not more than limits.slider.following_error, {ours:g} m"
-    remedy = f"a drive faults before the service stops all three: drives.following_error beyond {ours:g}"
-    return [Check("following error", "warning", found, remedy)]
 
 
 def can_interface(config: Config, machine: Machine) -> list[Check]:
@@ -244,102 +177,6 @@ def _queue(name: str, length: int | None, most_sent: int) -> Check:
         return Check(f"{name} queue", "ok", f"{length or 'unknown number of'} frames")
     found = f"{length} frames; two cycles may come together and take {wanted}"
     return Check(f"{name} queue", "warning", found, f"ip link set {name} txqueuelen 100")
-
-
-def protections(config: Config) -> list[Check]:
-    """What the configuration lets the drives lack of what would stop them where the service cannot."""
-    known = PROTOCOLS[config.drives.protocol].protections
-    drives: dict[str, list[str]] = {}
-    for name, drive in zip(NAMES, config.drives.each, strict=True):
-        for protection in drive.accept_without:
-            drives.setdefault(protection, []).append(name)
-    remedy = "named in accept_without; trirail drives CONFIG tells what each drive lacks"
-    return [
-        Check(f"lacking {name}", "warning", f"drives {', '.join(of)} may lack {name}, {known[name]}", remedy)
-        for name, of in drives.items()
-    ] or [Check("protections", "ok", "no drive may lack any")]
-
-
-def load(config: Config) -> Check:
-    """The share of the bus that the cycle takes at worst, as the driver counts it."""
-    rate, bitrate, drives = config.loop.rate_hz, config.can.bitrate, config.drives
-    traffic = PROTOCOLS[drives.protocol].traffic
-    share = traffic.bus_load(rate, bitrate, drives.heartbeat)
-    found = f"{share:.0%} of {bitrate} bit/s at {rate} Hz"
-    if share <= HIGH:
-        return Check("bus load", "ok", found)
-    remedy = f"loop.rate_hz below {HIGH * traffic.highest_rate(bitrate, drives.heartbeat):.0f}, or a higher bitrate"
-    return Check("bus load", "failure" if share > 1.0 else "warning", found, remedy)
-
-
-def network(config: Config, machine: Machine) -> list[Check]:
-    """Who can command the robot, endpoint by endpoint, and what is to be said of certificates and users."""
-    remedies = {
-        ReachableBy.MACHINE: "where others log in too: unixsock-stream/PATH lets in the socket's owner and group alone",
-        ReachableBy.NETWORK: "trirail keys init makes certificates for [zenoh.tls]",
-    }
-    found = []
-    for endpoint in config.zenoh.listen:
-        by = reach(endpoint)
-        verdict: Verdict = "warning" if by is ReachableBy.NETWORK else "ok"
-        found.append(Check("network", verdict, f"{endpoint}: {by} can command", remedies.get(by, "")))
-    if config.zenoh.tls is None:
-        return found
-    if isinstance(machine.guard, str):
-        return [*found, Check("certificates", "failure", machine.guard)]
-    if machine.guard is not None:
-        users = ", ".join(f"{user} {role}" for user, role in machine.guard.users.items())
-        found.append(Check("users", "ok" if users else "warning", users or "none, so nobody can do anything"))
-        warnings = machine.guard.certificate_warnings()
-        found += [Check("certificates", "warning", warning) for warning in warnings]
-        found += without_certificate(machine.guard.users, machine.issued)
-    return found
-
-
-def without_certificate(users: Mapping[str, Role], issued: Sequence[Issued] | None) -> list[Check]:
-    """Who has a role and no certificate with which to use it, as far as the authority's folder is here."""
-    if issued is None:
-        return []
-    known = {each.name: each for each in issued}
-    found = []
-    for user, role in users.items():
-        if user not in known:
-            found.append(
-                Check(
-                    "certificates",
-                    "warning",
-                    f"{user} has a role and no certificate",
-                    f"trirail keys add {user} --role {role}",
-                )
-            )
-        elif trouble := known[user].trouble():
-            found.append(Check("certificates", "warning", f"{user} cannot connect: {trouble}"))
-    return found
-
-
-def routers(found: Sequence[tuple[str, str]]) -> list[Check]:
-    """Whether the routers answer that users come through: without them the robot goes on for who is beside it."""
-    remedy = "start trirail router there, or correct zenoh.connect, zenoh.router and certificates"
-    return [
-        Check("router", "warning", f"{endpoint}: {why}", remedy)
-        if why
-        else Check("router", "ok", f"{endpoint} answers")
-        for endpoint, why in found
-    ]
-
-
-def metrics(config: Config) -> list[Check]:
-    """Who can read the metrics, where there are any."""
-    telemetry = config.telemetry
-    if not telemetry.metrics_port:
-        return []
-    endpoint = endpoint_of(telemetry.metrics_address, telemetry.metrics_port)
-    by = reach(endpoint)
-    if by is ReachableBy.NETWORK and config.zenoh.tls is not None:
-        by = ReachableBy.CERTIFICATE
-    verdict: Verdict = "warning" if by is ReachableBy.NETWORK else "ok"
-    remedy = "trirail keys init makes certificates for [zenoh.tls]" if by is ReachableBy.NETWORK else ""
-    return [Check("metrics", verdict, f"{endpoint}: {by} can read them", remedy)]
 
 
 def lateness(ticks: Sequence[Tick], config: Config) -> Check:

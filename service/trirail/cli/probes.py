@@ -14,8 +14,8 @@ from typing import Any
 from msgspec import structs
 from trirail_drivers.bus import adapters
 
-from trirail.cli.doctor import Machine, Passed
 from trirail.cli.key_folder import AUTHORITY_KEY, Issued, KeyFolder
+from trirail.cli.machine import Machine, Passed
 from trirail.config import Config, LoopTable
 from trirail.errors import ServiceError
 from trirail.processes import realtime

@@ -25,9 +25,9 @@ from trirail.wire.text import json_printable, printable, wall_clock
 from trirail.wire.vocabulary import Mode
 
 if TYPE_CHECKING:
-    from trirail.cli.doctor import Check
     from trirail.client.client import GoalHandle, Result, Robot
     from trirail.config import Config
+    from trirail.diagnosis import Check
 
 out = Console(highlight=False, emoji=False)
 err = Console(stderr=True, highlight=False, emoji=False)

@@ -1,8 +1,9 @@
 """A configuration: its keys (`tables`), how it is read (`loading`) and what is refused (`checks`, `explained`)."""
 
-from trirail.config.checks import check_as_built, check_reach
-from trirail.config.explained import explain
-from trirail.config.loading import SIM, load, parse
+from trirail.config.checks import check_as_built
+from trirail.config.explained import Mistake, explain, overlap
+from trirail.config.loading import SIM, Findings, everything, load, parse
+from trirail.config.network_checks import check_reach
 from trirail.config.tables import (
     BASE,
     PLATFORM,
@@ -32,12 +33,14 @@ __all__ = [
     "SIM",
     "Config",
     "ControlTable",
+    "Findings",
     "FramesTable",
     "GeometryTable",
     "InPosition",
     "LegTable",
     "Limits",
     "LoopTable",
+    "Mistake",
     "PlatformLimits",
     "Range",
     "SliderLimits",
@@ -47,10 +50,12 @@ __all__ = [
     "check_as_built",
     "check_reach",
     "corrected_geometry",
+    "everything",
     "explain",
     "geometry",
     "load",
     "metrics_url",
+    "overlap",
     "parse",
     "room",
 ]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgspec
 from trirail_drivers import files
@@ -12,11 +12,11 @@ from trirail_drivers.errors import FileError
 from trirail_drivers.interface import NAMES
 
 from trirail.config import as_built
-from trirail.config.checks import check
-from trirail.config.explained import explain, leaves
+from trirail.config.checks import check, mistakes
+from trirail.config.explained import Mistake, leaves, repaired
 from trirail.config.tables import Config, FramesTable, Limits
 from trirail.errors import ConfigError
-from trirail.wire.decoding import converted, prepare
+from trirail.wire.decoding import prepare
 
 _PACKAGED = Path(__file__).parents[1] / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[3] / "configs") / "sim.toml"
@@ -27,11 +27,8 @@ prepare(Config, Limits, FramesTable)
 def load(path: Path) -> Config:
     """Read a configuration file. Raises ConfigError with the file, the key, the value and what is allowed."""
     try:
-        text = files.text(path)
-    except FileError as error:
-        raise ConfigError(f"{error}; `trirail config copy sim` gives one to start from") from error
-    try:
-        config = _beside(path, _parsed(text))
+        config, wrong = _read(path)
+        _refuse(wrong)
         check(config)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
@@ -40,30 +37,65 @@ def load(path: Path) -> Config:
 
 def parse(text: str) -> Config:
     """Read a configuration from TOML. Raises ConfigError."""
-    config = _parsed(text)
+    config, wrong = repaired(_tables(text))
+    _refuse(wrong)
     check(config)
     return config
 
 
-def _parsed(text: str) -> Config:
-    """Read a configuration whose values are each possible by itself."""
+class Findings(NamedTuple):
+    """What a file holds, and everything in it that is refused."""
+
+    config: Config
+    """With something possible in the place of what is not."""
+    mistakes: list[Mistake]
+    left: list[str]
+    """Keys that were not looked at, for want of those that are impossible."""
+
+
+def everything(path: Path) -> Findings:
+    """Read a configuration file and find all its mistakes, where `load` ends at the first.
+
+    Raises ConfigError for what is no TOML.
+    """
+    try:
+        config, wrong = _read(path)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    more, left = mistakes(config, [each.key for each in wrong])
+    return Findings(config, [*wrong, *more], left)
+
+
+def _refuse(wrong: list[Mistake]) -> None:
+    if wrong:
+        raise ConfigError(wrong[0].text)
+
+
+def _read(path: Path) -> tuple[Config, list[Mistake]]:
+    """Read a file whose values may each be impossible. Raises ConfigError."""
+    try:
+        text = files.text(path)
+    except FileError as error:
+        without_path = str(error).removeprefix(f"{path}: ")
+        raise ConfigError(f"{without_path}; `trirail config copy sim` gives one to start from") from error
+    config, wrong = repaired(_tables(text))
+    return _beside(path, config, wrong), wrong
+
+
+def _tables(text: str) -> dict[str, Any]:
+    """Read TOML."""
     try:
         raw = tomllib.loads(text)
-        given = list(leaves(raw))
+        for _ in leaves(raw):
+            pass
     except RecursionError as error:
         raise ConfigError("not a configuration: its tables or arrays are nested too deeply") from error
     except ValueError as error:  # TOMLDecodeError, and Python's own about an integer of thousands of digits
         raise ConfigError(f"not TOML: {error}") from error
-    for key, value in given:
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ConfigError(f"{key} = {value}: it must be a finite number")
-    try:
-        return converted(raw, Config)
-    except msgspec.ValidationError as error:
-        raise ConfigError(explain(str(error), raw)) from error
+    return raw
 
 
-def _beside(path: Path, config: Config) -> Config:
+def _beside(path: Path, config: Config, wrong: list[Mistake]) -> Config:
     """The configuration with what lies relative to its file: EDS files, certificates, and what is in the map's file."""
     drives = config.drives
     for name, drive in zip(NAMES, drives.each, strict=True):
@@ -78,8 +110,7 @@ def _beside(path: Path, config: Config) -> Config:
     if correction.map is not None and correction.as_built is None:
         file = path.parent / correction.map
         try:
-            read = as_built.read(file)
+            correction = msgspec.structs.replace(correction, map=str(file), as_built=as_built.read(file))
         except ConfigError as error:
-            raise ConfigError(f"correction.map: {error}") from error
-        correction = msgspec.structs.replace(correction, map=str(file), as_built=read)
+            wrong.append(Mistake("correction.map", f"correction.map: {error}"))
     return msgspec.structs.replace(config, drives=drives, zenoh=zenoh, correction=correction)

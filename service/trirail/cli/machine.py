@@ -1,0 +1,52 @@
+"""What is read of a machine: trirail.cli.probes reads it, trirail.cli.doctor judges it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from msgspec import Struct
+
+from trirail.cli.key_folder import Issued
+from trirail.processes.clock import Tick
+from trirail.processes.guard import Guard
+
+
+class Passed(Struct, frozen=True):
+    """What the kernel counted on a network interface."""
+
+    seconds: float
+    """For how long [s]."""
+    frames: int
+    """Sent and received, whoever listens."""
+    data: int
+    """Bytes in them."""
+
+
+class Machine(Struct, frozen=True):
+    """What was read of the machine; None where it does not say."""
+
+    release: str
+    preempt_rt: bool
+    af_can: bool
+    lacking: tuple[str, ...]
+    """Real-time rights that the loop would lack, each with its remedy: trirail.processes.realtime.acquire."""
+    clock_source: str | None
+    resolution: float
+    """Of the monotonic clock [s]."""
+    cpu: int
+    """The processor that the loop would stay on."""
+    governor: str | None
+    isolated: tuple[int, ...]
+    link: dict[str, Any] | None
+    """The CAN interface as `ip -details -json link` has it."""
+    ticks: tuple[Tick, ...]
+    passed: Passed | None = None
+    """What passed on the CAN interface meanwhile."""
+    adapter: str = ""
+    """What python-can's interface would lack, with the remedy; "" for nothing."""
+    guard: Guard | str | None = None
+    """Who may do what over the network, or why its certificates cannot be used."""
+    routers: tuple[tuple[str, str], ...] = ()
+    """Each endpoint of zenoh.connect with why it cannot be reached, "" where it can."""
+    issued: tuple[Issued, ...] | None = None
+    """The certificates of the authority whose folder is that of [zenoh.tls]; None where it is elsewhere."""

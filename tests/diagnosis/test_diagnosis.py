@@ -1,0 +1,250 @@
+"""What a configuration is likely to mean otherwise: every number of every shipped file is spoilt."""
+
+from __future__ import annotations
+
+import copy
+import math
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import tomlkit
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from trirail.cli import rail_drawing
+from trirail.config import SIM, Config, everything, load, overlap
+from trirail.config.checks import rules
+from trirail.config.explained import Place, leaves, repaired
+from trirail.diagnosis import Check, examined, stops
+from trirail.diagnosis.configured import JUDGEMENTS
+from trirail.errors import TrirailError
+from trirail_drivers.errors import LONGEST
+
+FILES = sorted(SIM.parent.rglob("*.toml"))
+FACTORS = (1000, 0.001, -1)
+HARMLESS = {
+    # A better servo; a file of a recording that its size ends first; more than disks hold is for the disk to say; which
+    # way a drive counts is seen on the robot alone.
+    ("can.simulated.time_constant", 0.001),
+    ("telemetry.rotate_minutes", 1000),
+    ("telemetry.keep_mb", 1000),
+    ("drives.A.direction", -1),
+}
+WITHIN = {("vcan.toml", "can.simulated.feed_forward_gain", 0.001)}
+"""Its window takes the whole lag."""
+
+
+def key_of(place: Place) -> str:
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
+
+
+def spoilt(raw: dict[str, Any], place: Place, value: object) -> dict[str, Any]:
+    tables = copy.deepcopy(raw)
+    table: Any = tables
+    for part in place[:-1]:
+        table = table[part]
+    table[place[-1]] = value
+    return tables
+
+
+def times(value: float, factor: float) -> float:
+    """A number as people would write it: a whole one stays one."""
+    product = value * factor
+    return int(product) if isinstance(value, int) and float(product).is_integer() else product
+
+
+def wrong(path: Path) -> list[Check]:
+    """All that is told of a file, but what it lets drives lack on purpose."""
+    return [
+        check
+        for check in examined(path, everything(path))
+        if check.verdict != "ok" and not check.name.startswith("lacking")
+    ]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_nothing_false_is_said_of_what_is_shipped(path: Path) -> None:
+    assert wrong(path) == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_every_number_that_is_spoilt_is_told(path: Path, tmp_path: Path) -> None:
+    raw = tomllib.loads(path.read_text())
+    file = tmp_path / path.name
+    silent = []
+    for place, value in leaves(raw):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not value:
+            continue
+        for factor in FACTORS:
+            key = key_of(place)
+            file.write_text(tomlkit.dumps(spoilt(raw, place, times(value, factor))))
+            if not wrong(file) and (key, factor) not in HARMLESS and (path.name, key, factor) not in WITHIN:
+                silent.append(f"{key} * {factor}")
+    assert silent == []
+
+
+PLANTED: dict[str, tuple[str, str, str]] = {
+    # What is planted: what stood there, what stands there now, and what tells it.
+    "beyond the rail": ("quick_stop_deceleration = 2.0 ", "quick_stop_deceleration = 0.15 ", "rail"),
+    "power cut in motion": ("quick_stop_deceleration = 2.0 ", "quick_stop_deceleration = 0.05 ", "quick stop"),
+    "offset in millimetres": ("offset = 0.0 ", "offset = 20.0 ", "offset"),
+    "an EDS that is not there": ("[drives.B]\n", '[drives.B]\neds = "nowhere.eds"\n', "configuration"),
+    "a map that is not there": ("[drives]\n", '[correction]\nmap = "nowhere.toml"\n[drives]\n', "configuration"),
+    "too short to power up": ("enable_timeout = 5.0", "enable_timeout = 0.01", "times"),
+    "an hour to power up": ("enable_timeout = 5.0", "enable_timeout = 600.0", "times"),
+    "blind": ("heartbeat = 0.1 ", "missed_positions = 1000\nheartbeat = 0.1 ", "times"),
+    "a drive of its own kind": (
+        "[drives.B]\nnode = 2\ncounts_per_metre = 1e6", "[drives.B]\nnode = 2\ncounts_per_metre = 1e9", "drives alike",
+    ),
+    "millimetres a second": ("velocity = 0.1\n", "velocity = 100.0\n", "limits"),
+    "unknown": ("[loop]\n", "[loop]\nrate = 1000\n", "configuration"),
+    "reversed": ("x = [-0.1, 0.1] ", "x = [0.1, -0.1] ", "configuration"),
+    "no such role": ("[telemetry]\n", '[zenoh.users]\nme = "boss"\n[telemetry]\n', "configuration"),
+}  # fmt: skip
+REAL = (SIM.parent / "socketcan.toml").read_text()
+SOME = list(PLANTED)
+
+
+def planted(names: list[str]) -> str:
+    text = REAL
+    for name in names:
+        was, now, _ = PLANTED[name]
+        assert was in text, name
+        text = text.replace(was, now, 1)
+    return text
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_each_planted_mistake_is_told_with_its_key(name: str, tmp_path: Path) -> None:
+    (tmp_path / "robot.toml").write_text(planted([name]))
+    found = wrong(tmp_path / "robot.toml")
+    assert PLANTED[name][2] in {check.name for check in found}
+    assert all(check.key or check.name == "the rest" for check in found)
+    assert all("robot.toml" in check.found for check in found if check.name == "configuration")
+
+
+def test_what_is_told_of_nonsense_is_short(tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text(REAL.replace("rate_hz", "k" * 100_000).replace("l0 = 0.3", f"l0 = {'1' * 400}"))
+    found = wrong(file)
+    assert {check.key.partition(".")[0] for check in found} >= {"loop", "geometry"}
+    assert all(len(check.found) <= LONGEST and len(check.key) <= LONGEST for check in found)
+
+
+NOT_TOGETHER = (
+    {"beyond the rail", "power cut in motion", "millimetres a second"},
+    {"too short to power up", "an hour to power up"},
+)
+
+
+@settings(max_examples=25)
+@example(names={"unknown", "reversed", "no such role", "an EDS that is not there", "offset in millimetres", "blind"})
+@given(names=st.sets(st.sampled_from(SOME), min_size=2))
+def test_none_hides_another(names: set[str], tmp_path_factory: pytest.TempPathFactory) -> None:
+    """What is told of each alone is told of all together, but of what depends on one that is impossible."""
+    for group in NOT_TOGETHER:
+        names -= set(sorted(group & names)[1:])
+    folder = tmp_path_factory.mktemp("planted")
+    file = folder / "robot.toml"
+
+    def told(of: list[str]) -> set[tuple[str, str]]:
+        file.write_text(planted(of))
+        return {(check.key, check.found) for check in wrong(file) if check.name != "the rest"}
+
+    together = told(sorted(names))
+    impossible = [key for key, found in together if "robot.toml: " in found]
+    for name in sorted(names):
+        for key, found in told([name]):
+            depends = "robot.toml: " not in found and any(
+                overlap((key,), each.reads) and overlap(each.reads, impossible) for each in JUDGEMENTS
+            )
+            assert depends or (key, found) in together, name
+
+
+def numbers(raw: dict[str, Any]) -> list[tuple[Place, float]]:
+    found = leaves(raw)
+    return [(place, v) for place, v in found if isinstance(v, int | float) and not isinstance(v, bool)]
+
+
+RAW = {path.name: tomllib.loads(path.read_text()) for path in FILES}
+
+
+@settings(max_examples=150)
+@given(data=st.data(), name=st.sampled_from(sorted(RAW)), factor=st.sampled_from([1.01, 2, 0.5, 3, -1, 100, 0.01]))
+def test_every_check_names_what_it_reads(data: st.DataObject, name: str, factor: float) -> None:
+    """What stands at a key that a check does not name changes nothing of what it finds."""
+    place, value = data.draw(st.sampled_from(numbers(RAW[name])))
+    changed, mistakes = repaired(spoilt(RAW[name], place, times(value, factor)))
+    if mistakes:
+        return
+    base, key = load(SIM.parent / ("" if (SIM.parent / name).exists() else "drives") / name), key_of(place)
+    for judgement in JUDGEMENTS:
+        if not overlap(judgement.reads, [key]):
+            assert list(judgement.of(base)) == list(judgement.of(changed)), judgement
+
+    def refused(config: Config) -> list[tuple[str, str]]:
+        return [(rule.key, said(rule.check)) for rule in rules(config) if not overlap((rule.key, *rule.reads), [key])]
+
+    assert refused(base) == refused(changed)
+
+
+def said(check: Callable[[], object]) -> str:
+    try:
+        check()
+    except TrirailError as error:
+        return str(error)
+    return ""
+
+
+JUNK = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5),
+                 st.just([]), st.just({}), st.just([1, "x", 2.0]), st.just({"a": {"b": 1}}))  # fmt: skip
+
+
+@settings(max_examples=100)
+@given(data=st.data(), name=st.sampled_from(sorted(RAW)))
+def test_whatever_stands_in_a_file_all_of_it_is_told(data: st.DataObject, name: str) -> None:
+    """Of several keys with anything in them each that is refused alone is refused together; nothing raises."""
+    places = [place for place, _ in leaves(RAW[name])]
+    chosen = data.draw(st.lists(st.sampled_from(places), min_size=1, max_size=5, unique_by=lambda place: place[0]))
+    together, alone = RAW[name], []
+    for place in chosen:
+        junk = data.draw(JUNK)
+        if junk is None:
+            continue
+        together = spoilt(together, place, junk)
+        alone += repaired(spoilt(RAW[name], place, junk))[1]
+    found = repaired(together)[1]
+    assert {each.key for each in alone} == {each.key for each in found}
+    assert {each.text for each in alone} == {each.text for each in found}
+
+
+@given(v=st.floats(1e-3, 10.0), a=st.floats(0.01, 100.0), j=st.floats(0.1, 1e5), q=st.floats(0.01, 100.0))
+def test_stops_are_those_of_the_motion_itself(v: float, a: float, j: float, q: float) -> None:
+    """A controlled stop, integrated: jerk -j until -a is reached or half of v is gone, then -a, then j."""
+    config = load(SIM)
+    slider = msgspec.structs.replace(config.limits.slider, velocity=v, acceleration=a, jerk=j)
+    limits = msgspec.structs.replace(config.limits, slider=slider)
+    drives = msgspec.structs.replace(config.drives, quick_stop_deceleration=q)
+    found = stops(msgspec.structs.replace(config, limits=limits, drives=drives))
+    ramp = min(a / j, math.sqrt(v / j))
+    steady = max(0.0, v - j * ramp * ramp) / (j * ramp)
+    way, speed, rate = 0.0, v, 0.0
+    for jerk, time in ((-j, ramp), (0.0, steady), (j, ramp)):
+        way += speed * time + rate * time**2 / 2.0 + jerk * time**3 / 6.0
+        speed += rate * time + jerk * time**2 / 2.0
+        rate += jerk * time
+    assert speed == pytest.approx(0.0, abs=1e-9 * max(v, 1.0))
+    assert (found.way, found.time) == pytest.approx((way, 2.0 * ramp + steady), rel=1e-6)
+    assert (found.quick_way, found.quick_time) == pytest.approx((v / q * v / 2.0, v / q))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_the_rail_is_drawn(path: Path) -> None:
+    found = stops(load(path))
+    lines = rail_drawing.drawn(found)
+    assert [line.split("  ")[0] for line in lines[:4]] == ["rail", "travel", "stop", "quick stop"]
+    assert max(map(len, lines)) < 100
+    assert found.rail == pytest.approx((-0.1732, 0.3464), abs=1e-4)
