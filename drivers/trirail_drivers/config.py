@@ -21,8 +21,8 @@ Name = Annotated[str, Meta(max_length=4096, pattern=r"^[^\x00-\x1f\x7f]*$")]
 """A file's or a device's name: no control characters."""
 UnitName = Annotated[str, Meta(max_length=32)]
 """A unit of velocity or acceleration."""
-ObjectName = Annotated[str, Meta(pattern=r"^[0-9A-F]{4}(:[0-9A-F]{2})?$")]
-"""An object's index in hexadecimal, as 605A."""
+ProtectionName = Annotated[str, Meta(max_length=64, pattern=r"^([0-9A-F]{4}(:[0-9A-F]{2})?|[a-z_]+)$")]
+"""An object's index in hexadecimal, as 605A, or an ODrive's setting, as enable_watchdog."""
 NodeId = Annotated[int, Meta(ge=0, le=127)]
 """CANopen has 1 to 127, ODrive 0 to 62; the driver refuses the rest."""
 
@@ -155,9 +155,13 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     revolutions_per_metre: Annotated[float, Meta(ge=1e-6, le=1e9)] | None = None
     """Revolutions by which the drive counts velocities, per metre of the slider: wanted where these are in rpm or
     the like and the drive does not tell how many counts a revolution has."""
-    accept_without: tuple[ObjectName, ...] = ()
-    """Protections that the drive may lack, each named by its object, as ["1006", "6007"]: those of the table in
-    drivers/README.md; "6041" where bit 12 of its statusword says nothing."""
+    endpoints: Name | None = None
+    """An ODrive's flat_endpoints.json, relative to the configuration file: the maker's, for its firmware and hardware,
+    where trirail has not the numbers of its settings."""
+    accept_without: tuple[ProtectionName, ...] = ()
+    """Protections that the drive may lack, each named by its object, as ["1006", "6007"], or an ODrive's setting, as
+    ["enable_watchdog"]: those of the tables in drivers/README.md; "6041" where bit 12 of its statusword says
+    nothing."""
     write: tuple[ObjectWrite, ...] = ()
     """Objects of its maker's that it is to be given."""
 

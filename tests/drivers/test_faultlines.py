@@ -91,8 +91,8 @@ def test_frames_of_odrives_have_the_names_of_their_manual() -> None:
         [False, False, True],
         *[[False, False, False]] * 3,
     ]
-    with pytest.raises(FaultSyntaxError, match='unknown frames "tpdo2"; known are set_axis_state, '):
-        parse("B drop tpdo2", ODRIVE.fault_frames)
+    with pytest.raises(FaultSyntaxError, match='unknown frames "sync"; known are set_axis_state, '):
+        parse("B drop sync", ODRIVE.fault_frames)
 
 
 @pytest.mark.parametrize("line", ["B emcy 4310", "B fault 4310", "B reboot"])

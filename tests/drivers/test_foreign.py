@@ -344,7 +344,7 @@ def test_what_drives_do_without_is_known_by_drive_and_object(lacking: set[str], 
 
 @pytest.mark.parametrize(
     ("example", "name", "known"),
-    [("elmo_gold", "6040", "1006, "), ("elmo_gold", "1001", "1006, "), ("odrive_s1", "1006", "none$")],
+    [("elmo_gold", "6040", "1006, "), ("elmo_gold", "1001", "1006, "), ("odrive_s1", "1006", "endpoints, ")],
 )
 def test_what_is_no_protection_cannot_be_accepted_to_be_missing(
     tmp_path: Path, example: str, name: str, known: str

@@ -24,6 +24,7 @@ from trirail_drivers.interface import Feedback, PowerState
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.codes import words
 from trirail_drivers.odrive.drives import Odrive
+from trirail_drivers.odrive.endpoints import Version
 from trirail_drivers.odrive.frames import AxisState, Error, ProcedureResult
 from trirail_drivers.odrive.setpoints import SETTLING
 from trirail_drivers.simulated import SimulatedOdrive
@@ -133,7 +134,7 @@ class TestConfigure:
 
     def test_drive_that_keeps_its_power(self, new: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
         new.devices[1].axis_state = AxisState.CLOSED_LOOP_CONTROL
-        new.devices[1]._watchdog = math.inf
+        monkeypatch.setattr(new.devices[1], "fail", lambda errors: None)
         monkeypatch.setitem(new.devices[1]._handlers, frames.SET_AXIS_STATE, lambda data: None)
         with pytest.raises(DriveError, match=r"drive B: keeps its power on .*closed loop control"):
             new.drives.configure(PERIOD)
@@ -146,13 +147,13 @@ class TestConfigure:
         rig.drives.close()
 
     def test_drive_without_heartbeat(self, new: Rig) -> None:
-        new.devices[0]._heartbeat_due = math.inf
+        new.devices[0]._due["heartbeat"] = math.inf
         with pytest.raises(DriveTimeout, match=r"drive A: no heartbeat .*within 0\.3"):
             new.drives.configure(PERIOD)
 
-    def test_firmware_of_another_layout(self, new: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("trirail_drivers.simulated.odrive.FIRMWARE", (0, 5, 6))
-        with pytest.raises(DriveError, match=r"drive A: its firmware is 0\.5\.6; wanted 0\.6\.0"):
+    def test_firmware_of_another_layout(self, new: Rig) -> None:
+        new.devices[0].version = Version((3, 6, 56), (0, 5, 6))
+        with pytest.raises(DriveError, match=r"drive A: it has firmware 0\.5\.6 on .*; wanted firmware 0\.6\.0"):
             new.drives.configure(PERIOD)
 
     def test_drive_that_does_not_know_where_it_is(self, new: Rig) -> None:
@@ -384,7 +385,7 @@ class TestFaults:
 
     def test_lost_heartbeat(self, ready: Rig) -> None:
         ready.cycle()
-        ready.devices[0]._heartbeat_due = math.inf
+        ready.devices[0]._due["heartbeat"] = math.inf
         fault = ready.found("heartbeat", within=320).fault
         assert fault is not None
         assert fault.drive == "A"
@@ -602,7 +603,7 @@ class TestLateAnswers:
 class TestFaultsOnDemand:
     @pytest.mark.parametrize(
         ("line", "right"),
-        [("A emcy 4310", "drive A has no EMCY; as in: A fault 200"), ("B drop tpdo2", "known are set_axis_state, ")],
+        [("A emcy 4310", "drive A has no EMCY; as in: A fault 200"), ("B drop sync", "known are set_axis_state, ")],
     )
     def test_those_of_canopen_are_refused(self, ready: Rig, line: str, right: str) -> None:
         with pytest.raises(FaultSyntaxError, match=right):

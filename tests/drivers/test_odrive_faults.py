@@ -240,8 +240,9 @@ def elsewhere(rig: OdriveRig) -> None:
 def short_watchdog(rig: OdriveRig) -> None:
     """The watchdog of drive B is shorter than a cycle."""
     drive = rig.odrives[1]
-    before, drive._watchdog = drive._watchdog, 0.5 * PERIOD
-    rig.undo.append(lambda: setattr(drive, "_watchdog", before))
+    timeout = "axis0.config.watchdog_timeout"
+    before, drive.settings[timeout] = drive.settings[timeout], 0.5 * PERIOD
+    rig.undo.append(lambda: drive.settings.update({timeout: before}))
 
 
 BY_HAND: dict[str, Callable[[OdriveRig], None]] = {

@@ -6,6 +6,7 @@ for firmware 0.6, chapter "CAN Protocol".
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
 from struct import Struct
 from types import ModuleType
@@ -84,6 +85,8 @@ CANSIMPLE: dict[str, dict[str, object]] = {
         "HEARTBEAT": 0x01,
         "ESTOP": 0x02,
         "GET_ERROR": 0x03,
+        "RX_SDO": 0x04,
+        "TX_SDO": 0x05,
         "SET_AXIS_STATE": 0x07,
         "GET_ENCODER_ESTIMATES": 0x09,
         "SET_CONTROLLER_MODE": 0x0B,
@@ -94,13 +97,28 @@ CANSIMPLE: dict[str, dict[str, object]] = {
         "VERSION": "<BBBBBBBB",
         "BEAT": "<IBBBx",
         "ERRORS": "<II",
+        "SDO": "<BHB",
         "AXIS_STATE": "<I4x",
         "ESTIMATES": "<ff",
         "CONTROLLER_MODE": "<II",
         "INPUT_POS": "<fhh",
         "CLEAR": "<B",
     },
+    "opcodes of RxSdo": {"READ": 0, "WRITE": 1},
+    "types of endpoints": {
+        "TYPES": {
+            "bool": "<?",
+            "uint8": "<B",
+            "int8": "<b",
+            "uint16": "<H",
+            "int16": "<h",
+            "uint32": "<I",
+            "int32": "<i",
+            "float": "<f",
+        }
+    },
     "units, and node ids of six bits without 3Fh": {
+        "VELOCITY_SCALE": 1000,
         "VELOCITY_STEP": 0.001,
         "MAX_FEED_FORWARD": 32.767,
         "NODES": range(63),
@@ -119,6 +137,8 @@ CANSIMPLE: dict[str, dict[str, object]] = {
             12: "encoder hall polarity calibration",
             13: "encoder hall phase calibration",
             14: "anticogging calibration",
+            15: "harmonic calibration",
+            16: "harmonic calibration of the commutation encoder",
         }
     },
 }
@@ -126,6 +146,8 @@ OWN_OF_ODRIVE = {"ERROR_PERIOD", "TRAFFIC"}
 
 
 def number(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {name: number(each) for name, each in value.items()}
     return value.format if isinstance(value, Struct) else value
 
 
@@ -301,6 +323,12 @@ def test_a_simulated_odrive_by_its_bytes() -> None:
     assert device.answer("060#R") == ["060#0204043A00060A00"]
     assert device.answer("063#R") == ["063#0000000000000000"]
     assert device.answer("069#R") == ["069#0000C03F00000000"]  # 1.5 turns, at rest
+    # RxSdo: enable_watchdog, E0h, is off; input_vel_scale, 106h, is 1000, then 500; endpoint 1 is none that it tells.
+    assert device.answer("064#00E00000") == ["065#00E0000000"]
+    assert device.answer("064#00060100") == ["065#00060100E8030000"]
+    assert device.answer("064#01060100F4010000") == []
+    assert device.answer("064#00060100") == ["065#00060100F4010000"]
+    assert device.answer("064#00010000") == []
     assert device.answer("06B#0300000001000000") == []  # position control, passthrough
     assert device.answer("067#0800000000000000") == []  # closed loop control
     assert device.after(0.1) == ["061#0000000008000000"]
@@ -360,7 +388,12 @@ def test_the_odrive_driver_by_its_bytes() -> None:
     rig.drives.configure(PERIOD)
     said = sent(rig.bus)
     # Drive B is node 7: E0h and the command.
-    assert [frame for frame in said if frame[:2] in ("0E", "0F")] == ["0E7#0100000000000000", "0E0#", "0E3#", "0E9#"]
+    assert [frame for frame in said if frame[:2] in ("0E", "0F")] == [
+        "0E7#0100000000000000", "0E0#", "0E3#", "0E9#",
+        # RxSdo reads: watchdog, its timeout, input_vel_scale, heartbeats, what is cyclic: E0h, DFh, 106h, FEh, FDh …
+        "0E4#00E00000", "0E4#00DF0000", "0E4#00060100", "0E4#00FE0000", "0E4#00FD0000", "0E4#00FF0000",
+        *(f"0E4#00{low:02X}0100" for low in range(6)),
+    ]  # fmt: skip
     rig.enable()
     said = sent(rig.bus)
     assert [frame for frame in said if frame[:3] == "0EB"] == ["0EB#0300000001000000"]

@@ -27,6 +27,7 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
         yield Rule(counts, (*scale, *limits), partial(_check_counts, name, drive, required))
         for key in ("velocity_unit", "acceleration_unit"):
             yield Rule(f"{table}.{key}", (), partial(units.check, name, drive, key))
+        yield Rule(f"{table}.endpoints", (), partial(_check_endpoints, name, drive))
         for number in range(len(drive.write)):
             yield Rule(f"{table}.write[{number}]", (), partial(makers_objects.check, name, drive, number))
         reads = counts, f"{table}.revolutions_per_metre", "limits.slider.velocity"
@@ -48,6 +49,11 @@ def _check_eds(name: str, drive: Drive) -> None:
         eds.load(name, Path(drive.eds or ""), drive.node)
     except DriveError as error:
         raise DriveError(f"drives.{name}.eds = {drive.eds!r}: {error}; correct the name, or leave it out") from error
+
+
+def _check_endpoints(name: str, drive: Drive) -> None:
+    if drive.endpoints is not None:
+        raise DriveError(f"drives.{name}.endpoints = {drive.endpoints}: ODrives alone have endpoints; leave it out")
 
 
 def _check_window(name: str, drive: Drive, drives: Drives) -> None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from trirail_drivers.cia402.objects import PROTECTIONS, Key, Need, title, use
 from trirail_drivers.cia402.sdo import Remote, SdoRefused, same, shown
+from trirail_drivers.driver.refusals import judged
 from trirail_drivers.errors import ConfigurationRefused, DriveError
 
 
@@ -118,16 +119,7 @@ class Differences:
 
     def refusal(self, accepted: Sequence[str]) -> str:
         """Why the drive is refused: it lacks a protection that the configuration does not name. Tells of the others."""
-        refused = [name for name in self.lacking if name not in accepted]
-        for name, reason in self.lacking.items():
-            if name in accepted:
-                used = PROTECTIONS[name]
-                self.tell(f"lacks {name} ({used.purpose}): {reason}; accepted, so {used.without}")
-        if not refused:
-            return ""
-        what = "; ".join(f"{name}, {PROTECTIONS[name].purpose}: {self.lacking[name]}" for name in refused)
-        listed = ", ".join(f'"{name}"' for name in sorted({*refused, *accepted}))
-        return (
-            f"drive {self.remote.name} lacks protections: {what}. To drive it all the same say "
-            f"drives.{self.remote.name}.accept_without = [{listed}]"
-        )
+        refused, told = judged(self.remote.name, self.lacking, accepted, PROTECTIONS)
+        for text in told:
+            self.tell(text)
+        return refused

@@ -11,6 +11,7 @@ from trirail_drivers.cia402 import frames, setup
 from trirail_drivers.cia402.one_drive import SetUp
 from trirail_drivers.cia402.sdo import together
 from trirail_drivers.config import Drives
+from trirail_drivers.driver.refusals import raise_all
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import NAMES, Clock
@@ -31,7 +32,7 @@ def inspect(
     if apply:
         found = inspect(bus, drives, period, clock, fastest, apply=False)
         refused = dict.fromkeys(each["refused"] for each in found if each["refused"])
-        setup.raise_all([DriveError(text) for text in refused])
+        raise_all([DriveError(text) for text in refused])
         done = setup.configure(bus, drives, scales, period, clock, fastest)
         for drive in drives.each:
             bus.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node).message())

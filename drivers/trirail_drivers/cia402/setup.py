@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 import can
 
@@ -15,8 +13,9 @@ from trirail_drivers.cia402.sdo import Remote, together
 from trirail_drivers.cia402.sdo_client import Client
 from trirail_drivers.cia402.settings import check_nodes, heartbeat_of, interpolation_periods
 from trirail_drivers.config import Drives
+from trirail_drivers.driver.refusals import raise_all
 from trirail_drivers.driver.scaling import Scale
-from trirail_drivers.errors import LONGEST, DriveError, shortened
+from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES, Clock
 
 
@@ -84,27 +83,6 @@ def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:
     return accepted
 
 
-def raise_all(errors: Sequence[DriveError]) -> None:
-    """Raise what was found of each drive: none hides another's, and what is so of several is said once."""
-    if len(errors) == 1:
-        raise errors[0]
-    alike: dict[str, list[str]] = {}
-    for error in errors:
-        alike.setdefault(_NAMED.sub(r"\1_", str(error)), []).append(str(error))
-    told = [first + "".join(f"; drive {_name(text)}: the same" for text in more) for first, *more in alike.values()]
-    if told:
-        raise DriveError("; ".join(shortened(text, LONGEST // len(told) - 2) for text in told))
-
-
-_NAMED: Final = re.compile(r"\b(drive |drives\.)([ABC])\b")
-
-
-def _name(text: str) -> str:
-    """Of which drive an error is."""
-    found = _NAMED.search(text)
-    return found[2] if found else ""
-
-
 def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:
     """Why a unit of velocities is refused: not known, or unfit. A drive may refuse to map any: then it is no matter."""
     if made.way.setpoints.has_velocity:
@@ -129,15 +107,6 @@ def check_identifiers(done: Sequence[SetUp]) -> None:
                     f"that cannot be changed (1400:01, 1800:01 and on); give each its own with its maker's tool"
                 )
             owners[identifier] = made.name
-
-
-def told(made: Iterable[SetUp]) -> list[str]:
-    """What people should know of drives, a line each: what is so of several is said once."""
-    names: dict[str, list[str]] = {}
-    for each in made:
-        for note in each.notes:
-            names.setdefault(note, []).append(each.name)
-    return [f"drive{'s' * (len(of) > 1)} {', '.join(of)}: {note}" for note, of in names.items()]
 
 
 def remotes(bus: can.BusABC, drives: Drives, clock: Clock) -> list[Remote]:

@@ -10,6 +10,7 @@ from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.codes import words
+from trirail_drivers.odrive.endpoints import Version
 from trirail_drivers.odrive.frames import AxisState, ProcedureResult
 
 RESET_TIME = 3 * 3 * frames.ERROR_PERIOD
@@ -27,11 +28,12 @@ class OdriveAxis(Axis):
         "_restarted",
         "_result",
         "errors",
-        "firmware",
         "requested",
         "reset_until",
+        "sdo",
         "state",
         "told",
+        "version",
     )
 
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
@@ -42,8 +44,10 @@ class OdriveAxis(Axis):
         """Active errors, and why it was disarmed."""
         self.told = False
         """It has answered what its errors are."""
-        self.firmware: tuple[int, int, int] | None = None
-        """Version of its firmware, once it told."""
+        self.version: Version | None = None
+        """Of its hardware and firmware, once it told."""
+        self.sdo: tuple[int, bytes] | None = None
+        """Endpoint and value of the newest TxSdo."""
         self.requested: AxisState | None = None
         """The state it was asked for last; None makes the driver ask anew."""
         self.reset_until = -math.inf
@@ -55,8 +59,13 @@ class OdriveAxis(Axis):
 
     def on_version(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
         """Get_Version."""
-        *_, major, minor, revision, _ = frames.VERSION.unpack(data)
-        self.firmware = major, minor, revision
+        _, line, number, variant, major, minor, revision, unreleased = frames.VERSION.unpack(data)
+        self.version = Version((line, number, variant), (major, minor, revision), bool(unreleased))
+
+    def on_sdo(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
+        """TxSdo: the value of an endpoint that was asked for; its length is the endpoint's."""
+        _, endpoint, _ = frames.SDO.unpack_from(data)
+        self.sdo = endpoint, bytes(data[frames.SDO.size :])
 
     def on_estimates(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """Get_Encoder_Estimates: the position when the request came."""

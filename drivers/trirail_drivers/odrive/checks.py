@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 from trirail_drivers.config import Drive, Drives
@@ -11,7 +12,7 @@ from trirail_drivers.driver.requirements import Requirements, Rule, resolution
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
-from trirail_drivers.odrive import setup
+from trirail_drivers.odrive import endpoints, setup
 from trirail_drivers.odrive.frames import MAX_FEED_FORWARD
 
 _FLOAT_DIGITS: Final = 23
@@ -39,9 +40,11 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
         yield Rule("limits.slider.velocity", (counts,), partial(_check_feed_forward, name, drive, required))
 
 
-def files(drives: Drives) -> Iterator[Rule]:  # noqa: ARG001  one signature for all
-    """Yield nothing: no file is named."""
-    return iter(())
+def files(drives: Drives) -> Iterator[Rule]:
+    """Yield what refuses a flat_endpoints.json that is not there, or is none."""
+    for name, drive in zip(NAMES, drives.each, strict=True):
+        if drive.endpoints is not None:
+            yield Rule(f"drives.{name}.endpoints", (), partial(endpoints.read, name, Path(drive.endpoints)))
 
 
 def _check_canopen_only(name: str, drive: Drive, key: str) -> None:

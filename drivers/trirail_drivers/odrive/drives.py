@@ -20,10 +20,12 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.driver.driver import Driver
-from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
+from trirail_drivers.driver.refusals import told
+from trirail_drivers.interface import Clock, DriveFault, Feedback, MissingProtection, Triple
 from trirail_drivers.odrive import frames, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
+from trirail_drivers.odrive.protections import means
 from trirail_drivers.odrive.setpoints import SetpointSender
 
 
@@ -47,6 +49,7 @@ class Odrive(Driver[OdriveAxis]):
                 (frames.HEARTBEAT, axis.on_heartbeat),
                 (frames.GET_ERROR, axis.on_errors),
                 (frames.GET_ENCODER_ESTIMATES, axis.on_estimates),
+                (frames.TX_SDO, axis.on_sdo),
             ):
                 self._wire.listen(frames.identifier(axis.node, number), axis, handler)
         self._requests = tuple(frames.request(axis.node, frames.GET_ENCODER_ESTIMATES) for axis in self._axes)
@@ -60,12 +63,18 @@ class Odrive(Driver[OdriveAxis]):
     def configure(self, period: float, fastest: float | None = None) -> None:  # noqa: ARG002  their unit says any
         """Find the drives and leave them without power, for a cycle of `period` seconds.
 
-        Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout for a drive that is not there.
-        A drive with errors is not an error here; feedback tells of it and `reset` clears it.
+        Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout for one that is not there, and
+        for one that is not set as it must be, where its configuration does not accept that. One with errors is none;
+        feedback tells of it and `reset` clears it.
         """
         self._set_period(period, frames.TRAFFIC)
         self._setpoints.period = period
-        setup.configure(self._wire, self._axes, self._drives, self._clock)
+        done = setup.configure(self._wire, self._axes, self._drives, period, self._clock)
+        for line in told((made.name, made.notes) for made in done):
+            self._wire.warn(line)
+        self.missing_protections = tuple(
+            MissingProtection(made.name, name, means(name)) for made in done for name in made.lacking
+        )
 
     def sync(self) -> None:
         """Send the setpoints written since the last cycle, which are in force on arrival; ask for the positions.

@@ -18,6 +18,8 @@ GET_VERSION: Final = 0x00
 HEARTBEAT: Final = 0x01
 ESTOP: Final = 0x02
 GET_ERROR: Final = 0x03
+RX_SDO: Final = 0x04
+TX_SDO: Final = 0x05
 SET_AXIS_STATE: Final = 0x07
 GET_ENCODER_ESTIMATES: Final = 0x09
 SET_CONTROLLER_MODE: Final = 0x0B
@@ -30,6 +32,19 @@ BEAT: Final = Struct("<IBBBx")
 """Heartbeat: axis error, axis state, procedure result, trajectory done flag."""
 ERRORS: Final = Struct("<II")
 """Get_Error: active errors, disarm reason."""
+SDO: Final = Struct("<BHB")
+"""RxSdo: opcode, endpoint, reserved; TxSdo: reserved, endpoint, reserved. The value follows, in its endpoint's type."""
+READ: Final = 0
+WRITE: Final = 1
+"""Opcodes of RxSdo."""
+TYPES: Final = {
+    "bool": Struct("<?"),
+    "uint8": Struct("<B"), "int8": Struct("<b"),
+    "uint16": Struct("<H"), "int16": Struct("<h"),
+    "uint32": Struct("<I"), "int32": Struct("<i"),
+    "float": Struct("<f"),
+}  # fmt: skip
+"""Types of endpoints as flat_endpoints.json names them; those of eight bytes do not go into a message."""
 AXIS_STATE: Final = Struct("<I4x")
 """Set_Axis_State: requested state."""
 ESTIMATES: Final = Struct("<ff")
@@ -41,8 +56,10 @@ INPUT_POS: Final = Struct("<fhh")
 CLEAR: Final = Struct("<B")
 """Clear_Errors: whether to blink for identification."""
 
-VELOCITY_STEP: Final = 0.001
-"""Unit of the velocity feed-forward, at the drive's default input_vel_scale of 1000 [turns/s]."""
+VELOCITY_SCALE: Final = 1000
+"""The drive's input_vel_scale, by default: units of the velocity feed-forward in a turn per second."""
+VELOCITY_STEP: Final = 1.0 / VELOCITY_SCALE
+"""Unit of the velocity feed-forward [turns/s]."""
 MAX_FEED_FORWARD: Final = 32767 * VELOCITY_STEP
 """The fastest feed-forward that 16 bits hold [turns/s]."""
 
@@ -77,6 +94,8 @@ PROCEDURES: Final = {
     12: "encoder hall polarity calibration",
     13: "encoder hall phase calibration",
     14: "anticogging calibration",
+    15: "harmonic calibration",
+    16: "harmonic calibration of the commutation encoder",
 }
 """Axis states in which the drive moves or tries its motor by itself."""
 

@@ -1,7 +1,6 @@
-"""Finds the ODrives on the bus and takes their power off, before the cycle runs.
+"""Finds the ODrives on the bus, takes their power off and reads how they are set, before the cycle runs.
 
-CANSimple cannot read a drive's configuration back, nor set most of it: the numbers of its parameters differ from one
-firmware to the next. So this is what a drive must have been given by ODrive's own tools, and saved:
+Nothing is written: a drive must have been given by ODrive's own tools, and have saved,
 
 - `axis0.config.can.node_id`, `heartbeat_msg_rate_ms` as [drives] says, `encoder_msg_rate_ms = 0` and the other cyclic
   messages off: the driver asks for what it needs, and nothing else takes a share of the bus;
@@ -9,23 +8,26 @@ firmware to the next. So this is what a drive must have been given by ODrive's o
 - `axis0.config.enable_watchdog = True` with a `watchdog_timeout` that bridges a few cycles. It is all that disarms a
   drive whose host is gone, and every setpoint feeds it;
 - its gains, velocity and current limits, and a calibrated encoder whose position survives power-off.
+
+All but the last are read by RxSdo and TxSdo, and count as protections, see trirail_drivers.odrive.protections.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
-import can
-
-from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
-from trirail_drivers.errors import BusError, DriveError, DriveTimeout
+from trirail_drivers.driver.refusals import judged, raise_all
+from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import Clock
-from trirail_drivers.odrive import frames
+from trirail_drivers.odrive import frames, settings
+from trirail_drivers.odrive.asking import late, send
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
+from trirail_drivers.odrive.protections import PROTECTIONS, Settings, check_watchdog, lacking
 
 OLDEST_FIRMWARE = (0, 6, 0)
 """Since then errors and heartbeats are laid out as this driver reads them."""
@@ -41,33 +43,65 @@ def check_nodes(drives: Drives) -> None:
         )
 
 
-def configure(wire: Wire, axes: Sequence[OdriveAxis], drives: Drives, clock: Clock) -> None:
-    """Take power off, and see that every drive answers, lives, is of a known firmware and knows its position.
+class Allowed(NamedTuple):
+    """What a drive does without, as its configuration allows."""
+
+    name: str
+    lacking: tuple[str, ...]
+    """Protections, as `accept_without` names them."""
+    notes: tuple[str, ...]
+    """Lines for people."""
+
+
+def configure(
+    wire: Wire, axes: Sequence[OdriveAxis], drives: Drives, period: float, clock: Clock
+) -> tuple[Allowed, ...]:
+    """Take power off, and see that every drive answers, lives, is set as it must be and knows its position.
 
     Raises DriveError; of its kinds, DriveTimeout for a drive that does not answer. Errors of a drive are none here.
     """
     for axis in axes:
-        _send(wire, frames.command(axis.node, frames.SET_AXIS_STATE, frames.AXIS_STATE.pack(AxisState.IDLE)))
+        send(wire, frames.command(axis.node, frames.SET_AXIS_STATE, frames.AXIS_STATE.pack(AxisState.IDLE)))
         axis.ask(AxisState.IDLE)
         axis.answers.sync_sent()
         for number in (frames.GET_VERSION, frames.GET_ERROR, frames.GET_ENCODER_ESTIMATES):
-            _send(wire, frames.request(axis.node, number))
-    for axis in _late(wire, axes, clock, drives.sdo_timeout, _missing):
+            send(wire, frames.request(axis.node, number))
+    for axis in late(wire, axes, clock, drives.sdo_timeout, _missing):
         raise DriveTimeout(axis.name, f"answer to {_missing(axis)}", drives.sdo_timeout)
     for axis in axes:
         _check(axis)
+    done = _judge(axes, settings.read(wire, axes, drives, clock), drives, period)
     timeout = MISSED_HEARTBEATS * drives.heartbeat
-    for axis in _late(wire, axes, clock, timeout, _not_idle):
+    for axis in late(wire, axes, clock, timeout, _not_idle):
         if axis.state == AxisState.UNDEFINED:
             raise DriveTimeout(axis.name, "heartbeat (heartbeat_msg_rate_ms)", timeout)
         raise DriveError(
             f"drive {axis.name}: keeps its power on when told off (it is in {frames.state_name(axis.state)})"
         )
+    return done
+
+
+def _judge(
+    axes: Sequence[OdriveAxis], found: Sequence[Settings | None], drives: Drives, period: float
+) -> tuple[Allowed, ...]:
+    """Refuse drives whose settings are not as they must be, all in one; tell what their configuration accepts."""
+    done, refused = [], []
+    for axis, drive, read in zip(axes, drives.each, found, strict=True):
+        lacks = lacking(read, drives)
+        why, notes = judged(axis.name, lacks, drive.accept_without, PROTECTIONS)
+        refused += [DriveError(why)] if why else []
+        try:
+            check_watchdog(axis.name, read, period)
+        except DriveError as error:
+            refused.append(error)
+        done.append(Allowed(axis.name, tuple(lacks), tuple(notes)))
+    raise_all(refused)
+    return tuple(done)
 
 
 def _missing(axis: OdriveAxis) -> str:
     """What the drive has not answered yet, or ""."""
-    if axis.firmware is None:
+    if axis.version is None:
         return "Get_Version"
     if not axis.told:
         return "Get_Error"
@@ -79,29 +113,7 @@ def _not_idle(axis: OdriveAxis) -> bool:
 
 
 def _check(axis: OdriveAxis) -> None:
-    if axis.firmware is not None and axis.firmware < OLDEST_FIRMWARE:
-        raise DriveError(
-            f"drive {axis.name}: its firmware is {'.'.join(map(str, axis.firmware))}; wanted 0.6.0 or newer"
-        )
+    if axis.version is not None and axis.version.firmware < OLDEST_FIRMWARE:
+        raise DriveError(f"drive {axis.name}: it has {axis.version.words}; wanted firmware 0.6.0 or newer")
     if axis.event is not None:
         raise DriveError(axis.event.message)
-
-
-def _late(
-    wire: Wire, axes: Sequence[OdriveAxis], clock: Clock, seconds: float, lacks: Callable[[OdriveAxis], object]
-) -> list[OdriveAxis]:
-    """Take in frames until no drive lacks anything; those that still do when the time is over."""
-    deadline = clock() + seconds
-    while (late := [axis for axis in axes if lacks(axis)]) and (left := deadline - clock()) > 0.0:
-        try:
-            wire.wait(left, clock)
-        except (can.CanError, OSError) as error:
-            raise BusError(f"cannot receive on {wire.bus.channel_info}: {error}") from error
-    return late
-
-
-def _send(wire: Wire, frame: Frame) -> None:
-    try:
-        wire.bus.send(frame.message())
-    except (can.CanError, OSError) as error:
-        raise BusError(f"cannot send on {wire.bus.channel_info}: {error}; is the interface up?") from error

@@ -8,6 +8,7 @@ from trirail_drivers import config
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.odrive import checks, frames
 from trirail_drivers.odrive.drives import Odrive
+from trirail_drivers.odrive.protections import PROTECTIONS, means
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import Frames, Servo, SimulatedDevice, SimulatedOdrive
 
@@ -42,16 +43,18 @@ ODRIVE = Protocol(
     inputs=None,
     save=None,
     restore=None,
-    protections={},
+    protections={name: means(name) for name in PROTECTIONS},
     fault_frames={  # named as in the manual
         "set_axis_state": Frames(True, frames.SET_AXIS_STATE, _NODE),
         "set_controller_mode": Frames(True, frames.SET_CONTROLLER_MODE, _NODE),
         "set_input_pos": Frames(True, frames.SET_INPUT_POS, _NODE),
         "clear_errors": Frames(True, frames.CLEAR_ERRORS, _NODE),
         "position-request": Frames(True, frames.GET_ENCODER_ESTIMATES, _NODE),
+        "rxsdo": Frames(True, frames.RX_SDO, _NODE),
         "get_version": Frames(False, frames.GET_VERSION, _NODE),
         "get_error": Frames(False, frames.GET_ERROR, _NODE),
         "get_encoder_estimates": Frames(False, frames.GET_ENCODER_ESTIMATES, _NODE),
+        "txsdo": Frames(False, frames.TX_SDO, _NODE),
         "heartbeat": Frames(False, frames.HEARTBEAT, _NODE),
     },
 )

@@ -10,15 +10,21 @@ from typing import Final
 
 from trirail_drivers.interface import PowerState
 from trirail_drivers.odrive import frames
+from trirail_drivers.odrive.endpoints import KNOWN, Version
 from trirail_drivers.odrive.frames import AxisState, Error, ProcedureResult
 from trirail_drivers.simulated.servo import Servo
 
+HARDWARE: Final = (4, 4, 58)
 FIRMWARE: Final = (0, 6, 10)
+CAN: Final = "axis0.config.can"
 VELOCITY_CONTROL: Final = 2
 NEVER: Final = float("inf")
 BOOT: Final = 0.25
 """How long a restarted drive says that it initialises [s]."""
 
+_CYCLIC: Final = {"version": frames.GET_VERSION, "encoder": frames.GET_ENCODER_ESTIMATES, "error": frames.GET_ERROR}
+_OTHERS: Final = ("iq", "temperature", "bus_voltage", "torques", "powers")
+"""What it can send by itself beside heartbeats, and what nobody reads: settings that are told, and not sent."""
 _REQUESTS: Final = (frames.GET_VERSION, frames.GET_ERROR, frames.GET_ENCODER_ESTIMATES)
 
 
@@ -31,7 +37,7 @@ class SimulatedOdrive:
 
     It moves with the time, and follows each setpoint from its arrival on. Disarmed, it coasts: no brake holds it, and
     `friction` [turns/s²] brings it to rest. Its watchdog disarms it where no message has come for `watchdog` seconds.
-    By itself it sends heartbeats only.
+    By itself it sends heartbeats, and what its settings ask for.
     """
 
     def __init__(self, node: int, servo: Servo, *, heartbeat: float, friction: float, watchdog: float = NEVER) -> None:
@@ -48,13 +54,21 @@ class SimulatedOdrive:
         """True cuts the wire: nothing is heard or sent any more, while the device itself goes on."""
         self.modes = (VELOCITY_CONTROL, frames.PASSTHROUGH)
         """Control mode and input mode; at first whatever somebody else has left there."""
+        self.version = Version(HARDWARE, FIRMWARE)
+        self.settings: dict[str, float] = {
+            "axis0.config.enable_watchdog": watchdog < NEVER,
+            "axis0.config.watchdog_timeout": watchdog if watchdog < NEVER else 0.0,
+            f"{CAN}.input_vel_scale": 1000,
+            f"{CAN}.heartbeat_msg_rate_ms": round(1000 * heartbeat),
+            **{f"{CAN}.{name}_msg_rate_ms": 0 for name in (*_CYCLIC, *_OTHERS)},
+        }
+        """What it was set to, by the path; endpoints as its firmware numbers them."""
         self._input = (servo.position, 0.0)
-        self._heartbeat = heartbeat
-        self._watchdog = watchdog
         self._friction = friction
         self._fed = self._moved_at = 0.0
         self._booted = NEVER
-        self._heartbeat_due = NEVER
+        self._due: dict[str, float] = {}
+        """When each cyclic message is due."""
         self._transmit: Callable[[int, bytes], None] = _discard
         self._handlers: dict[int, Callable[[bytes], None]] = {
             frames.ESTOP: self._estop,
@@ -62,6 +76,7 @@ class SimulatedOdrive:
             frames.SET_CONTROLLER_MODE: self._set_mode,
             frames.SET_INPUT_POS: self._set_input,
             frames.CLEAR_ERRORS: self._clear,
+            frames.RX_SDO: self._sdo,
         }
 
     @property
@@ -85,7 +100,8 @@ class SimulatedOdrive:
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
         """Put the drive on a bus, that it sends to by `transmit(can_id, data)`, and switch it on."""
         self._transmit = transmit
-        self._moved_at = self._heartbeat_due = now
+        self._moved_at = now
+        self._due = dict.fromkeys(("heartbeat", *_CYCLIC), now)
 
     def receive(self, can_id: int, data: bytes, now: float) -> None:
         """Take in a data frame at time `now` [s]; an empty one is a request as well, a wrong length does nothing."""
@@ -113,13 +129,16 @@ class SimulatedOdrive:
         if now >= self._booted:
             self._booted = NEVER
             self.axis_state, self.errors = AxisState.IDLE, Error(0)
-        if self._armed and now >= self._fed + self._watchdog:
+        watchdog = self.settings["axis0.config.watchdog_timeout"]
+        if self._armed and self.settings["axis0.config.enable_watchdog"] and now >= self._fed + watchdog:
             self.fail(Error.WATCHDOG_TIMER_EXPIRED)
-        if now >= self._heartbeat_due:
-            self._send(frames.HEARTBEAT, frames.BEAT.pack(self._told, self.axis_state, self.result, 0))
-            self._heartbeat_due += self._heartbeat
-            if self._heartbeat_due <= now:  # too late for that one as well: leave it out
-                self._heartbeat_due = now + self._heartbeat
+        for name, command in (("heartbeat", frames.HEARTBEAT), *_CYCLIC.items()):
+            period = self.settings[f"{CAN}.{name}_msg_rate_ms"] / 1000.0
+            if period and now >= self._due[name]:
+                self._answer(command)
+                self._due[name] += period
+                if self._due[name] <= now:  # too late for that one as well: leave it out
+                    self._due[name] = now + period
 
     def press(self, switches: int) -> None:
         """Do nothing: CANSimple does not tell of switches."""
@@ -153,13 +172,30 @@ class SimulatedOdrive:
             self.servo.chase(*self._input, step)
 
     def _answer(self, command: int) -> None:
-        if command == frames.GET_VERSION:
-            data = frames.VERSION.pack(2, 4, 4, 58, *FIRMWARE, 0)
+        if command == frames.HEARTBEAT:
+            data = frames.BEAT.pack(self._told, self.axis_state, self.result, 0)
+        elif command == frames.GET_VERSION:
+            data = frames.VERSION.pack(2, *self.version.hardware, *self.version.firmware, self.version.unreleased)
         elif command == frames.GET_ERROR:
             data = frames.ERRORS.pack(self.errors, self.disarm_reason)
         else:
             data = frames.ESTIMATES.pack(self.servo.position, self.servo.velocity)
         self._send(command, data)
+
+    def _sdo(self, data: bytes) -> None:
+        """RxSdo: read or write a setting; none of another firmware's numbers is answered."""
+        opcode, number, _ = frames.SDO.unpack_from(data)
+        table = next((table.endpoints for table in KNOWN if table.is_of(self.version)), {})
+        for path, endpoint in table.items():
+            if endpoint.id != number or path not in self.settings:
+                continue
+            kind = frames.TYPES[endpoint.type]
+            if opcode == frames.WRITE:
+                (self.settings[path],) = kind.unpack_from(data, frames.SDO.size)
+            else:
+                value = self.settings[path]
+                data = kind.pack(value if endpoint.type in {"float", "bool"} else int(value))
+                self._send(frames.TX_SDO, frames.SDO.pack(0, number, 0) + data)
 
     def _estop(self, _data: bytes) -> None:
         self.fail(Error.ESTOP_REQUESTED)
@@ -188,7 +224,7 @@ class SimulatedOdrive:
     def _set_input(self, data: bytes) -> None:
         position, velocity, _ = frames.INPUT_POS.unpack(data)
         if math.isfinite(position):
-            self._input = position, velocity * frames.VELOCITY_STEP
+            self._input = position, velocity / self.settings[f"{CAN}.input_vel_scale"]
         else:
             self.fail(Error.MISSING_INPUT)
 

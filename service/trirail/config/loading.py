@@ -96,12 +96,12 @@ def _tables(text: str) -> dict[str, Any]:
 
 
 def _beside(path: Path, config: Config, wrong: list[Mistake]) -> Config:
-    """The configuration with what lies relative to its file: EDS files, certificates, and what is in the map's file."""
+    """The configuration with what lies relative to its file: files of drives, certificates, what is in the map's."""
     drives = config.drives
     for name, drive in zip(NAMES, drives.each, strict=True):
-        if drive.eds is not None:
-            found = msgspec.structs.replace(drive, eds=str(path.parent / drive.eds))
-            drives = msgspec.structs.replace(drives, **{name: found})
+        named = {key: getattr(drive, key) for key in ("eds", "endpoints")}
+        found = {key: str(path.parent / file) for key, file in named.items() if file is not None}
+        drives = msgspec.structs.replace(drives, **{name: msgspec.structs.replace(drive, **found)})
     zenoh = config.zenoh
     if zenoh.tls is not None:
         tls = msgspec.structs.replace(zenoh.tls, directory=str(path.parent / zenoh.tls.directory))
