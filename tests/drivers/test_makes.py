@@ -5,15 +5,19 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from edsfiles import MAKES, eds, make_eds, rows
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rigs import DeviceRig
 from trirail_drivers import config
 from trirail_drivers.connection.opening import connect, simulated_bus
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Mechanics, Servo, SimulatedDrive
+from trirail_drivers.simulated.dictionary import SdoAbort
 
 NODE = 5
 PERIOD = 0.001
@@ -174,6 +178,34 @@ def test_modes_are_those_of_6502(make: str, tmp_path: Path) -> None:
             assert rig.send(0x600 + NODE, request.ljust(8, b"\0"))[-1][1][0] == 0x60
         else:
             assert rig.abort(request) == 0x06090030
+
+
+@settings(max_examples=20)
+@given(value=st.integers(0, 0xFFFF))
+def test_technosofts_mode_7_is_linear_with_bit_8_of_208e(value: int) -> None:
+    """iPOS CANopen Programming, 9.2.1: else it is PT, where a position without its time moves nothing."""
+    with TemporaryDirectory() as folder:
+        rig = Rig(make_eds(Path(folder), "technosoft_ipos", {(0x208E, 0): value, (0x6065, 0): 1_000_000}))
+    rig.enabled(7)
+    begin = rig.get(0x6064)
+    rig.put(0x6040, 0x1F)
+    for tick in range(1, 101):
+        rig.put(0x60C1, begin + 10 * tick, 1)
+        rig.sync()
+    moved = rig.get(0x6064) - begin
+    assert moved == pytest.approx(1000, abs=120) if value >> 8 & 1 else moved == 0
+
+
+@pytest.mark.parametrize(("exponent", "taken"), [(-3, True), (-2, False), (-4, False), (0, False)])
+def test_nanotecs_interpolation_is_in_milliseconds(exponent: int, taken: bool, tmp_path: Path) -> None:
+    """Manual of the PD4-C, 60C2h:02: must hold -3."""
+    rig = Rig(make_eds(tmp_path, "nanotec_pd4n"))
+    if taken:
+        rig.put(0x60C2, exponent, 2)
+    else:
+        with pytest.raises(SdoAbort):
+            rig.put(0x60C2, exponent, 2)
+        assert rig.get(0x60C2, 2) == -3
 
 
 def test_without_60c2_the_drive_moves_as_syncs_come(tmp_path: Path) -> None:

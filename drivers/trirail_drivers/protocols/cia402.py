@@ -21,12 +21,18 @@ def _simulated_drive(
     drive: config.Drive,
     start: float,
 ) -> SimulatedDevice:
-    """A drive that is to be homed counts from 0 at power-on, and has its home switch at zero counts of [drives]."""
+    """A drive that is to be homed counts from 0 at power-on, and has its home switch at zero counts of [drives].
+
+    Without its maker's EDS it has the objects that the configuration writes, and they do nothing.
+    """
     counts = round(drive.direction * (start - drive.offset) * drive.counts_per_metre)
     switch = None if drive.homing is None else -counts
     servo = Servo.configured(simulated, drive, counts if switch is None else 0)
     eds = Path(drive.eds) if drive.eds is not None else EDS
-    return SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, mechanics_of(drive))
+    device = SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, mechanics_of(drive))
+    for each in drive.write if drive.eds is None else ():
+        device.objects.add(each.object, each.sub, each.bits, signed=each.signed)
+    return device
 
 
 def mechanics_of(drive: config.Drive) -> Mechanics:

@@ -193,6 +193,15 @@ class Dictionary:
             if compact.get(index):
                 self._entries[index, 0].default = self._entries[index, 0].value = compact[index]
 
+    def add(self, index: int, subindex: int, bits: int, *, signed: bool) -> None:
+        """Have one more integer that the bus may write, where there is none yet."""
+        variable = ODVariable(f"Object {index:04X}", index, subindex)
+        sizes = _SIGNED if signed else _UNSIGNED
+        variable.data_type = next(kind for kind, size in sizes.items() if size * 8 == bits and kind != _BOOLEAN)
+        variable.access_type = "rw"
+        self._indices.add(index)
+        self._entries.setdefault((index, subindex), ObjectEntry(variable))
+
     def __getitem__(self, key: tuple[int, int]) -> ObjectEntry:
         """The entry at (index, subindex); raises SdoAbort where there is none."""
         try:

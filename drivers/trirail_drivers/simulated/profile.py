@@ -8,6 +8,7 @@ from typing import Final
 
 from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, ObjectEntry, SdoAbort
 from trirail_drivers.simulated.homing import EDGES, STANDING
+from trirail_drivers.simulated.makes import MakersRules
 from trirail_drivers.simulated.servo import Servo
 from trirail_drivers.simulated.units import FactorGroup, Mechanics
 
@@ -39,6 +40,7 @@ class Profile:
         o = objects
         o.internal(0x1000, 0, DEVICE_TYPE)
         self.units = FactorGroup(o, mechanics)
+        self._makers = MakersRules(o)
         self.abort_option = o.internal(0x6007, 0)
         self.error_code = o.internal(0x603F, 0)
         self.controlword = o.internal(0x6040, 0)
@@ -77,7 +79,7 @@ class Profile:
     def follows_setpoints(self) -> bool:
         """Whether mode and controlword have it follow setpoints; mode 7 does while bit 4 is set (CiA 402-2)."""
         if self.mode.value == INTERPOLATED_POSITION:
-            return bool(self.controlword.value & _INTERPOLATE)
+            return bool(self.controlword.value & _INTERPOLATE) and self._makers.interpolates_linearly
         return self.mode.value == CYCLIC_SYNCHRONOUS_POSITION
 
     @property

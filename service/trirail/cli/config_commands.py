@@ -127,7 +127,7 @@ def toml(tables: _Tables, other: _Tables, path: str = "") -> Iterator[str]:
         for number, table in enumerate(value):
             yield ""
             yield f"[[{name}]]"
-            beside = was[number] if isinstance(was, list) else {}
+            beside = was[number] if isinstance(was, list) and number < len(was) else {}
             yield from toml(table, beside)
 
 
