@@ -223,6 +223,7 @@ BITRATES = st.sampled_from([10_000, 20_000, 50_000, 125_000, 250_000, 500_000, 8
 @example(rate=500, bitrate=500_000, heartbeat=0.1)
 @given(rate=RATES, bitrate=BITRATES, heartbeat=st.floats(0.01, 1.0))
 def test_the_bus_load_is_judged_as_the_driver_does(protocol: str, rate: int, bitrate: int, heartbeat: float) -> None:
+    heartbeat = max(heartbeat, 1.0 / rate)  # else the configuration is refused
     config = changed(SIMULATED, "can", bitrate=bitrate)
     scaled = {"B": msgspec.structs.replace(config.drives.B, counts_per_metre=25.0)} if protocol == "odrive" else {}
     config = changed(config, "drives", protocol=protocol, heartbeat=heartbeat, **scaled)

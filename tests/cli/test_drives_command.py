@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from trirail.cli.commands import app
+from trirail.cli.drives_command import UNTRIED
 from trirail.config import SIM
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.simulated import SimulatedDrive
@@ -37,6 +38,15 @@ def test_differences_are_written_when_that_is_asked_for(capsys: pytest.CaptureFi
     words = capsys.readouterr().out
     assert "drive C, node 3" in words
     assert "written: 1017:00 Producer heartbeat time: 0 -> 100, for this service's watch on it" in words
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_of_real_drives_it_is_said_that_no_make_was_tried(
+    simulated: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trirail.diagnosis.check.is_simulated", lambda section: simulated)
+    assert run("drives", str(SIM)) == 0
+    assert (UNTRIED in capsys.readouterr().out) == (not simulated)
 
 
 def test_drives_that_tell_nothing(tmp_path: Path) -> None:

@@ -89,6 +89,8 @@ def test_every_number_that_is_spoilt_is_told(path: Path, tmp_path: Path) -> None
 PLANTED: dict[str, tuple[str, str, str]] = {
     # What is planted: what stood there, what stands there now, and what tells it.
     "beyond the rail": ("quick_stop_deceleration = 2.0 ", "quick_stop_deceleration = 0.15 ", "rail"),
+    "a controlled stop beyond the rail": ("acceleration = 1.5\n", "acceleration = 0.1\n", "rail"),
+    "never as fast": ("acceleration = 1.5\n", "acceleration = 0.02\n", "travel"),
     "power cut in motion": ("quick_stop_deceleration = 2.0 ", "quick_stop_deceleration = 0.05 ", "quick stop"),
     "offset in millimetres": ("offset = 0.0 ", "offset = 20.0 ", "offset"),
     "an EDS that is not there": ("[drives.B]\n", '[drives.B]\neds = "nowhere.eds"\n', "configuration"),
@@ -135,7 +137,13 @@ def test_what_is_told_of_nonsense_is_short(tmp_path: Path) -> None:
 
 
 NOT_TOGETHER = (
-    {"beyond the rail", "power cut in motion", "millimetres a second"},
+    {
+        "beyond the rail",
+        "power cut in motion",
+        "millimetres a second",
+        "a controlled stop beyond the rail",
+        "never as fast",
+    },
     {"too short to power up", "an hour to power up"},
 )
 

@@ -90,6 +90,32 @@ def test_what_the_drive_cannot_take_is_refused(rigs: list[Rig], habits: Habits, 
         rig.drives.configure(PERIOD)
 
 
+@pytest.mark.parametrize(
+    ("vendor", "index", "refused"),
+    [
+        # maxon, EPOS4 Firmware Specification: 2000h Node-ID, 2001h CAN bit rate.
+        (0xFB, 0x2000, True), (0xFB, 0x2001, True), (0xFB, 0x2005, False),
+        # Nanotec, manuals, description of the object dictionary: 2005h CANopen Baudrate, 2009h CANopen NodeID.
+        (0x26C, 0x2005, True), (0x26C, 0x2009, True), (0x26C, 0x2000, False),
+        # Other makes have other things there.
+        (0x9A, 0x2000, False), (0x9A, 0x2009, False),
+    ],
+)  # fmt: skip
+def test_node_id_and_bitrate_are_refused_by_their_makers_numbers(
+    rigs: list[Rig], vendor: int, index: int, refused: bool
+) -> None:
+    habits = Habits(more=((index, 0, 5, "rw", 1, False),), values={(0x1018, 1): vendor})
+    rig = Rig("elmo_gold", habits, write=(ObjectWrite(index, 5, "u8", "x"),))
+    rigs.append(rig)
+    if refused:
+        with pytest.raises(DriveError, match=rf"object {index:04X}:00 changes node id or bitrate"):
+            rig.drives.configure(PERIOD)
+        assert not any(written[0] == index for node in rig.nodes for written in node.written)
+    else:
+        rig.drives.configure(PERIOD)
+        assert [node.value(index) for node in rig.nodes] == [5] * 3
+
+
 def test_a_value_that_does_not_stick_is_refused(rigs: list[Rig]) -> None:
     rig = Rig("elmo_gold", Habits(more=ROWS), write=(BRAKE,))
     rigs.append(rig)

@@ -18,8 +18,8 @@ _NEVER: Final = {0x1010: _STORES, 0x1011: _STORES, 0x100B: _ADDRESS}
 _UNITS: Final = (0x60A9, 0x60AA)
 """That the set-up may give itself, beside what it uses."""
 _ADDRESSES: Final = {
-    0x0000_00FB: (0x2000, 0x2001),  # maxon EPOS4, Firmware Specification: Node-ID, CAN bit rate
-    0x0000_026C: (0x2005, 0x2009),  # Nanotec, manuals: CANopen Baudrate, CANopen NodeID
+    0x0000_00FB: (0x2000, 0x2001),  # maxon, EPOS4 Firmware Specification: Node-ID, CAN bit rate
+    0x0000_026C: (0x2005, 0x2009),  # Nanotec, manuals, object dictionary: CANopen Baudrate, CANopen NodeID
 }
 """Objects with node id and bitrate, by vendor (1018h:01)."""
 _NAMED_SO: Final = re.compile(r"node.?id|bit.?rate|baud", re.IGNORECASE)

@@ -15,6 +15,9 @@ app = App(name="drives", help="Show the drives on the bus; save, compare and res
 for command in drive_parameters.COMMANDS:
     app.command(command)
 
+UNTRIED = "no make of drive was tried on hardware yet: go on with trirail commission, the hand on the emergency stop"
+"""What the examples of makes say in their first line, too."""
+
 
 @app.default
 def drives(
@@ -39,6 +42,7 @@ def drives(
 
     from trirail.commissioning import drives_told
     from trirail.config import SIM, load
+    from trirail.diagnosis.check import is_simulated
 
     settings = load(config or SIM)
     inspect = PROTOCOLS[settings.drives.protocol].inspect
@@ -55,4 +59,6 @@ def drives(
         for each in found:
             for line in (*drives_told.identity(each), *drives_told.differences(each, applied=apply)):
                 terminal.say(line)
+        if not is_simulated(settings.can):
+            terminal.say(UNTRIED)
     return 0 if fit else 1

@@ -52,28 +52,42 @@ def stops(config: Config) -> Stops:
 
 
 def _rail(config: Config) -> Iterator[Check]:
-    """A stop from full velocity at the edge of the travel has to end on the rail."""
+    """A slider at full velocity at the end of its travel, by a wrong scale or home, has to stop on the rail."""
     found = stops(config)
-    quick = f"a quick stop from {found.velocity * 1e3:g} mm/s takes {found.quick_way * 1e3:.3g} mm"
+    speed = f"from {found.velocity * 1e3:g} mm/s"
+    ways = f"{speed} a quick stop takes {found.quick_way * 1e3:.3g} mm, a controlled one {found.way * 1e3:.3g} mm"
+    longer = max(found.way, found.quick_way)
     if found.left is None:
         remedy = "see that so much of each rail is left beyond limits.slider.position: measured legs do not tell"
-        yield Check("rail", "ok", quick, remedy)
+        yield Check("rail", "ok", ways, remedy)
     elif found.left < 0.0:
         low, high = found.rail or found.travel
         said = f"limits.slider.position = [{found.travel[0]:g}, {found.travel[1]:g}] goes beyond the rails: with "
         said += f"geometry.l0 = {config.geometry.l0:g} m they end at {low:.4g} and {high:.4g} m"
         yield Check("rail", "failure", said, "correct the one that is wrong", "limits.slider.position")
-    elif found.left >= found.quick_way:
-        yield Check("rail", "ok", f"{quick}, {found.left * 1e3:.3g} mm of rail are left beyond the travel")
+    elif longer <= found.left:
+        yield Check("rail", "ok", f"{ways}; {found.left * 1e3:.3g} mm are left beyond the travel")
     elif is_simulated(config.can):
-        yield Check("rail", "ok", f"{quick}, {found.left * 1e3:.3g} mm of rail are left: enough for simulated drives")
+        yield Check("rail", "ok", f"{ways}; {found.left * 1e3:.3g} mm are left: enough for simulated drives")
     else:
-        said = f"{quick}, and {found.left * 1e3:.3g} mm of rail are left beyond limits.slider.position"
+        quick = found.quick_way > found.left
+        ramp = "drives.quick_stop_deceleration" if quick else "limits.slider.acceleration and jerk"
+        said = f"{ways}; {found.left * 1e3:.3g} mm of rail are left beyond limits.slider.position"
         remedy = (
-            f"at most {math.sqrt(2.0 * found.left * config.drives.quick_stop_deceleration) * 1e3:.3g} mm/s, a travel "
-            f"that ends {found.quick_way * 1e3:.3g} mm before the rail, or a steeper drives.quick_stop_deceleration"
+            f"lower limits.slider.velocity, a travel that ends {longer * 1e3:.3g} mm before the rail, or more of {ramp}"
         )
         yield Check("rail", "warning", said, remedy, "limits.slider.velocity")
+
+
+def _travel(config: Config) -> Iterator[Check]:
+    """A velocity is reached, and left again, within the travel."""
+    found = stops(config)
+    travel = found.travel[1] - found.travel[0]
+    if 2.0 * found.way > travel:
+        said = f"from {found.velocity * 1e3:g} mm/s a controlled stop takes {found.way * 1e3:.3g} mm, as getting there "
+        said += f"does: the travel is {travel * 1e3:.3g} mm, so that no motion is ever as fast"
+        remedy = "a lower limits.slider.velocity, or more of its acceleration and jerk"
+        yield Check("travel", "warning", said, remedy, "limits.slider.velocity")
 
 
 def _quick_stop(config: Config) -> Iterator[Check]:
@@ -97,6 +111,7 @@ def _quick_stop(config: Config) -> Iterator[Check]:
 
 JUDGEMENTS = (
     Judgement(("limits.slider", "drives.quick_stop_deceleration", "geometry", "can"), _rail),
+    Judgement(("limits.slider", "drives.quick_stop_deceleration", "geometry"), _travel),
     Judgement(
         ("limits.slider", "drives.quick_stop_deceleration", "drives.stop_timeout", "geometry", "loop.rate_hz"),
         _quick_stop,
