@@ -15,7 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.cli import doctor, doctor_network, probes
 from trirail.cli.machine import Machine, Passed
-from trirail.config import SIM, Config, Tls, load
+from trirail.config import SIM, Config, Tls, everything, load
 from trirail.diagnosis import Check, drives
 from trirail.errors import ServiceError
 from trirail.processes.clock import Tick
@@ -121,6 +121,33 @@ def test_the_drives_window_is_to_be_behind_the_services(window: float, bad_ones:
     """REAL has limits.slider.following_error = 0.002."""
     found = bad(doctor.examine(changed(REAL, "drives", following_error=window), GOOD))
     assert [(each.name, each.verdict) for each in found.values()] == [("following error", "warning")] * bad_ones
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "read"),
+    [
+        ("velocity = 0.1\n", "velocity = -0.1\n", True),
+        ("rate_hz = 1000 ", "rate_hz = 0 ", False),
+        ('channel = "can0"', "channel = 0", False),
+        ("node = 1\n", "node = 2\n", True),
+    ],
+)
+def test_the_machine_is_judged_beside_mistakes_that_are_none_of_it(
+    was: str, now: str, read: bool, tmp_path: Path
+) -> None:
+    text = (CONFIGS / "socketcan.toml").read_text()
+    assert was in text
+    (tmp_path / "robot.toml").write_text(text.replace(was, now, 1))
+    asked: list[Config] = []
+
+    def machine(config: Config) -> Machine:
+        asked.append(config)
+        return msgspec.structs.replace(GOOD, governor="powersave")
+
+    checks = bad(doctor.whole(tmp_path / "robot.toml", everything(tmp_path / "robot.toml"), machine))
+    assert {"configuration", "the rest"} <= checks.keys()
+    assert ("governor" in checks, bool(asked)) == (read, read)
+    assert ("the machine" in checks["the rest"].found) == (not read)
 
 
 def test_simulated_drives_need_no_real_machine() -> None:

@@ -18,7 +18,7 @@ from trirail.cli import rail_drawing
 from trirail.config import SIM, Config, everything, load, overlap
 from trirail.config.checks import rules
 from trirail.config.explained import Place, leaves, repaired
-from trirail.diagnosis import Check, examined, stops
+from trirail.diagnosis import Check, diagnose, stops, told
 from trirail.diagnosis.configured import JUDGEMENTS
 from trirail.errors import TrirailError
 from trirail_drivers.errors import LONGEST
@@ -56,13 +56,15 @@ def times(value: float, factor: float) -> float:
     return int(product) if isinstance(value, int) and float(product).is_integer() else product
 
 
+def told_of(path: Path) -> list[Check]:
+    """Each mistake of a file, and each check of it that can do without what is impossible."""
+    found = everything(path)
+    return told(path, found.mistakes) + diagnose(found.config, [mistake.key for mistake in found.mistakes])
+
+
 def wrong(path: Path) -> list[Check]:
     """All that is told of a file, but what it lets drives lack on purpose."""
-    return [
-        check
-        for check in examined(path, everything(path))
-        if check.verdict != "ok" and not check.name.startswith("lacking")
-    ]
+    return [check for check in told_of(path) if check.verdict != "ok" and not check.name.startswith("lacking")]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
@@ -124,7 +126,7 @@ def test_each_planted_mistake_is_told_with_its_key(name: str, tmp_path: Path) ->
     (tmp_path / "robot.toml").write_text(planted([name]))
     found = wrong(tmp_path / "robot.toml")
     assert PLANTED[name][2] in {check.name for check in found}
-    assert all(check.key or check.name == "the rest" for check in found)
+    assert all(check.key for check in found)
     assert all("robot.toml" in check.found for check in found if check.name == "configuration")
 
 
@@ -158,14 +160,14 @@ def test_none_hides_another(names: set[str], tmp_path_factory: pytest.TempPathFa
     folder = tmp_path_factory.mktemp("planted")
     file = folder / "robot.toml"
 
-    def told(of: list[str]) -> set[tuple[str, str]]:
+    def found_of(of: list[str]) -> set[tuple[str, str]]:
         file.write_text(planted(of))
-        return {(check.key, check.found) for check in wrong(file) if check.name != "the rest"}
+        return {(check.key, check.found) for check in wrong(file)}
 
-    together = told(sorted(names))
+    together = found_of(sorted(names))
     impossible = [key for key, found in together if "robot.toml: " in found]
     for name in sorted(names):
-        for key, found in told([name]):
+        for key, found in found_of([name]):
             depends = "robot.toml: " not in found and any(
                 overlap((key,), each.reads) and overlap(each.reads, impossible) for each in JUDGEMENTS
             )

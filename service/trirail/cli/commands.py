@@ -105,16 +105,15 @@ def doctor(config: Path | None = None, /, *, json: Annotated[bool, Flag] = False
         Print one JSON object instead of words.
     """
     from trirail.cli import probes, rail_drawing
-    from trirail.cli.doctor import examine
+    from trirail.cli.doctor import whole
     from trirail.config import SIM, everything
-    from trirail.diagnosis import examined, stops
+    from trirail.diagnosis import stops
 
     path = config or SIM
     found = everything(path)
-    right = None if found.mistakes else found.config
-    checks = examined(path, found) if right is None else examine(right, probes.machine(right))
+    checks = whole(path, found, probes.machine)
     fit = all(check.verdict != "failure" for check in checks)
-    way = None if right is None else stops(right)
+    way = None if found.mistakes else stops(found.config)
     if json:
         terminal.json({"ok": fit, "checks": msgspec.to_builtins(checks), "stops": msgspec.to_builtins(way)})
         return 0 if fit else 1

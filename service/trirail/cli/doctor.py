@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
 
 from trirail_drivers.bus.frames import bits_of
 from trirail_drivers.bus.load import HIGH
@@ -12,8 +13,8 @@ from trirail_drivers.protocols import PROTOCOLS
 from trirail.cli import units
 from trirail.cli.doctor_network import metrics, network, routers
 from trirail.cli.machine import Machine, Passed
-from trirail.config import Config, as_built
-from trirail.diagnosis import Check, Verdict, diagnose
+from trirail.config import Config, Findings, as_built, overlap
+from trirail.diagnosis import Check, Verdict, diagnose, told
 from trirail.processes.clock import Tick
 
 RELIABLE_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "riscv_clocksource")
@@ -24,8 +25,32 @@ LATE = 0.1
 """Share of the period by which one tick in a thousand may be late."""
 
 
-def examine(config: Config, machine: Machine) -> list[Check]:
-    """Return every check, in order."""
+READS: Final = (
+    "loop", "can", "zenoh", "watchdogs", "correction", "drives.protocol",
+    "telemetry.metrics_port", "telemetry.metrics_address",
+)  # fmt: skip
+"""What of a configuration the machine is read and judged by."""
+
+
+def whole(path: Path, found: Findings, read: Callable[[Config], Machine]) -> list[Check]:
+    """Return each mistake of a file, and every check that can do without what is impossible; `read` reads the machine.
+
+    It is not called where what it needs to know is impossible.
+    """
+    wrong = [mistake.key for mistake in found.mistakes]
+    checks = told(path, found.mistakes)
+    if overlap(READS, wrong):
+        checks += diagnose(found.config, wrong)
+    else:
+        checks += examine(found.config, read(found.config), wrong)
+    if wrong:
+        said = "what depends on the above" + (", and the machine," if overlap(READS, wrong) else "")
+        checks.append(Check("the rest", "warning", f"{said} is looked at once that is right", "correct it, ask again"))
+    return checks
+
+
+def examine(config: Config, machine: Machine, impossible: Sequence[str] = ()) -> list[Check]:
+    """Return every check, in order; of the configuration those that read no `impossible` key."""
     simulated = config.can.interface in {"simulated", "unix"}
     return [
         kernel(machine, simulated=simulated),
@@ -35,7 +60,7 @@ def examine(config: Config, machine: Machine) -> list[Check]:
         isolation(machine.cpu, machine.isolated, simulated=simulated),
         *can_interface(config, machine),
         *corrected(config),
-        *diagnose(config),
+        *diagnose(config, impossible),
         *network(config, machine),
         *routers(machine.routers),
         *metrics(config),
@@ -100,8 +125,8 @@ def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
 def corrected(config: Config) -> list[Check]:
     """What as-built errors are corrected by: nobody should have to guess that it is on."""
     section = config.correction
-    told = as_built.told(section.map, section.as_built, section.backlash)
-    return [] if told is None else [Check("correction", "ok", units.correction(told))]
+    words = as_built.told(section.map, section.as_built, section.backlash)
+    return [] if words is None else [Check("correction", "ok", units.correction(words))]
 
 
 def can_interface(config: Config, machine: Machine) -> list[Check]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from trirail_drivers.errors import shortened
 
-from trirail.config import Config, Findings, overlap
+from trirail.config import Config, Mistake, overlap
 from trirail.diagnosis import drives, limits, stopping, times
 from trirail.diagnosis.check import Check
 
@@ -19,14 +19,8 @@ def diagnose(config: Config, impossible: Sequence[str] = ()) -> list[Check]:
     return [check for each in JUDGEMENTS if not overlap(each.reads, impossible) for check in each.of(config)]
 
 
-def examined(path: Path, found: Findings) -> list[Check]:
-    """Return each mistake of a file, and what the checks find that can do without what is impossible."""
-    wrong = [mistake.key for mistake in found.mistakes]
-    checks = []
-    for key, text in found.mistakes:
-        checks.append(Check("configuration", "failure", shortened(f"{path}: {text}"), key=shortened(key)))
-    checks += diagnose(found.config, wrong)
-    if wrong:
-        said = "the machine, and what depends on the above, is looked at once that is right"
-        checks.append(Check("the rest", "warning", said, "correct it, and ask again"))
-    return checks
+def told(path: Path, mistakes: Sequence[Mistake]) -> list[Check]:
+    """Return each mistake of a file as a check that failed."""
+    return [
+        Check("configuration", "failure", shortened(f"{path}: {text}"), key=shortened(key)) for key, text in mistakes
+    ]
