@@ -196,6 +196,21 @@ def test_technosofts_mode_7_is_linear_with_bit_8_of_208e(value: int) -> None:
     assert moved == pytest.approx(1000, abs=120) if value >> 8 & 1 else moved == 0
 
 
+@pytest.mark.parametrize(("make", "waits"), [("technosoft_ipos", True), ("nanotec_pd4n", False)])
+def test_technosofts_show_their_mode_in_operation_enabled_alone(make: str, waits: bool, tmp_path: Path) -> None:
+    """iPOS CANopen Programming, 6061h: in a state below it takes the value of 6060h only once it is reached."""
+    rig = Rig(make_eds(tmp_path, make))
+    rig.put(0x6060, 7)
+    assert rig.get(0x6061) == (0 if waits else 7)
+    rig.enabled(7)
+    assert rig.get(0x6061) == 7
+    rig.put(0x6060, 6)
+    assert rig.get(0x6061) == 6
+    rig.put(0x6040, 0)
+    rig.put(0x6060, 7)
+    assert rig.get(0x6061) == (6 if waits else 7)
+
+
 @pytest.mark.parametrize(("exponent", "taken"), [(-3, True), (-2, False), (-4, False), (0, False)])
 def test_nanotecs_interpolation_is_in_milliseconds(exponent: int, taken: bool, tmp_path: Path) -> None:
     """Manual of the PD4-C, 60C2h:02: must hold -3."""

@@ -168,6 +168,7 @@ class SimulatedDrive(Device):
             self._setpoint_given = False
             self.homing.interrupt()
         self.state = state
+        self._profile.change(enabled=state is PowerState.OPERATION_ENABLED)
         if state not in _POWERED:
             self.servo.hold()
         if state is PowerState.OPERATION_ENABLED:

@@ -33,6 +33,14 @@ class MakersRules:
         """
         return not self._technosoft or bool(self._auxiliary.value & LINEAR)
 
+    @property
+    def shows_mode_with_power_alone(self) -> bool:
+        """Whether 6061h takes the value of 6060h in operation enabled only.
+
+        Technosoft, the same manual of 2019, 6061h, as yarp-devices quotes it in its issue 215.
+        """
+        return self._technosoft
+
 
 def _in_milliseconds(entry: ObjectEntry, _old: int) -> None:
     """Nanotec, manual of the PD4-C, 60C2h:02: must hold -3, milliseconds."""

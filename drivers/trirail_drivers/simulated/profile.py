@@ -41,6 +41,7 @@ class Profile:
         o.internal(0x1000, 0, DEVICE_TYPE)
         self.units = FactorGroup(o, mechanics)
         self._makers = MakersRules(o)
+        self._enabled = False
         self.abort_option = o.internal(0x6007, 0)
         self.error_code = o.internal(0x603F, 0)
         self.controlword = o.internal(0x6040, 0)
@@ -73,7 +74,14 @@ class Profile:
     def restarted(self) -> None:
         """The objects have their power-on values."""
         self.units.refresh()
-        self._mode_display.value = self.mode.value
+        if not self._makers.shows_mode_with_power_alone:
+            self._mode_display.value = self.mode.value
+
+    def change(self, *, enabled: bool) -> None:
+        """Have power, in operation enabled, or none."""
+        self._enabled = enabled
+        if enabled:
+            self._mode_display.value = self.mode.value
 
     @property
     def follows_setpoints(self) -> bool:
@@ -137,7 +145,8 @@ class Profile:
         mode = entry.value
         if mode != NO_MODE and not (mode in _MODES and self._supported.value >> (mode - 1) & 1):
             raise SdoAbort(INVALID_VALUE)
-        self._mode_display.value = mode
+        if self._enabled or not self._makers.shows_mode_with_power_alone:
+            self._mode_display.value = mode
         if mode != old:
             self._mode_changed()
 
