@@ -21,8 +21,7 @@ from trirail_drivers.cia402.objects import means
 from trirail_drivers.cia402.one_drive import HAS_POWER
 from trirail_drivers.cia402.strangers import Strangers
 from trirail_drivers.driver.driver import Driver
-from trirail_drivers.driver.refusals import told
-from trirail_drivers.interface import Clock, Feedback, MissingProtection, PowerState, Triple
+from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3
 """A controlword that a drive does not follow is sent again after so many SYNCs: the frame may be lost."""
@@ -63,11 +62,7 @@ class Cia402(Driver[Cia402Axis]):
             axis.error_code = start.error_code
             axis.take_status(start.statusword)
         self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
-        for line in told((made.name, made.notes) for made, _ in done):
-            self._wire.warn(line)
-        self.missing_protections = tuple(
-            MissingProtection(made.name, name, means(name)) for made, _ in done for name in made.lacking
-        )
+        self._tell([made for made, _ in done], means)
 
     def _listen(self, axis: Cia402Axis) -> None:
         listen, way = self._wire.listen, axis.way

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
 import can
@@ -14,6 +14,7 @@ from trirail_drivers import config
 from trirail_drivers.bus import load
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.refusals import SetUpDrive, told
 from trirail_drivers.driver.scaling import Scale, scale_of
 from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection
 
@@ -53,6 +54,14 @@ class Driver(ABC, Generic[AnyAxis]):
         self._asked = ""
         """By what that was asked for."""
         self._closed = False
+
+    def _tell(self, made: Sequence[SetUpDrive], means: Callable[[str], str]) -> None:
+        """Warn of what is done otherwise, and keep which protections drives do without; `means` words one."""
+        for line in told((each.name, each.notes) for each in made):
+            self._wire.warn(line)
+        self.missing_protections = tuple(
+            MissingProtection(each.name, name, means(name)) for each in made for name in each.lacking
+        )
 
     @property
     def traffic(self) -> int:

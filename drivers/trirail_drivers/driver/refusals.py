@@ -23,6 +23,22 @@ class Purpose(Protocol):
         """Likewise."""
 
 
+class SetUpDrive(Protocol):
+    """What a protocol tells of a drive that is set up."""
+
+    @property
+    def name(self) -> str:
+        """A, B or C."""
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Lines for people."""
+
+    @property
+    def lacking(self) -> Sequence[str]:
+        """Protections that it does without."""
+
+
 def judged(
     drive: str, lacking: Mapping[str, str], accepted: Sequence[str], protections: Mapping[str, Purpose]
 ) -> tuple[str, list[str]]:

@@ -20,8 +20,7 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.driver.driver import Driver
-from trirail_drivers.driver.refusals import told
-from trirail_drivers.interface import Clock, DriveFault, Feedback, MissingProtection, Triple
+from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import frames, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
@@ -69,12 +68,7 @@ class Odrive(Driver[OdriveAxis]):
         """
         self._set_period(period, frames.TRAFFIC)
         self._setpoints.period = period
-        done = setup.configure(self._wire, self._axes, self._drives, period, self._clock)
-        for line in told((made.name, made.notes) for made in done):
-            self._wire.warn(line)
-        self.missing_protections = tuple(
-            MissingProtection(made.name, name, means(name)) for made in done for name in made.lacking
-        )
+        self._tell(setup.configure(self._wire, self._axes, self._drives, period, self._clock), means)
 
     def sync(self) -> None:
         """Send the setpoints written since the last cycle, which are in force on arrival; ask for the positions.
