@@ -49,7 +49,7 @@ BOUNDS = (
     Bound("Ticks missed in a row", ("watchdogs.max_overruns",), "controlled stop"),
     Bound("No sign of life from the gateway", ("watchdogs.gateway_timeout",), "controlled stop"),
     Bound("No sign of life from a process", ("trirail.processes.supervisor:SILENT s",),
-          "it is killed; a gateway is started again, with the loop the service ends"),
+          "it is killed, if it could have given one; a gateway is started again, with the loop the service ends"),
     Bound("Controlled stop when the service ends", ("trirail.processes.loop:SHUTDOWN s",), "the drives' quick stop"),
     Bound("Goals that wait for the one under way", ("motion.queue",), "refused, `queue_full`"),
     Bound("Unread messages, of one user and of all", ("trirail.processes.inbox:UNREAD_OF_ONE messages",

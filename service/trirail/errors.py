@@ -134,7 +134,7 @@ class RefusalCode(StrEnum):
     NO_PLAN = "no_plan", "no motion to it was found from the present one", "send it again when the robot holds"
     PLANNER_LOST = (
         "planner_lost",
-        "the planner has died, or says nothing; what is under way goes on",
+        "the planner has died; what is under way goes on",
         "send it again: a planner that is lost is started again",
     )
     NO_VELOCITY = "no_velocity", "a jog that moves nothing", "give it a velocity"

@@ -37,8 +37,10 @@ from trirail.wire.sizes import MAX_PACKET, MAX_POINTS
 from trirail.wire.vocabulary import Command, Mode
 
 PERIOD = CONFIG.period
-SILENT = round(0.5 / PERIOD)
-"""Cycles that the planner may say nothing."""
+BUSY = round(0.5 / PERIOD)
+"""Cycles for which the planner may say nothing before everyone is told."""
+SILENT = round(8.0 / PERIOD)
+"""Cycles that a goal waits for it."""
 LEADS = (0.003, 0.012, 0.048)
 """How long before a motion from motion is to begin it is asked for, at the first, second and third time [s]."""
 
@@ -117,7 +119,7 @@ def test_a_motion_from_motion_that_comes_too_late_is_asked_for_anew_with_more_ti
 def test_a_planner_that_is_always_late_is_asked_three_times(rig: Rig, meddler: Meddler) -> None:
     moving(rig)
     meddler.asked.clear()
-    meddler.delays = [60]
+    meddler.delays = [20, 60, 150]
     rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
     rig.until(lambda: isinstance(rig.answers[-1], Refused))
     assert (code(rig), len(meddler.asked)) == ("no_plan", 3)
@@ -127,7 +129,7 @@ def test_a_planner_that_is_always_late_is_asked_three_times(rig: Rig, meddler: M
 
 
 @pytest.mark.parametrize("in_motion", [False, True])
-def test_a_planner_that_says_nothing_is_lost_and_what_is_under_way_goes_on(
+def test_a_planner_that_says_nothing_costs_a_goal_and_what_is_under_way_goes_on(
     rig: Rig, meddler: Meddler, in_motion: bool
 ) -> None:
     if in_motion:
@@ -135,13 +137,50 @@ def test_a_planner_that_says_nothing_is_lost_and_what_is_under_way_goes_on(
     meddler.change = lambda _: []
     sent = len(rig.rows)
     rig.post("lost", PoseGoal(0.0, 0.05, 0.0))
-    rig.until(lambda: isinstance(rig.answers[-1], Refused))
-    assert code(rig) == "planner_lost"
-    assert len(rig.rows) - sent <= SILENT + 3
+    rig.until(lambda: isinstance(rig.answers[-1], Refused), SILENT + 10)
+    assert code(rig) == "expired"
+    assert SILENT <= len(rig.rows) - sent <= SILENT + 3
     rig.until(rig.holds)
-    assert dict(rig.outcomes()) == {"lost": "rejected"} | ({"g1": "done"} if in_motion else {})
+    assert dict(rig.outcomes()) == {"lost": "expired"} | ({"g1": "done"} if in_motion else {})
     meddler.change = lambda answer: [answer]
     assert isinstance(rig.goal("next", 0.0, 0.0, 0.0), Accepted)
+
+
+@settings(max_examples=25)
+@given(
+    in_motion=st.booleans(),
+    delays=st.lists(st.integers(1, 2 * BUSY), min_size=1, max_size=4),
+    valid_for=st.one_of(st.none(), st.floats(0.01, 2.0)),
+)
+def test_a_goal_waits_its_own_time_for_a_planner_that_is_busy(
+    in_motion: bool, delays: list[int], valid_for: float | None
+) -> None:
+    """Whatever each answer takes: it begins, or is refused when its own time is over, and either is said with why."""
+    rig = Rig()
+    busy = rig.planner = rig.control._planner._port = Meddler(rig)  # type: ignore[assignment]
+    rig.enable()
+    if in_motion:
+        moving(rig)
+    busy.asked.clear()
+    busy.delays = list(delays)
+    sent = len(rig.rows)
+    answered = len(rig.answers)
+    rig.post("g2", PoseGoal(0.0, 0.05, 0.0, valid_for=valid_for))
+    rig.until(lambda: len(rig.answers) > answered, SILENT + 10)
+    waited, answer = len(rig.rows) - sent, rig.answers[-1]
+    longest = max([*delays, 1][: len(busy.asked)])
+    told = [notice.message for notice in rig.notices if "the planner is busy" in notice.message]
+    if isinstance(answer, Accepted):
+        assert valid_for is None or waited <= valid_for / PERIOD + 2
+        return
+    assert isinstance(answer, Refused)
+    if answer.code == "expired":
+        assert valid_for is not None
+        assert waited >= valid_for / PERIOD
+        assert f"it was valid for {valid_for:g} s" in answer.message
+    else:
+        assert (answer.code, len(busy.asked)) == ("no_plan", 3)
+    assert not told or longest > BUSY
 
 
 def test_a_planner_that_has_died_is_said_at_once(rig: Rig, meddler: Meddler) -> None:
@@ -213,9 +252,9 @@ def test_an_answer_for_another_motion_is_left_aside(rig: Rig, meddler: Meddler) 
     moving(rig)
     meddler.change = lambda answer: [msgspec.structs.replace(answer, version=answer.version - 1)]
     rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
-    rig.until(lambda: len(rig.outcomes()) == 2)
-    assert dict(rig.outcomes()) == {"g2": "rejected", "g1": "done"}
-    assert code(rig) == "planner_lost"
+    rig.until(lambda: len(rig.outcomes()) == 2, SILENT + 10)
+    assert dict(rig.outcomes()) == {"g2": "expired", "g1": "done"}
+    assert code(rig) == "expired"
 
 
 def test_an_override_while_a_goal_is_planned_has_it_planned_from_the_new_motion(rig: Rig, meddler: Meddler) -> None:

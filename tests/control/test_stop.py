@@ -78,11 +78,12 @@ def test_a_plan_that_does_not_end_is_refused(rig: Rig) -> None:
     rig.planner.delay = NEVER
     rig.post("g1", PoseGoal(0.01, 0.0, 0.0))
     assert confirmed_after(rig, "override", 3) <= 1
-    rig.until(lambda: bool(rig.outcomes()), 600)
-    assert rig.outcomes() == [("g1", "rejected")]
+    rig.until(lambda: bool(rig.outcomes()), round(8.1 / rig.config.period))
+    assert rig.outcomes() == [("g1", "expired")]
     refused = rig.answers[-1]
     assert isinstance(refused, Refused)
-    assert refused.code == "planner_lost"
+    assert refused.code == "expired"
+    assert "the planner is busy" in refused.message
 
 
 # ---------------------------------------------------------------------- what has been sent but not begun

@@ -49,6 +49,16 @@ def slower(by: float, within: float, edge: float) -> Path:
     return Path(knots, pieces)
 
 
+@given(knots=st.integers(2, 400), seconds=st.floats(0.1, 20.0))
+def test_a_look_along_a_path_gives_signs_of_life_between_its_parts(knots: int, seconds: float) -> None:
+    beats: list[None] = []
+    checker = Checker(geometry(CONFIG.geometry), LIMITS, Bounds(LIMITS, PERIOD), PERIOD, lambda: beats.append(None))
+    path = Path(np.linspace(0.0, seconds, knots), np.zeros((knots - 1, 3, 6)))
+    checker.whole(path, (0.0, 0.0, 0.0))
+    assert len(beats) == len(parts(path, constant(1.0), 0.0, seconds, feasibility.KNOTS_A_PART))
+    assert len(beats) >= (knots - 2) // feasibility.KNOTS_A_PART
+
+
 @pytest.mark.parametrize(("share", "within_limits"), [(0.9, True), (1.5, False)])
 def test_a_change_of_rate_counts_with_what_the_velocities_tell(share: float, within_limits: bool) -> None:
     """Within one cycle the accelerations before and after are zero; a slider's velocity takes a step all the same."""

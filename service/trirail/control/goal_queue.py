@@ -58,6 +58,7 @@ class GoalQueue:
         self._served: dict[str, int] = {}
         """When each user's last goal had its turn, counted since there was none to plan."""
         self._planned: _Sent | None = None
+        self._told_busy = False
 
     @property
     def idle(self) -> bool:
@@ -95,6 +96,7 @@ class GoalQueue:
                 self._ledger.refuse(self._planned.request, refusal)
         try:
             if self._planner.busy and self._planned is not None:
+                self._tell_busy(self._planned.request)
                 self._ledger.check_id(self._planned.request)  # it may end while its renewal is being planned
                 self._lease.check(self._planned.request.user)  # and the lease may have another holder by now
                 self._check_age(self._planned, cycle)
@@ -200,13 +202,23 @@ class GoalQueue:
             raise RefusedError(RefusalCode.WRONG_TIME, text, value=ago, limit=math.copysign(FURTHEST, ago))
         return structs.replace(planned, time=self._schedule.cycle * self._period - ago)
 
+    def _tell_busy(self, request: GoalRequest) -> None:
+        """Tell everyone, once until it has said something, that a goal waits for a planner that is busy."""
+        busy = self._planner.how_busy
+        if busy and not self._told_busy:
+            self._ledger.tell("service", "warning", f"{busy}: goal {request.id} waits", user=request.user)
+        self._told_busy = bool(busy)
+
     def _check_age(self, sent: _Sent, cycle: int) -> None:
         """Refuse what can no more begin in time."""
         valid = sent.request.goal.valid_for
+        why = f"; {self._planner.how_busy}" if self._planner.how_busy else ""
         if valid is not None and cycle - sent.cycle > valid / self._period:
-            raise RefusedError(RefusalCode.EXPIRED, f"the goal came too late: it was valid for {valid:g} s")
+            raise RefusedError(RefusalCode.EXPIRED, f"the goal came too late: it was valid for {valid:g} s{why}")
         if cycle > self._alive_until(sent):
-            raise RefusedError(RefusalCode.EXPIRED, "it came too late: its timeout was over before it could begin")
+            raise RefusedError(
+                RefusalCode.EXPIRED, f"it came too late: its timeout was over before it could begin{why}"
+            )
 
     def _alive_until(self, sent: _Sent) -> float:
         """Return the cycle in which a goal ends that nobody renews; infinite for those that need not be."""

@@ -33,8 +33,12 @@ LEADS = (0.003, 0.012, 0.048)
 """How long before it is to begin a motion from motion is asked for, each time that it has to be asked for anew [s]."""
 LEAST_LEAD = 2
 """And in cycles: an answer comes in the next one at the earliest."""
-PATIENCE = 0.5
-"""How long the planner may say nothing [s]."""
+PATIENCE = 8.0
+"""How long a goal waits for the planner, as for the goals before it; one that has died is told at once [s]."""
+BUSY = 0.5
+"""A planner that has said nothing for so long is told to be busy [s]."""
+SLACK = 2
+"""A motion that came too late is asked for so many times as far ahead as the answer took."""
 ROUND = 12
 """Cycles that a change of rate has for itself before a goal is planned all the same."""
 ROUNDING = (1e-9, 1e-7, 1e-5)
@@ -78,7 +82,6 @@ class PlanRequests:
         self._port = port
         self._schedule = schedule
         self._leads = [max(LEAST_LEAD, math.ceil(lead / self._period)) for lead in LEADS]
-        self._patience = max(LEAST_LEAD, round(PATIENCE / self._period))
         self._goal: PlannedGoal | None = None
         self._blend: float | None = None
         self._number = 0
@@ -98,6 +101,17 @@ class PlanRequests:
         """Whether a goal is being planned."""
         return self._goal is not None
 
+    @property
+    def silence(self) -> float:
+        """How long the planner has been asked for a goal, and has said nothing [s]."""
+        return (self._schedule.cycle - self._since) * self._period if self._since is not None else 0.0
+
+    @property
+    def how_busy(self) -> str:
+        """That the planner is busy, for people; empty while it is not."""
+        silence = self.silence
+        return f"the planner is busy, it has said nothing for {silence:.1f} s" if silence > BUSY else ""
+
     def warm_up(self) -> None:
         """Take a motion and stop it, on a schedule that nobody runs: what runs for the first time is slow."""
         nowhere = Schedule(rest(STILL), self._period)
@@ -112,7 +126,7 @@ class PlanRequests:
 
     def give_up(self) -> None:
         """Have the goal planned no longer: what is answered is left aside."""
-        self._goal = self._asked = self._answer = self._lost = None
+        self._goal = self._asked = self._answer = self._lost = self._since = None
 
     def run_at(self, rate: float) -> None:
         """Let the goal's motion run at another rate, as soon as the sliders allow."""
@@ -144,8 +158,8 @@ class PlanRequests:
         self._change_rate()
         if self._goal is None:
             return None
-        if self._since is not None and self._schedule.cycle - self._since > self._patience:
-            self.lose(f"the planner has said nothing for {PATIENCE:g} s")
+        if self.silence > PATIENCE:
+            raise RefusedError(RefusalCode.EXPIRED, f"{self.how_busy}: send the goal again when the machine has time")
         if self._lost is not None:
             raise RefusedError(RefusalCode.PLANNER_LOST, f"{self._lost}: send the goal again")
         if self._asked is not None and self._asked.version != self._schedule.version:
@@ -190,7 +204,9 @@ class PlanRequests:
     def _lead(self, goal: PlannedGoal) -> int:
         """Return in how many cycles a motion is to begin: of a target, which is told of often, as the last one came."""
         lead = self._leads[self._times]
-        return max(lead, self._took + 1) if isinstance(goal, TrackGoal) and self._times == 0 else lead
+        if self._times:
+            return max(lead, SLACK * self._took)
+        return max(lead, self._took + 1) if isinstance(goal, TrackGoal) else lead
 
     def _take(self, answer: PlanAnswer) -> AcceptedPlan | None:
         """Carry out what the planner has decided, once its time has come; ask anew where it does not fit any more."""

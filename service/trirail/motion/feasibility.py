@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -95,7 +95,15 @@ def parts(path: Path, law: Path, first: float, until: float, knots: int) -> list
 class Checker:
     """Looks at paths of one robot."""
 
-    def __init__(self, geometry: Geometry, limits: Limits, bounds: Bounds, period: float) -> None:
+    def __init__(
+        self,
+        geometry: Geometry,
+        limits: Limits,
+        bounds: Bounds,
+        period: float,
+        beat: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._beat = beat
         platform, slider = limits.platform, limits.slider
         x, y, phi = np.array([platform.velocity, platform.acceleration, platform.jerk]).T
         each = np.array([[slider.velocity, slider.acceleration, slider.jerk], x, y, phi, x, y])
@@ -116,7 +124,11 @@ class Checker:
         self._box = np.array([platform.x, platform.y, platform.phi, slider.position, slider.passive]).T.copy()
 
     def look(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Look:
-        """Look at a path under a law from one time of the law to another [s], from near a pose on."""
+        """Look at a path under a law from one time of the law to another [s], from near a pose on.
+
+        It gives a sign of life: each loop of the planner's looks at a path in each of its turns.
+        """
+        self._beat()
         until = max(first, min(until, first + LONGEST))
         # A path from standstill may begin with an acceleration: the step into it counts, as the one at the end does.
         if first == 0.0 and law.pieces[0, 0, 0] == 0.0 and not path.pieces[0, :, 1].any():

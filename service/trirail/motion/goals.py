@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 from trirail.config import Limits
@@ -62,9 +63,11 @@ class Extension(NamedTuple):
 class Goals:
     """Plans the goals of one robot."""
 
-    def __init__(self, geometry: Geometry, limits: Limits, period: float) -> None:
+    def __init__(
+        self, geometry: Geometry, limits: Limits, period: float, beat: Callable[[], None] = lambda: None
+    ) -> None:
         bounds = Bounds(limits, period)
-        checker = Checker(geometry, limits, bounds, period)
+        checker = Checker(geometry, limits, bounds, period, beat)
         self._checker = checker
         self._period = period
         self._planner = Planner(geometry, limits.platform, limits.slider, bounds, checker, period)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections import deque
+from collections.abc import Callable
 
 import msgspec
 
@@ -31,14 +32,14 @@ def revision(config: Config) -> int:
 
 
 class MotionPlanner:
-    """Plans the motions of one robot."""
+    """Plans the motions of one robot; `beat` is called between the parts of that work."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, beat: Callable[[], None] = lambda: None) -> None:
         robot = corrected_geometry(config)
         self._legs = robot.packed()
         self._period = config.period
         self._revision = revision(config)
-        self._goals = Goals(robot, planned_limits(config.limits, config.correction.backlash), config.period)
+        self._goals = Goals(robot, planned_limits(config.limits, config.correction.backlash), config.period, beat)
 
     def plan(self, request: PlanRequest) -> PlanAnswer:
         """Return the motion to a goal, or why there is none. Whatever goes wrong is an answer."""

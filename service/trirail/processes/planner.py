@@ -17,13 +17,20 @@ from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
 
 def main(config: Config, path: Path, heart: Heart, ready: Callable[[object], None]) -> int:
     """Answer what the loop asks until the loop has gone. It keeps nothing, so it may be killed at any time."""
-    planner = MotionPlanner(config)
+
+    def beat() -> None:
+        if serving:  # the first start compiles in its warm-up
+            heart.beat()
+
+    serving = False
+    planner = MotionPlanner(config, beat)
     planner.warm_up()
     lacking = realtime.stay_beside(config.loop)
     link = links.connect(path, MAX_PLANNING)
     ready({"lacking": lacking})
     poll = select.poll()
     poll.register(link.fileno(), select.POLLIN)
+    serving = True
     try:
         while True:
             heart.beat()

@@ -16,8 +16,9 @@ from trirail.errors import ServiceError
 from trirail.processes.child_process import ChildProcess
 from trirail.processes.compiling import Progress
 from trirail.processes.descriptors import raise_limit
+from trirail.processes.hanging import HangWatch
 from trirail.processes.health import Running
-from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
+from trirail.processes.heartbeats import PROCESSES, Heartbeats
 from trirail.processes.monitor import Monitor
 from trirail.processes.process import Order
 from trirail.processes.signals import Signals
@@ -47,7 +48,7 @@ RESTARTS = 5
 TURN = 0.1
 """How often the supervisor looks whether the others are alive [s]."""
 SILENT = 0.7
-"""A process that should give signs of life and gives none for so long is hung, and is killed [s]."""
+"""A process that could have given signs of life for so long and gave none hangs, and is killed [s]."""
 RECORDER_SILENT = 5.0
 """The same of the recorder, which may wait for a disk: nothing that moves depends on it [s]."""
 LEAST_CYCLES = 3
@@ -84,7 +85,7 @@ class Supervisor:
             "recorder": RECORDER_SILENT,
         }
         self._watches = {
-            name: Watch(self._heartbeats.of(name), round(seconds / TURN)) for name, seconds in self._patience.items()
+            name: HangWatch(self._heartbeats.of(name), seconds, TURN) for name, seconds in self._patience.items()
         }
         self._monitor = Monitor(config, self._heartbeats, TURN)
         self._watchdog = Watchdog([self._heartbeats.of(name) for name in WATCHED_BY_SYSTEMD])
@@ -177,7 +178,7 @@ class Supervisor:
                 child.kill_hung(START_WITHIN)
         self._monitor.look({name: self._running(name) for name in CHILDREN})
         for name, watch in self._watches.items():
-            if watch.silent() and name in self._children:
+            if name in self._children and watch.hangs(self._children[name].process.pid):
                 self._children[name].kill_hung(self._patience[name])
 
     def _running(self, name: str) -> Running:
