@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections import namedtuple
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,8 @@ import made
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from trirail.config import SIM, Config, load, parse
@@ -26,11 +30,15 @@ from trirail.telemetry.provenance import SOFTWARE
 from trirail.telemetry.reading import Recording, join, read
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.rotation import RETRY
+from trirail.telemetry.session_index import SessionIndex
 from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.vocabulary import Mode
 from trirail_drivers import interface
+from trirail_drivers.bus.capture import FRAME
+from trirail_drivers.bus.frames import Frame
 
 WALL_NS = 1_795_245_300_000_000_000
 BATCH = 20
@@ -73,6 +81,81 @@ def goal(cycle: int) -> ControlInput:
 
 def parts(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.rrd"), key=lambda path: (len(path.name), path.name))
+
+
+# ---------------------------------------------------------------------- files that are taken away
+
+
+def _taken_away(path: Path, how: str) -> None:
+    match how:
+        case "unlinked":
+            path.unlink()
+        case "renamed":
+            path.rename(path.with_suffix(".mine"))
+        case "replaced":
+            path.unlink()
+            path.write_bytes(b"somebody's own")
+        case "folder":
+            shutil.rmtree(path.parent)
+
+
+@settings(max_examples=15)
+@given(hows=st.lists(st.sampled_from(["", "unlinked", "renamed", "replaced", "folder"]), min_size=1, max_size=5))
+def test_a_recording_whose_file_is_taken_away_goes_on_in_another_and_says_so(hows: list[str]) -> None:
+    with tempfile.TemporaryDirectory() as parent:
+        folder, time = Path(parent) / "rec", Time()
+        told: list[str] = []
+        index = SessionIndex(folder)
+        config = configured(capture_can=True)
+        recording = recorder(folder, time, config, warn=told.append, index=index)
+        sent = made.records(0.5 * len(hows))
+        for number, how in enumerate(hows):
+            time.ns += round(RETRY * 1e9)
+            before, told[:] = recording.path, []
+            _taken_away(before, how)
+            recording.frames(FRAME.pack(1.0, Frame(0x201).packed))
+            for start in range(500 * number, 500 * (number + 1), BATCH):
+                recording.records(sent[start : start + BATCH].tobytes())
+            recording.save()
+            assert recording.lost == 0
+            assert (recording.path == before) is (how == "")
+            assert [words.partition(" has been deleted or moved")[0] for words in told] == [
+                *([str(log_of(recording, folder))] if how == "folder" else []),
+                *([str(before)] if how else []),
+            ]
+        recording.close()
+        last = max((number for number, how in enumerate(hows) if how), default=0)
+        rows = read(recording.path).records["cycle"]
+        assert set(range(500 * last + BATCH, len(sent))) <= set(rows.tolist())
+        assert recording.path.name in [name for found in index.find() for name in found.files]
+        assert all((folder / name).exists() for found in index.find() for name in found.files)
+
+
+def log_of(recording: Recorder, folder: Path) -> Path:
+    """Return the log of frames: it is beside the first file."""
+    return folder / f"{recording.path.name.partition('-part')[0].removesuffix('.rrd')}.log"
+
+
+def test_a_folder_that_cannot_be_made_again_is_said_and_tried_again(tmp_path: Path) -> None:
+    folder, time = tmp_path / "rec", Time()
+    told: list[str] = []
+    recording = recorder(folder, time, configured(), warn=told.append)
+    sent = made.records(60.0)
+    feed(recording, sent[:1000], time)
+    shutil.rmtree(folder)
+    folder.write_text("in the way")
+    feed(recording, sent[1000:30_000], time)
+    assert recording.unrecorded[0] == "nothing is recorded"
+    assert [words for words in told if "nothing is recorded" in words] == told
+    assert len(told) == 1
+    folder.unlink()
+    feed(recording, sent[30_000:], time)
+    assert recording.unrecorded == ("", "")
+    recording.close()
+    assert f"the recording goes on in {recording.path}" in told[1]
+    assert told[2].startswith(f"recorded again; missing so far: {recording.lost} batches")
+    assert len(told) == 3
+    assert read(recording.path).records["cycle"][-1] == len(sent) - 1
 
 
 # ---------------------------------------------------------------------- what a file says of itself
@@ -189,19 +272,26 @@ def test_the_recorder_tidies_its_folder(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------- disks that fail, and kills
 
 
-def test_a_full_disk_is_told_of_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("full_in", [range(2, 22), range(2, 22, 2), range(2, 3), range(2, 22, 7)])
+def test_a_full_disk_is_told_of_once_and_once_when_it_is_well_again(
+    full_in: range, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also one that is full in every other second."""
     told: list[str] = []
-    time, sent = Time(), made.records(2.0)
+    time, sent = Time(), made.records(36.0)
     recording = recorder(tmp_path, time, configured(), warn=told.append)
-    with monkeypatch.context() as full:
-        full.setattr("shutil.disk_usage", lambda _: Usage(free=10_000_000))
-        feed(recording, sent[:1000], time)
-    feed(recording, sent[1000:], time)
+    for second in range(36):
+        with monkeypatch.context() as full:
+            if second in full_in:
+                full.setattr("shutil.disk_usage", lambda _: Usage(free=10_000_000))
+            feed(recording, sent[1000 * second : 1000 * (second + 1)], time)
     recording.close()
-    assert len(told) == 1  # and not again within ten seconds
-    assert "batches in the file" in told[0]
+    assert [words.partition(":")[0] for words in told] == [
+        "nothing is recorded",
+        "recorded again; missing so far",
+    ]
     assert f"{tmp_path} is full: 10 MB are free" in told[0]
-    assert read(recording.path).records["cycle"].tolist() == list(range(1000, 2000))
+    assert f"{recording.lost} batches in the file" in told[1]
 
 
 LIMITED = """

@@ -339,6 +339,30 @@ def fits(parts: list[Contents], wanted: Wanted) -> bool:
     )
 
 
+def test_a_session_that_runs_is_found_and_one_that_was_cut_off_is_read(tmp_path: Path) -> None:
+    time = Time("2026-01-31 12:00:00")
+    index = SessionIndex(tmp_path)
+    recording = Recorder(
+        configured(), tmp_path, index=index, live=False, wall_ns=time.wall, monotonic_ns=time.monotonic
+    )
+    sent = made.records(2.0)
+    for start in range(0, 1000, 50):
+        time.ns = int(sent["deadline_ns"][start])
+        recording.records(sent[start : start + 50].tobytes())
+    (found,) = index.find()
+    assert (found.running, found.robot, found.files) == (True, "demo", [recording.path.name])
+    assert list(index.update(now=0.0)) == []
+    (still,) = index.find()
+    assert still == found
+    assert list(index.update(now=LATER)) == [recording.path]  # it was killed
+    (cut_off,) = index.find()
+    assert not cut_off.running
+    assert cut_off.cycles > found.cycles
+    recording.close()
+    (whole,) = index.find()
+    assert (whole.running, whole.cycles) == (False, 1000)
+
+
 @settings(max_examples=60)
 @given(
     files(),

@@ -56,7 +56,7 @@ def sessions(
     rebuild: Annotated[bool, Flag] = False,
     json: Annotated[bool, Flag] = False,
 ) -> int:
-    """List recorded sessions, the newest last: when, whose goals ended how, faults, and why a black box was kept.
+    """List sessions, the newest last, running ones too: when, whose goals ended how, faults, why a black box was kept.
 
     What the index of the folder lacks, as after a kill, is read first.
 
@@ -133,6 +133,7 @@ def _print(found: list[RecordedSession], of: int) -> None:
         head = (
             f"[bold]{wall_clock(session.began) if session.began is not None else 'nothing recorded'}[/]",
             _lasted(session),
+            "[bold]running[/]" if session.running else "",
             f"[bold]{terminal.plain(session.robot)}[/]",
             *(
                 f"[{palette.code(palette.OUTCOMES[outcome])}]{times} {outcome}[/]"

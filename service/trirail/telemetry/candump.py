@@ -5,26 +5,31 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 from trirail_drivers.bus.capture import FRAME
 from trirail_drivers.bus.frames import CAN_FRAME, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
 
-from trirail.telemetry.sinks import RESERVE, no_room
+from trirail.telemetry.sinks import RESERVE, identity, no_room
 
 
 class CandumpLog:
-    """A log of one bus's frames. It leaves RESERVE bytes of the disk free, and goes on where there is room again."""
+    """A log of one bus's frames. It leaves RESERVE bytes of the disk free, and goes on where there is room again.
 
-    def __init__(self, path: Path, channel: str) -> None:
+    One that is deleted is begun anew, and `warn` is told.
+    """
+
+    def __init__(self, path: Path, channel: str, warn: Callable[[str], None] = lambda _: None) -> None:
         self.lost = 0
         """Batches that are not in the file."""
         self.trouble = ""
         """Why the last batch is not in the file; empty if it is."""
         self._path = path
         self._channel = channel
-        self._file = path.open("wb", buffering=0)
-        self._size = 0
+        self._warn = warn
+        self._begin("wb")
 
     def write(self, batch: bytes) -> None:
         """Append a batch of captured frames, or count it as lost."""
@@ -33,6 +38,11 @@ class CandumpLog:
 
     def _append(self, batch: bytes) -> str:
         """Append a batch, whole or not at all; return why it could not be, or nothing."""
+        if identity(self._path) != self._identity:
+            try:
+                self._begin_anew()
+            except OSError as error:
+                return f"{self._path} has been deleted or moved, and cannot be begun anew: {error.strerror}"
         if full := no_room(self._path.parent, RESERVE):
             return full
         lines = "".join(f"({t:.6f}) {self._channel} {_written(frame)}\n" for t, frame in FRAME.iter_unpack(batch))
@@ -53,6 +63,17 @@ class CandumpLog:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+    def _begin(self, mode: Literal["wb", "xb"]) -> None:
+        self._file, self._size = self._path.open(mode, buffering=0), 0
+        self._identity = identity(self._path)
+
+    def _begin_anew(self) -> None:
+        deleted = self._file
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._begin("xb")  # what has its name now is somebody else's
+        deleted.close()
+        self._warn(f"{self._path} has been deleted or moved: it is begun anew")
 
 
 def _written(frame: bytes) -> str:

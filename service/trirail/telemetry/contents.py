@@ -52,6 +52,8 @@ class Contents(msgspec.Struct):
     """Of a black box: the fault for which it was kept."""
     trouble: str | None = None
     """Why it could not be read."""
+    running: bool = False
+    """Whether it is still being written, and this is what has been so far."""
 
     @property
     def session(self) -> str:

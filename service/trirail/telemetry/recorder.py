@@ -73,23 +73,27 @@ class Recorder:
         self._own_folder = directory if path is None and name is None else None
         session = name or f"{config.robot.name}-{datetime.fromtimestamp(started_ns * 1e-9).astimezone():{STAMP}}"
         telemetry = config.telemetry
+        self._streams = streams = Streams(ShownRobot.configured(config), session, started_ns - monotonic_ns())
+        self._warn = warn or (lambda words: streams.say("warning", words))
         server = live_server(telemetry.live_port, telemetry.live_mb) if live and telemetry.live_port else None
         try:
             first = claim(directory, session) if path is None else _overwrite(path)
             channel = config.can.channel or config.can.interface
             captured = config.telemetry.capture_can and not self._is_black_box
-            self._frames = CandumpLog(first.with_suffix(".log"), channel) if captured else None
+            log = first.with_suffix(".log")
+            self._frames = CandumpLog(log, channel, self._warn) if captured else None
         except OSError as error:
             raise ServiceError(
                 f"cannot write a recording to {path or directory}: {error.strerror}; {_remedy(error)}"
             ) from error
         self._frames_cause = ""
-        self._streams = streams = Streams(ShownRobot.configured(config), session, started_ns - monotonic_ns())
-        self._warn = warn or (lambda words: streams.say("warning", words))
         self._index, self._reason, self._wall_offset_ns = index, reason, started_ns - monotonic_ns()
         self._contents: Contents | None = None
+        self._entered = ""
+        """Why nothing could be entered into the index, when that was last tried."""
         reserve = 0 if self._is_black_box else RESERVE
-        self._files = RotatedFiles(first, self._open, streams.drop, reserve, lambda: monotonic_ns() * 1e-9)
+        self._own_files = first.parent
+        self._files = RotatedFiles(first, self._open, streams.drop, reserve, lambda: monotonic_ns() * 1e-9, self._warn)
         self._records = Batches(config.loop.rate_hz // RECORDS_HZ, self._record)
         streams.attach(self._files, DRAWING_HZ)
         self._live: Relay | None = None
@@ -106,6 +110,10 @@ class Recorder:
         self._next_report = 0.0
         self._next_tidy = 0.0
         self._untidy = ""
+        self._troubled = ""
+        """What was said to get into no file."""
+        self._well_at = 0.0
+        """When it will have got into one for long enough that this is said."""
 
     @property
     def path(self) -> Path:
@@ -209,14 +217,20 @@ class Recorder:
         self._streams.begin_anew()
         return stream
 
-    def _enter(self) -> None:
-        """Enter what is in the file that is complete now into the index."""
-        if self._index is None or self._contents is None:
+    def _enter(self, *, running: bool = False) -> None:
+        """Enter what is in the newest file into the index: all of it, or with `running` what is so far."""
+        if self._index is None or self._contents is None or not (self._own_files / self._contents.name).exists():
             return
+        self._contents.running = running
         try:
             self._index.put([self._contents])
         except (sqlite3.Error, OSError) as error:
-            self._warn(f"the index of sessions takes no more, trirail sessions makes it anew: {error}")
+            words = f"the index of sessions takes no more, trirail sessions makes it anew: {error}"
+        else:
+            words = ""
+        if words and words != self._entered:
+            self._warn(words)
+        self._entered = words
 
     def _record(self, records: NDArray[np.void]) -> None:
         self._files.send(self._streams.scene.complete(records))
@@ -235,9 +249,27 @@ class Recorder:
         if self._own_folder is not None and t >= self._next_tidy:
             self._next_tidy = t + TIDY_EVERY
             self._tidy(self._own_folder, self._config.telemetry.keep_mb * MB)
-        if t >= self._next_report and (words := self._missing()):
+            if not self._files.trouble:
+                self._enter(running=True)
+        if not self._tell_trouble(t) and t >= self._next_report and (words := self._missing()):
             self._next_report = t + REPORT_EVERY
             self._warn(words)
+
+    def _tell_trouble(self, t: float) -> bool:
+        """Say once that something gets into no file, and once that it does again; whether that is so or has just been.
+
+        A disk that is full now and then is told to be well when it has been for REPORT_EVERY.
+        """
+        what, why = self.unrecorded
+        if what:
+            self._well_at = t + REPORT_EVERY
+            if what != self._troubled:
+                self._warn(f"{what}: {why}")
+            self._troubled = what
+        elif self._troubled and t >= self._well_at:
+            self._troubled = ""
+            self._warn(f"recorded again; {self._missing()}")
+        return bool(self._troubled)
 
     def _rotate(self) -> None:
         """Go on in another file where it is time to; not where the disk is full, for that has no room for it."""

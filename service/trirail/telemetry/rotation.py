@@ -22,9 +22,20 @@ Close = Callable[[rr.RecordingStream], None]
 
 
 class RotatedFiles:
-    """Takes batches into the newest file; `turn` begins another one, and so does a file that fails."""
+    """Takes batches into the newest file; `turn` begins another one, and so does a file that fails, or that is deleted.
 
-    def __init__(self, path: Path, begin: Open, end: Close, reserve: int, clock: Callable[[], float]) -> None:
+    `warn` is told of the latter.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        begin: Open,
+        end: Close,
+        reserve: int,
+        clock: Callable[[], float],
+        warn: Callable[[str], None] = lambda _: None,
+    ) -> None:
         self.path = path
         """The newest file."""
         self.cause = ""
@@ -34,6 +45,7 @@ class RotatedFiles:
         self._end = end
         self._reserve = reserve
         self._clock = clock
+        self._warn = warn
         self._number = 1
         self._lost_before = 0
         self._failed: list[tuple[rr.RecordingStream, Archive]] = []  # to destroy them would wait for their disk
@@ -65,9 +77,15 @@ class RotatedFiles:
 
     def send(self, chunks: list[Chunk]) -> None:
         """Write a batch, or count it as lost. Waits for the disk, but not for long."""
+        now = self._clock()
+        if self._archive.gone and (self._retry is None or now >= self._retry):
+            self._retry, deleted = now + RETRY, self.path
+            if self.turn():
+                self._warn(f"{deleted} has been deleted or moved: the recording goes on in {self.path}")
         self._archive.send(chunks)
         self.cause = self.trouble or self.cause
-        now = self._clock()
+        if self._archive.gone:
+            return
         if not self._archive.stuck:
             self._retry = None
         elif self._retry is None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from trirail.telemetry.contents import Contents
 
 FILE: Final = "sessions.sqlite3"
-VERSION: Final = 1
+VERSION: Final = 2
 """Of the tables below; with another one the index is made anew."""
 PATIENCE: Final = 2.0
 """How long it is waited for others who write to the index [s]."""
@@ -28,7 +28,8 @@ _DAMAGED: Final = {sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_
 """Primary result codes of SQLite; the first one is an unknown table or column, since our SQL is right."""
 _TABLES: Final = f"""
 CREATE TABLE recording (name TEXT PRIMARY KEY, session TEXT NOT NULL, robot TEXT NOT NULL, began REAL, ended REAL,
-                        cycles INTEGER NOT NULL, reason TEXT, trouble TEXT) WITHOUT ROWID;
+                        cycles INTEGER NOT NULL, reason TEXT, trouble TEXT,
+                        running INTEGER NOT NULL) WITHOUT ROWID;
 CREATE TABLE sender (name TEXT NOT NULL REFERENCES recording ON DELETE CASCADE, user TEXT NOT NULL);
 CREATE TABLE goal (name TEXT NOT NULL REFERENCES recording ON DELETE CASCADE, user TEXT NOT NULL, outcome TEXT NOT NULL,
                    times INTEGER NOT NULL);
@@ -75,6 +76,8 @@ class RecordedSession(Struct):
     """How many ended, by outcome."""
     faults: list[str]
     """What was said of each, in order."""
+    running: bool = False
+    """Whether it is still being recorded: what is said of it is some seconds old."""
 
 
 class SessionIndex:
@@ -103,11 +106,20 @@ class SessionIndex:
         self._path.unlink(missing_ok=True)
 
     def update(self, read: Callable[[Path], Contents] | None = None, now: float | None = None) -> Iterator[Path]:
-        """Make it agree with the folder: yield each file that it lacks, then read it; leave out those being written."""
+        """Make it agree with the folder: yield each file that it lacks, then read it; leave out those being written.
+
+        One that is entered as running and is not being written was cut off: it is read as well.
+        """
         known: set[str] = set()
-        self._do(lambda index: known.update(name for (name,) in index.execute("SELECT name FROM recording")))
+        running: set[str] = set()
+
+        def look(index: sqlite3.Connection) -> None:
+            for name, runs in index.execute("SELECT name, running FROM recording"):
+                (running if runs else known).add(name)
+
+        self._do(look)
         there = {path.name: path for path in self._folder.glob("*.rrd")}
-        if gone := known - set(there):
+        if gone := (known | running) - set(there):
             self.forget(gone)
         free_since = (time.time() if now is None else now) - IN_USE
         for name in sorted(set(there) - known):
@@ -178,8 +190,8 @@ def _enter(index: sqlite3.Connection, row: Contents) -> None:
     name = row.name
     index.execute("DELETE FROM recording WHERE name = ?", (name,))
     index.execute(
-        "INSERT INTO recording VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-        (name, row.session, row.robot, row.began, row.ended, row.cycles, row.reason, row.trouble),
+        "INSERT INTO recording VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (name, row.session, row.robot, row.began, row.ended, row.cycles, row.reason, row.trouble, row.running),
     )
     index.executemany("INSERT INTO sender VALUES (?, ?)", [(name, user) for user in row.users])
     goals = [(name, user, outcome, times) for (user, outcome), times in row.goals.items()]
@@ -199,9 +211,9 @@ def _sessions(index: sqlite3.Connection, wanted: Wanted) -> dict[str, RecordedSe
     found: dict[str, RecordedSession] = {}
     of_chosen = "FROM recording JOIN chosen USING (session)"
     for name, session, *rest in index.execute(
-        f"SELECT name, session, robot, began, ended, cycles, reason, trouble {of_chosen} ORDER BY began, name"
+        f"SELECT name, session, robot, began, ended, cycles, reason, trouble, running {of_chosen} ORDER BY began, name"
     ):
-        robot, began, ended, cycles, reason, trouble = rest
+        robot, began, ended, cycles, reason, trouble, running = rest
         if session not in found:
             found[session] = RecordedSession(session, robot, began, ended, 0, [], reason, trouble, [], {}, [])
         known = found[session]
@@ -209,6 +221,7 @@ def _sessions(index: sqlite3.Connection, wanted: Wanted) -> dict[str, RecordedSe
         known.cycles += cycles
         known.ended = max(filter(None, (known.ended, ended)), default=None)
         known.trouble = known.trouble or trouble
+        known.running = known.running or bool(running)
     for session, user in index.execute(f"SELECT DISTINCT session, user {of_chosen} JOIN sender USING (name)"):
         found[session].users.append(user)
     for session, outcome, times in index.execute(

@@ -40,6 +40,15 @@ def no_room(directory: Path, reserve: int) -> str:
     return f"{directory} is full: {free / 1e6:.0f} MB are free, {reserve / 1e6:.0f} MB are to stay so"
 
 
+def identity(path: Path) -> tuple[int, int] | None:
+    """Return what tells a file from another one that has its name later; None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
 class Archive:
     """A recording file; every batch is handed to the operating system before the next.
 
@@ -53,13 +62,20 @@ class Archive:
         """Why the last batch is not in the file; empty if it is."""
         self._stream = stream
         self._reserve = reserve
+        self._path = path
         self._directory = path.parent
+        self._identity = identity(path)
         self._stuck = False
 
     def send(self, chunks: list[Chunk]) -> None:
         """Write a batch, or count it as lost. Waits for the disk, but not for long."""
         self.trouble = self._write(chunks)
         self.lost += bool(self.trouble)
+
+    @property
+    def gone(self) -> bool:
+        """Whether the file has been deleted or moved: what is written gets nowhere where it would be looked for."""
+        return identity(self._path) != self._identity
 
     @property
     def stuck(self) -> bool:
@@ -73,6 +89,8 @@ class Archive:
 
     def _write(self, chunks: list[Chunk]) -> str:
         """Write a batch; return why it could not be, or nothing."""
+        if self.gone:
+            return f"{self._path} has been deleted or moved, and no other file can be begun there"
         if full := no_room(self._directory, self._reserve):
             return full
         if not self._stuck or self._flushed(0.01):
