@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from itertools import combinations
 from pathlib import Path
 from typing import get_args
 
@@ -32,6 +34,8 @@ def test_every_mode_has_a_colour_of_its_own_wherever_it_is_shown() -> None:
 def test_every_outcome_has_one_colour_wherever_it_is_shown() -> None:
     assert set(palette.OUTCOMES) == {*get_args(Outcome), UNKNOWN}
     assert all(Style.parse(palette.code(colour)).color is not None for colour in palette.OUTCOMES.values())
+    for (one, of_one), (other, of_other) in combinations(palette.OUTCOMES.items(), 2):
+        assert math.dist(of_one, of_other) > 40.0, f"{one} looks like {other}"
 
 
 @pytest.mark.parametrize("picture", ["session.png", "session.svg"])

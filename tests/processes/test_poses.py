@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,12 +23,12 @@ from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Bounds
 from trirail.processes import poses
 from trirail.processes.incoming import Incoming, Kind
-from trirail.processes.pose_file import PoseFile, state_directory
-from trirail.processes.poses import MOST, UNDER_WAY, Poses
+from trirail.processes.pose_file import NAME, PoseFile, state_directory
+from trirail.processes.poses import LOOK_EVERY, MOST, UNDER_WAY, Poses
 from trirail.telemetry.provenance import toml
 from trirail.wire.goals import NamedGoal, OwnLimits, PoseGoal
 from trirail.wire.messages import ErrorReply
-from trirail.wire.packets import PoseChanged, Refused
+from trirail.wire.packets import PoseChanged, Refused, Remark
 from trirail.wire.records import DTYPE
 from trirail.wire.state import NamedPose
 from trirail.wire.vocabulary import MODES, Mode
@@ -49,9 +51,10 @@ class Asked:
     def __init__(self, config: Config) -> None:
         self.replies: list[NamedPose] = []
         self.refusals: list[RefusedError] = []
-        self.told: list[PoseChanged] = []
+        self.told: list[PoseChanged | Remark] = []
+        self.now = 0.0
         self.woken = threading.Event()
-        self.poses = Poses(config, self._reply, self._refuse, self.told.append, self.woken.set)
+        self.poses = Poses(config, self._reply, self._refuse, self.told.append, self.woken.set, lambda: self.now)
 
     def _reply(self, incoming: Incoming, reply: msgspec.Struct) -> None:
         if isinstance(reply, ErrorReply):
@@ -115,6 +118,45 @@ def test_a_pose_is_taught_where_the_next_record_has_the_robot_and_kept(make: Mak
     assert asked.replies[-1] == NamedPose("pick", 0.0, 0.0, 0.0, taught=True)
     assert asked.told[-1] == PoseChanged("ann", "pose pick removed by ann")
     assert asked.known() == make(CONFIG).known() == {}
+
+
+@given(acts=st.lists(st.sampled_from(["teach a", "teach b", "forget a", "delete", "look", "restart"]), max_size=12))
+def test_poses_whose_file_goes_are_neither_silently_kept_nor_lost(acts: list[str]) -> None:
+    """Whenever it goes, everyone is told, once; while the service lasts nothing is lost, and it is written again."""
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STATE_DIRECTORY", folder)
+        asked, file = Asked(CONFIG), Path(folder) / CONFIG.robot.name / NAME
+        known: set[str] = set()
+        gone = False
+        for act in acts:
+            match act.split():
+                case ["teach", name]:
+                    asked.teach(name)
+                    known, gone = known | {name}, False
+                case ["forget", name] if name in known:
+                    asked.ask("forget", name)
+                    asked.write()
+                    known, gone = known - {name}, False
+                case ["delete"]:
+                    gone = gone or file.exists()
+                    file.unlink(missing_ok=True)
+                case ["restart"]:
+                    asked.poses.close()
+                    asked = Asked(CONFIG)
+                    known = set() if gone else known
+            for _ in range(2):
+                asked.now += LOOK_EVERY
+                before = [said for said in asked.told if isinstance(said, Remark)]
+                was_told = bool(asked.poses.warnings())
+                asked.poses.look()
+                told = [said for said in asked.told if isinstance(said, Remark)][len(before) :]
+                assert len(told) == (gone and not was_told)
+                assert bool(asked.poses.warnings()) is gone
+                assert all(name in words for name in known for words in asked.poses.warnings())
+            assert set(asked.known()) == known
+            if not gone and file.exists():
+                assert set(json.loads(file.read_text())) == known
+        asked.poses.close()
 
 
 def test_it_is_answered_told_and_known_only_when_it_is_on_the_disk(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -346,7 +346,7 @@ def test_a_session_that_runs_is_found_and_one_that_was_cut_off_is_read(tmp_path:
         configured(), tmp_path, index=index, live=False, wall_ns=time.wall, monotonic_ns=time.monotonic
     )
     sent = made.records(2.0)
-    for start in range(0, 1000, 50):
+    for start in range(0, 1500, 50):
         time.ns = int(sent["deadline_ns"][start])
         recording.records(sent[start : start + 50].tobytes())
     (found,) = index.find()
@@ -360,7 +360,7 @@ def test_a_session_that_runs_is_found_and_one_that_was_cut_off_is_read(tmp_path:
     assert cut_off.cycles > found.cycles
     recording.close()
     (whole,) = index.find()
-    assert (whole.running, whole.cycles) == (False, 1000)
+    assert (whole.running, whole.cycles) == (False, 1500)
 
 
 @settings(max_examples=60)

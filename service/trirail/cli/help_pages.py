@@ -71,7 +71,12 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "status": ("trirail status", "trirail status --json"),
         "watch": ("trirail watch",),
         "fleet": ("trirail fleet --connect tls/192.168.1.9:7447", "trirail fleet --json"),
-        "events": ("trirail events", "trirail events --json"),
+        "events": (
+            "trirail events",
+            "trirail events --last 20",
+            "trirail events --last 20 --follow",
+            "trirail events --json",
+        ),
         "view": (
             "trirail view",
             "trirail view --web",

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
-from cyclopts import CycloptsError, Parameter
+from cyclopts import CycloptsError, Parameter, validators
 
 from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
@@ -20,6 +22,7 @@ from trirail.wire.vocabulary import Command
 
 if TYPE_CHECKING:
     from trirail.client.client import GoalHandle, Robot
+    from trirail.wire.messages import Event
 
 Tool = Annotated[units.ToolPoint, Parameter(completer=tools)]
 
@@ -366,18 +369,49 @@ def watch(*, service: Service = HERE) -> int:
     return 0
 
 
-def events(*, service: Service = HERE) -> int:
-    """Print past events and those to come until Ctrl-C."""
+PAST_WITHIN = 1.0
+"""After so long without another event the past is over: a thousand of them come in a tenth of that [s]."""
+
+
+def events(
+    *,
+    last: Annotated[int | None, Parameter(validator=validators.Number(gte=0))] = None,
+    follow: Annotated[bool, Flag] = False,
+    service: Service = HERE,
+) -> int:
+    """Print past events and those to come until Ctrl-C; with --last only past ones.
+
+    Parameters
+    ----------
+    last
+        Print so many of the past, the newest, and end; 0 for all that there are.
+    follow
+        Go on with those to come all the same.
+    """
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
-        robot.state()  # so that a missing service is said, not waited for
-        for event in robot.events(history=True):
-            if service.json:
-                terminal.json(msgspec.to_builtins(event))
-            else:
-                terminal.event(event)
+        now = robot.state().t  # so that a missing service is said, not waited for
+        seen = 0
+        if last is not None:
+            until_now = itertools.takewhile(
+                lambda event: event.t <= now, robot.events(history=True, timeout=PAST_WITHIN)
+            )
+            for event in deque(until_now, maxlen=last or None):
+                _show_event(service, event)
+                seen = event.seq
+            if not follow:
+                return 0
+        for event in itertools.dropwhile(lambda event: event.seq <= seen, robot.events(history=True)):
+            _show_event(service, event)
     return 0
+
+
+def _show_event(service: Service, event: Event) -> None:
+    if service.json:
+        terminal.json(msgspec.to_builtins(event))
+    else:
+        terminal.event(event)
 
 
 COMMANDS = (goto, move, sliders, jog, follow, teach, forget, poses, status, watch, events)

@@ -123,6 +123,7 @@ class Gateway:
                     self._hear(packet, ready)
                 self._requests.send_goals()  # those for which there was no room
                 self._poses.settle()
+                self._poses.look()
                 self._routers.look()
                 self._crowding.look()
                 self._requests.give_up_late()

@@ -48,15 +48,22 @@ class PoseFile:
             problem = str(error).replace("`", "")
             raise ServiceError(f"{self.path}: {problem}; mend it, or move it away and teach the poses anew") from error
 
-    def change(self, name: str, pose: Coordinates | None) -> None:
+    @property
+    def gone(self) -> bool:
+        """Whether it has been deleted or moved away: its folder is made with it, and it stays without a pose in it."""
+        return self.path.parent.is_dir() and not self.path.exists()
+
+    def change(self, name: str, pose: Coordinates | None, known: Taught | None = None) -> None:
         """Keep a pose by a name, None for none; it is on the disk when this returns. It may take as long as that does.
 
-        What another service of the same robot has written meanwhile stays.
+        What another service of the same robot has written meanwhile stays; where the file has gone, it has what is
+        `known` again.
         """
         try:
             files.make_folder(self.path.parent)
             with _alone_in(self.path.parent):
-                taught = {each: kept for each, kept in self.read().items() if each != name}
+                there = self.read() if self.path.exists() else known or {}
+                taught = {each: kept for each, kept in there.items() if each != name}
                 if pose is not None:
                     taught[name] = pose
                 content = msgspec.json.encode(dict(sorted(taught.items())))

@@ -7,6 +7,7 @@ is answered, told and known to goals when it is on the disk.
 from __future__ import annotations
 
 import queue
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +24,7 @@ from trirail.processes.pose_file import PoseFile, state_directory
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Coordinates, Goal, NamedGoal, PoseGoal
 from trirail.wire.messages import ErrorReply, NoContent
-from trirail.wire.packets import PoseChanged
+from trirail.wire.packets import PoseChanged, Remark
 from trirail.wire.state import NamedPose, NamedPoses
 from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.vocabulary import MODES, Mode
@@ -32,6 +33,8 @@ MOST = 1000
 """Poses that may be kept."""
 UNDER_WAY = 32
 """Poses that may be taught or removed at once; beyond that they are refused."""
+LOOK_EVERY = 2.0
+"""How often it is looked whether the file of taught poses is there [s]."""
 BELONGS = 1e-3
 """A measured pose whose sliders are not where they are measured is none [m]: it is of earlier cycles, and theirs is
 none that closes the loops."""
@@ -58,8 +61,9 @@ class Poses:
         config: Config,
         reply: Callable[[Incoming, msgspec.Struct], None],
         refuse: Callable[[Incoming, RefusedError], None],
-        tell: Callable[[PoseChanged], object],
+        tell: Callable[[PoseChanged | Remark], object],
         wake: Callable[[], None],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._robot = config.robot.name
         self._geometry = corrected_geometry(config)
@@ -71,12 +75,36 @@ class Poses:
         self._under_way = 0
         self._written: queue.SimpleQueue[tuple[_Change, ServiceError | None]] = queue.SimpleQueue()
         self._writer = ThreadPoolExecutor(1, "poses")
+        self._clock = clock
+        self._next_look = clock()
+        self._gone = ""
+        """That the file of taught poses has gone, and what that means; empty while it is there."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what people should know, one line each: names that were taught before the configuration had them."""
+        """Return what people should know, one line each: a file that has gone, names that the configuration has now."""
         both = sorted(self._taught.keys() & self._configured.keys())
-        return tuple(
+        gone = (self._gone,) if self._gone else ()
+        return *gone, *(
             f"pose {name} is that of [poses]; the taught one is not used: trirail forget {name}" for name in both
+        )
+
+    def look(self) -> None:
+        """See whether the file of taught poses is still there, once in a while; have everyone told where it is not."""
+        if self._clock() < self._next_look:
+            return
+        self._next_look = self._clock() + LOOK_EVERY
+        before, self._gone = self._gone, self._lost() if self._file.gone else ""
+        if self._gone and not before:
+            self._tell(Remark("warning", self._gone))
+
+    def _lost(self) -> str:
+        """Say what it means that the file has gone."""
+        if not self._taught:
+            return f"{self._file.path} has gone: what was taught is lost, if anything was"
+        known = ", ".join(sorted(self._taught))
+        return (
+            f"{self._file.path} has gone: taught poses are known only until the service ends ({known}); "
+            "the next trirail teach or forget writes them again"
         )
 
     def table(self) -> NamedPoses:
@@ -186,7 +214,7 @@ class Poses:
         """Write a change; in the thread that does nothing else."""
         failure = None
         try:
-            self._file.change(change.name, change.pose)
+            self._file.change(change.name, change.pose, dict(self._taught))
         except ServiceError as error:
             failure = error
         self._written.put((change, failure))

@@ -47,9 +47,9 @@ MODES: dict[Mode, Colour] = {
 OUTCOMES: dict[str, Colour] = {
     "done": (47, 150, 84),
     "rejected": (224, 161, 0),
-    "expired": (224, 161, 0),
+    "expired": (150, 116, 20),
     "preempted": (140, 107, 177),
-    "stopped": (140, 107, 177),
+    "stopped": (66, 120, 196),
     "faulted": (200, 56, 56),
     "unsettled": (168, 60, 160),
     "unknown": (123, 135, 148),

@@ -37,7 +37,7 @@ DRAWING_HZ = 1
 LOOKS_HZ = 1
 """How often a second it is looked whether files, folder, log or live view want something."""
 TIDY_EVERY = 10.0
-"""How often the folder is looked at [s]."""
+"""How often the folder is looked at, and the index gets what is in the newest file [s]."""
 MB = 1e6
 
 
@@ -109,6 +109,7 @@ class Recorder:
         self._next_look = 0
         self._next_report = 0.0
         self._next_tidy = 0.0
+        self._next_entry = 0.0
         self._untidy = ""
         self._troubled = ""
         """What was said to get into no file."""
@@ -249,6 +250,8 @@ class Recorder:
         if self._own_folder is not None and t >= self._next_tidy:
             self._next_tidy = t + TIDY_EVERY
             self._tidy(self._own_folder, self._config.telemetry.keep_mb * MB)
+        if t >= self._next_entry and self._contents is not None and self._contents.began is not None:
+            self._next_entry = t + TIDY_EVERY
             if not self._files.trouble:
                 self._enter(running=True)
         if not self._tell_trouble(t) and t >= self._next_report and (words := self._missing()):
