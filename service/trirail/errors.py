@@ -128,7 +128,7 @@ class RefusalCode(StrEnum):
     WRONG_START = (
         "wrong_start",
         "a trajectory that does not begin as the robot stands",
-        "go to its first point first, at rest",
+        "go to its first point first, at rest: follow with --go-there, go_there=True",
     )
     WRONG_END = "wrong_end", "a trajectory that ends in motion", "let it end at rest"
     NO_PLAN = "no_plan", "no motion to it was found from the present one", "send it again when the robot holds"

@@ -59,6 +59,9 @@ def test_a_session(locator: str) -> None:
         assert (await (await robot.move_sliders(0.0, 0.0, 0.0)).wait()).outcome == "done"
         points = [TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(1.0, 0.01, 0.0, 0.0)]
         assert (await (await robot.follow(points)).wait()).outcome == "done"
+        with pytest.raises(RefusedError, match="go_there=True"):
+            await robot.follow(points)
+        assert (await (await robot.follow(points, go_there=True)).wait()).outcome == "done"
         assert (await (await robot.move_to_named("corner")).wait()).outcome == "done"
         await robot.forget("corner")
         assert "corner" not in await robot.poses()

@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import urlsplit
@@ -427,6 +428,18 @@ def test_every_kind_of_goal(shared: tuple[Service, Robot, zenoh.Session], tmp_pa
     refused = trirail("follow", path, locator=service.locator)
     assert refused.returncode == 1
     assert "the trajectory begins at x = -30 mm" in refused.stderr
+    assert "--go-there" in refused.stderr
+    went = trirail("follow", path, "--go-there", "--wait", "--json", locator=service.locator)
+    assert json.loads(went.stdout)["outcome"] == "done"
+    assert robot.follow(path, go_there=True).wait(timeout=20.0).outcome == "done"
+    robot.override(10.0)
+    with ThreadPoolExecutor(1) as beside:
+        on_the_way = beside.submit(robot.follow, path, go_there=True)
+        until(robot, lambda state: state.mode == "moving")
+        robot.stop()
+        with pytest.raises(RefusedError, match="not at the first point of the trajectory, which was not sent"):
+            on_the_way.result(20.0)
+    robot.override(100.0)
 
 
 def test_a_flood_of_goals_ends_one_by_one_and_a_stop_overtakes_it(service: Service) -> None:
@@ -692,7 +705,7 @@ def test_a_recording_that_suffers_is_told_to_everyone(service: Service) -> None:
         until(robot, lambda state: any("nothing is recorded" in warning for warning in state.warnings))
         assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)
     service.end()
-    assert "trirail: recorder: missing so far" in service.log.read_text()
+    assert "trirail: recorder: nothing is recorded: " in service.log.read_text()
 
 
 def test_a_recorder_that_cannot_begin_again_never_ends_the_service(service: Service) -> None:
@@ -700,6 +713,7 @@ def test_a_recorder_that_cannot_begin_again_never_ends_the_service(service: Serv
     folder, aside = service.folder / "recordings", service.folder / "aside"
     with service.robot() as robot:
         in_motion(robot)
+        os.kill(service.child("recorder"), signal.SIGSTOP)  # it would notice
         folder.rename(aside)
         folder.write_bytes(b"")
         os.kill(service.child("recorder"), signal.SIGKILL)

@@ -229,6 +229,7 @@ def follow(
     /,
     *,
     stretch: Annotated[bool, Flag] = False,
+    go_there: Annotated[bool, Flag] = False,
     wait: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
@@ -240,14 +241,19 @@ def follow(
         CSV with columns t, x, y, phi (and vx, vy, w, and ax, ay, e), or JSON with a list of points.
     stretch
         Slow down what is too fast, instead of refusing it.
+    go_there
+        Go to its first point before, by an ordinary goal, if the robot is not there.
     wait
         Show the progress; exit 0 only when the robot has arrived.
     """
     from trirail.client.client import Robot
-    from trirail.client.trajectory import read
+    from trirail.client.trajectory import check_arrived, first_pose, read
 
     points = read(file)
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
+        if go_there:
+            way = robot.send(first_pose(points))
+            check_arrived(terminal.follow(robot, way, f"to the first point of {file.name}", show=not service.json))
         goal = robot.follow(points, stretch=stretch)
         return _follow(service, robot, goal, wait, f"{file.name}: {terminal.counted(len(points), 'point')}")
 

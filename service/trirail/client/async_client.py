@@ -27,6 +27,7 @@ from trirail.client.connection import REPLY_WITHIN
 from trirail.client.goal import GoalHandle
 from trirail.client.outgoing import content_message, goal_message, seconds
 from trirail.client.track import Taker
+from trirail.client.trajectory import check_arrived
 from trirail.errors import RefusedError, ServiceError
 from trirail.wire.goals import Goal
 from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, Stop
@@ -39,7 +40,12 @@ P = ParamSpec("P")
 
 
 class _Draft:
-    """Stands in for Robot: keeps the goal, or the command, that one of its methods would send."""
+    """Stands in for Robot: keeps the goal, or the command, that one of its methods would send, and a goal before it."""
+
+    before: Callable[[str], Goal] | None = None
+
+    def _arrive(self, make: Callable[[str], Goal]) -> None:
+        self.before = make
 
     def send(self, make: Callable[[str], Goal], id: str | None = None) -> None:  # noqa: A002 - as Robot's
         self.goal = make, id
@@ -57,6 +63,8 @@ def _goal(
     async def send(robot: AsyncRobot, /, *args: P.args, **kwargs: P.kwargs) -> AsyncGoalHandle:
         draft = _Draft()
         method(cast(Robot, draft), *args, **kwargs)
+        if draft.before is not None:
+            check_arrived(await (await robot.send(draft.before)).wait())
         return await robot.send(*draft.goal)
 
     return send

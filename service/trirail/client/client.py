@@ -24,7 +24,7 @@ from trirail.client.goal import GoalHandle, Jog, Result
 from trirail.client.lease import Lease
 from trirail.client.outgoing import content_message, goal_message, number, seconds
 from trirail.client.track import Taker, Track
-from trirail.client.trajectory import Points, points_of
+from trirail.client.trajectory import Points, check_arrived, first_pose, points_of
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire.credentials import Credentials, credentials_for
 from trirail.wire.endpoints import DEFAULT_LOCATOR, ReachableBy, reach
@@ -225,9 +225,13 @@ class Robot:
         *,
         stretch: bool = False,
         settle: bool = True,
+        go_there: bool = False,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> GoalHandle:
         """Send a timed trajectory that begins where the robot stands; return once it is accepted.
+
+        With `go_there` the robot goes to its first point before, by a goal as of move_to: this waits for its end, and
+        raises RefusedError `wrong_start` where that is not done.
 
         A point is t [s], x, y [m] and phi [rad], and where it is known, velocity and acceleration of the three.
         `points` may be rows of these four, as an array (N, 4), or the path of a CSV or JSON file.
@@ -236,6 +240,8 @@ class Robot:
         done when its path has ended, whether or not the robot is measured to be there.
         """
         meant = points_of(points)
+        if go_there:
+            self._arrive(first_pose(meant))
         return self.send(lambda name: TrajectoryGoal(meant, stretch=stretch, settle=settle, id=name), id)
 
     def jog(self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2) -> Jog:
@@ -279,6 +285,10 @@ class Robot:
             raise
         goal.reply = reply
         return goal
+
+    def _arrive(self, make: Callable[[str], Goal]) -> None:
+        """Send a goal and wait until it is done. Raises RefusedError where it ends otherwise."""
+        check_arrived(self.send(make).wait())
 
     def enable(self) -> None:
         """Power the drives up; return when the robot holds where it stands. Confirmed at once if it does already."""

@@ -5,17 +5,18 @@ from __future__ import annotations
 import csv
 import itertools
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
 from msgspec import structs
 from trirail_drivers import files
 
+from trirail.client.goal import Result
 from trirail.client.outgoing import number
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.decoding import decoded, prepare
-from trirail.wire.goals import TrajectoryPoint
+from trirail.wire.goals import PoseGoal, TrajectoryPoint
 from trirail.wire.text import number as number_in
 from trirail.wire.text import quoted
 
@@ -51,6 +52,21 @@ def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint
         raise RefusedError(RefusalCode.MALFORMED, f"points: row {n} is {found}; wanted are {MEANT}")
     t, x, y, phi = (number(value, f"points: {name} of row {n}") for name, value in zip(COLUMNS, values, strict=True))
     return TrajectoryPoint(t, x, y, phi)
+
+
+def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
+    """Return what makes the goal that leads to where a trajectory begins, by its id."""
+    if not points:
+        raise RefusedError(RefusalCode.MALFORMED, f"points: there are none; wanted are {MEANT}")
+    x, y, phi = points[0].x, points[0].y, points[0].phi
+    return lambda name: PoseGoal(x=x, y=y, phi=phi, id=name)
+
+
+def check_arrived(result: Result) -> None:
+    """Raise RefusedError where the goal that led to a trajectory's first point was not done."""
+    if result.outcome != "done":
+        text = f"the robot is not at the first point of the trajectory, which was not sent: {result.message}"
+        raise RefusedError(RefusalCode.WRONG_START, text)
 
 
 def read(path: Path) -> list[TrajectoryPoint]:

@@ -16,6 +16,8 @@ from trirail.quantities import apart, worded
 
 START = 1e-4
 """How far a trajectory may begin from where the robot stands [m, rad]."""
+GO_THERE = "trirail follow --go-there or in Python follow(…, go_there=True)"
+"""What does."""
 STANDS = 1e-6
 """Velocity at the ends of a trajectory that counts as rounding, and is taken for none [m/s, rad/s]."""
 
@@ -82,8 +84,8 @@ def check_ends(points: Sequence[Point], start: MotionState) -> None:
         raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it stands")
     for name, unit, given, stands in zip(COORDINATES, UNITS, points[0].pose, start.pose, strict=True):
         if abs(given - stands) > START:
-            text = "the trajectory begins at {} = {}, the robot is at {}: go there first".format(
-                name, *apart(given, stands, unit)
+            text = "the trajectory begins at {} = {}, the robot is at {}: go there first, {}".format(
+                name, *apart(given, stands, unit), GO_THERE
             )
             raise RefusedError(RefusalCode.WRONG_START, text, value=given, limit=stands)
     ends = (

@@ -219,12 +219,18 @@ class Recorder:
         return stream
 
     def _enter(self, *, running: bool = False) -> None:
-        """Enter what is in the newest file into the index: all of it, or with `running` what is so far."""
-        if self._index is None or self._contents is None or not (self._own_files / self._contents.name).exists():
+        """Enter what is in the newest file into the index: all of it, or with `running` what is so far.
+
+        One that has been deleted is taken out.
+        """
+        if self._index is None or self._contents is None:
             return
         self._contents.running = running
         try:
-            self._index.put([self._contents])
+            if (self._own_files / self._contents.name).exists():
+                self._index.put([self._contents])
+            else:
+                self._index.forget([self._contents.name])
         except (sqlite3.Error, OSError) as error:
             words = f"the index of sessions takes no more, trirail sessions makes it anew: {error}"
         else:
