@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import warnings
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -60,6 +62,7 @@ def run(
     from trirail.config import SIM, load
     from trirail.processes.log import Log
     from trirail.processes.supervisor import Supervisor
+    from trirail.wire.starting import Starting
 
     settings = load(config or SIM)
     form = log or settings.telemetry.log
@@ -68,13 +71,19 @@ def run(
     drives = f"drives on {can.interface} {can.channel}".strip() if can.interface != "simulated" else "simulated drives"
     lines.say(f"starting robot {settings.robot.name}: {drives}, {settings.loop.rate_hz} Hz")
 
+    starting = Starting(settings.zenoh.listen)
+
     def up(ready: dict[str, dict[str, Any]]) -> None:
+        starting.up()
         if form == "json":
             lines.say(f"up: robot {settings.robot.name}, goals {', '.join(settings.zenoh.listen)}")
         else:
             terminal.up(settings, ready)
 
-    return Supervisor(settings, record, lines.say, lines.event).run(up)
+    try:
+        return Supervisor(settings, record, lines.say, lines.event).run(up)
+    finally:
+        starting.up()
 
 
 @app.command
@@ -195,11 +204,22 @@ def completion(shell: Shell | None = None, /, *, install: Annotated[bool, Flag] 
 help_pages.arrange(app)
 
 
+class Terminated(BaseException):
+    """Somebody told this process to end: what a command holds is let go of on the way out, as at Ctrl-C."""
+
+
+def _terminated(_signal: int, _frame: FrameType | None) -> None:
+    raise Terminated
+
+
 def main() -> None:
     """Run a command and exit as it says."""
     words = sys.argv[1:]
     warnings.showwarning = lambda message, *_, **__: terminal.complain(str(message))
     try:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:  # not where it is ignored, as under nohup
+                signal.signal(number, _terminated)
         code = app(units.numbers(words), exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
         terminal.complain(_wrong_usage(error, words))
@@ -212,6 +232,8 @@ def main() -> None:
         code = 1
     except KeyboardInterrupt:
         code = 130
+    except Terminated:
+        code = 143
     except BrokenPipeError:  # the reader, head for one, has seen enough
         sys.stderr.close()
         code = 0

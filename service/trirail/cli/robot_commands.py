@@ -325,8 +325,12 @@ def override(percent: units.Percent, /, *, service: Service = HERE) -> int:
     return 0
 
 
+WAKE_EVERY = 0.2
+"""How often who waits looks for a signal: the kernel may have handed it to another thread, which wakes nobody [s]."""
+
+
 def acquire(*, force: Annotated[bool, Flag] = False, timeout: units.Time = 1.0, service: Service = HERE) -> int:
-    """Hold the lease until Ctrl-C, or until it is lost.
+    """Hold the lease until Ctrl-C or SIGTERM, or until it is lost.
 
     Parameters
     ----------
@@ -346,7 +350,8 @@ def acquire(*, force: Annotated[bool, Flag] = False, timeout: units.Time = 1.0, 
     ):
         show(service, {"lease": robot.user}, f"{robot.user} holds the lease until Ctrl-C")
         with contextlib.suppress(KeyboardInterrupt):
-            lease.wait()
+            while not lease.wait(WAKE_EVERY):
+                pass
     if lease.lost is not None:
         raise lease.lost
     return 0

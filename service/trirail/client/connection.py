@@ -19,6 +19,7 @@ from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import least_role
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply, ErrorReply, Event, RoleReply
+from trirail.wire.starting import is_starting
 from trirail.wire.state import State
 from trirail.wire.text import is_name, quoted
 from trirail.wire.vocabulary import Role
@@ -154,7 +155,7 @@ class Connection:
                 answers.append(error)
 
         def on_end() -> None:
-            silent = SilenceError(f"no robot {self.robot!r} answers at {self._connect}: is its service running?")
+            silent = SilenceError(self._silent("is its service running?"))
             take(answers[0] if answers else silent)
 
         handler = zenoh.handlers.Callback(on_reply, on_end, indirect=False)
@@ -181,9 +182,14 @@ class Connection:
     def why_nobody(self, parts: tuple[str, ...], reply: RoleReply | None) -> ServiceError | RefusedError:
         """Return what to raise where nobody answers, and this did when the user's role was asked for."""
         return (reply and self._denied(parts, reply.user, reply.role)) or ServiceError(
-            f"no robot {self.robot!r} answers at {self._connect}: is its service running, is the name right "
-            "(--robot), is it linked to the router if this is one?"
+            self._silent("is its service up, is the name right (--robot), is it linked to the router if this is one?")
         )
+
+    def _silent(self, why: str) -> str:
+        """Return the words for nobody answering."""
+        if is_starting(self._connect):
+            why = "the service there is starting; try again when it says that it is up"
+        return f"no robot {self.robot!r} answers at {self._connect}: {why}"
 
     def _denied(self, parts: tuple[str, ...], user: str, role: str | None) -> RefusedError | None:
         """Return the refusal where the user's role does not allow to use the key of these parts."""

@@ -25,6 +25,14 @@ class Progress:
         self._patience = patience
         self._begun: set[str] = set()
 
+    @property
+    def interrupted(self) -> str:
+        """What it means that the start is interrupted now, for people."""
+        if not self._begun:
+            return "the start is interrupted, nothing has moved"
+        place = len(self._begun)
+        return f"compiling is interrupted at function {place}: those before it are kept, the next start goes on there"
+
     def begin(self, name: str) -> None:
         """Take in that a function is being compiled; `patience` seconds may pass until the next one [s]."""
         from trirail.kinematics.compiled import FUNCTIONS  # with numba, which a start without compiling goes without
@@ -79,7 +87,12 @@ def _import_rooms() -> None:
 
 def main() -> int:
     """Compile what is not kept yet."""
-    compile_all(Progress(lambda words: print(f"trirail: {words}", flush=True), 0.0).begin)  # noqa: T201
+    progress = Progress(lambda words: print(f"trirail: {words}", flush=True), 0.0)  # noqa: T201
+    try:
+        compile_all(progress.begin)
+    except KeyboardInterrupt:
+        print(f"trirail: {progress.interrupted}", flush=True)  # noqa: T201
+        return 130
     return 0
 
 

@@ -140,7 +140,8 @@ class Supervisor:
             # The loop first: the others end because it has ended, and not by themselves.
             for child in sorted(heard, key=lambda child: child is not self._children.get("loop")):
                 if child is None:
-                    self._say(f"{signals.take().name}: stopping the robot and disabling the drives", "info")
+                    ending = progress.interrupted if not is_up else "stopping the robot and disabling the drives"
+                    self._say(f"{signals.take().name}: {ending}", "info")
                     self._ending = True
                 elif not child.listen() and not self._ending:
                     self._on_end(child)

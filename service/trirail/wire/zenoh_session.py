@@ -14,6 +14,7 @@ from trirail.wire.credentials import Credentials
 from trirail.wire.dialling import why_not
 from trirail.wire.endpoints import DEFAULT_LOCATOR, leads_to
 from trirail.wire.sizes import MAX_TRANSPORT
+from trirail.wire.starting import is_starting
 
 SESSIONS = 512
 """Clients that may be connected to a service at once; a router is one."""
@@ -150,8 +151,11 @@ def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.S
 
 def _why_nobody(locator: str, credentials: Credentials | None) -> str:
     """Say why no session opens at a locator, and what to do; a second look, for Zenoh does not tell."""
-    taken = "clients" if credentials is None else "clients, or not these certificates"
-    why = why_not(locator, credentials) or f"nobody answers, or takes more {taken}"
+    if is_starting(locator):
+        return " yet: it is starting; try again when it says that it is up"
+    refused = "" if credentials is None else ", or these certificates are refused"
+    silent = f"who listens there does not answer, or has as many clients as it may{refused}"
+    why = why_not(locator, credentials) or silent
     start = "start one with: trirail run"
     if locator != DEFAULT_LOCATOR:
         start = "start what is to answer there, trirail run or trirail router"
