@@ -222,3 +222,19 @@ def test_half_a_tool_or_half_a_pose_is_wrong_usage(
         commands.main()
     assert ended.value.code == 2
     assert said in capsys.readouterr().err
+
+
+@given(st.integers(0, 999), st.integers(0, 999), st.sampled_from(["", "-"]), st.sampled_from(["", "mm", " m", "deg"]))
+def test_a_decimal_comma_is_told_with_a_point(whole: int, part: int, sign: str, unit: str) -> None:
+    with pytest.raises(ValueError, match=rf": write {sign}{whole}\.{part}, with a point"):
+        units.quantity(f"{sign}{whole},{part}{unit}", units.LENGTH)
+
+
+@given(st.text("0123456789,;. m-", max_size=8).filter(lambda text: not re.match(r"\s*-?\d+,\d+(?![\d,.])", text)))
+def test_nothing_else_is_taken_for_one(text: str) -> None:
+    said = ""
+    try:
+        units.quantity(text, units.LENGTH)
+    except ValueError as error:
+        said = str(error)
+    assert "with a point" not in said

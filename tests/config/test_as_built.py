@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tempfile
 from dataclasses import replace
@@ -123,6 +124,7 @@ def test_where_it_is_too_steep_and_by_how_much_is_said(tmp_path: Path) -> None:
     said = refused(tmp_path, written(a_map(nodes=tupled(nodes.tolist()))).encode())
     place = [float(number) for number in re.findall(r"(?:x|y|phi) (-?[\d.]+)", said.partition("near ")[2])[:3]]
     size = np.array([0.3, 0.3, 2.05]) / 8.0
+    place = [place[0] * 1e-3, place[1] * 1e-3, math.radians(place[2])]
     centre = np.array([-0.15, -0.15, -1.2]) + (np.array([7, 3, 5]) - 1.0) * size  # where its spline is greatest
     assert (np.abs(np.array(place) - centre) <= 2.0 * size).all()
 

@@ -416,7 +416,7 @@ def test_the_singular_leg_is_named() -> None:
     a, b, c = PAPER.legs
     geometry = Geometry(legs=(a, replace(b, edge_angle=b.edge_angle + 0.1), c))
     pose = 0.0, 0.0, math.pi / 3 - 0.1
-    with pytest.raises(KinematicsError, match=r"leg B: edge parallel to its rail at phi = 0\.947"):
+    with pytest.raises(KinematicsError, match=r"leg B: edge parallel to its rail at phi = 54.2704°"):
         inverse(geometry, pose)
     assert inverse_into(geometry.packed(), np.array([pose, (0, 0, 0), (0, 0, 0)]), np.empty((6, 3))) == 2
 
@@ -429,7 +429,7 @@ def test_sliders_can_leave_the_loops_open() -> None:
     )
     geometry = Geometry(legs=(a, b, c))
     sliders = np.full(3, -0.25)
-    with pytest.raises(KinematicsError, match=r"no pose closes the loops, which reach 0.129904 of the") as refused:
+    with pytest.raises(KinematicsError, match=r"no pose closes the loops, which reach 129.904 mm of the") as refused:
         forward(geometry, sliders)
     assert refused.value.value == pytest.approx(3 * math.sqrt(3) / 2 * 0.05)
     assert refused.value.limit == pytest.approx(3 * math.sqrt(3) / 2 * 0.3 * math.sin(1.9))
@@ -443,14 +443,14 @@ def test_sliders_can_bring_the_symmetric_robot_to_its_singularity() -> None:
     with pytest.raises(KinematicsError, match=r"singular, .det J2. is"):
         forward(PAPER, at)
     assert forward_into(PAPER.packed(), at, np.zeros(3), np.empty(3)) == 5
-    with pytest.raises(KinematicsError, match=r"leg .: edge parallel to its rail at phi = 1.0471975"):
+    with pytest.raises(KinematicsError, match=r"leg .: edge parallel to its rail at phi = 60° "):
         forward(PAPER, 1.2 * at)
     assert forward_into(PAPER.packed(), 1.2 * at, np.zeros(3), np.empty(3)) in {1, 2, 3}
 
 
 @pytest.mark.parametrize("phi", [math.pi / 3, math.pi / 3 + 1e-11, -2 * math.pi / 3])
 def test_near_must_be_regular(phi: float) -> None:
-    with pytest.raises(KinematicsError, match=r"near = \(0.1, 0, .*\) is a singular pose"):
+    with pytest.raises(KinematicsError, match=r"near = \(100 mm, 0 mm, .*°\) is a singular pose"):
         forward(PAPER, np.zeros(3), near=(0.1, 0.0, phi))
 
 

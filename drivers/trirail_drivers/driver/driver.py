@@ -143,5 +143,5 @@ class Driver(ABC, Generic[AnyAxis]):
 
     def _refuse_setpoint(self, axis: Axis, position: float, velocity: float) -> None:
         """A setpoint [m], [m/s] that no frame can hold is a fault."""
-        text = f"drive {axis.name}: cannot take setpoint {position:g} m, {velocity:g} m/s"
+        text = f"drive {axis.name}: cannot take setpoint {position * 1e3:g} mm, {velocity * 1e3:g} mm/s"
         self._wire.fail(DriveFault(axis.name, "setpoint", 0, text))

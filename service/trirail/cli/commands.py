@@ -10,7 +10,7 @@ from types import FrameType
 from typing import Annotated, Any, Literal
 
 import msgspec
-from cyclopts import App, CoercionError, CycloptsError, UnknownOptionError
+from cyclopts import App, CoercionError, CycloptsError, UnknownOptionError, UnusedCliTokensError
 
 from trirail import __version__
 from trirail.cli import (
@@ -35,6 +35,7 @@ from trirail.cli.completion import Shell, script
 from trirail.cli.options import ALL_HERE, Flag, Services
 from trirail.errors import TrirailError
 from trirail.wire.stop_door import STOPS
+from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command
 
 app = App(
@@ -249,6 +250,9 @@ def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
         said = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
     elif isinstance(error, CoercionError) and error.msg and error.argument and not said.startswith("Invalid value"):
         said = f"Invalid value for {error.argument.name.strip('-')}: {said}"
+    elif isinstance(error, UnusedCliTokensError):
+        more = " ".join(quoted(word.strip()) for word in error.unused_tokens or ())
+        said = f"{more} {'is' if ' ' not in more else 'are'} more than it takes"
     by_command = type(error) is CycloptsError  # raised by the command itself, which is not told how it was called
     command = " ".join(("trirail", *(words[:1] if by_command else error.command_chain or ())))
     return f"{said} ({command} --help tells the usage)"

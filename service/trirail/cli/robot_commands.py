@@ -18,7 +18,7 @@ from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taug
 from trirail.cli.options import poses as poses_of_robot
 from trirail.wire.messages import LONGEST_LEASE, SHORTEST_LEASE, CommandReply
 from trirail.wire.text import check_name, check_new_pose
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import Command, Mode
 
 if TYPE_CHECKING:
     from trirail.client.client import GoalHandle, Robot
@@ -445,7 +445,11 @@ def telling(name: Command) -> Callable[..., int]:
 
 def confirmed(service: Service, name: Command, reply: CommandReply) -> None:
     """Print that a command has been carried out."""
-    show(service, msgspec.to_builtins(reply), f"{name}: done, the robot is {reply.mode}")
+    show(
+        service,
+        msgspec.to_builtins(reply),
+        f"{name}: done, the robot is {'in fault' if reply.mode == Mode.FAULT else reply.mode}",
+    )
 
 
 def _sliders(*positions: float) -> str:

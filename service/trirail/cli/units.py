@@ -18,7 +18,7 @@ from cyclopts import Parameter, Token
 from trirail.wire.decoding import converted, prepare
 from trirail.wire.messages import LOWEST_OVERRIDE, Override
 from trirail.wire.state import CorrectionTold
-from trirail.wire.text import NAME_RULE, NUMBER, is_name, quoted
+from trirail.wire.text import NAME_RULE, NUMBER, comma_hint, is_name, quoted
 
 prepare(Override)
 
@@ -110,7 +110,7 @@ def quantity(text: str, dimension: Dimension, bare: str | None = None) -> float:
         units = ", ".join(name for name in dimension.units if "μ" not in name and "^" not in name)
         raise ValueError(
             f"{quoted(text.strip())!r} is not {dimension.name} such as {dimension.examples}; "
-            f"units are {units}, a bare number is in {alone}"
+            f"units are {units}, a bare number is in {alone}{comma_hint(text)}"
         )
     return float(Decimal(match[1]) * size)
 
@@ -180,6 +180,7 @@ def share(text: str) -> float:
     if not LOWEST_SHARE <= value <= 1.0:
         raise ValueError(
             f"{quoted(text.strip())!r} is no share of the limits: {LOWEST_SHARE} to 1, or {LOWEST_SHARE:.1%} to 100%"
+            + comma_hint(text)
         )
     return value
 
@@ -190,7 +191,9 @@ def percent(text: str) -> float:
         value = quantity(text, PERCENTAGE)
         converted({"percent": value}, Override)
     except (ValueError, msgspec.ValidationError):
-        raise ValueError(f"{quoted(text.strip())!r} is no override: 0, or {LOWEST_OVERRIDE:g} to 200 %") from None
+        raise ValueError(
+            f"{quoted(text.strip())!r} is no override: 0, or {LOWEST_OVERRIDE:g} to 200 %{comma_hint(text)}"
+        ) from None
     return value
 
 

@@ -101,6 +101,7 @@ def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
         raise TrirailError(
             f"{path}: line 1: columns {quoted(', '.join(names)) or 'none'}; wanted {', '.join(COLUMNS)}, "
             f"and if known {', '.join(VELOCITY)} and {', '.join(ACCELERATION)}, each once"
+            + ("; commas separate columns, and numbers have a point" if ";" in "".join(names) else "")
         )
     points = []
     for row in rows:

@@ -25,6 +25,7 @@ from trirail.errors import ConfigError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.correction import STEEPEST, Correction
 from trirail.kinematics.geometry import LEGS, Geometry, Room, travels
+from trirail.quantities import worded
 from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import CorrectionTold
 
@@ -191,8 +192,8 @@ def _adds(errors: Correction, robot: Geometry, room: Room, rates: Array) -> tupl
 
 
 def _steep(place: Array, what: str, right: str) -> str:
-    x, y, phi = place.tolist()
+    x, y, phi = (worded(value, unit) for value, unit in zip(place.tolist(), ("m", "m", "rad"), strict=True))
     return (
-        f"too steep near x {x:.4g} m, y {y:.4g} m, phi {phi:.4g} rad: it {what}, and the limits have room for {right}; "
+        f"too steep near x {x}, y {y}, phi {phi}: it {what}, and the limits have room for {right}; "
         "measure there again, take fewer cells, or let calibrate.py find [geometry] before"
     )

@@ -27,6 +27,7 @@ from trirail.kinematics.closure import (
     loop_equation,
 )
 from trirail.kinematics.geometry import LEGS, PARALLEL, Geometry
+from trirail.quantities import apart, worded
 
 __all__ = ["Motion", "forward", "forward_into", "inverse", "inverse_into", "jacobians", "warm_up"]
 
@@ -163,8 +164,9 @@ def _refuse_angle(geometry: Geometry, leg: int, phi: float, place: str) -> NoRet
     built = geometry.legs[leg]
     delta = math.remainder(phi + built.edge_angle - built.rail_angle, math.pi)
     what = "edge parallel to its rail" if abs(delta) <= 2.0 * PARALLEL else "out of all reach"
+    at, singular = worded(phi, "rad"), worded(phi - delta, "rad")
     raise KinematicsError(
-        f"{place}leg {LEGS[leg]}: {what} at phi = {phi:.9g} rad (singular at {phi - delta:.9g} rad)",
+        f"{place}leg {LEGS[leg]}: {what} at phi = {at} (singular at {singular})",
         leg=LEGS[leg],
         value=phi,
         limit=phi - delta,
@@ -175,13 +177,15 @@ def _refuse_loops(geometry: Geometry, sliders: Array, near: Array, place: str) -
     """Say by how much the loops fail to close, or that they do so singularly."""
     A, B, C = loop_equation(geometry.packed(), sliders)
     reach, needed = math.hypot(A, B), abs(C)
-    given = "{}sliders ({:g}, {:g}, {:g}) m".format(place, *sliders)
+    given = "{}sliders ({}, {}, {})".format(place, *(worded(slider, "m") for slider in sliders))
     if needed > reach * (1.0 + ROUNDING):
-        message = f"{given}: no pose closes the loops, which reach {reach:.6g} of the needed {needed:.6g} m"
+        near_by, wanted = apart(reach, needed, "m")
+        message = f"{given}: no pose closes the loops, which reach {near_by} of the needed {wanted}"
         raise KinematicsError(message, value=reach, limit=needed)
     det = math.sqrt(max((reach - needed) * (reach + needed), 0.0))
     limit = math.sqrt(ROUNDING) * reach
     if det > 2.0 * limit:
-        message = "{}: near = ({:g}, {:g}, {:g}) is a singular pose".format(given, *near)
+        x, y, phi = (worded(value, unit) for value, unit in zip(near.tolist(), ("m", "m", "rad"), strict=True))
+        message = f"{given}: near = ({x}, {y}, {phi}) is a singular pose"
         raise KinematicsError(message, value=float(near[2]))
-    raise KinematicsError(f"{given}: singular, |det J2| is {det:.3g} m there", value=det, limit=limit)
+    raise KinematicsError(f"{given}: singular, |det J2| is {worded(det, 'm')} there", value=det, limit=limit)

@@ -25,11 +25,20 @@ QUANTITY_RULE = "reads as a number or a quantity: a pose is told from one by its
 ID_RULE = f"at most {MAX_NAME} characters, none of them for control or formatting"
 
 
+_WITH_COMMA = re.compile(r"\s*[-+]?[0-9]+,[0-9]+(?![0-9,.])")
+
+
 def number(text: str) -> float:
     """Return what a number says, blanks around it aside. Raises ValueError for what is none, or not finite."""
     if re.fullmatch(NUMBER, text.strip()) is None or not math.isfinite(value := float(text)):
-        raise ValueError(f"{quoted(text.strip())!r} is no number")
+        raise ValueError(f"{quoted(text.strip())!r} is no number{comma_hint(text)}")
     return value
+
+
+def comma_hint(text: str) -> str:
+    """Return how a number with a decimal comma is to be written, "" for what is none."""
+    found = _WITH_COMMA.match(text)
+    return f": write {text[: found.end()].strip().replace(',', '.')}, with a point" if found is not None else ""
 
 
 def is_name(text: str) -> bool:
