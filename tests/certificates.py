@@ -63,3 +63,4 @@ def put(folder: Path, name: str, by: Pair, own: Pair) -> None:
 def _file(path: Path, content: bytes) -> None:
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(content)
+    path.chmod(0o600)

@@ -7,13 +7,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, get_args, get_origin
 
+import msgspec
 import pytest
 from conftest import Rig
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from msgspec import Meta, Struct
 from msgspec.structs import fields
-from trirail.config import SIM, Config, load, metrics_url, parse
+from trirail.config import SIM, Config, geometry, load, metrics_url, parse
+from trirail.config.checks import check
+from trirail.config.tables import LegTable
 from trirail.errors import ConfigError
 from trirail.telemetry import provenance
 from trirail.wire.goals import PoseGoal
@@ -118,7 +121,12 @@ def test_shipped_configurations_load(path: Path) -> None:
             "frames.work.base: every robot has a frame of that",
         ),
         ("node = 3", "nod = 3", "drives.C.nod: unknown key; did you mean node?"),
-        ("node = 2", "node = 1", "the node ids of master_node, A, B and C must differ, but are 126, 1, 1, 3"),
+        (
+            "node = 2",
+            "node = 1",
+            "node ids must differ, but are drives.A.node = 1, drives.B.node = 1, drives.C.node = 3, ",
+        ),
+        ("node = 1", "node = 0", "drives.A.node = 0: that is all nodes' on CANopen; wanted 1 to 127"),
         ("node = 2", "node = 128", "drives.B.node = 128: expected int <= 127"),
         (
             'protocol = "cia402"',
@@ -147,8 +155,8 @@ def test_shipped_configurations_load(path: Path) -> None:
             "limits.platform.x = [0.1, -0.1]: the lower limit must be below",
         ),
         ("x = [-0.15, 0.15]", "x = [0.1]", "limits.platform.x = [0.1]: expected array of length 2"),
-        ("phi = [-1.2, 0.85]", "phi = [-1.2, 1.0]", "singular angle 1.0472: keep below 0.8972"),
-        ("phi = [-1.2, 0.85]", "phi = [-2.1, 0.8]", "singular angle -2.0944: keep above -1.9444"),
+        ("phi = [-1.2, 0.85]", "phi = [-1.2, 1.0]", "singular angle 1.0472: keep it within [-1.9443, 0.8971]"),
+        ("phi = [-1.2, 0.85]", "phi = [-2.1, 0.8]", "singular angle -2.0944: keep it within [-1.9443, 0.8971]"),
         ("jerk = [40.0, 40.0, 300.0]", "jerk = [40.0, 0.0, 300.0]", "jerk[1] = 0.0: expected float >= 0.001"),
     ],
 )
@@ -481,3 +489,46 @@ def test_certificates_are_looked_for_beside_the_configuration(tmp_path: Path) ->
     assert zenoh.tls is not None
     assert zenoh.tls.directory == str(tmp_path / "keys")
     assert zenoh.users == {"ann": "operator"}
+
+
+@given(
+    low=st.floats(-3.0, 3.0),
+    high=st.floats(-3.0, 3.0),
+    margin=st.floats(0.001, 0.4),
+    reach=st.floats(0.01, 0.15),
+    edges=st.tuples(*[st.floats(-0.05, 0.05)] * 3),
+)
+def test_what_is_said_of_a_singular_angle_is_accepted(
+    low: float, high: float, margin: float, reach: float, edges: tuple[float, float, float]
+) -> None:
+    """Of robots as built too, whose singular angles move with the centre: it is the least over all corners."""
+    symmetric = geometry(load(SIM).geometry)
+    a, b, c = (
+        LegTable(leg.anchor, leg.rail_angle, leg.home, leg.edge_point, leg.edge_angle + by)
+        for leg, by in zip(symmetric.legs, edges, strict=True)
+    )
+    config = load(SIM)
+    platform = msgspec.structs.replace(config.limits.platform, x=(-reach, reach), y=(-reach, reach), phi=(low, high))
+    limits = msgspec.structs.replace(config.limits, platform=platform, singularity_margin=margin)
+    table = msgspec.structs.replace(config.geometry, l0=None, leg=(a, b, c))
+    config = msgspec.structs.replace(config, limits=limits, geometry=table, poses={})
+    try:
+        check(config)
+    except ConfigError as error:
+        said = str(error)
+    else:
+        return
+    found = re.search(r"singular angle .*: keep it within \[(.*), (.*)\]", said)
+    assume(found is not None)
+    assert found is not None
+    phi = float(found[1]), float(found[2])
+    assume(phi[0] < phi[1])
+    platform = msgspec.structs.replace(platform, phi=phi)
+    limits = msgspec.structs.replace(limits, platform=platform)
+    try:
+        check(msgspec.structs.replace(config, limits=limits))
+    except ConfigError as error:
+        said = str(error)
+    else:
+        said = ""
+    assert "singular angle" not in said

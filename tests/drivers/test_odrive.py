@@ -176,7 +176,8 @@ class TestConfigure:
     @pytest.mark.parametrize("node", [7, 63, 100])
     def test_node_ids_that_cannot_be(self, node: int) -> None:
         drives = msgspec.structs.replace(CONFIG, C=Drive(node=node, counts_per_metre=25.0))
-        with pytest.raises(DriveError, match=f"must differ and be 0 to 62, but are 0, 7, {node}"):
+        said = "drives.B.node = 7, drives.C.node = 7" if node == 7 else f"drives.C.node = {node}: an ODrive has 0 to 62"
+        with pytest.raises(DriveError, match=said):
             Odrive(Bus([], Clock(), {}), 1_000_000, drives)
 
     def test_dead_bus(self, new: Rig) -> None:

@@ -12,6 +12,7 @@ from trirail_drivers.cia402.sdo import SdoRefused, shown
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives, Homing
 from trirail_drivers.errors import ConfigurationRefused, DriveError
+from trirail_drivers.interface import NAMES
 
 PREFERRED_EXPONENT: Final = -3
 """Of 60C2h: milliseconds, which every drive takes; some take nothing else."""
@@ -37,11 +38,14 @@ def interpolation_periods(period: float) -> list[tuple[int, int]]:
 
 def check_nodes(drives: Drives) -> None:
     """Refuse node ids that CANopen does not have, or that two nodes share, with DriveError."""
-    nodes = [drive.node for drive in drives.each] + [drives.master_node]
-    if len(set(nodes)) < len(nodes):
-        raise DriveError(f"node ids of drives A, B, C and the master must differ, but are {', '.join(map(str, nodes))}")
-    if 0 in nodes:
-        raise DriveError("node id 0 is all nodes' on CANopen; wanted 1 to 127")
+    nodes = {f"drives.{name}.node": drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
+    nodes["drives.master_node"] = drives.master_node
+    for key, node in nodes.items():
+        if node == 0:
+            raise DriveError(f"{key} = 0: that is all nodes' on CANopen; wanted 1 to 127")
+    if len(set(nodes.values())) < len(nodes):
+        told = ", ".join(f"{key} = {node}" for key, node in nodes.items())
+        raise DriveError(f"node ids must differ, but are {told}")
 
 
 def heartbeat_of(drives: Drives) -> int:

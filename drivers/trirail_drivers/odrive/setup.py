@@ -22,7 +22,7 @@ from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.driver.refusals import judged, raise_all
 from trirail_drivers.errors import DriveError, DriveTimeout
-from trirail_drivers.interface import Clock
+from trirail_drivers.interface import NAMES, Clock
 from trirail_drivers.odrive import frames, settings
 from trirail_drivers.odrive.asking import late, send
 from trirail_drivers.odrive.axis import OdriveAxis
@@ -35,12 +35,12 @@ OLDEST_FIRMWARE = (0, 6, 0)
 
 def check_nodes(drives: Drives) -> None:
     """Refuse node ids that CANSimple does not have, or that two drives share, with DriveError."""
-    nodes = [drive.node for drive in drives.each]
-    if len(set(nodes)) < len(nodes) or not all(node in frames.NODES for node in nodes):
-        raise DriveError(
-            f"node ids of ODrives A, B and C must differ and be 0 to {frames.NODES[-1]}, "
-            f"but are {', '.join(map(str, nodes))}"
-        )
+    nodes = {f"drives.{name}.node": drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
+    for key, node in nodes.items():
+        if node not in frames.NODES:
+            raise DriveError(f"{key} = {node}: an ODrive has 0 to {frames.NODES[-1]}")
+    if len(set(nodes.values())) < len(nodes):
+        raise DriveError(f"node ids must differ, but are {', '.join(f'{key} = {node}' for key, node in nodes.items())}")
 
 
 class Allowed(NamedTuple):

@@ -24,7 +24,7 @@ from trirail_drivers import files
 
 from trirail.errors import ServiceError
 from trirail.wire.certificates import Pair, authority, common_name, issue, renew, serves
-from trirail.wire.credentials import AUTHORITY, CERTIFICATE, KEY, REVOKED, Credentials, revoked
+from trirail.wire.credentials import AUTHORITY, CERTIFICATE, KEY, REVOKED, Credentials, check_private, revoked
 
 AUTHORITY_KEY = "ca-key.pem"
 USERS = "users"
@@ -123,7 +123,9 @@ class KeyFolder:
         return _issued(self.folder, is_robot=True)
 
     def _authority(self) -> Pair:
-        return Pair(_read(self.folder / AUTHORITY), _read(self.folder / AUTHORITY_KEY))
+        pair = Pair(_read(self.folder / AUTHORITY), _read(self.folder / AUTHORITY_KEY))
+        check_private(self.folder / AUTHORITY_KEY)
+        return pair
 
 
 def _issued(folder: Path, *, is_robot: bool) -> Issued:

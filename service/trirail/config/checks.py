@@ -115,12 +115,16 @@ def _check_singular_angles(config: Config) -> None:
     beside = [(low - more, high + more) for (low, high), more in ((platform.x, x), (platform.y, y))]
     centres = [(0.0, 0.0), *itertools.product(*beside)]
     robot = geometry(config.geometry)
-    for angle in {angle for centre in centres for angle in singular_angles(robot, centre)}:
+    singular = {angle for centre in centres for angle in singular_angles(robot, centre)}
+    for angle in singular:
         if low - margin < angle < high + margin:
+            least = max(angle for angle in (-math.pi, *singular) if angle <= 0.0) + margin + phi
+            most = min(angle for angle in (math.pi, *singular) if angle > 0.0) - margin - phi
+            # Both ends, over all corners, and rounded inwards: what is said is accepted.
             raise ConfigError(
-                f"limits.platform.phi = [{low:g}, {high:g}] comes nearer than limits.singularity_margin = {margin:g} "
-                f"to the singular angle {angle:.4f}: keep {'below ' if angle > 0 else 'above '}"
-                f"{angle - math.copysign(margin, angle):.4f}"
+                f"limits.platform.phi = [{platform.phi[0]:g}, {platform.phi[1]:g}] comes nearer than "
+                f"limits.singularity_margin = {margin:g} to the singular angle {angle:.4f}: keep it within "
+                f"[{math.ceil(least * 1e4 + 1e-6) * 1e-4:.4f}, {math.floor(most * 1e4 - 1e-6) * 1e-4:.4f}]"
             )
 
 
@@ -130,22 +134,9 @@ def _check_settling(config: Config) -> None:
         raise ConfigError(
             f"limits.in_position.timeout = {settling.timeout:g}: it must be longer than the dwell, {settling.dwell:g} s"
         )
-
-
-def _check_frame(name: str) -> None:
-    if name in (BASE, PLATFORM):
-        raise ConfigError(f"frames.work.{name}: every robot has a frame of that name; give this one another")
-
-
-def _check_nodes(config: Config) -> None:
-    nodes = [config.drives.master_node, *(drive.node for drive in config.drives.each)]
-    if len(set(nodes)) < len(nodes):
-        raise ConfigError(
-            f"drives: the node ids of master_node, A, B and C must differ, but are {', '.join(map(str, nodes))}"
-        )
-
-
-def _check_rate(config: Config) -> None:
+    robot = geometry(config.geometry)
+    singular = {angle for centre in centres for angle in singular_angles(robot, centre)}
+    for angle in singular:
     # The drives take the period as an integer times a power of ten of a second, object 60C2h.
     if 1_000_000 % config.loop.rate_hz:
         raise ConfigError(

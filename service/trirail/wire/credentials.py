@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -58,6 +59,7 @@ class Credentials(NamedTuple):
             certificate.verify_directly_issued_by(authority)
         except (ValueError, TypeError, InvalidSignature) as error:
             raise ServiceError(f"{folder}: {CERTIFICATE} is not signed by the authority of {AUTHORITY}") from error
+        check_private(key_file)
         now = now or datetime.now(UTC)
         if now < certificate.not_valid_before_utc:
             raise ServiceError(
@@ -86,6 +88,16 @@ class Credentials(NamedTuple):
         if left > WARNED:
             return ""
         return f"the certificate in {self.folder} expires in {left.days} days; trirail keys renew makes a new one"
+
+
+def check_private(key_file: Path) -> None:
+    """Raise ServiceError where others than its owner can read a private key, or, where root owns it, than its group."""
+    found = key_file.stat()
+    if found.st_mode & (0o037 if found.st_uid == 0 else 0o077):
+        raise ServiceError(
+            f"{key_file}: its mode {stat.S_IMODE(found.st_mode):04o} lets others use this private key: "
+            f"chmod 600 {key_file}; if somebody may have read it, revoke it and make another"
+        )
 
 
 def revoked(folder: Path) -> frozenset[str]:

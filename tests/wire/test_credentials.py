@@ -1,0 +1,42 @@
+"""Private keys that others can use are refused, whoever reads them: service, router, client and `trirail keys`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from certificates import tls_config, user
+from trirail.cli.key_folder import AUTHORITY_KEY, KeyFolder
+from trirail.errors import ServiceError
+from trirail.wire.credentials import KEY, Credentials, check_private
+
+
+@pytest.mark.parametrize("mode", range(0o1000))
+def test_a_key_is_its_owners_alone_and_roots_its_groups_to_read(mode: int, tmp_path: Path) -> None:
+    file = tmp_path / KEY
+    file.touch()
+    file.chmod(mode)
+    of_root = file.stat().st_uid == 0
+    others = mode & 0o007 or mode & 0o030 or (mode & 0o040 and not of_root)
+    if not others:
+        check_private(file)
+        return
+    with pytest.raises(ServiceError, match=rf"its mode {mode:04o} lets others .* chmod 600 {file}"):
+        check_private(file)
+
+
+def test_everybody_who_reads_one_looks_at_that(tmp_path: Path) -> None:
+    tls_config(tmp_path)
+    keys = tmp_path / "keys"
+    readers: dict[Path, Callable[[], object]] = {
+        keys / KEY: lambda: Credentials.read_server(keys),
+        user(tmp_path, "ann") / KEY: lambda: Credentials.read(user(tmp_path, "ann")),
+        keys / AUTHORITY_KEY: lambda: KeyFolder(keys).renew("ann", 9.0),
+    }
+    for file, read in readers.items():
+        read()
+        file.chmod(0o644)
+        with pytest.raises(ServiceError, match="lets others use this private key"):
+            read()
+        file.chmod(0o600)
