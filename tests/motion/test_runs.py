@@ -126,6 +126,14 @@ def test_paths_are_joined_cut_and_stretched(
     assert at(slow, slower * first.duration / 3.0) * rates == pytest.approx(at(both, first.duration / 3.0), abs=1e-5)
 
 
+@given(factor=st.floats(1.0, 1e300), rates=st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6))
+def test_a_path_may_be_made_as_slow_as_a_float_can_tell(factor: float, rates: list[float]) -> None:
+    """Without a warning; what is too slow to be told stands."""
+    path = stretched(Path(np.array([0.0, 1.0]), np.tile(rates, (1, 3, 1))), factor)
+    assert np.isfinite(path.pieces).all()
+    assert path.pieces[0, 0, 1] == rates[1] / factor
+
+
 # ---------------------------------------------------------------------- a run
 
 
