@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from hil_needs import BIN, SEARCH, Failed, last
+from hil_needs import BIN, MODULES, SEARCH, Failed, busybox, last
 
 ROOT = Path(__file__).parents[1]
 PRECEDENCE = "-10"
@@ -100,7 +100,7 @@ def script(folder: Path, packed: tuple[Path, ...]) -> str:
     binds = "\n".join(f"mount --bind /run/python{path} {path}" for path in packed)
     return f"""set -e
 echo 'the machine is up'
-modprobe -a kvaser_pci can-raw vcan virtio_blk squashfs
+modprobe -a {" ".join(Path(module).name for module in MODULES)}
 mkdir /run/python
 mount -t squashfs -o ro /dev/vda /run/python
 {binds}
@@ -145,6 +145,7 @@ def machine(folder: Path, kernel: Path, packed: tuple[Path, ...]) -> Iterator[qu
         *(str(BIN / "vng"), "--run", str(kernel), "--user", "root", "--cpus", "2", "--memory", "2G"),
         # Emulated on purpose: the same everywhere, also where KVM is not to be had or hangs.
         *("--disable-kvm", "--disable-microvm", "--force-9p", "--force-initramfs"),
+        *("--busybox", str(busybox())),  # else it takes the first of that name, which may need libraries
         *("--append", "mitigations=off", "--rwdir", str(folder), f"--qemu-opts={' '.join(devices)}"),
         *("--", f"bash {folder}/machine.sh"),
     ]

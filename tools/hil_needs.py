@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 import shutil
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,8 +14,20 @@ from pathlib import Path
 
 BIN = Path(sys.executable).parent
 SEARCH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
-CARD = "kernel/drivers/net/can/sja1000/kvaser_pci.ko"
-"""The driver of the emulated cards, by which a kernel is known to be one that will do."""
+MODULES = (
+    "drivers/net/can/sja1000/kvaser_pci",
+    "net/can/can-raw",
+    "drivers/net/can/vcan",
+    "drivers/block/virtio_blk",
+    "fs/squashfs/squashfs",
+)
+"""What the machine loads: drivers of the emulated cards, of CAN, of the disk that it is given."""
+DRIVERS = (*MODULES, "net/9p/9pnet_virtio", "fs/9p/9p")
+"""Without all of these a kernel will not do: the last two bring it the host's folders."""
+BUSYBOXES = ("busybox-static", "busybox.static", "busybox")
+"""Programs of that name may be linked statically: the machine begins without a library."""
+PT_INTERP = 3
+"""The segment of an ELF file that names what links it to libraries (elf(5))."""
 
 PROGRAMS = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-static", "modprobe": "kmod", "udevadm": "udev"}
 PROGRAMS |= {"ip": "iproute2", "candump": "can-utils", "chrt": "util-linux", "mksquashfs": "squashfs-tools"}
@@ -30,18 +43,53 @@ class Failed(Exception):
 
 def lacking() -> tuple[str, ...]:
     """The Debian packages that are missing on this machine."""
-    packages = [package for program, package in PROGRAMS.items() if shutil.which(program, path=SEARCH) is None]
+    there = {program: shutil.which(program, path=SEARCH) for program in PROGRAMS} | {"busybox": busybox()}
+    packages = [package for program, package in PROGRAMS.items() if there[program] is None]
     if not kernels():
         packages.append(KERNELS.get(_distribution(), KERNELS["debian"]))
     return tuple(packages)
 
 
+def busybox() -> str | None:
+    """The busybox that needs no library; None where there is none: that of initramfs-tools is no such one."""
+    found = (shutil.which(name, path=folder) for name in BUSYBOXES for folder in SEARCH.split(":"))
+    return next((path for path in found if path is not None and is_static(Path(path))), None)
+
+
+def is_static(file: Path) -> bool:
+    """Whether a file is a program in ELF that no other one has to link."""
+    try:
+        with file.open("rb") as opened:
+            head = opened.read(64)
+            if len(head) < 52 or head[:4] != b"\x7fELF" or head[4] not in (1, 2) or head[5] not in (1, 2):
+                return False
+            order, wide = "<>"[head[5] - 1], head[4] == 2
+            (table,) = struct.unpack_from(f"{order}{'Q' if wide else 'I'}", head, 32 if wide else 28)
+            size, number = struct.unpack_from(f"{order}HH", head, 54 if wide else 42)
+            opened.seek(table)
+            segments = opened.read(size * number)
+            return bool(segments) and all(
+                struct.unpack_from(f"{order}I", segments, size * n)[0] != PT_INTERP for n in range(number)
+            )
+    except (OSError, OverflowError, struct.error):
+        return False
+
+
+def has_drivers(modules: Path) -> bool:
+    """Whether a kernel's folder of modules has all DRIVERS, or says that they are built in."""
+    try:
+        built_in = (modules / "modules.builtin").read_text().split()
+    except OSError:
+        built_in = []
+    return all(f"kernel/{driver}.ko" in built_in or any(modules.glob(f"kernel/{driver}.ko*")) for driver in DRIVERS)
+
+
 def kernels(boot: Path = Path("/boot"), modules: Path = Path("/lib/modules")) -> list[Path]:
-    """Installed kernels that have the cards' driver and can be read, the newest last."""
+    """Installed kernels that have the drivers and can be read, the newest last."""
     found = (
         image
         for image in boot.glob("vmlinuz-*")
-        if os.access(image, os.R_OK) and any((modules / image.name.removeprefix("vmlinuz-")).glob(f"{CARD}*"))
+        if os.access(image, os.R_OK) and has_drivers(modules / image.name.removeprefix("vmlinuz-"))
     )
     return sorted(found, key=lambda image: [int(number) for number in re.findall(r"\d+", image.name)])
 

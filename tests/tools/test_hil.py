@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -15,6 +17,8 @@ import hil_second
 import pytest
 from edsfiles import MAKES
 from hil_needs import Failed
+from hypothesis import given
+from hypothesis import strategies as st
 from trirail.config import load
 from trirail_drivers.cia402 import setup
 from trirail_drivers.config import Drive, Drives
@@ -23,19 +27,80 @@ from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
 
 
-def test_the_newest_kernel_with_the_cards_driver_is_taken(tmp_path: Path) -> None:
-    boot, modules = tmp_path / "boot", tmp_path / "modules"
-    boot.mkdir()
-    for release, has_driver in {"6.1.0-9-amd64": True, "6.1.0-56-amd64": True, "6.1.0-99-cloud": False}.items():
-        (boot / f"vmlinuz-{release}").touch()
-        driver = modules / release / f"{hil_needs.CARD}.xz"
-        driver.parent.mkdir(parents=True)
-        if has_driver:
-            driver.touch()
-    assert [kernel.name for kernel in hil_needs.kernels(boot, modules)] == [
-        "vmlinuz-6.1.0-9-amd64",
-        "vmlinuz-6.1.0-56-amd64",
-    ]
+@given(
+    has=st.lists(st.sets(st.sampled_from(hil_needs.DRIVERS)) | st.just(set(hil_needs.DRIVERS)), max_size=4),
+    built_in=st.sets(st.sampled_from(hil_needs.DRIVERS)),
+    suffix=st.sampled_from(["", ".xz", ".zst"]),
+)
+def test_kernels_with_all_drivers_are_taken_the_newest_last(
+    has: list[set[str]], built_in: set[str], suffix: str
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        boot, modules = Path(folder) / "boot", Path(folder) / "modules"
+        boot.mkdir()
+        will_do = []
+        for number, drivers in enumerate(has):
+            release = f"6.1.0-{9 + 40 * number}-amd64"
+            (boot / f"vmlinuz-{release}").touch()
+            for driver in drivers:
+                file = modules / release / f"kernel/{driver}.ko{suffix}"
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.touch()
+            if number % 2 and built_in:
+                (modules / release).mkdir(parents=True, exist_ok=True)
+                said = "".join(f"kernel/{driver}.ko\n" for driver in built_in)
+                (modules / release / "modules.builtin").write_text(said)
+            if drivers | (built_in if number % 2 else set()) == set(hil_needs.DRIVERS):
+                will_do.append(f"vmlinuz-{release}")
+        assert [kernel.name for kernel in hil_needs.kernels(boot, modules)] == will_do
+
+
+def elf(segments: list[int], wide: bool, order: str) -> bytes:
+    """Return an ELF file with program headers of these types, as elf(5) has them."""
+    ident = b"\x7fELF" + bytes([2 if wide else 1, "<>".index(order) + 1, 1]) + bytes(9)
+    size, table = (56, 64) if wide else (32, 52)
+    address = "Q" if wide else "I"
+    head = struct.pack(f"{order}HHI{address}{address}{address}I", 2, 62, 1, 0, table, 0, 0)
+    head += struct.pack(f"{order}HHHHHH", table, size, len(segments), 0, 0, 0)
+    return ident + head + b"".join(struct.pack(f"{order}I", kind).ljust(size, b"\0") for kind in segments)
+
+
+@given(segments=st.lists(st.integers(0, 10), min_size=1, max_size=9), wide=st.booleans(), order=st.sampled_from("<>"))
+def test_a_program_is_static_that_names_nobody_who_links_it(segments: list[int], wide: bool, order: str) -> None:
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(elf(segments, wide, order))
+        file.flush()
+        assert hil_needs.is_static(Path(file.name)) is (hil_needs.PT_INTERP not in segments)
+
+
+@given(content=st.binary(max_size=80) | st.binary(max_size=80).map(lambda rest: elf([1], True, "<")[:40] + rest))
+def test_what_is_no_program_is_not_static_and_no_error(content: bytes) -> None:
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(content)
+        file.flush()
+        if not content.startswith(b"\x7fELF"):
+            assert not hil_needs.is_static(Path(file.name))
+        hil_needs.is_static(Path(file.name))
+
+
+@given(
+    there=st.dictionaries(
+        st.tuples(st.sampled_from(["a", "b"]), st.sampled_from(hil_needs.BUSYBOXES)), st.booleans(), max_size=6
+    )
+)
+def test_a_static_busybox_is_taken_wherever_one_is_and_no_other(there: dict[tuple[str, str], bool]) -> None:
+    """That of initramfs-tools, which is linked to libraries, stands in the way of none, and counts as missing."""
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hil_needs, "SEARCH", f"{folder}/a:{folder}/b")
+        for (place, name), static in there.items():
+            file = Path(folder) / place / name
+            file.parent.mkdir(exist_ok=True)
+            file.write_bytes(elf([1] if static else [1, hil_needs.PT_INTERP], True, "<"))
+            file.chmod(0o755)
+        found = hil_needs.busybox()
+        good = {f"{folder}/{place}/{name}" for (place, name), static in there.items() if static}
+        assert found in good if good else found is None
+        assert ("busybox-static" in hil_needs.lacking()) is (not good)
 
 
 def test_what_is_missing_is_named_in_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
