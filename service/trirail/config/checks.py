@@ -93,8 +93,6 @@ def rules(config: Config) -> Iterator[Rule]:
         yield Rule(f"frames.work.{name}", (), partial(_check_frame, name))
     for name in config.poses:
         yield Rule(f"poses.{name}", ("geometry", "correction", *ranges), partial(_check_pose, config, name))
-    nodes = tuple(f"drives.{name}.node" for name in NAMES)
-    yield Rule("drives.master_node", nodes, partial(_check_nodes, config))
     yield Rule("loop.rate_hz", (), partial(_check_rate, config))
     yield from checks.bus_rules(config.can)
     yield from checks.rules(config.drives, _required(config))
@@ -134,9 +132,14 @@ def _check_settling(config: Config) -> None:
         raise ConfigError(
             f"limits.in_position.timeout = {settling.timeout:g}: it must be longer than the dwell, {settling.dwell:g} s"
         )
-    robot = geometry(config.geometry)
-    singular = {angle for centre in centres for angle in singular_angles(robot, centre)}
-    for angle in singular:
+
+
+def _check_frame(name: str) -> None:
+    if name in (BASE, PLATFORM):
+        raise ConfigError(f"frames.work.{name}: every robot has a frame of that name; give this one another")
+
+
+def _check_rate(config: Config) -> None:
     # The drives take the period as an integer times a power of ten of a second, object 60C2h.
     if 1_000_000 % config.loop.rate_hz:
         raise ConfigError(

@@ -179,8 +179,9 @@ class Supervisor:
                 child.kill_hung(START_WITHIN)
         self._monitor.look({name: self._running(name) for name in CHILDREN})
         for name, watch in self._watches.items():
-            if name in self._children and watch.hangs(self._children[name].process.pid):
-                self._children[name].kill_hung(self._patience[name])
+            watched = self._children.get(name)
+            if watched is not None and watched.process.pid is not None and watch.hangs(watched.process.pid):
+                watched.kill_hung(self._patience[name])
 
     def _running(self, name: str) -> Running:
         child, restarts = self._children.get(name), self._started[name] - 1
