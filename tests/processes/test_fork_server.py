@@ -79,7 +79,7 @@ class Parent:
         """Wait until a child is up, and return what it said."""
         watched: list[Any] = [child.pipe, self.warm]
         deadline = time.monotonic() + WITHIN
-        while child.ready_with is None:
+        while child.ready_with is None or child.process.pid is None:
             heard, _, _ = select.select(watched, [], [], deadline - time.monotonic())
             assert heard
             self.warm.hear()
