@@ -160,11 +160,8 @@ class Steps:
 
     def home(self, name: str) -> Done:
         """Home one drive, which alone has power."""
-        bench, index, homing = (
-            self.session.bench(),
-            NAMES.index(name),
-            self._config.drives.each[NAMES.index(name)].homing,
-        )
+        bench, index = self.session.bench(), NAMES.index(name)
+        homing = self._config.drives.each[index].homing
         if homing is None:
             return Judged("ok", ("its encoder is absolute: nothing to home",)), {}
         began, stopped, rules = bench.position[index], "", self._see.rules()
