@@ -230,7 +230,7 @@ def test_a_session_with_odrives(tmp_path: Path) -> None:
             assert robot.state().sliders.status == ("switch on disabled",) * 3
         assert service.end() == 0
         sent = service.frames()
-        commands = {0x00, 0x01, 0x03, 0x07, 0x09, 0x0B, 0x0C}
+        commands = {0x00, 0x01, 0x03, 0x04, 0x05, 0x07, 0x09, 0x0B, 0x0C}
         assert {identifier for identifier, _ in sent} == {
             node << 5 | number for node in (1, 2, 3) for number in commands
         }
