@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import warnings
@@ -60,6 +61,10 @@ def run(
     log
         Write what happens as lines for people, or as JSON, instead of as [telemetry] log has it.
     """
+    from trirail.processes.interpreter import ONE_THREAD
+
+    os.environ.update(ONE_THREAD)  # before anything imports numpy
+
     from trirail.config import SIM, load
     from trirail.processes.log import Log
     from trirail.processes.supervisor import Supervisor

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from pathlib import Path
+from typing import Final
 
 from trirail.errors import ServiceError
 
@@ -17,6 +18,9 @@ def python(*arguments: str) -> list[str]:
     return [sys.executable, "-P", *arguments]
 
 
+ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""The environment in which numpy's libraries begin no threads: none is carried over a fork, and the service's matrices
+are small."""
 TITLE = "trirail: "
 """What `ps` and its like show of one of the service's processes, before its name."""
 FORK_SERVER = "trirail.processes.fork_server"

@@ -14,12 +14,9 @@ from pathlib import Path
 import msgspec
 
 from trirail.processes.fork_server import LARGEST, Ended, Fork, Forked
-from trirail.processes.interpreter import FORK_SERVER, python
+from trirail.processes.interpreter import FORK_SERVER, ONE_THREAD, python
 from trirail.processes.process import Order
 from trirail.wire.decoding import decoded, prepare
-
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""For numpy's libraries: a fork carries no threads over, and the service's matrices are small."""
 
 TELLS_WITHIN = 1.0
 """So long after the end of a child the fork server may take to say how it ended [s]."""
