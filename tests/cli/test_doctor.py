@@ -14,7 +14,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.cli import doctor, doctor_network, probes
-from trirail.cli.machine import Machine, Passed
+from trirail.cli.machine import Gathered, Machine, Passed
 from trirail.config import SIM, Config, Tls, everything, load
 from trirail.diagnosis import Check, drives
 from trirail.errors import ServiceError
@@ -53,6 +53,7 @@ GOOD = Machine(
     governor="performance",
     isolated=(2, 3),
     link=LINK,
+    gathered=Gathered(1, 0),
     ticks=(Tick(0, 20_000, 0),) * 2000,
 )
 
@@ -95,6 +96,8 @@ def test_nothing_is_wrong_with_a_good_machine(config: Config) -> None:
         ({"link": link("BUS-OFF")}, "can0 state", "failure", "ip link set can0 down"),
         ({"link": link("STOPPED")}, "can0 state", "failure", ""),
         ({"link": link(txqlen=10)}, "can0 queue", "warning", "txqueuelen"),
+        ({"gathered": Gathered(8, 0)}, "can0 coalescing", "warning", "ethtool -C can0 rx-usecs-irq 0 rx-frames-irq 1"),
+        ({"gathered": Gathered(0, 50)}, "can0 coalescing", "warning", "ip link set can0 down"),
         ({"ticks": (Tick(0, 0, 0), *(Tick(0, 900_000, 0),) * 3)}, "lateness", "warning", "loop.rate_hz"),
         ({"ticks": (Tick(0, 0, 0), Tick(0, 0, 1), Tick(0, 0, 0))}, "lateness", "warning", "isolate"),
         ({"ticks": (Tick(0, 0, 6), Tick(0, 0, 5), Tick(0, 0, 0))}, "lateness", "failure", "isolate"),

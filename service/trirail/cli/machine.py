@@ -22,6 +22,15 @@ class Passed(Struct, frozen=True):
     """Bytes in them."""
 
 
+class Gathered(Struct, frozen=True):
+    """After how many frames, or how long, a network interface hands over what it has received: ethtool -c."""
+
+    frames: int
+    """1, or 0 where the driver counts none: each as it comes."""
+    microseconds: int
+    """0 for no waiting [µs]."""
+
+
 class Machine(Struct, frozen=True):
     """What was read of the machine; None where it does not say."""
 
@@ -42,6 +51,8 @@ class Machine(Struct, frozen=True):
     ticks: tuple[Tick, ...]
     passed: Passed | None = None
     """What passed on the CAN interface meanwhile."""
+    gathered: Gathered | None = None
+    """How the CAN interface hands frames over; None where its driver does not say."""
     adapter: str = ""
     """What python-can's interface would lack, with the remedy; "" for nothing."""
     guard: Guard | str | None = None

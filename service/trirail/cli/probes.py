@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
+import fcntl
 import json
 import os
 import platform
 import socket
+import struct
 import subprocess
 import time
 from pathlib import Path
@@ -15,7 +18,7 @@ from msgspec import structs
 from trirail_drivers.bus import adapters
 
 from trirail.cli.key_folder import AUTHORITY_KEY, Issued, KeyFolder
-from trirail.cli.machine import Machine, Passed
+from trirail.cli.machine import Gathered, Machine, Passed
 from trirail.config import Config, LoopTable
 from trirail.errors import ServiceError
 from trirail.processes import realtime
@@ -23,6 +26,8 @@ from trirail.processes.clock import Tick, Ticker
 from trirail.processes.guard import Guard
 
 SYSTEM = Path("/sys")
+_SIOCETHTOOL, _GCOALESCE, _COALESCE = 0x8946, 0x0E, 23
+"""A request of linux/sockios.h, a command of linux/ethtool.h, and the 32-bit words of its struct ethtool_coalesce."""
 MEASURED = 2.0
 """How long ticks are measured [s]."""
 
@@ -49,6 +54,7 @@ def machine(config: Config) -> Machine:
         link=link(config.can.channel) if config.can.interface == "socketcan" else None,
         ticks=ticked,
         passed=passed(before, counted(channel)),
+        gathered=gathered(channel) if channel else None,
         adapter=adapters.lacking(config.can.interface),
         guard=door,
         issued=issued(config),
@@ -101,6 +107,19 @@ def link(name: str) -> dict[str, Any] | None:
         raise ServiceError(f"{' '.join(command)}: {error.stderr.decode(errors='replace').strip()}") from error
     (found,) = json.loads(said.stdout)
     return dict(found)
+
+
+def gathered(name: str) -> Gathered | None:
+    """How a network interface hands over what it receives; None where its driver does not say (linux/ethtool.h)."""
+    said = (ctypes.c_uint32 * _COALESCE)(_GCOALESCE)
+    request = struct.pack("16sP", name.encode(), ctypes.addressof(said))
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+            fcntl.ioctl(asking, _SIOCETHTOOL, request)
+    except OSError:
+        return None
+    _, time_of_any, any_frames, time_of_irq, irq_frames, *_ = said
+    return Gathered(max(any_frames, irq_frames), max(time_of_any, time_of_irq))
 
 
 def counted(name: str) -> Passed | None:
