@@ -35,17 +35,17 @@ def top_level(*packages: ModuleType) -> Iterator[ast.stmt]:
     [
         ("import trirail; trirail.__version__; dir(trirail)", set()),
         ("from trirail import TrirailError, RefusedError, ServiceError, ConfigError, KinematicsError", set()),
-        ("from trirail import Robot", {"numpy", "zenoh"}),
+        ("from trirail import Robot", {"zenoh"}),
         ("from trirail import Geometry, Leg, inverse, forward, jacobians", {"numba", "numpy"}),
         ("from trirail import read", {"numpy", "rerun"}),
-        ("from trirail.cli import commands", {"numpy", "zenoh", "rich", "cyclopts"}),
+        ("from trirail.cli import commands", {"rich", "cyclopts"}),
         ("from trirail.telemetry.session_index import SessionIndex", set()),
         ("from trirail.config import SIM, load; load(SIM)", {"numpy", "can", "canopen"}),
         ("from trirail.processes import supervisor", {"numpy"}),
         ("from trirail.processes import gateway", {"numpy", "zenoh"}),
         ("from trirail.processes import planner", {"numpy", "numba", "ruckig"}),
         ("from trirail.processes import loop", {"numpy", "numba", "ruckig", "can", "canopen"}),
-        ("from trirail.processes import recording", {"numpy", "numba", "rerun", "can"}),
+        ("from trirail.processes import recording", {"numpy", "rerun", "can"}),
     ],
 )
 def test_each_name_loads_what_it_needs_and_no_more(statement: str, loaded: set[str]) -> None:

@@ -70,10 +70,12 @@ class Parent:
         self.listening = [links.listen(folder / f"port-{number}") for number in range(3)]
         self.heartbeats = Heartbeats.create()
         sockets = [listening.fileno() for listening in self.listening]
+        self.children: list[ChildProcess] = []
         self.warm = WarmParent(Order(load(SIM), None), folder, self.heartbeats.descriptor, sockets)
 
     def child(self, name: str, record: str | None = None) -> ChildProcess:
-        return ChildProcess(self.warm, name, record)
+        self.children.append(ChildProcess(self.warm, name, record))
+        return self.children[-1]
 
     def until_said(self, child: ChildProcess) -> dict[str, object]:
         """Wait until a child is up, and return what it said."""
@@ -105,6 +107,8 @@ def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Parent]:
         yield made
     finally:
         made.warm.close()
+        for descriptor in (made.heartbeats.descriptor, *(child.pipe for child in made.children)):
+            os.close(descriptor)
         for listening in made.listening:
             listening.close()
 

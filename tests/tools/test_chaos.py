@@ -17,7 +17,7 @@ from trirail_drivers.cia402 import frames
 
 
 def test_it_has_every_mode_process_and_harm() -> None:
-    assert len(set(CASES)) == len(MODES) * len(PROCESSES) * len(HARM) == 150
+    assert len(set(CASES)) == len(MODES) * len(PROCESSES) * len(HARM) == 180
     assert set(MODES) == {*map(str, vocabulary.MODES)} - {"homing"}  # its drives have absolute encoders
 
 

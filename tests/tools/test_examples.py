@@ -64,7 +64,7 @@ def test_the_kinematics_alone() -> None:
     lines = run("kinematics_alone.py")
     assert float(lines[2].split(":")[1].split()[0]) < 1e-12
     assert float(lines[3].split(":")[1]) < 1e-12
-    assert lines[4].startswith("leg A: edge parallel to its rail at phi = 1.04719755 rad")
+    assert lines[4].startswith("leg A: edge parallel to its rail at phi = 60°")
 
 
 @pytest.mark.slow

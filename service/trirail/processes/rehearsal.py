@@ -38,7 +38,7 @@ SLOW = 0.1
 """Share of the platform's velocity along x at which it jogs."""
 
 
-class _Clock:
+class _RehearsedTime:
     """The monotonic clock until the cycles begin, and then their time: a busy machine makes nobody late."""
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class _Rehearsal:
     def __init__(self, config: Config, folder: Path) -> None:
         self._config = config
         self._folder = folder
-        self._clock = _Clock()
+        self._clock = _RehearsedTime()
         self._bus = simulated_bus(config.can, config.drives, self._clock)
         driver = PROTOCOLS[config.drives.protocol].driver
         self._drives = driver(self._bus, config.can.bitrate, config.drives, self._clock)
