@@ -17,7 +17,7 @@ from trirail.processes import warm_parent
 from trirail.processes.child_process import ChildProcess
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.process import Order
-from trirail.processes.warm_parent import WarmParent
+from trirail.processes.warm_parent import UNTOLD, WarmParent
 from trirail.wire import links
 
 SERVER = """
@@ -27,8 +27,11 @@ from typing import Any
 from trirail.processes import compiling, fork_server
 
 folder = Path({folder!r})
+server = os.getpid()
 
 def load():
+    if (folder / "importing").exists():
+        time.sleep(1.5)
     return (folder / "kept").exists()
 
 def compile_all(begin):
@@ -51,7 +54,7 @@ def work(child):
         "blocked": [int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, [])],
         "handled": signal.getsignal(signal.SIGTERM) is signal.SIG_DFL,
     }})
-    while True:
+    while os.getppid() == server:  # gateway and recorder end by the loop alone, which there is none of
         time.sleep(0.05)
         if (folder / child.name).exists():
             exec((folder / child.name).read_text())
@@ -215,7 +218,28 @@ def test_a_dead_parent_is_told_and_so_are_its_children(parent: Parent) -> None:
     child = parent.child("planner")
     parent.until_said(child)
     (parent.folder / "planner").write_text("os.kill(os.getppid(), signal.SIGKILL)")
-    assert parent.until_over(child) == f"exit code {os.EX_UNAVAILABLE}"
+    assert parent.until_over(child) == "its parent does not say how"
     assert parent.warm.gone
     assert parent.warm.how() == "killed by SIGKILL"
-    assert parent.child("gateway").process.returncode == os.EX_UNAVAILABLE
+    assert parent.child("gateway").process.returncode == UNTOLD
+
+
+def test_how_a_child_ended_is_told_also_where_its_parent_is_importing(parent: Parent) -> None:
+    gateway = parent.child("gateway")
+    parent.until_said(gateway)
+    (parent.folder / "importing").touch()
+    parent.child("loop")
+    (parent.folder / "gateway").write_text("os._exit(7)")
+    assert parent.until_over(gateway) == "exit code 7"
+
+
+def test_a_frozen_parent_is_waited_for_once(parent: Parent) -> None:
+    children = [parent.child(name) for name in ("planner", "gateway", "recorder")]
+    for child in children:
+        parent.until_said(child)
+    (parent.folder / "planner").write_text("os.kill(os.getppid(), signal.SIGSTOP); os._exit(1)")
+    assert parent.until_over(children[0]) == "its parent does not say how"
+    assert parent.warm.tells_within == 0.0
+    for child in children[1:]:
+        child.process.kill()
+        assert parent.until_over(child) == "its parent does not say how"

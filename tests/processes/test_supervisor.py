@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -22,8 +23,10 @@ compiling.load = lambda: True
 def begun(other):
     return (folder / f"{{other}}.begun").exists()
 
+SUPERVISOR = os.getppid()
+
 def never():
-    return False
+    return not Path(f"/proc/{{SUPERVISOR}}").exists()  # a test run that was killed leaves nobody behind
 
 def freeze():
     while not never():
@@ -35,12 +38,12 @@ def work(child):
     (folder / f"{{name}}-{{number}}.begun").touch()
 
     def beat_until(condition):
-        while not condition():
+        while not (condition() or never()):
             heartbeats.of(name).beat()
             time.sleep(0.01)
 
     def loop_gone():
-        return heartbeats.of("loop").count == 0
+        return heartbeats.of("loop").count == 0 or never()
 
     exec((folder / f"{{name}}-{{number}}").read_text(), globals() | locals())
     return 0
@@ -186,3 +189,39 @@ def test_the_terminals_interrupt_reaches_no_child_not_even_one_that_is_still_imp
     turning = "beat_until(lambda: begun('planner-1')); time.sleep(1.0); heartbeats.of('loop').rest()"
     run(told, tmp_path, loop_1=interrupted + turning, gateway_1=interrupted + "freeze()", recorder_1=RECORDING)
     assert told[0] == "up"
+
+
+def test_a_start_that_is_interrupted_has_not_failed(told: list[str], tmp_path: Path) -> None:
+    """SIGTERM ends the children before they have said what it is to do."""
+    interrupting = f"os.kill({os.getpid()}, signal.SIGTERM); freeze()"
+    assert run(told, tmp_path, loop_1=interrupting, gateway_1="freeze()", recorder_1="freeze()") == 0
+    assert told == ["SIGTERM: the start is interrupted, nothing has moved"]
+
+
+def test_who_does_not_end_is_a_failure_also_of_a_start_that_is_interrupted(told: list[str], tmp_path: Path) -> None:
+    deaf = "signal.signal(signal.SIGTERM, signal.SIG_IGN); (folder / 'deaf.begun').touch(); freeze()"
+    interrupting = f"beat_until(lambda: begun('deaf')); os.kill({os.getpid()}, signal.SIGTERM); freeze()"
+    assert run(told, tmp_path, loop_1=interrupting, gateway_1=deaf, recorder_1="freeze()") == 1
+    assert told[1] == "the gateway does not end: killing it"
+
+
+def test_a_frozen_fork_server_ends_the_service_when_a_child_is_wanted(
+    told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody could bring the gateway back, and the robot would wait for it."""
+    monkeypatch.setattr(supervisor, "FORKS_WITHIN", 0.5)
+    code = run(
+        told,
+        tmp_path,
+        loop_1="ready(); beat_until(lambda: begun('gateway-2'))",
+        gateway_1="ready(); beat_until(lambda: begun('planner-1')); up = time.monotonic() + 0.5; "
+        "beat_until(lambda: time.monotonic() > up); os.kill(os.getppid(), signal.SIGSTOP); os._exit(1)",
+        recorder_1=RECORDING,
+    )
+    assert code == 1
+    assert told[:3] == [
+        "up",
+        "the gateway has died (its parent does not say how): the loop stops the robot and holds; starting it again",
+        "the process that forks the others has died (no sign of life for 0.5 s, so it was killed): the loop stops the "
+        "robot and disables the drives; ending",
+    ]

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from trirail.processes.process import COMPILING, HAPPENED, MEASURED
-from trirail.processes.warm_parent import WarmParent, how_ended
+from trirail.processes.warm_parent import WarmParent, how_ended, hung
 from trirail.wire.decoding import converted
 from trirail.wire.messages import Event
 
@@ -61,5 +61,5 @@ class ChildProcess:
         """How it ended, for people."""
         code = self.process.returncode
         if self._hung_for and code == -signal.SIGKILL:
-            return f"no sign of life for {self._hung_for:g} s, so it was killed"
+            return hung(self._hung_for)
         return how_ended(code) if code else "another process sent it SIGTERM"

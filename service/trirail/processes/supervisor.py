@@ -41,6 +41,8 @@ CONSEQUENCES = {
 """What the death of a process means for the robot."""
 START_WITHIN = 300.0
 """How long the processes may take to come up; the very first start may for each function that it compiles [s]."""
+FORKS_WITHIN = 5.0
+"""How long the fork server, once the service is up, may take for a child: it does nothing else [s]."""
 END_WITHIN = 6.0
 """How long they may take to end before they are killed [s]."""
 RESTARTS = 5
@@ -94,6 +96,7 @@ class Supervisor:
         self._ending = False
         self._failed = False
         self._turned = False
+        self._up = False
 
     def run(self, up: Callable[[dict[str, dict[str, Any]]], None]) -> int:
         """Run until a signal or a process that must not be missing ends it; return the exit code.
@@ -132,7 +135,6 @@ class Supervisor:
     def _watch(self, up: Callable[[dict[str, dict[str, Any]]], None], signals: Signals) -> None:
         progress = Progress(lambda words: self._say(words, "info"), START_WITHIN)
         began = time.monotonic()
-        is_up = False
         while not self._ending:
             keys = [key for key, _ in self._selector.select(TURN)]
             self._hear_parent()
@@ -140,7 +142,7 @@ class Supervisor:
             # The loop first: the others end because it has ended, and not by themselves.
             for child in sorted(heard, key=lambda child: child is not self._children.get("loop")):
                 if child is None:
-                    ending = progress.interrupted if not is_up else "stopping the robot and disabling the drives"
+                    ending = progress.interrupted if not self._up else "stopping the robot and disabling the drives"
                     self._say(f"{signals.take().name}: {ending}", "info")
                     self._ending = True
                 elif not child.listen() and not self._ending:
@@ -154,12 +156,12 @@ class Supervisor:
                 continue
             self._start_due()
             self._look_after()
-            if is_up:
+            if self._up:
                 self._watchdog.feed()
                 continue
             ready = {name: child.ready_with for name, child in self._children.items() if child.ready_with is not None}
             if len(ready) == len(CHILDREN):
-                is_up = True
+                self._up = True
                 up(ready)
                 notify("READY=1")
             elif time.monotonic() - max(began, self._went_on) > START_WITHIN:
@@ -177,6 +179,8 @@ class Supervisor:
                 if child.process.pid is None:
                     self._parent.kill()
                 child.kill_hung(START_WITHIN)
+            elif self._up and child.process.pid is None and now - child.began > FORKS_WITHIN:
+                self._parent.kill_hung(FORKS_WITHIN)
         self._monitor.look({name: self._running(name) for name in CHILDREN})
         for name, watch in self._watches.items():
             watched = self._children.get(name)
@@ -286,7 +290,9 @@ class Supervisor:
         for child in list(self._children.values()):
             if not child.process.wait(asked):
                 self._kill_unwilling(child)
-            self._failed = self._failed or child.process.returncode != 0
+                self._failed = True
+            # In a start that is interrupted, the SIGTERM may come before they have said what it is to do.
+            self._failed = self._failed or (self._turned and child.process.returncode != 0)
             self._forget(child)
 
     def _kill_unwilling(self, child: ChildProcess) -> None:

@@ -13,13 +13,17 @@ from pathlib import Path
 
 import msgspec
 
-from trirail.processes.fork_server import LARGEST, Ended, Fork, Forked
+from trirail.processes.fork_server import LARGEST, MATHEMATICS, Ended, Fork, Forked
 from trirail.processes.interpreter import FORK_SERVER, ONE_THREAD, python
 from trirail.processes.process import Order
 from trirail.wire.decoding import decoded, prepare
 
 TELLS_WITHIN = 1.0
 """So long after the end of a child the fork server may take to say how it ended [s]."""
+IMPORTS_WITHIN = 6.0
+"""The same while it may be importing the mathematics [s]."""
+UNTOLD = os.EX_UNAVAILABLE
+"""The code of a child whose parent, gone, frozen or busy, does not say how it ended; none ends with it by itself."""
 
 prepare(Forked | Ended)
 
@@ -48,6 +52,9 @@ class WarmParent:
             self._process.stdin.close()
         self._asked: dict[int, ForkedProcess] = {}
         self._numbers = 0
+        self._hung_for = 0.0
+        self.tells_within = IMPORTS_WITHIN
+        """How long what it has to say may take; nothing where it has been waited for in vain [s]."""
         self.gone = False
         """Whether it has ended: then the loop has been told to end as well."""
 
@@ -58,7 +65,7 @@ class WarmParent:
     def fork(self, name: str, record: str | None, voice: int) -> ForkedProcess:
         """Ask for a child that speaks on the descriptor `voice`."""
         self._numbers += 1
-        process = self._asked[self._numbers] = ForkedProcess(self)
+        process = self._asked[self._numbers] = ForkedProcess(self, name)
         try:
             socket.send_fds(self._control, [msgspec.json.encode(Fork(self._numbers, name, record))], [voice])
         except OSError:
@@ -78,17 +85,32 @@ class WarmParent:
             return
         said: Forked | Ended = decoded(packet, Forked | Ended)
         if isinstance(said, Forked):
-            self._asked[said.number].begun(said.pid, *descriptors)
+            process = self._asked[said.number]
+            process.begun(said.pid, *descriptors)
+            if process.name in MATHEMATICS:
+                self.tells_within = TELLS_WITHIN
         else:
             self._asked.pop(said.number).over(said.code)
 
+    def speaks(self) -> bool:
+        """Wait until it says something; False where it does not, and then it is not waited for again."""
+        heard = bool(select.select([self], [], [], self.tells_within)[0])
+        self.tells_within = self.tells_within if heard else 0.0
+        return heard
+
     def how(self) -> str:
         """How it ended, for people."""
-        return how_ended(self._process.wait())
+        code = self._process.wait()
+        return hung(self._hung_for) if self._hung_for and code == -signal.SIGKILL else how_ended(code)
 
     def kill(self) -> None:
         """Kill it: the loop, if there is one, stops the robot and ends."""
         self._process.kill()
+
+    def kill_hung(self, silent: float) -> None:
+        """Kill it for not having answered for so long [s]."""
+        self._hung_for = silent
+        self.kill()
 
     def close(self) -> None:
         """End it: it has nothing to keep."""
@@ -105,7 +127,8 @@ class WarmParent:
 class ForkedProcess:
     """A child of the fork server: what Popen is for one's own child."""
 
-    def __init__(self, parent: WarmParent) -> None:
+    def __init__(self, parent: WarmParent, name: str) -> None:
+        self.name = name
         self._parent = parent
         self._pidfd: int | None = None
         self._killed = False
@@ -131,7 +154,7 @@ class ForkedProcess:
     def orphaned(self) -> None:
         """Its parent has ended before it, and nobody will tell how it does."""
         if self.pid is None and self.returncode is None:
-            self.over(os.EX_UNAVAILABLE)
+            self.over(UNTOLD)
 
     def send_signal(self, number: int) -> None:
         """Send a signal."""
@@ -156,11 +179,18 @@ class ForkedProcess:
                 return False
             if self._parent.fileno() in ready:
                 self._parent.hear()
-            elif self._parent.gone or not select.select([self._parent], [], [], TELLS_WITHIN)[0]:
-                self.over(os.EX_UNAVAILABLE)  # it has ended, and its parent, gone or frozen, does not say how
+            elif self._parent.gone or not self._parent.speaks():
+                self.over(UNTOLD)  # it has ended, and its parent does not say how
         return True
 
 
 def how_ended(code: int) -> str:
     """Return how a process ended, for people, by its exit code as Popen has it."""
+    if code == UNTOLD:
+        return "its parent does not say how"
     return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+def hung(silent: float) -> str:
+    """Return how a process ended that had given no sign of life for so long [s], for people."""
+    return f"no sign of life for {silent:g} s, so it was killed"
