@@ -433,3 +433,12 @@ def test_watch_into_a_pipe_is_a_line_a_second(monkeypatch: pytest.MonkeyPatch) -
         live.watch(Moving(1.0), json_lines=False)  # type: ignore[arg-type]
     assert [line.split("   ")[0] for line in said] == [f"{t} s  moving  x 10.000 mm" for t in ("0.00", "1.00", "2.00")]
     assert said[0].endswith("goal g-1 40%  a")
+
+
+def test_what_a_command_opens_never_has_the_number_of_a_closed_standard_stream() -> None:
+    opens = (
+        "import os, sys; from trirail.__main__ import _open_standard_streams as prepare; prepare(); "
+        "sys.stdout.write('to nobody'); sys.stderr.write('neither'); sys.exit(os.open(os.devnull, os.O_RDONLY))"
+    )
+    ended = subprocess.run(["sh", "-c", '"$0" -c "$1" <&- >&- 2>&-', sys.executable, opens], check=False)
+    assert ended.returncode == 3

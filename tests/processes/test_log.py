@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 
 import msgspec
@@ -77,3 +78,21 @@ def test_what_comes_slowly_is_written_whole() -> None:
         now += 1.0
         log.event(msgspec.structs.replace(FAULT, seq=seq, level="info"))
     assert len(out.getvalue().splitlines()) == 500
+
+
+def test_a_full_disk_stops_no_robot() -> None:
+    """Neither now nor at the interpreter's end, which writes what is left."""
+    with open("/dev/full", "w") as full:
+        log = Log("text", full)
+        for _ in range(1000):
+            log.say("the planner has died", "warning")
+        log.close()
+
+
+def test_a_reader_that_has_gone_stops_no_robot() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as nobody:
+        log = Log("text", nobody)
+        log.event(FAULT)
+        log.close()

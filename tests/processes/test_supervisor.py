@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from trirail.config import SIM, load
+from trirail.errors import ServiceError
 from trirail.kinematics.compiled import FUNCTIONS
 from trirail.processes import supervisor, warm_parent
 
@@ -181,21 +182,23 @@ for number in range({FUNCTIONS}):
     assert told[4:6] == [f"compiling: {FUNCTIONS} of {FUNCTIONS} functions", "up"]
 
 
-def test_the_terminals_interrupt_reaches_no_child_not_even_one_that_is_still_importing(
-    told: list[str], tmp_path: Path
+@pytest.mark.parametrize("sent", ["SIGINT", "SIGHUP"])
+def test_the_terminals_interrupt_and_end_reach_no_child_not_even_one_that_is_still_importing(
+    sent: str, told: list[str], tmp_path: Path
 ) -> None:
-    """Ctrl-C goes to all of the terminal's processes: the supervisor alone acts on it."""
-    interrupted = "os.kill(os.getpid(), signal.SIGINT); ready(); "
+    """Ctrl-C, and its own end, go to all of the terminal's processes: the supervisor alone acts on it."""
+    interrupted = f"os.kill(os.getpid(), signal.{sent}); ready(); "
     turning = "beat_until(lambda: begun('planner-1')); time.sleep(1.0); heartbeats.of('loop').rest()"
     run(told, tmp_path, loop_1=interrupted + turning, gateway_1=interrupted + "freeze()", recorder_1=RECORDING)
     assert told[0] == "up"
 
 
-def test_a_start_that_is_interrupted_has_not_failed(told: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("sent", ["SIGTERM", "SIGINT", "SIGHUP"])
+def test_a_start_that_is_interrupted_has_not_failed(sent: str, told: list[str], tmp_path: Path) -> None:
     """SIGTERM ends the children before they have said what it is to do."""
-    interrupting = f"os.kill({os.getpid()}, signal.SIGTERM); freeze()"
+    interrupting = f"os.kill({os.getpid()}, signal.{sent}); freeze()"
     assert run(told, tmp_path, loop_1=interrupting, gateway_1="freeze()", recorder_1="freeze()") == 0
-    assert told == ["SIGTERM: the start is interrupted, nothing has moved"]
+    assert told == [f"{sent}: the start is interrupted, nothing has moved"]
 
 
 def test_who_does_not_end_is_a_failure_also_of_a_start_that_is_interrupted(told: list[str], tmp_path: Path) -> None:
@@ -225,3 +228,12 @@ def test_a_frozen_fork_server_ends_the_service_when_a_child_is_wanted(
         "the process that forks the others has died (no sign of life for 0.5 s, so it was killed): the loop stops the "
         "robot and disables the drives; ending",
     ]
+
+
+def test_a_runtime_folder_of_somebody_else_is_refused_in_words(
+    told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `su` leaves it to another user."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "gone"))
+    with pytest.raises(ServiceError, match=r"sockets in .*gone, the XDG_RUNTIME_DIR: .*; unset that, or set"):
+        run(told, tmp_path)

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Literal
@@ -84,12 +85,14 @@ def run(
         if form == "json":
             lines.say(f"up: robot {settings.robot.name}, goals {', '.join(settings.zenoh.listen)}")
         else:
-            terminal.up(settings, ready)
+            with suppress(OSError, SystemExit):  # a full disk, or a reader that has gone, at which Rich would exit
+                terminal.up(settings, ready)
 
     try:
         return Supervisor(settings, record, lines.say, lines.event).run(up)
     finally:
         starting.up()
+        lines.close()
 
 
 @app.command

@@ -33,6 +33,8 @@ MATHEMATICS = ("loop", "planner")
 WITH_PARENT: Final = {"loop": signal.SIGTERM, "planner": signal.SIGKILL}
 """What ends a child when this process ends, however that ends. Gateway and recorder end by themselves once the loop has
 gone, so that what it says of its end is published and on disk."""
+OF_TERMINAL: Final = (signal.SIGINT, signal.SIGHUP)
+"""What a terminal sends to all of its processes: Ctrl-C, and its own end."""
 LARGEST = 4096
 """Bytes of a packet on CONTROL."""
 
@@ -198,8 +200,9 @@ def main(work: Callable[[Child], int] = run) -> int:
     runtime, control, beats, *sockets = sys.argv[1:]
     name_process("fork-server")
     die_with_parent(signal.SIGKILL)
-    # The terminal sends it to all, and the supervisor alone acts on it; SIGTERM waits for the child that unblocks it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The supervisor alone acts on what a terminal sends; SIGTERM waits for the child that unblocks it.
+    for number in OF_TERMINAL:
+        signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_SETMASK, [signal.SIGTERM])
     gc.disable()
     order = decoded(sys.stdin.buffer.read(), Order)

@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Final, Literal, TextIO
 
 import msgspec
@@ -75,5 +76,15 @@ class Log:
             line = f"{wall_clock(moment)}  {level:7}  {printable(words)}"
             if self._to_journal:
                 line = f"<{PRIORITIES[level]}>{line}"
-        self._out.write(f"{line}\n")
-        self._out.flush()
+        with suppress(OSError):  # a full disk, or a reader that has gone, stops no robot
+            self._out.write(f"{line}\n")
+            self._out.flush()
+
+    def close(self) -> None:
+        """Leave out what cannot be written, which the interpreter would try again at its end."""
+        try:
+            self._out.flush()
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._out.fileno())
+            os.close(nowhere)

@@ -7,7 +7,7 @@ import socket
 
 
 class Signals:
-    """SIGTERM and SIGINT as something to select on.
+    """SIGTERM, SIGINT and, where it is not ignored, as under nohup, SIGHUP as something to select on.
 
     Whichever thread the kernel hands a signal: Python's handlers are run by the main thread alone, which nothing wakes
     from a lock where another one was interrupted.
@@ -16,9 +16,10 @@ class Signals:
     def __enter__(self) -> Signals:
         self.reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
-        self._before = {
-            number: signal.signal(number, lambda _signal, _frame: None) for number in (signal.SIGTERM, signal.SIGINT)
-        }
+        numbers = [signal.SIGTERM, signal.SIGINT]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            numbers.append(signal.SIGHUP)
+        self._before = {number: signal.signal(number, lambda _signal, _frame: None) for number in numbers}
         self._wakeup = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
         return self
 

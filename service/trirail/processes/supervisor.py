@@ -104,8 +104,7 @@ class Supervisor:
         `up` is called once with what each process said when it was ready.
         """
         raise_limit()
-        parent = os.environ.get("XDG_RUNTIME_DIR")
-        runtime = tempfile.TemporaryDirectory(prefix="trirail-", dir=parent)
+        runtime = _runtime_folder()
         with runtime as folder, Signals() as signals, self._monitor:
             self._runtime = Path(folder)
             self._listening = [links.listen(self._runtime / name) for name in PORTS]
@@ -302,3 +301,16 @@ class Supervisor:
     def _kill(self, child: ChildProcess) -> None:
         child.process.kill()
         child.process.wait(time.monotonic() + END_WITHIN)
+
+
+def _runtime_folder() -> tempfile.TemporaryDirectory[str]:
+    """Return a new folder for sockets. Raises ServiceError where none can be made."""
+    parent = os.environ.get("XDG_RUNTIME_DIR")
+    try:
+        return tempfile.TemporaryDirectory(prefix="trirail-", dir=parent)
+    except OSError as error:
+        where = f"{parent}, the XDG_RUNTIME_DIR" if parent else "any folder for temporary files"
+        raise ServiceError(
+            f"cannot make a folder for sockets in {where}: {error.strerror}; "
+            f"{'unset that, or ' if parent else ''}set {'it' if parent else 'TMPDIR'} to a folder of this user"
+        ) from error

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from trirail.processes.fork_server import LARGEST, MATHEMATICS, Ended, Fork, Forked
+from trirail.processes.fork_server import LARGEST, MATHEMATICS, OF_TERMINAL, Ended, Fork, Forked
 from trirail.processes.interpreter import FORK_SERVER, ONE_THREAD, python
 from trirail.processes.process import Order
 from trirail.wire.decoding import decoded, prepare
@@ -35,8 +35,8 @@ class WarmParent:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setblocking(False)
         arguments = [str(runtime), str(theirs.fileno()), str(beats), *map(str, sockets)]
-        # The terminal sends it to all, and the supervisor alone acts on it: also while the server is still importing.
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        # The supervisor alone acts on what a terminal sends to all: also while the server is still importing.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, OF_TERMINAL)
         try:
             self._process = subprocess.Popen(
                 python("-m", FORK_SERVER, *arguments),
