@@ -106,4 +106,6 @@ def test_a_file_is_never_written_over(tmp_path: Path) -> None:
         run("drives", "save", str(tmp_path))
     with pytest.raises(FileError, match="nowhere: no such folder"):
         run("drives", "save", str(tmp_path / "nowhere"))
+    with pytest.raises(FileError, match=r"drive-B\.toml: a file, no folder; a configuration follows --config"):
+        run("drives", "save", str(tmp_path / "drive-B.toml"))
     assert [path.name for path in tmp_path.iterdir()] == ["drive-B.toml"]

@@ -57,7 +57,8 @@ def save(
         if path.exists():
             raise FileError(f"{path} exists already: name another folder")
     if not folder.is_dir():
-        raise FileError(f"{folder}: no such folder")
+        what = "a file, no folder; a configuration follows --config" if folder.is_file() else "no such folder"
+        raise FileError(f"{folder}: {what}")
     ends = _read(settings, protocol, sorted(paths))
     read = {name: end for name, end in ends.items() if not isinstance(end, DriveError)}
     for name, saved in read.items():
