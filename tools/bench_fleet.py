@@ -71,6 +71,7 @@ class Net:
             folder_of.mkdir(parents=True)
             for file, content in ((AUTHORITY, by.certificate), (CERTIFICATE, own.certificate), (KEY, own.key)):
                 (folder_of / file).write_bytes(content)
+            (folder_of / KEY).chmod(0o600)
         self._config = folder / "router.toml"
         self._config.write_text(
             f"robots = {json_format.dumps(self.robots)}\n"
