@@ -16,9 +16,9 @@ from typing import Final, ParamSpec
 
 import can
 import pytest
+from trirail_drivers.bus.can_frame import CAN_FRAME
 from trirail_drivers.bus.capture import Capture, CapturedBus
 from trirail_drivers.bus.frame_io import FrameIO, PythonCanFrames, SocketFrames, frame_io
-from trirail_drivers.bus.frames import CAN_FRAME
 from trirail_drivers.bus.unixbus import UnixBus
 
 P = ParamSpec("P")

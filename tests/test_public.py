@@ -45,7 +45,7 @@ def top_level(*packages: ModuleType) -> Iterator[ast.stmt]:
         ("from trirail.processes import gateway", {"numpy", "zenoh"}),
         ("from trirail.processes import planner", {"numpy", "numba", "ruckig"}),
         ("from trirail.processes import loop", {"numpy", "numba", "ruckig", "can", "canopen"}),
-        ("from trirail.processes import recording", {"numpy", "rerun", "can"}),
+        ("from trirail.processes import recording", {"numpy", "rerun"}),
     ],
 )
 def test_each_name_loads_what_it_needs_and_no_more(statement: str, loaded: set[str]) -> None:

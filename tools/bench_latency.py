@@ -20,9 +20,9 @@ import numpy as np
 from bench_rig import rig
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
-from trirail_drivers.bus.capture import FRAME, Capture
+from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED
+from trirail_drivers.bus.capture import Capture
 from trirail_drivers.bus.frame_io import SocketFrames
-from trirail_drivers.bus.frames import CAN_FRAME
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import frames as layout
 from trirail_drivers.interface import NAMES
@@ -79,7 +79,7 @@ class Listener:
 
     def _taken(self) -> Iterator[tuple[float, int, bytes]]:
         for chunk in self._capture.take():
-            for t, frame in FRAME.iter_unpack(chunk):
+            for t, frame in CAPTURED.iter_unpack(chunk):
                 identifier, _, data = CAN_FRAME.unpack(frame)
                 yield t, identifier, data
 

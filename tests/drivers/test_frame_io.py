@@ -14,9 +14,10 @@ import pytest
 from carriers import FarEnd, over
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail_drivers.bus.capture import FRAME, Capture
+from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED, ERROR, EXTENDED, REMOTE
+from trirail_drivers.bus.capture import Capture
 from trirail_drivers.bus.frame_io import FrameIO, PythonCanFrames
-from trirail_drivers.bus.frames import CAN_FRAME, ERROR, EXTENDED, REMOTE, Frame
+from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.wire import Wire
 
 BUSES = [
@@ -107,7 +108,7 @@ def test_a_capture_has_every_frame_with_its_time(kind: str, way: str) -> None:
             far.send(identifier, data)
         arriving(frames, len(KINDS))
     ended = time.time()
-    noted = [line for chunk in capture.take() for line in FRAME.iter_unpack(chunk)]
+    noted = [line for chunk in capture.take() for line in CAPTURED.iter_unpack(chunk)]
     # Linux turns stamping on a moment after it is asked to: until then a frame has the time at which it is read.
     assert all(began <= t <= ended for t, _ in noted)
     seen = [CAN_FRAME.unpack(frame) for _, frame in noted]
@@ -122,7 +123,7 @@ def test_a_captured_frame_has_the_time_of_its_arrival() -> None:
         while time.time() - arrived_by < 0.01:
             os.sched_yield()
         assert frames.receive() is not None
-    ((t, _),) = (line for chunk in capture.take() for line in FRAME.iter_unpack(chunk))
+    ((t, _),) = (line for chunk in capture.take() for line in CAPTURED.iter_unpack(chunk))
     assert t <= arrived_by
 
 

@@ -16,7 +16,8 @@ import carriers
 import pytest
 from carriers import FarEnd
 from trirail_drivers.bus import wire as wires
-from trirail_drivers.bus.frames import ERROR, EXTENDED, REMOTE, Frame, frame_bits
+from trirail_drivers.bus.can_frame import ERROR, EXTENDED, REMOTE
+from trirail_drivers.bus.frames import Frame, frame_bits
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.interface import DriveFault

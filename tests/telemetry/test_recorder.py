@@ -28,7 +28,7 @@ from trirail.telemetry.sinks import BACKLOG, RESERVE, Archive, Relay, free_port
 from trirail.telemetry.streams import Streams
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
-from trirail_drivers.bus.capture import FRAME
+from trirail_drivers.bus.can_frame import CAPTURED
 from trirail_drivers.bus.frames import Frame, packed
 from trirail_drivers.errors import FileError
 
@@ -341,7 +341,7 @@ def test_captured_frames_are_a_log_that_python_can_reads(tmp_path: Path) -> None
         packed(passive),
     ]
     for number, frame in enumerate(seen):
-        recording.frames(FRAME.pack(1_795_245_300.25 + number, frame))
+        recording.frames(CAPTURED.pack(1_795_245_300.25 + number, frame))
     recording.close()
     with can.CanutilsLogReader(recording.path.with_suffix(".log")) as log:
         first, second, third, fourth, fifth = log
@@ -362,7 +362,7 @@ def test_the_log_of_frames_leaves_the_reserve_free_says_so_and_goes_on(
     recording = recorder(tmp_path, configured(capture_can=True), warn=told.append)
 
     def frame(number: int) -> None:
-        recording.frames(FRAME.pack(number, Frame(0x200 + number).packed))
+        recording.frames(CAPTURED.pack(number, Frame(0x200 + number).packed))
 
     frame(1)
     with monkeypatch.context() as full:
@@ -384,7 +384,7 @@ def test_the_log_of_frames_leaves_the_reserve_free_says_so_and_goes_on(
 def test_a_batch_of_frames_that_the_disk_takes_in_part_leaves_no_part(tmp_path: Path) -> None:
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     log = CandumpLog(tmp_path / "x.log", "can0")
-    batch = FRAME.pack(1.0, Frame(0x201, bytes(8)).packed)
+    batch = CAPTURED.pack(1.0, Frame(0x201, bytes(8)).packed)
     log.write(batch)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (50, limit[1]))
@@ -400,6 +400,6 @@ def test_a_batch_of_frames_that_the_disk_takes_in_part_leaves_no_part(tmp_path: 
 
 def test_frames_are_not_kept_unless_asked_for(tmp_path: Path) -> None:
     recording = recorder(tmp_path)
-    recording.frames(FRAME.pack(1.0, Frame(0x201).packed))
+    recording.frames(CAPTURED.pack(1.0, Frame(0x201).packed))
     recording.close()
     assert [path.suffix for path in tmp_path.iterdir()] == [".rrd"]

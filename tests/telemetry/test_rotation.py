@@ -37,7 +37,7 @@ from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.vocabulary import Mode
 from trirail_drivers import interface
-from trirail_drivers.bus.capture import FRAME
+from trirail_drivers.bus.can_frame import CAPTURED
 from trirail_drivers.bus.frames import Frame
 
 WALL_NS = 1_795_245_300_000_000_000
@@ -113,7 +113,7 @@ def test_a_recording_whose_file_is_taken_away_goes_on_in_another_and_says_so(how
             time.ns += round(RETRY * 1e9)
             before, told[:] = recording.path, []
             _taken_away(before, how)
-            recording.frames(FRAME.pack(1.0, Frame(0x201).packed))
+            recording.frames(CAPTURED.pack(1.0, Frame(0x201).packed))
             for start in range(500 * number, 500 * (number + 1), BATCH):
                 recording.records(sent[start : start + BATCH].tobytes())
             recording.save()

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import struct
 import time
 from collections.abc import Iterator
 
 import can
 
-from trirail_drivers.bus.frames import CAN_FRAME, packed
+from trirail_drivers.bus.can_frame import CAPTURED
+from trirail_drivers.bus.frames import packed
 
-FRAME = struct.Struct(f"<d{CAN_FRAME.size}s")
-"""A captured frame: seconds since 1970, `struct can_frame`."""
 CHUNK = 1024
 """Frames handed over at a time."""
 KEPT = 100_000
@@ -26,14 +24,14 @@ class Capture:
 
     def note(self, frame: bytes | bytearray, t: float) -> None:
         """Note a `struct can_frame` and its time, in seconds since 1970."""
-        if len(self._frames) < KEPT * FRAME.size:
-            self._frames += FRAME.pack(t, frame)
+        if len(self._frames) < KEPT * CAPTURED.size:
+            self._frames += CAPTURED.pack(t, frame)
 
     def take(self) -> Iterator[bytes]:
         """Hand over what has been noted, in chunks of at most CHUNK frames."""
         frames, self._frames = self._frames, bytearray()
-        for start in range(0, len(frames), CHUNK * FRAME.size):
-            yield bytes(frames[start : start + CHUNK * FRAME.size])
+        for start in range(0, len(frames), CHUNK * CAPTURED.size):
+            yield bytes(frames[start : start + CHUNK * CAPTURED.size])
 
 
 class CapturedBus(can.BusABC):

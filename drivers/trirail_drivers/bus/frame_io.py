@@ -19,8 +19,9 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 
+from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, HEAD, REMOTE, STANDARD_BITS
 from trirail_drivers.bus.capture import Capture, CapturedBus
-from trirail_drivers.bus.frames import CAN_FRAME, DATA_AT, HEAD, REMOTE, STANDARD_BITS, Frame, can_id
+from trirail_drivers.bus.frames import Frame, can_id
 from trirail_drivers.bus.unixbus import UnixBus
 
 MOST_NOTHINGS = 64

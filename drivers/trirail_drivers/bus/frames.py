@@ -7,18 +7,7 @@ from typing import Final
 
 import can
 
-CAN_FRAME: Final = Struct("=IB3x8s")
-"""`struct can_frame`: identifier with flags, length, data."""
-HEAD: Final = Struct("=IB")
-"""Its beginning: identifier with flags, length."""
-DATA_AT: Final = 8
-"""Where its data begins."""
-EXTENDED: Final = 1 << 31
-REMOTE: Final = 1 << 30
-ERROR: Final = 1 << 29
-"""Flags beside the identifier: one of 29 bits, a remote frame, a report of the controller."""
-STANDARD_BITS: Final = 0x7FF
-EXTENDED_BITS: Final = 0x1FFF_FFFF
+from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
 
 
 def frame_bits(n: int) -> int:

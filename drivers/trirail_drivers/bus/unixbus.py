@@ -11,7 +11,8 @@ from pathlib import Path
 
 import can
 
-from trirail_drivers.bus.frames import CAN_FRAME, packed, unpacked
+from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.errors import BusError
 
 

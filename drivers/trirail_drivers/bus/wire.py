@@ -9,8 +9,9 @@ from typing import Protocol
 import can
 
 from trirail_drivers.bus import canerrors
+from trirail_drivers.bus.can_frame import ERROR, EXTENDED_BITS
 from trirail_drivers.bus.frame_io import frame_io
-from trirail_drivers.bus.frames import BITS, ERROR, EXTENDED_BITS, Frame
+from trirail_drivers.bus.frames import BITS, Frame
 from trirail_drivers.interface import Clock, DriveFault
 
 MOST_FRAMES = 1000

@@ -25,6 +25,7 @@ from trirail.processes.incoming import Incoming
 from trirail.processes.info import info
 from trirail.processes.last_words import LastWords
 from trirail.processes.measured import Meter
+from trirail.processes.memory import give_back
 from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications
 from trirail.processes.refusals import Refusals
@@ -290,5 +291,10 @@ def main(
     with guard.open() as opened:
         gateway = Gateway(config, link, beat, opened, guard, log, measured)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
-        gateway.serve(lambda: ready({"warnings": gateway.warnings()}))
+
+        def is_ready() -> None:
+            ready({"warnings": gateway.warnings()})
+            give_back()
+
+        gateway.serve(is_ready)
     return 0

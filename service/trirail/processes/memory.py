@@ -13,14 +13,19 @@ _libc = ctypes.CDLL(None)
 _libc.madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 
 
+def trim() -> None:
+    """Collect garbage, and return to the system what is free."""
+    gc.collect()
+    _libc.malloc_trim(0)
+
+
 def give_back() -> None:
-    """Collect garbage, return to the system what is free, and unmap what of libraries their files have as well.
+    """Trim, and unmap what of libraries their files have as well.
 
     Loading a library touches most of it, LLVM's 68 MB for instance; what is needed of it later comes from the page
     cache again.
     """
-    gc.collect()
-    _libc.malloc_trim(0)
+    trim()
     for start, end in _clean():
         _libc.madvise(start, end - start, _MADV_DONTNEED)
 

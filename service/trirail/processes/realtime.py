@@ -13,6 +13,7 @@ from setproctitle import setproctitle
 from trirail.config import LoopTable
 from trirail.errors import ServiceError
 from trirail.processes.interpreter import title
+from trirail.processes.memory import trim
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
@@ -76,7 +77,7 @@ _MEASURES: tuple[tuple[str, Callable[[LoopTable], None], str], ...] = (
 
 def stay_beside(loop: LoopTable) -> tuple[str, ...]:
     """Keep off the loop's processor where there is another, and below its priority; return what failed, and why."""
-    gc.collect()
+    trim()
     gc.freeze()
     if loop.realtime == "off":
         return ()
@@ -97,7 +98,7 @@ def acquire(loop: LoopTable) -> tuple[str, ...]:
     Raises ServiceError with `realtime = "enforce"` where one of them is missing.
     """
     _call("prctl", _PR_SET_TIMERSLACK, 1)  # 50 µs by default for tasks that are not real-time
-    gc.collect()
+    trim()
     gc.freeze()
     gc.disable()
     if loop.realtime == "off":

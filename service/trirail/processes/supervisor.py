@@ -19,6 +19,7 @@ from trirail.processes.descriptors import raise_limit
 from trirail.processes.hanging import HangWatch
 from trirail.processes.health import Running
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
+from trirail.processes.memory import give_back
 from trirail.processes.monitor import Monitor
 from trirail.processes.process import Order
 from trirail.processes.signals import Signals
@@ -163,6 +164,7 @@ class Supervisor:
                 self._up = True
                 up(ready)
                 notify("READY=1")
+                give_back()
             elif time.monotonic() - max(began, self._went_on) > START_WITHIN:
                 missing = ", ".join(name for name in CHILDREN if name not in ready)
                 raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")

@@ -18,6 +18,8 @@ from trirail.processes.interpreter import FORK_SERVER, ONE_THREAD, python
 from trirail.processes.process import Order
 from trirail.wire.decoding import decoded, prepare
 
+AS_NEEDED = {"MIMALLOC_ARENA_EAGER_COMMIT": "0"}
+"""The environment in which Rerun's allocator takes memory as it is needed, and not in advance."""
 TELLS_WITHIN = 1.0
 """So long after the end of a child the fork server may take to say how it ended [s]."""
 IMPORTS_WITHIN = 6.0
@@ -42,7 +44,7 @@ class WarmParent:
                 python("-m", FORK_SERVER, *arguments),
                 stdin=subprocess.PIPE,
                 pass_fds=[theirs.fileno(), beats, *sockets],
-                env=os.environ | ONE_THREAD,
+                env=os.environ | ONE_THREAD | AS_NEEDED,
             )
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)

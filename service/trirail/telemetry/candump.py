@@ -9,8 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-from trirail_drivers.bus.capture import FRAME
-from trirail_drivers.bus.frames import CAN_FRAME, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
+from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
 
 from trirail.telemetry.sinks import RESERVE, identity, no_room
 
@@ -45,7 +44,7 @@ class CandumpLog:
                 return f"{self._path} has been deleted or moved, and cannot be begun anew: {error.strerror}"
         if full := no_room(self._path.parent, RESERVE):
             return full
-        lines = "".join(f"({t:.6f}) {self._channel} {_written(frame)}\n" for t, frame in FRAME.iter_unpack(batch))
+        lines = "".join(f"({t:.6f}) {self._channel} {_written(frame)}\n" for t, frame in CAPTURED.iter_unpack(batch))
         content = lines.encode()
         try:
             written = self._file.write(content)
