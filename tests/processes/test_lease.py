@@ -79,25 +79,35 @@ def test_a_holder_that_dies_or_hangs_is_a_controlled_stop_and_the_lease_is_free(
             holder.kill()
 
 
-@pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_gateway_that_is_lost_neither_keeps_a_lease_nor_frees_it_in_silence(
-    service: Service, harm: signal.Signals
+def test_a_gateway_that_is_lost_for_longer_than_a_lease_neither_keeps_it_nor_frees_it_in_silence(
+    service: Service,
 ) -> None:
     with service.robot() as bob:
-        with bob.lease() as lease:
+        with bob.lease(timeout=0.5) as lease:
             bob.enable()
             bob.move_to(x=0.1, y=0.0, phi=0.0, speed=0.1)
-            os.kill(service.child("gateway"), harm)
+            os.kill(service.child("gateway"), signal.SIGSTOP)  # it is killed after 0.7 s
             assert lease.wait(20.0)
             assert lease.lost is not None
         with again(service) as ann:
             until(ann, lambda state: state.mode == "holding" and state.lease is None)
             assert told(ann) == [
                 ("lease acquired by ann", "ann"),
-                ("lease of ann is over: no sign of life for 1 s", None),
+                ("lease of ann is over: no sign of life for 0.5 s", None),
             ]
             with ann.lease():
                 assert ann.move_to(x=0.0, y=0.0, phi=0.0).wait(20.0).outcome == "done"
+
+
+def test_a_gateway_that_is_back_at_once_leaves_the_lease_to_a_holder_who_lives(service: Service) -> None:
+    with service.robot() as bob, bob.lease(timeout=10.0) as lease:
+        bob.enable()
+        bob.move_to(x=0.1, y=0.0, phi=0.0, speed=0.1)
+        os.kill(service.child("gateway"), signal.SIGKILL)
+        with again(service) as ann:
+            until(ann, lambda state: state.mode == "holding" and state.lease is not None)
+            assert lease.lost is None
+        assert bob.move_to(x=0.0, y=0.0, phi=0.0).wait(20.0).outcome == "done"
 
 
 def test_it_is_taken_over_by_those_who_may_and_both_are_told(service: Service) -> None:
