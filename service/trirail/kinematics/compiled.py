@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import operator
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -40,8 +41,8 @@ _functions: list[Any] = []
 def compile_no_more() -> None:
     """Drop what is needed of the compiled functions to compile others that call them: 16 MB."""
     for function in _functions:
-        for overload in function.overloads.values():
-            overload.library._shared_module = None
+        for library in map(operator.attrgetter("library"), function.overloads.values()):
+            library._shared_module = None
 
 
 def tell_of_compiling(listener: Callable[[str], None]) -> None:
