@@ -190,8 +190,8 @@ def test_where_nothing_can_be_kept_each_compiles_for_itself(parent: Parent) -> N
     (parent.folder / "kept").unlink()
     (parent.folder / "compiler").write_text("")
     loop, planner = parent.child("loop"), parent.child("planner")
-    parent.until_said(loop)
-    parent.until_said(planner)
+    assert [parent.until_said(child)["named"] for child in (loop, planner)] == ["trirail: loop", "trirail: planner"]
+    assert loop.compiling + planner.compiling == ["first", "second"]  # by one compiler, and no second one
 
 
 def test_a_compiler_that_dies_is_the_end_of_who_needs_it(parent: Parent) -> None:

@@ -87,6 +87,7 @@ def test_a_full_disk_stops_no_robot() -> None:
         for _ in range(1000):
             log.say("the planner has died", "warning")
         log.close()
+        assert os.readlink(f"/proc/self/fd/{full.fileno()}") == os.devnull
 
 
 def test_a_reader_that_has_gone_stops_no_robot() -> None:
@@ -96,3 +97,4 @@ def test_a_reader_that_has_gone_stops_no_robot() -> None:
         log = Log("text", nobody)
         log.event(FAULT)
         log.close()
+        assert os.readlink(f"/proc/self/fd/{nobody.fileno()}") == os.devnull
