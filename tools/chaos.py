@@ -114,6 +114,7 @@ def run(rig: Rig, case: Case) -> None:
     with rig.robot() as robot, open_client(rig.locator) as session:
         bring_to(case.mode, rig, robot, lambda name: session.get(key("demo", "cmd", "chaos", name)))
         os.kill(victim, number)
+        stands_by = time.monotonic() + STANDS_AFTER
     if seconds is not None:
         time.sleep(seconds)
         with contextlib.suppress(ProcessLookupError):  # it may have been killed for being frozen
@@ -133,6 +134,7 @@ def run(rig: Rig, case: Case) -> None:
     if rig.service.returncode not in case.exit_codes:
         raise Failed(f"exit code {rig.service.returncode}, expected was {case.exit_codes[0]}")
     wait_for(lambda: not rig.remains(), "all processes have ended")
+    time.sleep(max(0.0, stands_by - time.monotonic()))  # the service may have ended before the drives' watchdogs know
     rig.check_rest()
     rig.check_unpowered()
     rig.check_setpoints()
