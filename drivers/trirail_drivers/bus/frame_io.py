@@ -11,7 +11,7 @@ import select
 import socket
 import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from struct import Struct
 from typing import Final, Protocol
 
@@ -49,6 +49,13 @@ class FrameIO(Protocol):
     def hear(self, identifiers: Collection[int]) -> None:
         """Only data frames of these 11-bit identifiers are needed, and what the controller reports."""
 
+    @property
+    def descriptor(self) -> int | None:
+        """The socket, where frames may pass it beside this object; else None."""
+
+    def hand_in(self, received: Iterable[Received]) -> None:
+        """Frames that somebody else took from the descriptor: they come before all that is there."""
+
 
 def frame_io(bus: can.BusABC) -> FrameIO:
     """Frames to and from a bus, the cheapest way that it has."""
@@ -72,6 +79,7 @@ class SocketFrames:
         self._capture = capture
         self._filtered = filtered
         self._packet = bytearray(CAN_FRAME.size)
+        self._handed_in: deque[Received] = deque()
         self._poll = select.poll()
         self._poll.register(carrier, select.POLLIN)
         if capture is not None:
@@ -85,6 +93,8 @@ class SocketFrames:
 
     def receive(self, timeout: float = 0.0) -> Received | None:
         """The next frame that has arrived, or arrives within `timeout` [s]; None where there is none left."""
+        if self._handed_in:
+            return self._handed_in.popleft()
         if timeout > 0.0:
             self._poll.poll(timeout * 1000.0)
         packet = self._packet
@@ -106,6 +116,15 @@ class SocketFrames:
             self._filtered.set_filters(
                 [{"can_id": identifier, "can_mask": STANDARD_BITS, "extended": False} for identifier in identifiers]
             )
+
+    @property
+    def descriptor(self) -> int | None:
+        """The socket, unless every frame is to be noted with its time."""
+        return self._socket.fileno() if self._capture is None else None
+
+    def hand_in(self, received: Iterable[Received]) -> None:
+        """Frames that somebody else took from the descriptor."""
+        self._handed_in.extend(received)
 
     def _receive_timed(self, capture: Capture) -> int:
         """Receive into the packet, and note it with the time at which the kernel had it."""
@@ -176,6 +195,14 @@ class PythonCanFrames:
 
     def hear(self, identifiers: Collection[int]) -> None:
         """Do nothing: filters are each interface's own affair."""
+
+    @property
+    def descriptor(self) -> int | None:
+        """None: only python-can knows how its frames lie there."""
+        return None
+
+    def hand_in(self, received: Iterable[Received]) -> None:
+        """Do nothing: nobody else takes frames."""
 
     def _may_have_more(self) -> bool:
         if self._poll is not None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 import can
 
 from trirail_drivers.bus import canerrors
 from trirail_drivers.bus.can_frame import ERROR, EXTENDED_BITS
-from trirail_drivers.bus.frame_io import frame_io
+from trirail_drivers.bus.frame_io import Received, frame_io
 from trirail_drivers.bus.frames import BITS, Frame
 from trirail_drivers.interface import Clock, DriveFault
 
@@ -65,6 +65,20 @@ class Wire:
         if self.fault is None:
             self.fault = fault
             self._stop()
+
+    @property
+    def descriptor(self) -> int | None:
+        """The bus' socket, where frames may pass it beside this object; else None."""
+        return self._frames.descriptor
+
+    @property
+    def calm(self) -> bool:
+        """Whether nothing is wrong, nothing is to be told, and the bus takes what it is given."""
+        return self.fault is None and not self._warnings and not self._unsent and self._unsent_cycles == 0
+
+    def hand_in(self, received: Iterable[Received]) -> None:
+        """Frames that somebody else took from the socket: they come before all that is there."""
+        self._frames.hand_in(received)
 
     def warn(self, text: str) -> None:
         """Tell something once, until faults are reset."""

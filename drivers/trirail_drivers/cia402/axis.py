@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Any
+
+import numpy as np
 
 from trirail_drivers.cia402 import frames, ways
 from trirail_drivers.cia402.codes import words
@@ -11,6 +14,7 @@ from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.cyclic import expected
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
@@ -26,6 +30,8 @@ RESET_TIME = 2 * frames.STATUS_PERIOD
 """How long a drive may take to leave fault after a fault reset, in which it tells its state twice [s]."""
 
 _NMT_STATES = {frames.STOPPED: "stopped", frames.PRE_OPERATIONAL: "pre-operational"}
+_STATE_BITS = 0x6F
+"""Bits of a statusword that tell the state."""
 _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
 _WITHOUT_POWER = (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.SWITCH_ON_DISABLED)
 _ON_THE_WAY = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON)
@@ -139,6 +145,70 @@ class Cia402Axis(Axis):
             self.status_heard = now
             self.take_status(statusword)
         self._operational = True  # CiA 301: PDOs are sent in NMT operational only
+
+    def rests(self, wanted: frames.Wanted) -> bool:
+        """Whether nothing is to be done for it, nor found out, as long as its frames say nothing new."""
+        settled = self.state is wanted and wanted is not PowerState.QUICK_STOP_ACTIVE
+        told = self.event is None and not self.error_code and self.reset_until == -math.inf
+        lives = self._operational and not (self.stopped or self.left_operational or self.mute or self.register_wanted)
+        asked = self.sdo_asked is not None or self.way.polled or self.awaits_mode
+        follows = wanted is PowerState.OPERATION_ENABLED and self.way.tells_following
+        quiet = self._answers_after.idle and self._answers_per_sync.calm and self._unfollowed_since is None
+        return (
+            (settled and told and lives and quiet and not asked)
+            and (self.cyclic and self.follows and self.holds is None and self.setpoint is not None)
+            and self.answers.missed == 0
+            and self._followed == follows
+            and self.controlword == self.word(-math.inf, wanted)
+        )
+
+    def lend(self, row: np.void) -> None:
+        """Write what is kept of it, where it rests, into a row of trirail_drivers.driver.cyclic.AXIS."""
+        row["position"], row["actual"], row["heard"] = self.position, self.actual, self.heard
+        row["statusword"], row["seen_clear"], row["status_heard"] = self.statusword, self.seen_clear, self.status_heard
+        row["stands_at"], row["stands_since"], row["command_age"] = (
+            self._stands_at,
+            self._stands_since,
+            self.command_age,
+        )
+        row["target"], row["offset"] = self.setpoint or (0, 0)
+        row["counts_per_metre"], row["zero"] = self.scale.counts_per_metre, self.scale.offset
+        row["velocity_per_metre"] = self.units.velocity_per_metre
+        row["still"] = max(1.0, abs(self.scale.counts_per_metre) * STILL)
+        row["heard_within"], row["status_within"] = self._heartbeat_timeout, MISSED_STATUSES * frames.STATUS_PERIOD
+        row["position_at"], row["velocity_at"] = self.way.setpoints.place(0), self.way.setpoints.place(1)
+        self.answers.lend(row)
+        self._answers_per_sync.lend(row)
+
+    def take_back(self, row: np.void, cycles: int) -> None:
+        """Go on from there, so many whole cycles later."""
+        self.position, self.heard, self.status_heard = (
+            float(row[name]) for name in ("position", "heard", "status_heard")
+        )
+        self.actual, self.statusword, self.seen_clear, self._stands_at, self.command_age = (
+            int(row[name]) for name in ("actual", "statusword", "seen_clear", "stands_at", "command_age")
+        )
+        self._stands_since = float(row["stands_since"])
+        self.setpoint = int(row["target"]), int(row["offset"])
+        self.answers.take_back(row)
+        self._answers_per_sync.take_back(row, cycles)
+
+    def expected(self, number: int) -> list[tuple[Any, ...]]:
+        """The frames that say nothing new of it, as rows of trirail_drivers.driver.cyclic.EXPECTED; it has a number."""
+        way, word = self.way, frames.STATUSWORD.pack(self.statusword)
+        decides = frames.STATUSWORD.pack(_STATE_BITS | (frames.FOLLOWS if way.tells_following else 0))
+        feedback, place = way.feedback, way.feedback.place(ways.STATUSWORD)
+        data, mask = bytearray(feedback.size), bytearray(feedback.size)
+        if place >= 0:
+            data[place : place + 2], mask[place : place + 2] = word, decides
+        position, identifier = feedback.place(ways.ACTUAL_POSITION), feedback.identifier
+        rows = [expected(identifier, number, bytes(data), bytes(mask), position_at=position, status_at=place)]
+        if way.status is not None:
+            rows.append(expected(way.status, number, word, decides, status_at=0))
+        alive = frames.NMT_STATE.pack(frames.OPERATIONAL)
+        bits = bytes([frames.NMT_STATE_BITS if way.guarded else 0xFF])
+        rows.append(expected(frames.HEARTBEAT + self.node, number, alive, bits, lives=way.heard))
+        return rows
 
     def take_position(self, counts: int) -> None:
         """Note an actual position."""

@@ -20,6 +20,7 @@ from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.cia402.objects import means
 from trirail_drivers.cia402.one_drive import HAS_POWER
 from trirail_drivers.cia402.strangers import Strangers
+from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
@@ -42,6 +43,7 @@ class Cia402(Driver[Cia402Axis]):
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
+        self._lent: Cyclic | None = None
 
     def configure(self, period: float, fastest: float | None = None) -> None:
         """Set the drives up for a cycle of `period` seconds, read every value back, start them without power.
@@ -104,7 +106,6 @@ class Cia402(Driver[Cia402Axis]):
         """Take in every frame that has arrived."""
         now = self._clock()
         self._wire.receive(now)
-        a, b, c = self._axes
         for axis in self._axes:
             axis.answers.read_over()
             mistaken = axis.cycle_over()
@@ -120,6 +121,10 @@ class Cia402(Driver[Cia402Axis]):
                 self._wire.fail(fault)
         for axis in self._axes:
             self._ask(axis, now)
+        return self._feedback()
+
+    def _feedback(self) -> Feedback:
+        a, b, c = self._axes
         return Feedback(
             (a.position, b.position, c.position),
             (a.shown_state, b.shown_state, c.shown_state),
@@ -161,6 +166,44 @@ class Cia402(Driver[Cia402Axis]):
             elif late:
                 axis.setpoints_late += 1
         self._command()
+
+    def lend(self) -> Cyclic | None:
+        """The tables of a cycle, where every drive rests in what it was asked for and nothing else is to be done."""
+        due, descriptor = self._heartbeat_due, self._wire.descriptor
+        if due is None or descriptor is None or not (self._wire.calm and self._homing.idle) or self._period == 0.0:
+            return None
+        if self._stopped_in_this_cycle or not all(axis.rests(_asked_of(axis, self._wanted)) for axis in self._axes):
+            return None
+        lent = self._lent = self._lent or Cyclic(descriptor, self._sync)
+        lent.times[0] = min(due, self._off_by), self._wire.traffic, 0
+        for axis, row, frame in zip(self._axes, lent.axes, self._setpoints, strict=True):
+            axis.lend(row)
+            axis.way.setpoints.fill(frame, *(axis.setpoint or (0, 0)), axis.controlword)
+        lent.setpoints.fill(self._setpoints)
+        lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected(number)])
+        return lent
+
+    def take_back(self, arrived: int, *, synced: float | None = None) -> Feedback:
+        """Go on from what the tables hold: see trirail_drivers.driver.cyclic.Lender."""
+        assert self._lent is not None
+        times = self._lent.times[0]
+        self._wire.traffic = int(times["traffic"])
+        for axis, row in zip(self._axes, self._lent.axes, strict=True):
+            axis.take_back(row, int(times["cycles"]))
+        times["cycles"] = 0
+        self._wire.hand_in(self._lent.arrived.unpacked(arrived))
+        if synced is not None:
+            self._wire.begin()
+            self._synced = synced
+        return self._feedback()
+
+    def send_on(self, first: int) -> None:
+        """Send the setpoints in the tables that the bus has not taken, one at a time."""
+        assert self._lent is not None
+        for axis, packed in zip(self._axes[first:], self._lent.setpoints.frames[first:], strict=True):
+            frame = axis.way.setpoints.frame()
+            frame.packed[:] = packed.tobytes()
+            axis.setpoints_lost += not self._wire.send(frame)
 
     def enable(self, alone: str | None = None) -> None:
         """Begin to power up, all drives or one `alone`; the following writes carry it out, the states tell when.

@@ -94,6 +94,11 @@ class HomingSequence:
             axis.mode_bits = 0
             axis.held = None
 
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to be done, cycle by cycle."""
+        return self._steps is None
+
     def step(self, now: float) -> DriveFault | None:
         """Go on, when every frame of this cycle is in; return why that is impossible."""
         self._now = now

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import Final
 
+import numpy as np
+
 from trirail_drivers.interface import DriveFault
 
 FAR: Final = 0.005
@@ -35,6 +37,11 @@ class AnswersAfter:
     def __init__(self) -> None:
         self._said: DriveFault | None = None
         self._answers = 0
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is looked for."""
+        return self._said is None
 
     def begin(self, said: DriveFault | None) -> None:
         """Count from now on; `said` is what was told of the node."""
@@ -84,6 +91,20 @@ class AnswersPerSync:
             self._two = self._two or step * self._step < 0
             self._far = self._far or abs(step) > self._counts_far
         self._newest, self._step, self._came = counts, step or self._step, True
+
+    @property
+    def calm(self) -> bool:
+        """Whether no SYNC has had two positions lately."""
+        return not (self._far_in_a_row or self._with_two or self._two or self._far)
+
+    def lend(self, row: np.void) -> None:
+        """Write what is kept of a calm one into a row of trirail_drivers.driver.cyclic.AXIS."""
+        row["came"], row["newest"], row["step"] = self._came, self._newest, self._step
+
+    def take_back(self, row: np.void, cycles: int) -> None:
+        """Go on from there, so many cycles later: no SYNC has had two positions since."""
+        self._cycles = (self._cycles + cycles) % COUNTED
+        self._came, self._newest, self._step = bool(row["came"]), int(row["newest"]), int(row["step"])
 
     def from_two_nodes(self) -> bool:
         """Whether the positions of the cycle that is over, with those before it, are two nodes'."""

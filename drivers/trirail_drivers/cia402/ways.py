@@ -55,6 +55,13 @@ class SetpointPdo:
         given = counts, velocity, controlword
         frame.fill(self._layout, *[given[field] for field in self._order])
 
+    def place(self, field: int) -> int:
+        """Where in a frame's data position (0) or velocity (1) stands; -1 where it has none."""
+        if field not in self._order:
+            return -1
+        before = self.entries[: self._order.index(field)]
+        return sum((entry & 0xFF) // 8 for entry in before)
+
     @property
     def has_velocity(self) -> bool:
         """Whether the drive is told the velocity beside the position."""
@@ -80,6 +87,12 @@ class FeedbackPdo:
         formats = ("H" if entry == STATUSWORD else _FORMATS[entry & 0xFF] for entry in entries)
         self._layout = Struct("<" + "".join(formats))
         self.size = self._layout.size
+
+    def place(self, entry: int) -> int:
+        """Where in a frame's data an entry stands; -1 where it has none."""
+        if entry not in self.entries:
+            return -1
+        return sum((each & 0xFF) // 8 for each in self.entries[: self.entries.index(entry)])
 
     def unpack(self, data: bytes | bytearray) -> tuple[int, int | None]:
         """Position [counts] and statusword; struct.error where the length is wrong."""

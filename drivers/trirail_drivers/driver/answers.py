@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 
 class Answers:
     """Counts SYNCs and the positions that answer them.
@@ -54,6 +56,18 @@ class Answers:
         self.late += self._prompt and self._between and sampled > self.sampled
         self.sampled = sampled
         self._prompt = not self._between and not to_the_one_before
+
+    def lend(self, row: np.void) -> None:
+        """Write what is kept into a row of trirail_drivers.driver.cyclic.AXIS."""
+        row["syncs"], row["sampled"], row["late"], row["lost"] = self.syncs, self.sampled, self.late, self.lost
+        row["between"], row["prompt"] = self._between, self._prompt
+
+    def take_back(self, row: np.void) -> None:
+        """Go on from there."""
+        self.syncs, self.sampled, self.late, self.lost = (
+            int(row[name]) for name in ("syncs", "sampled", "late", "lost")
+        )
+        self._between, self._prompt = bool(row["between"]), bool(row["prompt"])
 
     def forgive(self) -> None:
         """Forget what has not been answered."""

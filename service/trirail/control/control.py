@@ -7,7 +7,7 @@ and `write` the setpoints behind the last gate. What is to be said of it waits a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
 
@@ -47,13 +47,32 @@ Given = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
 """What the control is given in a cycle, and when, by the monotonic clock [ns]."""
 
 
+class Calm(NamedTuple):
+    """What cycles come to in which nothing happens."""
+
+    run: Run | None
+    """The motion under way, if setpoints come from one."""
+    follows: bool
+    """Whether setpoints follow what is measured; else, without a run, they stay."""
+    held: bool
+    """As of trirail.control.cycle.follow."""
+    stands: bool
+    """As of trirail.control.cycle.observe."""
+    found: int
+    """What trirail.control.cycle.command goes on to find."""
+    until: float
+    """The last cycle before something is due."""
+    settles_by: int | None
+    """The cycle in which a goal ends that waits for the robot to be in position; None where none does."""
+
+
 class Control:
     """Modes, motion, kinematics and limits of one robot over one set of drives."""
 
     def __init__(self, config: Config, drives: DriveGroup, planner: PlannerPort) -> None:
         robot = corrected_geometry(config)
         self._drives = drives
-        self._period = config.period
+        self._period = self.period = config.period
         self.schedule = Schedule(rest(STILL), config.period)
         self._planner = PlanRequests(config, planner, self.schedule)
         self.ledger = Ledger()
@@ -76,6 +95,7 @@ class Control:
         )
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._run: Run | None = None
+        self._found = 0
 
     @property
     def cycles(self) -> int:
@@ -91,6 +111,34 @@ class Control:
     def fault(self) -> str | None:
         """The first reason of the fault; None where there is none."""
         return self.modes.fault
+
+    def calm(self) -> Calm | None:
+        """Return what the next cycles come to if nothing happens in them; None where something is to be done."""
+        mode, runs, goal, settling = self.state.mode, self.schedule.runs, self.ledger.goal, self.measured.settling
+        follows = mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed
+        busy = mode in (Mode.ENABLING, Mode.HOMING) or self.modes.entered == self.cycles
+        if busy or self.ledger.busy or len(self.ledger.goals) > 1 or not (self.goal_queue.idle and self._planner.idle):
+            return None
+        if len(runs) > 1 or not self.schedule.single or (mode is Mode.STOPPING and not runs):
+            return None
+        run = runs[0] if runs and not follows else None
+        found = self._found if run is not None else 0
+        waits = mode is Mode.HOLDING or (mode is Mode.MOVING and settling.under_way and run is not None and run.arrived)
+        if found and (self.setpoints.refusal(found) or not waits):
+            return None
+        until = self.lease.alive_until
+        if goal is not None and not goal.released:
+            until = min(until, goal.alive_until)
+        held = mode not in (Mode.DISABLED, Mode.FAULT)
+        return Calm(run, follows, held, self._stands, found, until, settling.ends)
+
+    def go_on(self, feedback: Feedback, cycles: int, time: float) -> None:
+        """Take over from so many calm cycles: the newest feedback in them, and the time of the run's law [s]."""
+        self.modes.cycle += cycles
+        self.schedule.cycle += cycles
+        self.measured.feedback = feedback
+        if self.schedule.runs:
+            self.schedule.runs[0].time = time
 
     def cycle(self, feedback: Feedback, given: Iterable[Given], mark: Callable[[Part], None] = lambda _: None) -> None:
         """Run one cycle: what the drives said at its SYNC, and what else is given in it; then motion and setpoints.
@@ -201,7 +249,7 @@ class Control:
             return
         schedule, run = self.schedule, self._run
         single = schedule.single
-        found = self.setpoints.solve(schedule, run)
+        found = self._found = self.setpoints.solve(schedule, run)
         if found and run is not None:
             for _ in range(schedule.end_cycle(run)):
                 self.ledger.pass_on()

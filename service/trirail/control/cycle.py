@@ -71,15 +71,15 @@ FEEDBACK = np.dtype(
 SAID = struct.Struct("<3d3q10B")
 """To pack them."""
 
-_LEGS = typeof(Geometry.symmetric().packed())  # type: ignore[no-untyped-call]
-_BOUNDS, _FEEDBACK, _RECORD = from_dtype(BOUNDS)[::1], from_dtype(FEEDBACK)[::1], from_dtype(DTYPE)[::1]
-_MONITOR, _BACKLASH = from_dtype(MONITOR)[::1], from_dtype(BACKLASH)[::1]
-_MOTION, _SLIDERS = f8[:, :, ::1], f8[:, :, ::1]
-_KNOTS, _PIECES = f8[::1], f8[:, :, ::1]
+LEGS = typeof(Geometry.symmetric().packed())  # type: ignore[no-untyped-call]
+BOUND, FEEDBACKS, RECORD = from_dtype(BOUNDS)[::1], from_dtype(FEEDBACK)[::1], from_dtype(DTYPE)[::1]
+MONITORED, KEPT = from_dtype(MONITOR)[::1], from_dtype(BACKLASH)[::1]
+MOTION, SLIDERS = f8[:, :, ::1], f8[:, :, ::1]
+KNOTS, PIECES = f8[::1], f8[:, :, ::1]
 _ENABLED = int(PowerState.OPERATION_ENABLED)
 
 
-@compiled(i8(_LEGS, _FEEDBACK, f8[:, ::1], _BACKLASH, f8, f8, f8, b1, b1[::1], f8[:, ::1], _MONITOR, _RECORD))
+@compiled(i8(LEGS, FEEDBACKS, f8[:, ::1], KEPT, f8, f8, f8, b1, b1[::1], f8[:, ::1], MONITORED, RECORD))
 def observe(
     legs: Array,
     feedback: NDArray[np.void],
@@ -172,8 +172,8 @@ def _solve(
 
 @compiled(
     i8(
-        *(_LEGS, _BOUNDS, _KNOTS, _PIECES, b1, f8[:, ::1], _KNOTS, _PIECES),
-        *(f8, f8, f8[::1], f8, f8, f8, _MOTION, _SLIDERS, _BACKLASH, f8[::1], _RECORD),
+        *(LEGS, BOUND, KNOTS, PIECES, b1, f8[:, ::1], KNOTS, PIECES),
+        *(f8, f8, f8[::1], f8, f8, f8, MOTION, SLIDERS, KEPT, f8[::1], RECORD),
     )
 )
 def command(
@@ -222,7 +222,7 @@ def command(
     return PASSED * passed + STANDS * stands + 4 * refused
 
 
-@compiled(i8(_LEGS, _BOUNDS, _MOTION, _SLIDERS, _BACKLASH, f8[::1], _RECORD))
+@compiled(i8(LEGS, BOUND, MOTION, SLIDERS, KEPT, f8[::1], RECORD))
 def hold(
     legs: Array,
     bounds: NDArray[np.void],
@@ -248,7 +248,7 @@ def refusal(code: int) -> int:
     return code >> 2
 
 
-@compiled(void(_LEGS, _FEEDBACK, b1[::1], b1, b1, f8, _MOTION, _SLIDERS, _BACKLASH, _RECORD))
+@compiled(void(LEGS, FEEDBACKS, b1[::1], b1, b1, f8, MOTION, SLIDERS, KEPT, RECORD))
 def follow(
     legs: Array,
     feedback: NDArray[np.void],

@@ -47,13 +47,13 @@ class Measured:
         """Whether the robot is in position."""
         self.backlash = backlash(taken, period)
         """What of the setpoints takes up backlash, (2,) of trirail.control.backlash.BACKLASH."""
-        self._legs = legs
+        self.legs = legs
         self._period = period
-        self._fastest = 2.0 * step / period  # the age may be one off, and makes a step a double one
-        self._limit = limit
+        self.fastest = 2.0 * step / period  # the age may be one off, and makes a step a double one
+        self.limit = limit
         self._packed = self.numbers.view(np.uint8).data
-        self._written = np.zeros((2 + cycle.OLDEST, 3))
-        self._room = np.zeros((2, 3))
+        self.written = np.zeros((2 + cycle.OLDEST, 3))
+        self.room = np.zeros((2, 3))
 
     @property
     def pose(self) -> Triple:
@@ -90,7 +90,7 @@ class Measured:
         """Take the first feedback, for the setpoints of the past too."""
         self._pack(feedback)
         self.numbers[1] = self.numbers[0]
-        self._written[:] = self.record["commanded_position"] = feedback.position
+        self.written[:] = self.record["commanded_position"] = feedback.position
 
     def take(self, feedback: Feedback, stands: bool = False) -> int:
         """Take the feedback of the next cycle; return 0, or 1 + i if slider i's following error is beyond its limit.
@@ -99,27 +99,27 @@ class Measured:
         """
         self._pack(feedback)
         return cycle.observe(
-            self._legs,
+            self.legs,
             self.numbers,
-            self._written,
+            self.written,
             self.backlash,
             self._period,
-            self._fastest,
-            self._limit,
+            self.fastest,
+            self.limit,
             stands,
             self.jumping,
-            self._room,
+            self.room,
             self.settling.monitored,
             self.record,
         )
 
     def pose_of(self, sliders: Triple) -> Triple | None:
         """Return the pose to which setpoints belong, the one nearest to the newest; None if they belong to none."""
-        self._room[:] = sliders, self.pose
-        self._room[0] -= self.backlash[0]["offset"]
-        if forward_into(self._legs, self._room[0], self._room[1], self._room[1]):
+        self.room[:] = sliders, self.pose
+        self.room[0] -= self.backlash[0]["offset"]
+        if forward_into(self.legs, self.room[0], self.room[1], self.room[1]):
             return None
-        x, y, phi = self._room[1].tolist()
+        x, y, phi = self.room[1].tolist()
         return x, y, phi
 
     def _pack(self, feedback: Feedback) -> None:

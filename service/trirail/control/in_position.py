@@ -65,6 +65,11 @@ class Settling:
         """Whether a goal's path has ended, and the goal has not."""
         return self._since is not None
 
+    @property
+    def ends(self) -> int | None:
+        """The cycle in which its time is over; None where there is no such goal."""
+        return self._since + self._timeout if self._since is not None else None
+
     def begin(self, cycle: int) -> None:
         """The path has ended, with the setpoints of this cycle."""
         self._since = cycle

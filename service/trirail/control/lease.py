@@ -6,6 +6,7 @@ program, the network, the gateway. Time is counted in cycles, so that a recorded
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from trirail.errors import RefusalCode, RefusedError
@@ -46,6 +47,11 @@ class LeaseArbiter:
     def user(self) -> str | None:
         """Who holds it; None for nobody."""
         return self._held.user if self._held is not None else None
+
+    @property
+    def alive_until(self) -> float:
+        """The last cycle in which it is held without another sign of life; infinite where nobody holds it."""
+        return self._held.alive_until if self._held is not None else math.inf
 
     def check(self, user: str) -> None:
         """Raise RefusedError where a user's goals and commands do not move the robot now."""

@@ -263,6 +263,11 @@ class Ledger:
         """Take a command on; it is answered once it has been carried out."""
         self._commands.setdefault(request.name, deque()).append((request, cycle))
 
+    @property
+    def busy(self) -> bool:
+        """Whether a command is under way, or something is to be said."""
+        return bool(self.answers or self.notices or any(self._commands.values()))
+
     def settle(self, verdict: Callable[[Command, int], str | None], mode: str) -> None:
         """Answer the commands that are done or never will be.
 

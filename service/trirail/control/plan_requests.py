@@ -102,6 +102,11 @@ class PlanRequests:
         return self._goal is not None
 
     @property
+    def idle(self) -> bool:
+        """Whether there is no goal to be planned and no rate to be changed."""
+        return self._goal is None and self._change is None
+
+    @property
     def silence(self) -> float:
         """How long the planner has been asked for a goal, and has said nothing [s]."""
         return (self._schedule.cycle - self._since) * self._period if self._since is not None else 0.0

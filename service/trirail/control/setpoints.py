@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from trirail_drivers.interface import NAMES, Triple
 
 from trirail.control import cycle
@@ -24,16 +25,26 @@ class Setpoints:
         self._legs = legs
         self._bounds = bounds
         self._measured = measured
-        self._step = step
-        self._sliders = np.zeros((2, 6, 3))
-        self._sent = self._sliders[0, :2]
+        self.step = step
+        self.sliders = np.zeros((2, 6, 3))
+        self._sent = self.sliders[0, :2]
         self._motion = np.zeros((3, 3))
         self._tried = np.zeros((6, 3))
 
     @property
+    def bounds(self) -> NDArray[np.void]:
+        """The last gate's, (1,) of trirail.motion.limits.BOUNDS."""
+        return self._bounds.packed
+
+    @property
+    def found(self) -> Array:
+        """What the last gate has found, (2,)."""
+        return self._bounds.found
+
+    @property
     def rows(self) -> list[list[float]]:
         """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32."""
-        return self._sliders[0].tolist()  # type: ignore[no-any-return]  # numpy does not tell of what type its lists are
+        return self.sliders[0].tolist()  # type: ignore[no-any-return]  # numpy does not tell of what type its lists are
 
     @property
     def sent(self) -> tuple[Triple, Triple]:
@@ -43,7 +54,7 @@ class Setpoints:
 
     def start(self) -> None:
         """Begin where the sliders are."""
-        self._sliders[0, 0] = self._measured.feedback.position
+        self.sliders[0, 0] = self._measured.feedback.position
 
     def solve(self, schedule: Schedule, run: Run | None) -> int:
         """Move the commanded motion on, by the run under way, and solve the sliders by the paper's recursion.
@@ -51,7 +62,7 @@ class Setpoints:
         Where the last gate refuses that they stay as they are. Returns what trirail.control.cycle.command does.
         """
         legs, bounds, found = self._legs, self._bounds.packed, self._bounds.found
-        motion, sliders, record = schedule.motion, self._sliders, self._measured.record
+        motion, sliders, record = schedule.motion, self.sliders, self._measured.record
         kept = self._measured.backlash
         if run is None:
             return cycle.hold(legs, bounds, motion, sliders, kept, found, record)
@@ -83,8 +94,8 @@ class Setpoints:
         cycle: then no setpoint is sent.
         """
         measured = self._measured
-        arrays = schedule.motion, self._sliders, measured.backlash, measured.record
-        cycle.follow(self._legs, measured.numbers, measured.jumping, held, stopped_now, self._step, *arrays)
+        arrays = schedule.motion, self.sliders, measured.backlash, measured.record
+        cycle.follow(self._legs, measured.numbers, measured.jumping, held, stopped_now, self.step, *arrays)
 
     def tell_progress(self, progress: float, remaining: float) -> None:
         """Let the record say how much of the goal under way is over, as a share, and what remains [s]."""
@@ -94,7 +105,7 @@ class Setpoints:
     def check_rest(self) -> None:
         """Refuse to enable while a setpoint is on its way to where its slider is."""
         for name, setpoint, position in zip(NAMES, self.rows[0], self._measured.feedback.position, strict=True):
-            if not abs(setpoint - position) <= self._step:
+            if not abs(setpoint - position) <= self.step:
                 raise RefusedError(
                     RefusalCode.NOT_AT_REST,
                     f"slider {name} moves too fast for its setpoint to follow: enable when it stands",

@@ -82,15 +82,16 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     return _kept(njit(function, error_model="numpy", forceinline=True, cache=True))  # type: ignore[no-any-return]
 
 
-def compiled(*signatures: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def compiled(*signatures: Any, releases: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorate a function to run compiled: now, for these signatures; without any, at its first call.
 
     Division by zero gives an infinity or NaN, never an exception. Compiled code is kept beside the source, or
-    in the user's cache directory where that cannot be written, and a later start only loads it.
+    in the user's cache directory where that cannot be written, and a later start only loads it. One that `releases` the
+    interpreter's lock lets other threads run meanwhile.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        dispatcher = _kept(njit(function, error_model="numpy", cache=True))
+        dispatcher = _kept(njit(function, error_model="numpy", cache=True, nogil=releases))
         kept = dispatcher._cache._cache_file
         if signatures:
             # Processes that start together compile each function once: who comes second loads what the first has kept.

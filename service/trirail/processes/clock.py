@@ -37,13 +37,18 @@ class Ticker:
         self._period_ns = period_ns
         self._now = now
         self._sleep = sleep
-        self._deadline_ns = now()
+        self.deadline_ns = now()
+        """When the newest tick was due."""
 
     def wait(self) -> Tick:
         """Sleep until the next deadline that is not over yet by a whole period."""
-        self._deadline_ns += self._period_ns
-        self._sleep(self._deadline_ns)
-        lateness_ns = self._now() - self._deadline_ns
+        self.deadline_ns += self._period_ns
+        self._sleep(self.deadline_ns)
+        return self.tick()
+
+    def tick(self) -> Tick:
+        """Return the tick whose deadline has come; somebody else has waited for it."""
+        lateness_ns = self._now() - self.deadline_ns
         missed = max(0, lateness_ns // self._period_ns)
-        self._deadline_ns += missed * self._period_ns
-        return Tick(self._deadline_ns, lateness_ns - missed * self._period_ns, missed)
+        self.deadline_ns += missed * self._period_ns
+        return Tick(self.deadline_ns, lateness_ns - missed * self._period_ns, missed)

@@ -23,6 +23,11 @@ class Heartbeats:
         """To be inherited by the processes that beat and look."""
         self._counts = memoryview(mmap.mmap(descriptor, mmap.PAGESIZE)).cast("Q")
 
+    @property
+    def counts(self) -> memoryview[int]:
+        """All counters, in the order of PROCESSES."""
+        return self._counts
+
     @classmethod
     def create(cls) -> Heartbeats:
         """Return counters of which nobody has beaten yet."""
@@ -64,20 +69,22 @@ class Watch:
 
     def __init__(self, heart: Heart, patience: int) -> None:
         self._heart = heart
-        self._patience = patience
-        self._seen = 0
-        self._turns = 0
+        self.patience = patience
+        self.seen = 0
+        """Its count when it was last looked at."""
+        self.turns = 0
+        """Turns for which that has stayed the same."""
 
     def silent(self) -> bool:
         """Look, in every turn; whether there has been no beat for more turns than there is patience."""
         count = self._heart.count
-        if count == self._seen and count:
-            self._turns += 1
+        if count == self.seen and count:
+            self.turns += 1
         else:
-            self._seen, self._turns = count, 0
-        return self._turns > self._patience
+            self.seen, self.turns = count, 0
+        return self.turns > self.patience
 
     @property
     def heard(self) -> bool:
         """Whether the last look found a beat."""
-        return self._seen > 0 and self._turns == 0
+        return self.seen > 0 and self.turns == 0

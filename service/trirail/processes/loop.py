@@ -11,16 +11,19 @@ from typing import NamedTuple
 
 from trirail_drivers.bus.capture import Capture
 from trirail_drivers.connection.opening import connect
+from trirail_drivers.driver.cyclic import Lender
 from trirail_drivers.interface import DriveFault, DriveGroup
 
 from trirail.config import Config
 from trirail.control.control import Control, Given
 from trirail.control.modes import ModeEvent
+from trirail.control.quiet import Reached
 from trirail.kinematics.robot import warm_up
 from trirail.processes import realtime
 from trirail.processes.clock import Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.planner_port import PlannerLink
+from trirail.processes.quiet_cycles import QuietCycles
 from trirail.processes.reports import Reports
 from trirail.wire.links import Port
 from trirail.wire.packets import (
@@ -83,6 +86,10 @@ class Loop:
         patience = max(LEAST_PATIENCE, round(self._gateway_timeout * config.loop.rate_hz))
         self._gateway_watch = Watch(heartbeats.of("gateway"), patience)
         self._gateway_frozen = False
+        self._quiet: QuietCycles | None = None
+        if isinstance(drives, Lender):
+            quiet = self.control, drives, self._reports, heartbeats, ports.gateway, self._gateway_watch
+            self._quiet = QuietCycles(*quiet)
         self._fault: DriveFault | None = None
         self._marked_ns = 0
         self._parts_ns = [0] * len(Part)
@@ -94,14 +101,35 @@ class Loop:
         self._drives.sync()
         self.control.start(self._drives.read())
         while not self._over():
-            self.cycle(ticker.wait())
+            self.turn(ticker)
         self._flush()
+
+    def turn(self, ticker: Ticker) -> None:
+        """Run the cycles in which nothing happens, and then one in which something does, or to the end of a batch."""
+        quiet, newest = self._quiet, None
+        disturbed = self.ending or self._late_streak or self._gateway_frozen or not self._planner.idle
+        if quiet is not None and not disturbed:
+            newest = quiet.run(ticker, self._overruns)
+        if newest is None:
+            self.cycle(ticker.wait())
+        elif newest.reached is Reached.WAITED:
+            self.cycle(ticker.tick())
+        elif newest.reached is Reached.SYNCED:
+            self._marked_ns, self._parts_ns[Part.SYNC] = newest.marked_ns, newest.sync_ns
+            self._go_on(Tick(newest.deadline_ns, newest.lateness_ns, 0))
+        elif self._reports.full and quiet is not None:
+            self._flush()
+            quiet.add(Part.RECORD)
 
     def cycle(self, tick: Tick) -> None:
         """Run one cycle. Nothing in it waits, and nothing that goes wrong in it leaves the robot moving."""
         self._marked_ns = time.perf_counter_ns()
         self._drives.sync()
         self._mark(Part.SYNC)
+        self._go_on(tick)
+
+    def _go_on(self, tick: Tick) -> None:
+        """Run what a cycle is from its SYNC on."""
         feedback = self._drives.read()
         self._mark(Part.READ)
         self.control.cycle(feedback, self._given_in(tick, feedback.fault), self._mark)

@@ -22,6 +22,11 @@ class PlannerLink:
         self._awaited: int | None = None
         self._unsent: str | None = None
 
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is awaited, nor to be said."""
+        return self._awaited is None and self._unsent is None
+
     def ask(self, request: PlanRequest) -> None:
         """Send a request; what cannot be sent is said in the next cycle."""
         if not self._port.connected:

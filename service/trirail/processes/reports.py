@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from trirail_drivers.bus.capture import Capture
 from trirail_drivers.interface import DriveGroup
 
@@ -66,7 +67,8 @@ class Reports:
         """The cycle's record, as the control makes it."""
         self._batch = memoryview(bytearray(1 + self._batch_size * SIZE))
         self._batch[0] = Kind.RECORDS
-        self._batched = 0
+        self.batched = 0
+        """Records in the batch."""
         self._recorded = False
         self._unrecorded = ""
 
@@ -80,10 +82,25 @@ class Reports:
         control = self._control
         ticks = control.cycles, tick.deadline_ns, tick.lateness_ns, overruns
         HEAD.pack_into(self._made, 0, *ticks, *parts_ns, MODES.index(control.state.mode))
-        begin = 1 + self._batched * SIZE
+        begin = 1 + self.batched * SIZE
         self._batch[begin : begin + SIZE] = self._made
-        self._batched += 1
-        return self._batched == self._batch_size
+        self.batched += 1
+        return self.full
+
+    @property
+    def full(self) -> bool:
+        """Whether the batch is, and is to be flushed."""
+        return self.batched == self._batch_size
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits to be passed on but records."""
+        return not (self._given or self._answers or self._told < self._events)
+
+    @property
+    def batch(self) -> NDArray[np.uint8]:
+        """Room for the records of a batch, (n, SIZE) bytes; `batched` of them are there."""
+        return np.frombuffer(self._batch, np.uint8)[1:].reshape(-1, SIZE)
 
     def pass_on(self) -> None:
         """Pass on what was given to the control, what has happened and what is answered, if anything."""
@@ -94,9 +111,9 @@ class Reports:
 
     def flush(self) -> None:
         """Send the batch, take new peers, and what was kept for them; listen to the recorder."""
-        if self._batched:
-            batch = self._batch[: 1 + self._batched * SIZE]
-            self._batched = 0
+        if self.batched:
+            batch = self._batch[: 1 + self.batched * SIZE]
+            self.batched = 0
             self._gateway.send(batch)
             self._recorder.send(batch)
         if self._capture is not None and self._recorder.connected:

@@ -111,6 +111,15 @@ class Port:
         """Whether there is a peer."""
         return self._link is not None
 
+    @property
+    def calm(self) -> bool:
+        """Whether no peer has gone of whom nobody has asked yet."""
+        return not self._lost
+
+    def fileno(self) -> int:
+        """The peer's descriptor; -1 where there is none."""
+        return self._link.fileno() if self._link is not None else -1
+
     def accept(self) -> bool:
         """Take a peer that waits; True if one has just come."""
         if self._link is not None:

@@ -1,0 +1,162 @@
+"""What one cycle exchanges with three drives, as data: who compiles the cycle knows these tables, and no protocol.
+
+A driver fills them in while all it would do in a cycle is to take positions that it expects and to send setpoints. What
+it keeps of each drive is in them as long as they are lent, and goes back to it with `Lender.take_back`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Final, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, HEAD
+from trirail_drivers.bus.frames import Frame
+from trirail_drivers.interface import Feedback
+
+MOST_FRAMES: Final = 32
+"""Frames that are taken at once; more than a cycle's are no quiet one's."""
+NOWHERE: Final = -1
+"""Of a place in a frame: it has no such number."""
+
+AXIS = np.dtype(
+    [
+        ("position", "<f8"),  # newest position [m]
+        ("actual", "<i8"),  # likewise [counts]
+        ("heard", "<f8"),  # when a frame said last that the drive lives [s]
+        ("status_heard", "<f8"),  # when it told its state last [s]
+        ("statusword", "<i8"),  # the newest one
+        ("seen_clear", "<i8"),  # its bits that have been 0 since somebody began to watch
+        ("syncs", "<i8"),  # as trirail_drivers.driver.answers.Answers has it, down to `prompt`
+        ("sampled", "<i8"),
+        ("late", "<i8"),
+        ("lost", "<i8"),
+        ("between", "u1"),
+        ("prompt", "u1"),
+        ("came", "u1"),  # whether a position has come in this cycle
+        ("newest", "<i8"),  # counts that came last, and how far these were from those before
+        ("step", "<i8"),
+        ("stands_at", "<i8"),  # counts where the slider has been, and since when [s]
+        ("stands_since", "<f8"),
+        ("command_age", "<i8"),  # SYNCs since it was sent a command
+        ("target", "<i8"),  # position and velocity that were sent last, in its units
+        ("offset", "<i8"),
+        # What stays as it is.
+        ("counts_per_metre", "<f8"),
+        ("zero", "<f8"),  # slider position at zero counts [m]
+        ("velocity_per_metre", "<f8"),
+        ("still", "<f8"),  # counts within which a slider stands
+        ("heard_within", "<f8"),  # how old that may be [s]
+        ("status_within", "<f8"),
+        ("position_at", "<i8"),  # where in its setpoint's frame position and velocity go; NOWHERE for neither
+        ("velocity_at", "<i8"),
+    ],
+    align=True,
+)
+"""One drive."""
+
+EXPECTED = np.dtype(
+    [
+        ("identifier", "<u4"),
+        ("length", "u1"),
+        ("axis", "u1"),
+        ("mask", "u1", 8),  # the bits of its data that decide something
+        ("data", "u1", 8),  # and what they must be
+        ("position_at", "i1"),  # where in it a position stands, 32 bits [counts]
+        ("status_at", "i1"),  # where in it the statusword stands
+        ("lives", "u1"),  # whether it says that the drive lives
+    ],
+    align=True,
+)
+"""A frame that may come in any cycle, and changes nothing but what it is read for."""
+
+TIMES = np.dtype([("due", "<f8"), ("traffic", "<i8"), ("cycles", "<i8")], align=True)
+"""When the driver has to do something else itself [s]; bits that have passed the bus, and whole cycles."""
+
+
+def expected(
+    identifier: int,
+    axis: int,
+    data: bytes,
+    mask: bytes,
+    *,
+    position_at: int = NOWHERE,
+    status_at: int = NOWHERE,
+    lives: bool = False,
+) -> tuple[Any, ...]:
+    """A row of EXPECTED, from data as it came last."""
+    wanted = bytes(byte & bits for byte, bits in zip(data, mask, strict=True))
+    padded = [tuple(part.ljust(8, b"\0")) for part in (mask, wanted)]
+    return identifier, len(data), axis, *padded, position_at, status_at, lives
+
+
+class Packets:
+    """Frames as libc's sendmmsg and recvmmsg take them: `struct mmsghdr` of sys/socket.h, one `iovec` each."""
+
+    def __init__(self, number: int) -> None:
+        self.frames = np.zeros((number, CAN_FRAME.size), np.uint8)
+        """`struct can_frame`, one a row."""
+        self._vectors = np.zeros((number, 2), np.uint64)
+        self.headers = np.zeros((number, 8), np.uint64)
+        """`struct mmsghdr`: what was received of each is in the last number."""
+        for frame, vector, header in zip(self.frames, self._vectors, self.headers, strict=True):
+            vector[:] = frame.ctypes.data, CAN_FRAME.size
+            header[2:4] = vector.ctypes.data, 1
+
+    def fill(self, frames: Iterable[Frame]) -> None:
+        """Have these frames."""
+        for row, frame in zip(self.frames, frames, strict=True):
+            row[:] = np.frombuffer(frame.packed, np.uint8)
+
+    def unpacked(self, number: int) -> list[tuple[int, bytearray]]:
+        """The first so many, as identifier with flags and data."""
+        found = []
+        for row in self.frames[:number]:
+            packed = row.tobytes()
+            identifier, length = HEAD.unpack_from(packed)
+            found.append((identifier, bytearray(packed[DATA_AT : DATA_AT + length])))
+        return found
+
+
+class Cyclic:
+    """The tables of three drives, made once, and filled in each time that they are lent."""
+
+    def __init__(self, descriptor: int, sync: Frame) -> None:
+        self.descriptor = descriptor
+        """The bus: a socket of `struct can_frame`, one a packet."""
+        self.axes: NDArray[np.void] = np.zeros(3, AXIS)
+        self.times: NDArray[np.void] = np.zeros(1, TIMES)
+        self.expected: NDArray[np.void] = np.zeros(0, EXPECTED)
+        self.begin = Packets(1)
+        """What begins a cycle."""
+        self.begin.fill([sync])
+        self.setpoints = Packets(3)
+        """What ends it: one frame for each drive, in their order."""
+        self.arrived = Packets(MOST_FRAMES)
+
+    def expect(self, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Expect these frames: rows of EXPECTED."""
+        self.expected = np.array(rows, EXPECTED)
+
+
+@runtime_checkable
+class Lender(Protocol):
+    """A DriveGroup whose cycles somebody else may run, by tables."""
+
+    def lend(self) -> Cyclic | None:
+        """Between two cycles: the tables of a cycle, where all that drives need is to have it run by these.
+
+        None where there is more to do, or the bus has no socket. As long as they are lent, nothing else is called.
+        """
+
+    def take_back(self, arrived: int, *, synced: float | None = None) -> Feedback:
+        """Go on from what the tables hold; return what the drives had said at the end of the last whole cycle.
+
+        The first `arrived` frames in them have not been looked at. `synced` is when the SYNC of a cycle was sent whose
+        feedback has not been read [s], if there is one.
+        """
+
+    def send_on(self, first: int) -> None:
+        """Send the setpoints in the tables from that of drive `first` on, which the bus has not taken."""

@@ -1,0 +1,168 @@
+"""Frames of a cycle, compiled: which of them say nothing new, what they are read for, and what setpoints look like.
+
+It knows no protocol, only the tables of trirail_drivers.driver.cyclic: `axes` (3,) of AXIS, `expected` (n,) of
+EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct can_frame`. What a driver does with them is in its axes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import f8, from_dtype, i8, u1
+from numpy.typing import NDArray
+from trirail_drivers.bus.can_frame import DATA_AT
+from trirail_drivers.bus.frames import BITS
+from trirail_drivers.driver.cyclic import AXIS, EXPECTED, NOWHERE, TIMES
+from trirail_drivers.driver.scaling import INT32_MAX
+
+from trirail.kinematics.arrays import Array
+from trirail.kinematics.compiled import compiled
+
+__all__ = [
+    "AXES",
+    "EXPECTATIONS",
+    "FRAMES",
+    "LENGTH_AT",
+    "TIMINGS",
+    "begin_cycle",
+    "end_read",
+    "set_frames",
+    "take_frames",
+]
+
+AXES, EXPECTATIONS, TIMINGS = from_dtype(AXIS)[::1], from_dtype(EXPECTED)[::1], from_dtype(TIMES)[::1]
+FRAMES = u1[:, ::1]
+LENGTH_AT = 4
+"""Where in a frame the length of its data stands."""
+
+
+@compiled()
+def _number(frame: NDArray[np.uint8], at: int, size: int) -> int:
+    """Return the little-endian number of so many bytes, without sign."""
+    number = np.int64(0)
+    for i in range(size):
+        number |= np.int64(frame[at + i]) << (8 * i)
+    return int(number)
+
+
+@compiled()
+def _signed(number: int) -> int:
+    """Return what 32 bits stand for."""
+    return number - (1 << 32) if number >> 31 else number
+
+
+@compiled()
+def _come(axis: Any) -> None:
+    """Take in that a position has come: trirail_drivers.driver.answers.Answers.come."""
+    to_the_one_before = not axis.between and not axis.prompt and axis.sampled < axis.syncs - 1
+    sampled = axis.syncs - to_the_one_before
+    axis.lost += max(0, sampled - axis.sampled - 1)
+    axis.late += axis.prompt and axis.between and sampled > axis.sampled
+    axis.sampled = sampled
+    axis.prompt = not axis.between and not to_the_one_before
+
+
+@compiled()
+def _take_position(axis: Any, counts: int, now: float) -> bool:
+    """Take a position in; False where it is the second one that answers a SYNC."""
+    if axis.came:
+        return False
+    if abs(counts - axis.stands_at) > axis.still:
+        axis.stands_at, axis.stands_since = counts, now
+    axis.stands_since = min(axis.stands_since, now)
+    step = counts - axis.newest
+    if step:
+        axis.step = step
+    axis.newest, axis.came = counts, True
+    axis.actual, axis.position = counts, counts / axis.counts_per_metre + axis.zero
+    _come(axis)
+    return True
+
+
+@compiled(i8(FRAMES, i8, EXPECTATIONS, AXES, TIMINGS, f8))
+def take_frames(
+    frames: NDArray[np.uint8],
+    number: int,
+    expected: NDArray[np.void],
+    axes: NDArray[np.void],
+    times: NDArray[np.void],
+    now: float,
+) -> int:
+    """Take in so many frames that have come by a time [s]; return how many say nothing new, before the first that does.
+
+    Where that is not all of them, what has been taken in of the others is to be forgotten.
+    """
+    for i in range(number):
+        frame = frames[i]
+        identifier, length, known = _number(frame, 0, 4), frame[LENGTH_AT], NOWHERE
+        for k in range(len(expected)):
+            if expected[k].identifier == identifier and expected[k].length == length:
+                known = k
+        if known == NOWHERE:
+            return i
+        row = expected[known]
+        for k in range(length):
+            if frame[DATA_AT + k] & row.mask[k] != row.data[k]:
+                return i
+        axis = axes[row.axis]
+        if row.position_at != NOWHERE:
+            counts = _signed(_number(frame, DATA_AT + row.position_at, 4))
+            if not _take_position(axis, counts, now):
+                return i
+        if row.status_at != NOWHERE:
+            axis.statusword = _number(frame, DATA_AT + row.status_at, 2)
+            axis.seen_clear |= ~axis.statusword
+            axis.status_heard = now
+        if row.lives:
+            axis.heard = now
+        times[0].traffic += BITS[length]
+    return number
+
+
+@compiled()
+def begin_cycle(axes: NDArray[np.void]) -> None:
+    """Note that the SYNC has been sent."""
+    for i in range(3):
+        axes[i].syncs += 1
+        axes[i].between = False
+        axes[i].command_age += 1
+
+
+@compiled(i8(AXES, TIMINGS, f8))
+def end_read(axes: NDArray[np.void], times: NDArray[np.void], now: float) -> int:
+    """Note that the frames of a cycle are in; return whether every drive has told all that it should, in time."""
+    for i in range(3):
+        axis = axes[i]
+        axis.between, axis.came = True, False
+        missed = axis.syncs - axis.sampled - (not axis.prompt)
+        if missed or now - axis.heard > axis.heard_within or now - axis.status_heard > axis.status_within:
+            return False
+    in_time: bool = now < times[0].due
+    return in_time
+
+
+@compiled()
+def _put(frame: NDArray[np.uint8], at: int, number: int) -> None:
+    """Write 32 bits, little-endian."""
+    for i in range(4):
+        frame[DATA_AT + at + i] = (number >> (8 * i)) & 0xFF
+
+
+@compiled(i8(FRAMES, AXES, f8[:, ::1]))
+def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -> int:
+    """Write setpoints, rows of positions [m] and velocities [m/s], into their frames; False where one does not fit."""
+    for i in range(3):
+        axis = axes[i]
+        counts = np.rint(axis.counts_per_metre * (sent[0, i] - axis.zero))
+        if not abs(counts) <= INT32_MAX:
+            return False
+        axis.target, axis.offset = np.int64(counts), 0
+        _put(frames[i], axis.position_at, axis.target)
+        if axis.velocity_at != NOWHERE:
+            offset = np.rint(axis.velocity_per_metre * sent[1, i])
+            if not abs(offset) <= INT32_MAX:
+                return False
+            axis.offset = np.int64(offset)
+            _put(frames[i], axis.velocity_at, axis.offset)
+    return True

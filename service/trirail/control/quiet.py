@@ -1,0 +1,314 @@
+"""Cycles in which nothing happens, as one compiled call: it goes on from cycle to cycle until Python is needed.
+
+Wait, SYNC, what has arrived, `observe`, `command`, `hold` or `follow`, the last gate, setpoints, record. A cycle where
+anything is not as it was in the one before leaves no trace: what it has changed is put back, and Python runs it as all
+cycles were run that are not quiet, from its SYNC on. So nothing is decided here.
+
+A wait that a signal interrupts goes on to its deadline; Python's handlers run when the call has returned, which is at
+the end of a batch of records at the latest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any, Final
+
+import numpy as np
+from numba import f8, from_dtype, i4, i8, types, u1, u8
+from numpy.typing import NDArray
+from trirail_drivers.bus.frames import BITS
+from trirail_drivers.driver.cyclic import MOST_FRAMES
+
+from trirail.control import cycle
+from trirail.control.exchange import (
+    AXES,
+    EXPECTATIONS,
+    FRAMES,
+    LENGTH_AT,
+    TIMINGS,
+    begin_cycle,
+    end_read,
+    set_frames,
+    take_frames,
+)
+from trirail.kinematics.arrays import Array
+from trirail.kinematics.compiled import compiled
+from trirail.wire.records import Part
+
+__all__ = ["COMMAND", "FOLLOW", "HOLD", "STATE", "Reached", "run"]
+
+# Of libc, by name: sys/socket.h, time.h, poll.h, string.h.
+_sendmmsg: Any = types.ExternalFunction("sendmmsg", i4(i4, types.intp, types.uint32, i4))
+_recvmmsg: Any = types.ExternalFunction("recvmmsg", i4(i4, types.intp, types.uint32, i4, types.intp))
+_clock_nanosleep: Any = types.ExternalFunction("clock_nanosleep", i4(i4, i4, types.intp, types.intp))
+_clock_gettime: Any = types.ExternalFunction("clock_gettime", i4(i4, types.intp))
+_poll: Any = types.ExternalFunction("poll", i4(types.intp, u8, i4))
+_memcpy: Any = types.ExternalFunction("memcpy", types.intp(types.intp, types.intp, u8))
+
+_MONOTONIC: Final = 1
+_ABSOLUTE: Final = 1
+"""Of clock_nanosleep: to a deadline."""
+_INTERRUPTED: Final = 4
+"""EINTR."""
+_FLAGS: Final = 0x40 | 0x4000
+"""MSG_DONTWAIT, MSG_NOSIGNAL."""
+_FRAME: Final = 16
+_SECOND: Final = 1_000_000_000
+
+
+class Reached(IntEnum):
+    """How far the newest cycle has come."""
+
+    WAITED = 0
+    """Its tick is there; frames may have been taken from the bus."""
+    SYNCED = 1
+    """Its SYNC has been sent, and frames have been taken from the bus."""
+    WRITTEN = 2
+    """All is done, but for setpoints that the bus has not taken."""
+    DONE = 3
+    """All is done."""
+
+
+FOLLOW, HOLD, COMMAND = 0, 1, 2
+"""What the setpoints come from."""
+
+STATE = np.dtype(
+    [
+        ("period_ns", "<i8"),
+        ("period", "<f8"),  # the same [s]
+        ("injected_ns", "<i8"),  # the time, for tests; negative: the monotonic clock
+        ("deadline_ns", "<i8"),  # of the newest tick
+        ("lateness_ns", "<i8"),
+        ("synced", "<f8"),  # when its SYNC was sent [s]
+        ("marked_ns", "<i8"),  # when its newest part ended
+        ("cycle", "<i8"),
+        ("until", "<i8"),  # the last cycle that may be run
+        ("overruns", "<i8"),
+        ("parts_ns", "<i4", len(Part)),
+        ("mode", "u1"),  # as in a record
+        ("source", "u1"),  # FOLLOW, HOLD or COMMAND
+        ("held", "u1"),  # as of trirail.control.cycle.follow
+        ("stands", "u1"),  # as of trirail.control.cycle.observe
+        ("in_sliders", "u1"),  # of the path
+        ("found", "<i8"),  # what trirail.control.cycle.command is to find
+        ("time", "<f8"),  # of the law [s], and the rate that it leads to
+        ("target", "<f8"),
+        ("course", "<f8", 3),  # trirail.motion.runs.Course
+        ("fastest", "<f8"),  # as of trirail.control.cycle.observe
+        ("limit", "<f8"),
+        ("step", "<f8"),  # as of trirail.control.cycle.follow
+        ("settles", "u1"),  # whether a goal waits for the robot to be in position, and until which cycle
+        ("timeout", "<i8"),
+        ("gateway_seen", "<u8"),  # trirail.processes.heartbeats.Watch
+        ("gateway_turns", "<i8"),
+        ("gateway_patience", "<i8"),
+        ("gateway_place", "<i8"),
+        ("batched", "<i8"),  # records in the batch
+        ("arrived", "<i8"),  # frames that Python has to look at
+        ("sent", "<i8"),  # setpoints that the bus has taken
+    ],
+    align=True,
+)
+"""What the call goes on from, and what it leaves."""
+
+_STATE, _DOORS = from_dtype(STATE)[::1], i4[:, ::1]
+
+
+@compiled()
+def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
+    """Return the time [ns]."""
+    if state[0].injected_ns >= 0:
+        return int(state[0].injected_ns)
+    _clock_gettime(_MONOTONIC, moment.ctypes.data)
+    return int(moment[0] * _SECOND + moment[1])
+
+
+@compiled()
+def _wait(state: NDArray[np.void], moment: NDArray[np.int64]) -> None:
+    """Wait for the deadline, whatever interrupts that."""
+    if state[0].injected_ns >= 0:
+        return
+    moment[0], moment[1] = state[0].deadline_ns // _SECOND, state[0].deadline_ns % _SECOND
+    while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, moment.ctypes.data, 0) == _INTERRUPTED:
+        pass
+
+
+@compiled()
+def _mark(state: NDArray[np.void], moment: NDArray[np.int64], part: int) -> None:
+    """Note how long a part of the cycle has taken, at its end."""
+    now = _now_ns(state, moment)
+    state[0].parts_ns[part] = now - state[0].marked_ns
+    state[0].marked_ns = now
+
+
+@compiled()
+def _copy(kept: NDArray[np.int64], to: int, source: int) -> None:
+    """Copy all that is kept: rows of two addresses and a number of bytes; `to` and `source` say which is which."""
+    for i in range(len(kept)):
+        _memcpy(kept[i, to], kept[i, source], np.uint64(kept[i, 2]))
+
+
+@compiled()
+def _receive(bus: int, headers: NDArray[np.uint64]) -> int:
+    """Take what has arrived; return how many frames that are, and one more than there is room for where it failed."""
+    number = _recvmmsg(bus, headers.ctypes.data, np.uint32(MOST_FRAMES), _FLAGS, 0)
+    for i in range(number):
+        if headers[i, 7] & np.uint64(0xFFFFFFFF) != np.uint64(_FRAME):
+            return MOST_FRAMES + 1  # the other end has gone: Python finds that again
+    return int(max(number, 0))
+
+
+@compiled(
+    i8(
+        *(_STATE, i8[:, ::1], i8[::1], i8, FRAMES, u8[:, ::1], u8[:, ::1], FRAMES, u8[:, ::1]),
+        *(EXPECTATIONS, AXES, TIMINGS, _DOORS, u8[::1], FRAMES),
+        *(cycle.LEGS, cycle.BOUND, cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
+        *(cycle.MOTION, cycle.SLIDERS, cycle.KEPT, f8[::1], cycle.FEEDBACKS, f8[:, ::1], types.b1[::1], f8[:, ::1]),
+        *(cycle.MONITORED, cycle.RECORD, u1[::1]),
+    ),
+    releases=True,
+)
+def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
+    state: NDArray[np.void],
+    kept: NDArray[np.int64],
+    moment: NDArray[np.int64],
+    bus: int,
+    arrived: NDArray[np.uint8],
+    arrivals: NDArray[np.uint64],
+    begin: NDArray[np.uint64],
+    setpoints: NDArray[np.uint8],
+    departures: NDArray[np.uint64],
+    expected: NDArray[np.void],
+    axes: NDArray[np.void],
+    times: NDArray[np.void],
+    doors: NDArray[np.int32],
+    hearts: NDArray[np.uint64],
+    batch: NDArray[np.uint8],
+    legs: Array,
+    bounds: NDArray[np.void],
+    knots: Array,
+    pieces: Array,
+    tools: Array,
+    law_knots: Array,
+    law_pieces: Array,
+    furthest: Array,
+    motion: Array,
+    sliders: Array,
+    backlash: NDArray[np.void],
+    found: Array,
+    feedback: NDArray[np.void],
+    written: Array,
+    jumps: NDArray[np.bool],
+    room: Array,
+    monitored: NDArray[np.void],
+    record: NDArray[np.void],
+    made: NDArray[np.uint8],
+) -> int:
+    """Run cycles; return how far the newest has come: Reached.
+
+    `kept` (n, 3) are addresses and sizes of all that a cycle changes, and of copies of it; `moment` (2,) room for a
+    struct timespec, `doors` (n, 2) as poll takes them, `hearts` the counters of trirail.processes.heartbeats, `batch`
+    (n, SIZE) room for records, `made` (SIZE,) the bytes of `record`. All else as in trirail.control.cycle and exchange.
+    """
+    s, row = state[0], record[0]
+    while s.cycle < s.until and s.batched < len(batch):
+        s.deadline_ns += s.period_ns
+        _wait(state, moment)
+        now = _now_ns(state, moment)
+        s.marked_ns, s.arrived, s.sent = now, 0, 0
+        s.lateness_ns = now - s.deadline_ns
+        if s.lateness_ns >= s.period_ns:
+            return Reached.WAITED
+        _copy(kept, 1, 0)
+        t = now / 1e9
+        number = _receive(bus, arrivals)
+        if (
+            number >= MOST_FRAMES
+            or t >= times[0].due
+            or take_frames(arrived, number, expected, axes, times, t) < number
+        ):
+            _copy(kept, 0, 1)
+            s.arrived = min(number, MOST_FRAMES) if number <= MOST_FRAMES else 0
+            return Reached.WAITED
+        if _sendmmsg(bus, begin.ctypes.data, np.uint32(1), _FLAGS) != 1:
+            _copy(kept, 0, 1)
+            s.arrived = number
+            return Reached.WAITED
+        begin_cycle(axes)
+        times[0].traffic += BITS[0]
+        s.synced = t
+        _mark(state, moment, Part.SYNC)
+
+        _copy(kept, 1, 0)
+        t = _now_ns(state, moment) / 1e9
+        number = _receive(bus, arrivals)
+        s.arrived = min(number, MOST_FRAMES) if number <= MOST_FRAMES else 0
+        if number >= MOST_FRAMES or take_frames(arrived, number, expected, axes, times, t) < number:
+            _copy(kept, 0, 1)
+            return Reached.SYNCED
+        if not end_read(axes, times, t):
+            _copy(kept, 0, 1)
+            return Reached.SYNCED
+        _mark(state, moment, Part.READ)
+
+        for i in range(3):
+            feedback[0].position[i] = axes[i].position
+            feedback[0].age[i] = axes[i].syncs - axes[i].sampled
+        behind = cycle.observe(
+            *(legs, feedback, written, backlash, s.period, s.fastest, s.limit, s.stands != 0),
+            *(jumps, room, monitored, record),
+        )
+        in_position = s.settles and (monitored[0].inside >= monitored[0].dwell or s.cycle + 1 >= s.timeout)
+        called = _poll(doors.ctypes.data, np.uint64(len(doors)), 0) != 0
+        count = hearts[s.gateway_place]  # as trirail.processes.heartbeats.Watch looks at it
+        turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
+        if behind or in_position or called or turns > s.gateway_patience:
+            _copy(kept, 0, 1)
+            return Reached.SYNCED
+        _mark(state, moment, Part.MODE)
+        _mark(state, moment, Part.MOTION)
+
+        time = s.time
+        if s.source == COMMAND:
+            time = s.time + s.period
+            begun, end, arrival = s.course[0], s.course[1], s.course[2]
+            code = cycle.command(
+                *(legs, bounds, knots, pieces, s.in_sliders != 0, tools, law_knots, law_pieces, time, s.target),
+                *(furthest, begun, end, arrival, motion, sliders, backlash, found, record),
+            )
+        elif s.source == HOLD:
+            code = cycle.hold(legs, bounds, motion, sliders, backlash, found, record)
+        else:
+            code = 0
+            cycle.follow(legs, feedback, jumps, s.held != 0, False, s.step, motion, sliders, backlash, record)
+        late = _now_ns(state, moment) / 1e9 - s.synced > s.period
+        if code != s.found or late or not set_frames(setpoints, axes, sliders[0]):
+            _copy(kept, 0, 1)
+            return Reached.SYNCED
+        _mark(state, moment, Part.KINEMATICS)
+
+        s.arrived, s.time, s.gateway_seen, s.gateway_turns = 0, time, count, turns
+        s.sent = max(_sendmmsg(bus, departures.ctypes.data, np.uint32(3), _FLAGS), 0)
+        for i in range(s.sent):
+            times[0].traffic += BITS[setpoints[i, LENGTH_AT]]
+        _mark(state, moment, Part.WRITE)
+
+        s.cycle += 1
+        times[0].cycles += 1
+        row.cycle, row.deadline_ns, row.lateness_ns, row.overruns = s.cycle, s.deadline_ns, s.lateness_ns, s.overruns
+        row.parts_ns[:] = s.parts_ns
+        row.mode = s.mode
+        batch[s.batched] = made
+        s.batched += 1
+        _mark(state, moment, Part.RECORD)
+        if s.sent < 3:
+            return Reached.WRITTEN
+    return Reached.DONE
+
+
+def copies(arrays: Sequence[NDArray[Any]]) -> tuple[NDArray[np.int64], list[NDArray[Any]]]:
+    """Return what `run` keeps of arrays, (n, 3), and the room where it keeps it, which is to live as long."""
+    rooms = [np.empty_like(array) for array in arrays]
+    rows = [(array.ctypes.data, room.ctypes.data, array.nbytes) for array, room in zip(arrays, rooms, strict=True)]
+    return np.array(rows, np.int64), rooms

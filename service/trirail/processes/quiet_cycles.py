@@ -1,0 +1,137 @@
+"""Runs the cycles in which nothing happens by the compiled call, as far as it goes."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from trirail_drivers.driver.cyclic import Cyclic, Lender
+
+from trirail.control import quiet
+from trirail.control.control import Calm, Control
+from trirail.control.quiet import Reached
+from trirail.motion.paths import Path, constant
+from trirail.processes.clock import Ticker
+from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
+from trirail.processes.reports import Reports
+from trirail.wire.links import Port
+from trirail.wire.records import Part
+from trirail.wire.vocabulary import MODES
+
+_POLLIN = 1
+_NOWHERE = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
+"""A path for compiled code where there is none."""
+
+
+class Newest(NamedTuple):
+    """The newest cycle that the compiled call has begun."""
+
+    reached: Reached
+    deadline_ns: int
+    lateness_ns: int
+    marked_ns: int
+    """When its newest part ended."""
+    sync_ns: int
+    """How long its SYNC took."""
+
+
+class QuietCycles:
+    """Holds what the compiled call needs. `run` is to be called between two cycles, while nothing is under way."""
+
+    def __init__(
+        self, control: Control, drives: Lender, reports: Reports, hearts: Heartbeats, gateway: Port, watch: Watch
+    ) -> None:
+        self._control = control
+        self._drives = drives
+        self._reports = reports
+        self._gateway = gateway
+        self._watch = watch
+        self._hearts = np.frombuffer(hearts.counts, np.uint64)[: len(PROCESSES)]
+        self._state = np.zeros(1, quiet.STATE)
+        self._moment = np.zeros(2, np.int64)
+        self._doors = np.zeros((1, 2), np.int32)
+        self._nothing = np.zeros(1)
+        self._rooms: list[NDArray[Any]] = []
+        self._kept = np.zeros((0, 3), np.int64)
+        measured, setpoints = control.measured, control.setpoints
+        self._made = measured.record.view(np.uint8)
+        state = self._state[0]
+        state["period"], state["period_ns"] = control.period, round(control.period * 1e9)
+        state["injected_ns"] = -1
+        state["fastest"], state["limit"], state["step"] = measured.fastest, measured.limit, setpoints.step
+        state["gateway_place"], state["gateway_patience"] = PROCESSES.index("gateway"), watch.patience
+
+    def run(self, ticker: Ticker, overruns: int, injected_ns: int = -1, most: float = math.inf) -> Newest | None:
+        """Run cycles until something happens; return how far the newest has come, None where none was begun.
+
+        At most `most` of them, and by the time `injected_ns` where that is given, for tests.
+        """
+        calm = self._control.calm()
+        if calm is None or not (self._reports.idle and self._gateway.calm):
+            return None
+        lent = self._drives.lend()
+        if lent is None:
+            return None
+        state, control, watch = self._state[0], self._control, self._watch
+        before = control.cycles
+        self._take(calm)
+        state["injected_ns"], state["overruns"], state["deadline_ns"] = injected_ns, overruns, ticker.deadline_ns
+        state["cycle"], state["until"] = before, int(min(calm.until, before + most, before + 2**40))
+        state["mode"], state["batched"] = MODES.index(control.state.mode), self._reports.batched
+        state["gateway_seen"], state["gateway_turns"] = watch.seen, watch.turns
+        self._doors[0] = self._gateway.fileno(), _POLLIN
+        reached = Reached(self._call(lent, calm))
+        watch.seen, watch.turns = int(state["gateway_seen"]), int(state["gateway_turns"])
+        self._reports.batched = int(state["batched"])
+        ticker.deadline_ns = int(state["deadline_ns"])
+        synced = float(state["synced"]) if reached is Reached.SYNCED else None
+        feedback = self._drives.take_back(int(state["arrived"]), synced=synced)
+        control.go_on(feedback, int(state["cycle"]) - before, float(state["time"]))
+        if reached is Reached.WRITTEN:
+            self._drives.send_on(int(state["sent"]))
+        marked = int(state["marked_ns"])
+        sync = int(state["parts_ns"][Part.SYNC])
+        return Newest(reached, ticker.deadline_ns, int(state["lateness_ns"]), marked, sync)
+
+    def add(self, part: Part) -> None:
+        """Count what has passed since the newest cycle into a part of it."""
+        self._state[0]["parts_ns"][part] += time.perf_counter_ns() - int(self._state[0]["marked_ns"])
+
+    def _take(self, calm: Calm) -> None:
+        """Write what cycles come to into the state."""
+        state, run = self._state[0], calm.run
+        state["source"] = quiet.FOLLOW if calm.follows else quiet.HOLD if run is None else quiet.COMMAND
+        state["held"], state["stands"], state["found"] = calm.held, calm.stands, calm.found
+        state["settles"] = calm.settles_by is not None
+        state["timeout"] = calm.settles_by or 0
+        runs = self._control.schedule.runs
+        state["time"] = runs[0].time if runs else 0.0
+        if run is not None:
+            state["in_sliders"], state["target"], state["course"] = run.path.in_sliders, run.target, run.course
+
+    def _call(self, lent: Cyclic, calm: Calm) -> int:
+        control, run = self._control, calm.run
+        measured, setpoints, schedule = control.measured, control.setpoints, control.schedule
+        path, law = (run.path, run.law) if run is not None else (_NOWHERE, constant(1.0))
+        furthest = run.furthest if run is not None else self._nothing
+        if not self._rooms:
+            kept = (
+                *(measured.numbers, measured.written, measured.backlash, measured.jumping),
+                *(measured.settling.monitored, measured.record, schedule.motion, setpoints.sliders),
+                *(setpoints.found, lent.axes, lent.times, self._nothing),
+            )
+            self._kept, self._rooms = quiet.copies(kept)
+        self._kept[-1, 0] = furthest.ctypes.data
+        given: tuple[Any, ...] = (
+            *(self._state, self._kept, self._moment, lent.descriptor),
+            *(lent.arrived.frames, lent.arrived.headers, lent.begin.headers),
+            *(lent.setpoints.frames, lent.setpoints.headers, lent.expected, lent.axes, lent.times),
+            *(self._doors, self._hearts, self._reports.batch, measured.legs, setpoints.bounds, path.knots, path.pieces),
+            *(path.tools, law.knots, law.pieces, furthest, schedule.motion, setpoints.sliders, measured.backlash),
+            *(setpoints.found, measured.numbers, measured.written, measured.jumping, measured.room),
+            *(measured.settling.monitored, measured.record, self._made),
+        )
+        return quiet.run(*given)
