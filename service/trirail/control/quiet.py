@@ -34,7 +34,7 @@ from trirail.control.exchange import (
 )
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
-from trirail.wire.records import Part
+from trirail.wire.records import LONGEST, Part
 
 __all__ = ["COMMAND", "FOLLOW", "HOLD", "STATE", "Reached", "run"]
 
@@ -138,7 +138,7 @@ def _wait(state: NDArray[np.void], moment: NDArray[np.int64]) -> None:
 def _mark(state: NDArray[np.void], moment: NDArray[np.int64], part: int) -> None:
     """Note how long a part of the cycle has taken, at its end."""
     now = _now_ns(state, moment)
-    state[0].parts_ns[part] = now - state[0].marked_ns
+    state[0].parts_ns[part] = min(now - state[0].marked_ns, LONGEST)
     state[0].marked_ns = now
 
 

@@ -40,6 +40,16 @@ class Ticker:
         self.deadline_ns = now()
         """When the newest tick was due."""
 
+    def come(self) -> int:
+        """Sleep to the next deadline by a clock that is not the machine's, and return the time by it [ns].
+
+        By the machine's -1, at once: who asks can wait for that one by himself.
+        """
+        if self._now is time.monotonic_ns:
+            return -1
+        self._sleep(self.deadline_ns + self._period_ns)
+        return self._now()
+
     def wait(self) -> Tick:
         """Sleep until the next deadline that is not over yet by a whole period."""
         self.deadline_ns += self._period_ns

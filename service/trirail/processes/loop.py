@@ -34,7 +34,7 @@ from trirail.wire.packets import (
     decode_request,
     message,
 )
-from trirail.wire.records import Part
+from trirail.wire.records import LONGEST, Part
 from trirail.wire.vocabulary import Mode
 
 REQUESTS_A_CYCLE = 4
@@ -67,7 +67,9 @@ class Loop:
         *,
         capture: Capture | None = None,
         lacking: tuple[str, ...] = (),
+        quiet: bool = True,
     ) -> None:
+        """`quiet`: cycles in which nothing happens are run by the compiled call; else all by Python."""
         self._drives = drives
         self._gateway = ports.gateway
         self._planner = PlannerLink(ports.planner)
@@ -87,22 +89,31 @@ class Loop:
         self._gateway_watch = Watch(heartbeats.of("gateway"), patience)
         self._gateway_frozen = False
         self._quiet: QuietCycles | None = None
-        if isinstance(drives, Lender):
-            quiet = self.control, drives, self._reports, heartbeats, ports.gateway, self._gateway_watch
-            self._quiet = QuietCycles(*quiet)
+        if quiet and isinstance(drives, Lender):
+            beside = self._reports, heartbeats, ports.gateway, self._gateway_watch
+            self._quiet = QuietCycles(self.control, drives, *beside)
         self._fault: DriveFault | None = None
         self._marked_ns = 0
         self._parts_ns = [0] * len(Part)
 
     def run(self, ticker: Ticker) -> None:
         """Run cycles until told to end and the robot stands without power."""
+        self.begin()
+        while not self._over():
+            self.turn(ticker)
+        self._flush()
+
+    def begin(self) -> None:
+        """Take those who are there already, and what the drives say, before the first cycle."""
         self._planner.accept()
         self._reports.accept_peers()  # so that a recorder that is there has every cycle from the first
         self._drives.sync()
         self.control.start(self._drives.read())
-        while not self._over():
-            self.turn(ticker)
-        self._flush()
+
+    @property
+    def quiet_cycles(self) -> int:
+        """How many cycles the compiled call has run."""
+        return self._quiet.cycles if self._quiet is not None else 0
 
     def turn(self, ticker: Ticker) -> None:
         """Run the cycles in which nothing happens, and then one in which something does, or to the end of a batch."""
@@ -141,7 +152,7 @@ class Loop:
     def _mark(self, part: Part) -> None:
         """Note how long a part of the cycle has taken, at its end."""
         now = time.perf_counter_ns()
-        self._parts_ns[part] = now - self._marked_ns
+        self._parts_ns[part] = min(now - self._marked_ns, LONGEST)
         self._marked_ns = now
 
     def _given_in(self, tick: Tick, fault: DriveFault | None) -> Iterator[Given]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from typing import Any, NamedTuple
 
@@ -18,10 +17,12 @@ from trirail.processes.clock import Ticker
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
 from trirail.processes.reports import Reports
 from trirail.wire.links import Port
-from trirail.wire.records import Part
+from trirail.wire.records import LONGEST, Part
 from trirail.wire.vocabulary import MODES
 
 _POLLIN = 1
+_MOST = 1 << 40
+"""Cycles that are run at once: more than any batch has."""
 _NOWHERE = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
 """A path for compiled code where there is none."""
 
@@ -44,6 +45,8 @@ class QuietCycles:
     def __init__(
         self, control: Control, drives: Lender, reports: Reports, hearts: Heartbeats, gateway: Port, watch: Watch
     ) -> None:
+        self.cycles = 0
+        """So many have been run."""
         self._control = control
         self._drives = drives
         self._reports = reports
@@ -64,13 +67,10 @@ class QuietCycles:
         state["fastest"], state["limit"], state["step"] = measured.fastest, measured.limit, setpoints.step
         state["gateway_place"], state["gateway_patience"] = PROCESSES.index("gateway"), watch.patience
 
-    def run(self, ticker: Ticker, overruns: int, injected_ns: int = -1, most: float = math.inf) -> Newest | None:
-        """Run cycles until something happens; return how far the newest has come, None where none was begun.
-
-        At most `most` of them, and by the time `injected_ns` where that is given, for tests.
-        """
+    def run(self, ticker: Ticker, overruns: int) -> Newest | None:
+        """Run cycles until something happens; return how far the newest has come, None where none was begun."""
         calm = self._control.calm()
-        if calm is None or not (self._reports.idle and self._gateway.calm):
+        if calm is None or calm.until <= self._control.cycles or not (self._reports.idle and self._gateway.calm):
             return None
         lent = self._drives.lend()
         if lent is None:
@@ -78,8 +78,9 @@ class QuietCycles:
         state, control, watch = self._state[0], self._control, self._watch
         before = control.cycles
         self._take(calm)
-        state["injected_ns"], state["overruns"], state["deadline_ns"] = injected_ns, overruns, ticker.deadline_ns
-        state["cycle"], state["until"] = before, int(min(calm.until, before + most, before + 2**40))
+        state["injected_ns"], state["overruns"], state["deadline_ns"] = ticker.come(), overruns, ticker.deadline_ns
+        most = 1 if state["injected_ns"] >= 0 else _MOST
+        state["cycle"], state["until"] = before, int(min(calm.until, before + most))
         state["mode"], state["batched"] = MODES.index(control.state.mode), self._reports.batched
         state["gateway_seen"], state["gateway_turns"] = watch.seen, watch.turns
         self._doors[0] = self._gateway.fileno(), _POLLIN
@@ -89,6 +90,7 @@ class QuietCycles:
         ticker.deadline_ns = int(state["deadline_ns"])
         synced = float(state["synced"]) if reached is Reached.SYNCED else None
         feedback = self._drives.take_back(int(state["arrived"]), synced=synced)
+        self.cycles += int(state["cycle"]) - before
         control.go_on(feedback, int(state["cycle"]) - before, float(state["time"]))
         if reached is Reached.WRITTEN:
             self._drives.send_on(int(state["sent"]))
@@ -98,7 +100,8 @@ class QuietCycles:
 
     def add(self, part: Part) -> None:
         """Count what has passed since the newest cycle into a part of it."""
-        self._state[0]["parts_ns"][part] += time.perf_counter_ns() - int(self._state[0]["marked_ns"])
+        parts = self._state[0]["parts_ns"]
+        parts[part] = min(int(parts[part]) + time.perf_counter_ns() - int(self._state[0]["marked_ns"]), LONGEST)
 
     def _take(self, calm: Calm) -> None:
         """Write what cycles come to into the state."""

@@ -71,6 +71,8 @@ DTYPE: np.dtype[Any] = np.dtype(
 """The layout of a record: in the loop's memory, between the processes and on the wire."""
 SIZE = DTYPE.itemsize
 """Bytes of a record."""
+LONGEST = 2**31 - 1
+"""A part that took longer is recorded as that long [ns]."""
 HEAD = struct.Struct(f"<4q{len(Part)}iB")
 """The fields at its beginning that the loop writes, up to `mode`; the control has written the others."""
 

@@ -1,0 +1,296 @@
+"""The compiled call runs cycles as Python runs them: the same frames, records and events, whatever happens in between.
+
+Whole sessions are generated, and run twice over a socket by a clock of the test's: once with every cycle run by Python.
+"""
+
+from __future__ import annotations
+
+import random
+import socket
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import NamedTuple
+
+import can
+import numpy as np
+import pytest
+from conftest import CONFIG
+from trirail.config import Config
+from trirail.motion.planning import MotionPlanner
+from trirail.processes.clock import Ticker
+from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.loop import Loop, Ports
+from trirail.wire import links
+from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrackGoal, VelocityGoal
+from trirail.wire.links import Port
+from trirail.wire.packets import CommandRequest, GoalRequest, Happened, Kind, Request, decode_answer, message
+from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
+from trirail.wire.records import DTYPE, unpack
+from trirail.wire.vocabulary import Command
+from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.frames import packed, unpacked
+from trirail_drivers.bus.unixbus import UnixBus
+from trirail_drivers.connection.opening import simulated_bus
+from trirail_drivers.protocols import PROTOCOLS
+from trirail_drivers.simulated import SimulatedBus
+
+CYCLES = 1500
+STEP_NS = 200_000
+"""How time passes for who waits."""
+NEVER_MIND = ("parts_ns",)
+"""What a record has of the time that the program itself took."""
+
+
+GENTLE = ("pose", "pose", "pose", "move", "jog", "track", "order")
+ROUGH = ("frame", "fault", "time")
+"""What may happen in a session: the latter end most of it by a fault."""
+
+
+class Happening(NamedTuple):
+    """What is done to a session before one of its cycles."""
+
+    does: Callable[[Session], None]
+
+
+class Pumped(UnixBus):
+    """The service's end of a bus, whose other end lives while it waits."""
+
+    def __init__(self, channel: str, session: Session) -> None:
+        self._session = session
+        super().__init__(channel)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        end = self._session.now_ns + round((timeout or 0.0) * 1e9)
+        while (found := super().recv(0)) is None and self._session.now_ns < end:
+            self._session.pass_time(STEP_NS)
+        return found
+
+
+class Session:
+    """A loop, what is around it, and everything that it has said; one turn of it is a cycle."""
+
+    def __init__(self, config: Config, folder: Path, *, quiet: bool) -> None:
+        self.now_ns = 100_000_000_000
+        self.config = config
+        self.late_ns = 0
+        """By how much the next tick comes late."""
+        self.beats = True
+        self.sent: list[bytes] = []
+        self.held: list[bytes] = []
+        self.holds = False
+        """Whether what the drives say is kept for the next cycle."""
+        self._stack = ExitStack()
+        listening = self._stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+        listening.bind(str(folder / "can"))
+        listening.listen()
+        self.drives: SimulatedBus = simulated_bus(config.can, config.drives, self.clock)
+        bus = Pumped.__new__(Pumped)
+        self.end: socket.socket | None = None
+        bus.__init__(str(folder / "can"), self)  # type: ignore[misc]
+        self.end, _ = listening.accept()
+        self.end.setblocking(False)
+        self.bus = bus
+        driver = PROTOCOLS[config.drives.protocol].driver(bus, config.can.bitrate, config.drives, self.clock)
+        driver.configure(config.period, config.limits.slider.velocity)
+        names = ("gateway", "recorder", "planner")
+        ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))
+        self.gateway, self.recorder, self.planner = (links.connect(folder / name, MAX_PLANNING) for name in names)
+        for closes in (*ports, self.gateway, self.recorder, self.planner, self.end):
+            self._stack.callback(closes.close)
+        self._stack.callback(bus.shutdown)
+        self.hearts = Heartbeats.create()
+        self.motion = MotionPlanner(config)
+        self.loop = Loop(config, driver, ports, self.hearts, quiet=quiet)
+        self.loop.begin()
+        self.ticker = Ticker(round(config.period * 1e9), lambda: self.now_ns, self.sleep)
+        self.heard: list[object] = []
+
+    def clock(self) -> float:
+        return self.now_ns / 1e9
+
+    def close(self) -> None:
+        self._stack.close()
+
+    def sleep(self, deadline_ns: int) -> None:
+        """Let a cycle's time pass, with all that others do in it."""
+        self.pump()
+        while (packet := self.planner.receive()) is not None:
+            self.planner.send(encode(self.motion.plan(decode_plan_request(packet))))
+        if self.beats:
+            self.hearts.of("gateway").beat()
+        self.now_ns = deadline_ns + self.late_ns
+        self.late_ns = 0
+        self.pump()
+
+    def pass_time(self, ns: int) -> None:
+        self.now_ns += ns
+        self.pump()
+
+    def pump(self) -> None:
+        """Bring to the drives what has been sent, and back what they say."""
+        if self.end is None:
+            return
+        while True:
+            try:
+                packet = self.end.recv(CAN_FRAME.size)
+            except BlockingIOError:
+                break
+            self.sent.append(packet)
+            self.drives.send(unpacked(packet))
+        said, self.held = self.held, []
+        while (frame := self.drives.recv(0)) is not None:
+            (self.held if self.holds else said).append(packed(frame))
+        self.holds = False
+        for packet in said:
+            self.end.send(packet)
+
+    def inject(self, packet: bytes) -> None:
+        """Somebody else sends a frame."""
+        assert self.end is not None
+        self.end.send(packet)
+
+    def ask(self, request: Request) -> None:
+        self.gateway.send(message(request))
+
+    def run(self, script: dict[int, list[Happening]]) -> None:
+        for number in range(CYCLES):
+            for what in script.get(number, ()):
+                what.does(self)
+            self.loop.turn(self.ticker)
+            while self.gateway.receive() is not None:
+                pass
+            while (packet := self.recorder.receive()) is not None:
+                self.heard += list(_comparable(packet))
+
+
+def _comparable(packet: bytes) -> Iterator[object]:
+    """What a packet says, without wall clocks and the program's own times."""
+    if packet[0] == Kind.RECORDS:
+        records = np.frombuffer(bytearray(packet[1:]), DTYPE)
+        for name in NEVER_MIND:
+            records[name] = 0
+        yield from (record.tobytes() for record in records)
+    elif packet[0] == Kind.MESSAGE:
+        said = decode_answer(packet[1:])
+        if isinstance(said, Happened):
+            event = said.event
+            yield event.seq, event.cycle, event.t, event.kind, event.message, event.outcome
+        else:
+            yield type(said).__name__, repr(said) if type(said).__name__ == "Status" else ""
+
+
+def script(seed: int) -> dict[int, list[Happening]]:
+    """What happens in a session: often much at once, and often nothing for long."""
+    chance = random.Random(seed)
+    tickets = iter(range(1, 10_000))
+    happens: dict[int, list[Happening]] = {}
+
+    def at(number: int, does: Callable[[Session], None]) -> None:
+        happens.setdefault(number, []).append(Happening(does))
+
+    def order(number: int, name: Command, value: float | None = None) -> None:
+        ticket = next(tickets)
+        at(number, lambda session: session.ask(CommandRequest(ticket, "ann", name, value)))
+
+    def send(number: int, goal: Goal, name: str | None = None) -> None:
+        ticket = next(tickets)
+        given = name or f"g{ticket}"
+        at(number, lambda session: session.ask(GoalRequest(ticket, "ann", given, goal, session.now_ns)))
+
+    order(30, Command.ENABLE)
+    number = 100
+    while number < CYCLES - 50:
+        number += chance.choice((1, 2, 7, 20, 50, 150))
+        match chance.choice(GENTLE if seed % 3 else GENTLE + ROUGH):
+            case "pose":
+                x, y, phi = chance.uniform(-0.05, 0.05), chance.uniform(-0.05, 0.05), chance.uniform(-0.3, 0.3)
+                blend = chance.choice((None, None, 0.01))
+                send(number, PoseGoal(x, y, phi, speed=chance.choice((0.2, 1.0)), blend=blend))
+            case "move":
+                send(number, MoveGoal(chance.uniform(-0.01, 0.01), 0.0, 0.0))
+            case "jog":
+                jog = f"j{number}"
+                for renewed in range(number, number + chance.choice((1, 3, 8)) * 40, 40):
+                    send(renewed, VelocityGoal(0.05, 0.02, 0.0, timeout=0.1), jog)
+            case "track":
+                track = f"t{number}"
+                for told in range(number, number + 200, 20):
+                    send(told, TrackGoal(0.001 * (told - number) / 20, 0.0, 0.0, timeout=0.1), track)
+            case "order":
+                name = chance.choice(
+                    (Command.STOP, Command.PAUSE, Command.RESUME, Command.DISABLE, Command.QUICK_STOP, Command.OVERRIDE)
+                )
+                order(number, name, chance.choice((0.3, 1.5)) if name is Command.OVERRIDE else None)
+                if name in (Command.DISABLE, Command.QUICK_STOP):
+                    order(number + 150, Command.RESET)
+                    order(number + 160, Command.ENABLE)
+                    number += 200
+            case "frame":
+                kind = chance.choice(("strange", "error", "word", "position", "hold"))
+                node = chance.randrange(1, 4)
+                frames = {
+                    "strange": CAN_FRAME.pack(0x123, 2, b"ab"),
+                    "error": CAN_FRAME.pack(1 << 29 | 0x20, 8, bytes(8)),
+                    "word": CAN_FRAME.pack(0x180 + node, 2, struct.pack("<H", chance.choice((0x1637, 0x0637, 0x0218)))),
+                    "position": CAN_FRAME.pack(0x280 + node, chance.choice((3, 4)), struct.pack("<i", 5)),
+                }
+                if kind == "hold":
+                    at(number, lambda session: setattr(session, "holds", True))
+                else:
+                    at(number, lambda session, frame=frames[kind]: session.inject(frame))  # type: ignore[misc]
+            case "fault":
+                axis = chance.choice("ABC")
+                line = chance.choice(
+                    ("silent for 0.004", "fault 2310", "drop tpdo2 for 0.002", "emcy 8110", "stuck for 0.05")
+                )
+                at(number, lambda session, line=f"{axis} {line}": _fault(session, line))  # type: ignore[misc]
+                order(number + 150, Command.RESET)
+                order(number + 170, Command.ENABLE)
+                number += chance.choice((5, 220))
+            case "time":
+                late = chance.choice((300_000, 900_000, 1_000_000, 2_500_000, 30_000_000))
+                at(number, lambda session, late=late: setattr(session, "late_ns", late))  # type: ignore[misc]
+                if late > 20_000_000:
+                    order(number + 150, Command.RESET)
+                    order(number + 170, Command.ENABLE)
+    return happens
+
+
+def _fault(session: Session, line: str) -> None:
+    try:
+        session.drives.faults.add(line)
+    except ValueError:
+        pytest.fail(f"no such fault: {line}")
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_quiet_cycles_are_those_of_python_to_the_last_bit(seed: int, tmp_path: Path) -> None:
+    """Frames on the bus, records and events; and most cycles were quiet, so there was something to compare."""
+    told = []
+    for quiet in (True, False):
+        folder = tmp_path / str(quiet)
+        folder.mkdir()
+        session = Session(CONFIG, folder, quiet=quiet)
+        try:
+            session.run(script(seed))
+        finally:
+            session.close()
+        told.append((session.sent, session.heard))
+        assert (session.loop.quiet_cycles > 100) is quiet
+    (frames, heard), (frames_of_python, heard_of_python) = told
+    assert len(heard) > CYCLES
+    first = next((i for i, (a, b) in enumerate(zip(heard, heard_of_python, strict=False)) if a != b), None)
+    assert first is None, _difference(heard[first], heard_of_python[first])
+    assert heard == heard_of_python
+    assert frames == frames_of_python
+
+
+def _difference(one: object, other: object) -> str:
+    if isinstance(one, bytes) and isinstance(other, bytes):
+        a, b = unpack(one)[0], unpack(other)[0]
+        return "; ".join(
+            f"{name}: {a[name]} {b[name]}" for name in a.dtype.names if not np.array_equal(a[name], b[name])
+        )
+    return f"{one}\n{other}"
