@@ -38,12 +38,14 @@ class Cia402(Driver[Cia402Axis]):
             self._listen(axis)
         self._homing = HomingSequence(self._axes, drives, self._wire.send)
         self._sync = Frame(frames.SYNC)
-        self._heartbeat = Frame(frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL))
+        self._beats = [Frame(frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL))]
         self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
         self._lent: Cyclic | None = None
+        self._away = False
+        """What is kept of the drives is lent."""
 
     def configure(self, period: float, fastest: float | None = None) -> None:
         """Set the drives up for a cycle of `period` seconds, read every value back, start them without power.
@@ -64,6 +66,8 @@ class Cia402(Driver[Cia402Axis]):
             axis.error_code = start.error_code
             axis.take_status(start.statusword)
         self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
+        guarded = (axis.node for axis in self._axes if axis.way.guarded)
+        self._beats += [Frame(frames.HEARTBEAT + node, b"\0", remote=True) for node in guarded]
         self._tell([made for made, _ in done], means)
 
     def _listen(self, axis: Cia402Axis) -> None:
@@ -94,10 +98,8 @@ class Cia402(Driver[Cia402Axis]):
                 axis.heard = now if axis.way.heard else math.inf
         if now >= self._heartbeat_due:
             self._heartbeat_due = now + self._drives.heartbeat
-            self._wire.send(self._heartbeat)
-            for axis in self._axes:
-                if axis.way.guarded:
-                    self._wire.send(Frame(frames.HEARTBEAT + axis.node, b"\0", remote=True))
+            for frame in self._beats:
+                self._wire.send(frame)
         for axis in self._axes:
             axis.answers.sync_sent()
             axis.command_age += 1
@@ -167,6 +169,11 @@ class Cia402(Driver[Cia402Axis]):
                 axis.setpoints_late += 1
         self._command()
 
+    @property
+    def traffic(self) -> int:
+        """See trirail_drivers.interface.DriveGroup."""
+        return int(self._lent.times[0]["traffic"]) if self._away and self._lent is not None else super().traffic
+
     def lend(self) -> Cyclic | None:
         """The tables of a cycle, where every drive rests in what it was asked for and nothing else is to be done."""
         due, descriptor = self._heartbeat_due, self._wire.descriptor
@@ -174,27 +181,30 @@ class Cia402(Driver[Cia402Axis]):
             return None
         if self._stopped_in_this_cycle or not all(axis.rests(_asked_of(axis, self._wanted)) for axis in self._axes):
             return None
-        lent = self._lent = self._lent or Cyclic(descriptor, self._sync)
-        lent.times[0] = min(due, self._off_by), self._wire.traffic, 0
+        lent = self._lent = self._lent or Cyclic(descriptor, self._sync, self._beats)
+        lent.times[0] = self._off_by, due, self._drives.heartbeat, 0, self._wire.traffic, 0
         for axis, row, frame in zip(self._axes, lent.axes, self._setpoints, strict=True):
             axis.lend(row)
             axis.way.setpoints.fill(frame, *(axis.setpoint or (0, 0)), axis.controlword)
         lent.setpoints.fill(self._setpoints)
+        self._away = True
         lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected(number)])
         return lent
 
     def take_back(self, arrived: int, *, synced: float | None = None) -> Feedback:
         """Go on from what the tables hold: see trirail_drivers.driver.cyclic.Lender."""
         assert self._lent is not None
-        times = self._lent.times[0]
-        self._wire.traffic = int(times["traffic"])
-        for axis, row in zip(self._axes, self._lent.axes, strict=True):
+        self._away = False
+        lent, times = self._lent, self._lent.times[0]
+        self._wire.traffic, self._heartbeat_due = int(times["traffic"]), float(times["beat_due"])
+        for axis, row in zip(self._axes, lent.axes, strict=True):
             axis.take_back(row, int(times["cycles"]))
-        times["cycles"] = 0
-        self._wire.hand_in(self._lent.arrived.unpacked(arrived))
+        self._wire.hand_in(lent.arrived.unpacked(arrived))
         if synced is not None:
             self._wire.begin()
             self._synced = synced
+        for frame in self._beats[len(self._beats) - int(times["unsent"]) :]:
+            self._wire.send(frame)
         return self._feedback()
 
     def send_on(self, first: int) -> None:

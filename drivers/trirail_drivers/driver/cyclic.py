@@ -72,8 +72,18 @@ EXPECTED = np.dtype(
 )
 """A frame that may come in any cycle, and changes nothing but what it is read for."""
 
-TIMES = np.dtype([("due", "<f8"), ("traffic", "<i8"), ("cycles", "<i8")], align=True)
-"""When the driver has to do something else itself [s]; bits that have passed the bus, and whole cycles."""
+TIMES = np.dtype(
+    [
+        ("due", "<f8"),  # when the driver has to do something else itself [s]
+        ("beat_due", "<f8"),  # when the service's own signs of life are due [s], and how often they are
+        ("beat_period", "<f8"),
+        ("unsent", "<i8"),  # so many of them, the last ones, the bus has not taken
+        ("traffic", "<i8"),  # bits that have passed the bus
+        ("cycles", "<i8"),  # whole cycles
+    ],
+    align=True,
+)
+"""What is due when, and what has been."""
 
 
 def expected(
@@ -123,7 +133,7 @@ class Packets:
 class Cyclic:
     """The tables of three drives, made once, and filled in each time that they are lent."""
 
-    def __init__(self, descriptor: int, sync: Frame) -> None:
+    def __init__(self, descriptor: int, sync: Frame, beats: Sequence[Frame]) -> None:
         self.descriptor = descriptor
         """The bus: a socket of `struct can_frame`, one a packet."""
         self.axes: NDArray[np.void] = np.zeros(3, AXIS)
@@ -132,6 +142,9 @@ class Cyclic:
         self.begin = Packets(1)
         """What begins a cycle."""
         self.begin.fill([sync])
+        self.beats = Packets(len(beats))
+        """What goes behind that from time to time, that the drives know the service to live."""
+        self.beats.fill(beats)
         self.setpoints = Packets(3)
         """What ends it: one frame for each drive, in their order."""
         self.arrived = Packets(MOST_FRAMES)

@@ -132,11 +132,10 @@ class Control:
         held = mode not in (Mode.DISABLED, Mode.FAULT)
         return Calm(run, follows, held, self._stands, found, until, settling.ends)
 
-    def go_on(self, feedback: Feedback, cycles: int, time: float) -> None:
-        """Take over from so many calm cycles: the newest feedback in them, and the time of the run's law [s]."""
-        self.modes.cycle += cycles
-        self.schedule.cycle += cycles
-        self.measured.feedback = feedback
+    def go_on(self, cycle: int, time: float) -> None:
+        """Take over after calm cycles: the number of the newest one, and the time of the run's law in it [s]."""
+        self.schedule.cycle += cycle - self.cycles
+        self.modes.cycle = cycle
         if self.schedule.runs:
             self.schedule.runs[0].time = time
 

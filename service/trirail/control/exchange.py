@@ -53,19 +53,20 @@ def _signed(number: int) -> int:
 
 
 @compiled()
-def _come(axis: Any) -> None:
-    """Take in that a position has come: trirail_drivers.driver.answers.Answers.come."""
+def _come(axis: Any) -> bool:
+    """Take in that a position has come, as trirail_drivers.driver.answers.Answers.come; False where that is late."""
     to_the_one_before = not axis.between and not axis.prompt and axis.sampled < axis.syncs - 1
     sampled = axis.syncs - to_the_one_before
-    axis.lost += max(0, sampled - axis.sampled - 1)
-    axis.late += axis.prompt and axis.between and sampled > axis.sampled
+    if sampled - axis.sampled > 1 or (axis.prompt and axis.between and sampled > axis.sampled):
+        return False
     axis.sampled = sampled
     axis.prompt = not axis.between and not to_the_one_before
+    return True
 
 
 @compiled()
 def _take_position(axis: Any, counts: int, now: float) -> bool:
-    """Take a position in; False where it is the second one that answers a SYNC."""
+    """Take a position in; False where it is the second one that answers a SYNC, or others have been late or lost."""
     if axis.came:
         return False
     if abs(counts - axis.stands_at) > axis.still:
@@ -76,8 +77,7 @@ def _take_position(axis: Any, counts: int, now: float) -> bool:
         axis.step = step
     axis.newest, axis.came = counts, True
     axis.actual, axis.position = counts, counts / axis.counts_per_metre + axis.zero
-    _come(axis)
-    return True
+    return _come(axis)
 
 
 @compiled(i8(FRAMES, i8, EXPECTATIONS, AXES, TIMINGS, f8))

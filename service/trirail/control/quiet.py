@@ -161,7 +161,8 @@ def _receive(bus: int, headers: NDArray[np.uint64]) -> int:
 
 @compiled(
     i8(
-        *(_STATE, i8[:, ::1], i8[::1], i8, FRAMES, u8[:, ::1], u8[:, ::1], FRAMES, u8[:, ::1]),
+        *(_STATE, i8[:, ::1], i8[::1], i8, FRAMES, u8[:, ::1], u8[:, ::1]),
+        *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(EXPECTATIONS, AXES, TIMINGS, _DOORS, u8[::1], FRAMES),
         *(cycle.LEGS, cycle.BOUND, cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
         *(cycle.MOTION, cycle.SLIDERS, cycle.KEPT, f8[::1], cycle.FEEDBACKS, f8[:, ::1], types.b1[::1], f8[:, ::1]),
@@ -177,6 +178,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     arrived: NDArray[np.uint8],
     arrivals: NDArray[np.uint64],
     begin: NDArray[np.uint64],
+    signs: NDArray[np.uint8],
+    beats: NDArray[np.uint64],
     setpoints: NDArray[np.uint8],
     departures: NDArray[np.uint64],
     expected: NDArray[np.void],
@@ -238,6 +241,14 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         begin_cycle(axes)
         times[0].traffic += BITS[0]
         s.synced = t
+        if t >= times[0].beat_due:
+            times[0].beat_due = t + times[0].beat_period
+            gone = max(_sendmmsg(bus, beats.ctypes.data, np.uint32(len(beats)), _FLAGS), 0)
+            times[0].unsent = len(beats) - gone
+            for i in range(gone):
+                times[0].traffic += BITS[signs[i, LENGTH_AT]]
+            if gone < len(beats):
+                return Reached.SYNCED
         _mark(state, moment, Part.SYNC)
 
         _copy(kept, 1, 0)

@@ -121,6 +121,8 @@ class Loop:
         disturbed = self.ending or self._late_streak or self._gateway_frozen or not self._planner.idle
         if quiet is not None and not disturbed:
             newest = quiet.run(ticker, self._overruns)
+        elif quiet is not None:
+            quiet.leave()
         if newest is None:
             self.cycle(ticker.wait())
         elif newest.reached is Reached.WAITED:

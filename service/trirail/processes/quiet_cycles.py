@@ -56,6 +56,8 @@ class QuietCycles:
         self._state = np.zeros(1, quiet.STATE)
         self._moment = np.zeros(2, np.int64)
         self._doors = np.zeros((1, 2), np.int32)
+        self._lent: Cyclic | None = None
+        self._calm: Calm | None = None
         self._nothing = np.zeros(1)
         self._rooms: list[NDArray[Any]] = []
         self._kept = np.zeros((0, 3), np.int64)
@@ -68,35 +70,54 @@ class QuietCycles:
         state["gateway_place"], state["gateway_patience"] = PROCESSES.index("gateway"), watch.patience
 
     def run(self, ticker: Ticker, overruns: int) -> Newest | None:
-        """Run cycles until something happens; return how far the newest has come, None where none was begun."""
-        calm = self._control.calm()
-        if calm is None or calm.until <= self._control.cycles or not (self._reports.idle and self._gateway.calm):
+        """Run cycles until something happens; return how far the newest has come, None where none was begun.
+
+        At the end of a batch the next call goes on, if nothing has been said meanwhile.
+        """
+        control, state = self._control, self._state[0]
+        over = self._calm is not None and self._calm.until <= control.cycles
+        if over or control.ledger.busy:
+            self.leave()
+        if not (self._reports.idle and self._gateway.calm and (self._lent is not None or self._borrow())):
+            self.leave()
             return None
-        lent = self._drives.lend()
-        if lent is None:
-            return None
-        state, control, watch = self._state[0], self._control, self._watch
-        before = control.cycles
-        self._take(calm)
+        lent, calm, watch = self._lent, self._calm, self._watch
+        assert lent is not None
+        assert calm is not None
         state["injected_ns"], state["overruns"], state["deadline_ns"] = ticker.come(), overruns, ticker.deadline_ns
         most = 1 if state["injected_ns"] >= 0 else _MOST
-        state["cycle"], state["until"] = before, int(min(calm.until, before + most))
-        state["mode"], state["batched"] = MODES.index(control.state.mode), self._reports.batched
+        state["until"] = int(min(calm.until, control.cycles + most))
+        state["batched"] = self._reports.batched
         state["gateway_seen"], state["gateway_turns"] = watch.seen, watch.turns
         self._doors[0] = self._gateway.fileno(), _POLLIN
         reached = Reached(self._call(lent, calm))
         watch.seen, watch.turns = int(state["gateway_seen"]), int(state["gateway_turns"])
         self._reports.batched = int(state["batched"])
         ticker.deadline_ns = int(state["deadline_ns"])
-        synced = float(state["synced"]) if reached is Reached.SYNCED else None
-        feedback = self._drives.take_back(int(state["arrived"]), synced=synced)
-        self.cycles += int(state["cycle"]) - before
-        control.go_on(feedback, int(state["cycle"]) - before, float(state["time"]))
+        self.cycles += int(state["cycle"]) - control.cycles
+        control.go_on(int(state["cycle"]), float(state["time"]))
+        if reached is not Reached.DONE:
+            self.leave(int(state["arrived"]), synced=float(state["synced"]) if reached is Reached.SYNCED else None)
         if reached is Reached.WRITTEN:
             self._drives.send_on(int(state["sent"]))
-        marked = int(state["marked_ns"])
         sync = int(state["parts_ns"][Part.SYNC])
-        return Newest(reached, ticker.deadline_ns, int(state["lateness_ns"]), marked, sync)
+        return Newest(reached, ticker.deadline_ns, int(state["lateness_ns"]), int(state["marked_ns"]), sync)
+
+    def leave(self, arrived: int = 0, *, synced: float | None = None) -> None:
+        """Give back to the drives what they have lent, as of trirail_drivers.driver.cyclic.Lender.take_back."""
+        if self._lent is not None:
+            self._control.measured.feedback = self._drives.take_back(arrived, synced=synced)
+            self._lent = None
+
+    def _borrow(self) -> bool:
+        """Have the drives lend their tables, where nothing is to be done but what these hold."""
+        self._calm = self._control.calm()
+        if self._calm is None or self._calm.until <= self._control.cycles:
+            return False
+        self._lent = self._drives.lend()
+        if self._lent is not None:
+            self._take(self._calm)
+        return self._lent is not None
 
     def add(self, part: Part) -> None:
         """Count what has passed since the newest cycle into a part of it."""
@@ -107,6 +128,7 @@ class QuietCycles:
         """Write what cycles come to into the state."""
         state, run = self._state[0], calm.run
         state["source"] = quiet.FOLLOW if calm.follows else quiet.HOLD if run is None else quiet.COMMAND
+        state["cycle"], state["mode"] = self._control.cycles, MODES.index(self._control.state.mode)
         state["held"], state["stands"], state["found"] = calm.held, calm.stands, calm.found
         state["settles"] = calm.settles_by is not None
         state["timeout"] = calm.settles_by or 0
@@ -130,7 +152,7 @@ class QuietCycles:
         self._kept[-1, 0] = furthest.ctypes.data
         given: tuple[Any, ...] = (
             *(self._state, self._kept, self._moment, lent.descriptor),
-            *(lent.arrived.frames, lent.arrived.headers, lent.begin.headers),
+            *(lent.arrived.frames, lent.arrived.headers, lent.begin.headers, lent.beats.frames, lent.beats.headers),
             *(lent.setpoints.frames, lent.setpoints.headers, lent.expected, lent.axes, lent.times),
             *(self._doors, self._hearts, self._reports.batch, measured.legs, setpoints.bounds, path.knots, path.pieces),
             *(path.tools, law.knots, law.pieces, furthest, schedule.motion, setpoints.sliders, measured.backlash),
