@@ -7,6 +7,7 @@ python-can opens and configures the bus, and whatever it knows of interfaces hol
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import socket
 import time
@@ -53,8 +54,11 @@ class FrameIO(Protocol):
     def descriptor(self) -> int | None:
         """The socket, where frames may pass it beside this object; else None."""
 
-    def hand_in(self, received: Iterable[Received]) -> None:
-        """Frames that somebody else took from the descriptor: they come before all that is there."""
+    def hand_in(self, received: Iterable[Received], error: int = 0) -> None:
+        """Frames that somebody else took from the descriptor, and the number of an error that he met after them.
+
+        They come before all that is there.
+        """
 
 
 def frame_io(bus: can.BusABC) -> FrameIO:
@@ -80,6 +84,7 @@ class SocketFrames:
         self._filtered = filtered
         self._packet = bytearray(CAN_FRAME.size)
         self._handed_in: deque[Received] = deque()
+        self._error = 0
         self._poll = select.poll()
         self._poll.register(carrier, select.POLLIN)
         if capture is not None:
@@ -95,6 +100,9 @@ class SocketFrames:
         """The next frame that has arrived, or arrives within `timeout` [s]; None where there is none left."""
         if self._handed_in:
             return self._handed_in.popleft()
+        if self._error:
+            error, self._error = self._error, 0
+            raise OSError(error, os.strerror(error))
         if timeout > 0.0:
             self._poll.poll(timeout * 1000.0)
         packet = self._packet
@@ -122,9 +130,10 @@ class SocketFrames:
         """The socket, unless every frame is to be noted with its time."""
         return self._socket.fileno() if self._capture is None else None
 
-    def hand_in(self, received: Iterable[Received]) -> None:
-        """Frames that somebody else took from the descriptor."""
+    def hand_in(self, received: Iterable[Received], error: int = 0) -> None:
+        """Frames that somebody else took from the descriptor, and the error that he met after them."""
         self._handed_in.extend(received)
+        self._error = error
 
     def _receive_timed(self, capture: Capture) -> int:
         """Receive into the packet, and note it with the time at which the kernel had it."""
@@ -201,7 +210,7 @@ class PythonCanFrames:
         """None: only python-can knows how its frames lie there."""
         return None
 
-    def hand_in(self, received: Iterable[Received]) -> None:
+    def hand_in(self, received: Iterable[Received], error: int = 0) -> None:
         """Do nothing: nobody else takes frames."""
 
     def _may_have_more(self) -> bool:

@@ -76,9 +76,9 @@ class Wire:
         """Whether nothing is wrong, nothing is to be told, and the bus takes what it is given."""
         return self.fault is None and not self._warnings and not self._unsent and self._unsent_cycles == 0
 
-    def hand_in(self, received: Iterable[Received]) -> None:
-        """Frames that somebody else took from the socket: they come before all that is there."""
-        self._frames.hand_in(received)
+    def hand_in(self, received: Iterable[Received], error: int = 0) -> None:
+        """Frames that somebody else took from the socket, and the error that he met after them (errno.h)."""
+        self._frames.hand_in(received, error)
 
     def warn(self, text: str) -> None:
         """Tell something once, until faults are reset."""

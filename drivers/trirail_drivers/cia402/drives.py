@@ -191,7 +191,7 @@ class Cia402(Driver[Cia402Axis]):
         lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected(number)])
         return lent
 
-    def take_back(self, arrived: int, *, synced: float | None = None) -> Feedback:
+    def take_back(self, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
         """Go on from what the tables hold: see trirail_drivers.driver.cyclic.Lender."""
         assert self._lent is not None
         self._away = False
@@ -199,7 +199,7 @@ class Cia402(Driver[Cia402Axis]):
         self._wire.traffic, self._heartbeat_due = int(times["traffic"]), float(times["beat_due"])
         for axis, row in zip(self._axes, lent.axes, strict=True):
             axis.take_back(row, int(times["cycles"]))
-        self._wire.hand_in(lent.arrived.unpacked(arrived))
+        self._wire.hand_in(lent.arrived.unpacked(arrived), error)
         if synced is not None:
             self._wire.begin()
             self._synced = synced

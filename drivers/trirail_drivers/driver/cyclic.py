@@ -164,11 +164,11 @@ class Lender(Protocol):
         None where there is more to do, or the bus has no socket. As long as they are lent, nothing else is called.
         """
 
-    def take_back(self, arrived: int, *, synced: float | None = None) -> Feedback:
+    def take_back(self, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
         """Go on from what the tables hold; return what the drives had said at the end of the last whole cycle.
 
         The first `arrived` frames in them have not been looked at. `synced` is when the SYNC of a cycle was sent whose
-        feedback has not been read [s], if there is one.
+        feedback has not been read [s], if there is one; `error` with which taking frames has failed (errno.h).
         """
 
     def send_on(self, first: int) -> None:

@@ -44,13 +44,17 @@ _recvmmsg: Any = types.ExternalFunction("recvmmsg", i4(i4, types.intp, types.uin
 _clock_nanosleep: Any = types.ExternalFunction("clock_nanosleep", i4(i4, i4, types.intp, types.intp))
 _clock_gettime: Any = types.ExternalFunction("clock_gettime", i4(i4, types.intp))
 _poll: Any = types.ExternalFunction("poll", i4(types.intp, u8, i4))
+_errno: Any = types.ExternalFunction("__errno_location", types.intp())
 _memcpy: Any = types.ExternalFunction("memcpy", types.intp(types.intp, types.intp, u8))
 
 _MONOTONIC: Final = 1
 _ABSOLUTE: Final = 1
 """Of clock_nanosleep: to a deadline."""
 _INTERRUPTED: Final = 4
-"""EINTR."""
+_NOTHING_THERE: Final = 11
+"""EINTR and EAGAIN of errno.h."""
+_ENDED: Final = -1
+"""The other end has gone: whoever receives next finds that again."""
 _FLAGS: Final = 0x40 | 0x4000
 """MSG_DONTWAIT, MSG_NOSIGNAL."""
 _FRAME: Final = 16
@@ -106,6 +110,7 @@ STATE = np.dtype(
         ("gateway_place", "<i8"),
         ("batched", "<i8"),  # records in the batch
         ("arrived", "<i8"),  # frames that Python has to look at
+        ("error", "<i8"),  # with which taking frames has failed: a number of errno.h
         ("sent", "<i8"),  # setpoints that the bus has taken
     ],
     align=True,
@@ -150,12 +155,18 @@ def _copy(kept: NDArray[np.int64], to: int, source: int) -> None:
 
 
 @compiled()
-def _receive(bus: int, headers: NDArray[np.uint64]) -> int:
-    """Take what has arrived; return how many frames that are, and one more than there is room for where it failed."""
+def _receive(state: NDArray[np.void], moment: NDArray[np.int64], bus: int, headers: NDArray[np.uint64]) -> int:
+    """Take what has arrived; return how many frames that are. Where it has failed after them, the error is set."""
     number = _recvmmsg(bus, headers.ctypes.data, np.uint32(MOST_FRAMES), _FLAGS, 0)
+    if number < 0:
+        moment[0] = 0
+        _memcpy(moment.ctypes.data, _errno(), np.uint64(4))
+        if moment[0] != _NOTHING_THERE:
+            state[0].error = moment[0]  # the kernel tells of it once
     for i in range(number):
         if headers[i, 7] & np.uint64(0xFFFFFFFF) != np.uint64(_FRAME):
-            return MOST_FRAMES + 1  # the other end has gone: Python finds that again
+            state[0].error = _ENDED
+            return i
     return int(max(number, 0))
 
 
@@ -219,28 +230,27 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         s.deadline_ns += s.period_ns
         _wait(state, moment)
         now = _now_ns(state, moment)
-        s.marked_ns, s.arrived, s.sent = now, 0, 0
+        s.marked_ns, s.arrived, s.sent, s.error = now, 0, 0, 0
         s.lateness_ns = now - s.deadline_ns
         if s.lateness_ns >= s.period_ns:
             return Reached.WAITED
         _copy(kept, 1, 0)
         t = now / 1e9
-        number = _receive(bus, arrivals)
+        number = s.arrived = _receive(state, moment, bus, arrivals)
         if (
-            number >= MOST_FRAMES
+            s.error != 0
+            or number >= MOST_FRAMES
             or t >= times[0].due
             or take_frames(arrived, number, expected, axes, times, t) < number
         ):
             _copy(kept, 0, 1)
-            s.arrived = min(number, MOST_FRAMES) if number <= MOST_FRAMES else 0
             return Reached.WAITED
         if _sendmmsg(bus, begin.ctypes.data, np.uint32(1), _FLAGS) != 1:
             _copy(kept, 0, 1)
-            s.arrived = number
             return Reached.WAITED
         begin_cycle(axes)
         times[0].traffic += BITS[0]
-        s.synced = t
+        s.synced, s.arrived = t, 0
         if t >= times[0].beat_due:
             times[0].beat_due = t + times[0].beat_period
             gone = max(_sendmmsg(bus, beats.ctypes.data, np.uint32(len(beats)), _FLAGS), 0)
@@ -253,9 +263,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
 
         _copy(kept, 1, 0)
         t = _now_ns(state, moment) / 1e9
-        number = _receive(bus, arrivals)
-        s.arrived = min(number, MOST_FRAMES) if number <= MOST_FRAMES else 0
-        if number >= MOST_FRAMES or take_frames(arrived, number, expected, axes, times, t) < number:
+        number = s.arrived = _receive(state, moment, bus, arrivals)
+        if s.error != 0 or number >= MOST_FRAMES or take_frames(arrived, number, expected, axes, times, t) < number:
             _copy(kept, 0, 1)
             return Reached.SYNCED
         if not end_read(axes, times, t):

@@ -97,16 +97,17 @@ class QuietCycles:
         self.cycles += int(state["cycle"]) - control.cycles
         control.go_on(int(state["cycle"]), float(state["time"]))
         if reached is not Reached.DONE:
-            self.leave(int(state["arrived"]), synced=float(state["synced"]) if reached is Reached.SYNCED else None)
+            synced = float(state["synced"]) if reached is Reached.SYNCED else None
+            self.leave(int(state["arrived"]), synced=synced, error=max(int(state["error"]), 0))
         if reached is Reached.WRITTEN:
             self._drives.send_on(int(state["sent"]))
         sync = int(state["parts_ns"][Part.SYNC])
         return Newest(reached, ticker.deadline_ns, int(state["lateness_ns"]), int(state["marked_ns"]), sync)
 
-    def leave(self, arrived: int = 0, *, synced: float | None = None) -> None:
+    def leave(self, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
         """Give back to the drives what they have lent, as of trirail_drivers.driver.cyclic.Lender.take_back."""
         if self._lent is not None:
-            self._control.measured.feedback = self._drives.take_back(arrived, synced=synced)
+            self._control.measured.feedback = self._drives.take_back(arrived, synced=synced, error=error)
             self._lent = None
 
     def _borrow(self) -> bool:
