@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from itertools import count
@@ -10,15 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from trirail.cli import doctor, doctor_network, probes
+from trirail.cli import doctor, doctor_cycle, doctor_network, probes
 from trirail.cli.machine import Gathered, Machine, Passed
 from trirail.config import SIM, Config, Tls, everything, load
 from trirail.diagnosis import Check, drives
 from trirail.errors import ServiceError
-from trirail.processes.clock import Tick
+from trirail.processes import bare_loop
+from trirail.processes.bare_loop import Cycles
 from trirail_drivers.bus.frames import bits_of, frame_bits
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.errors import BusError
@@ -27,6 +30,13 @@ from trirail_drivers.protocols import PROTOCOLS
 CONFIGS = SIM.parent
 SIMULATED = load(SIM)
 REAL = load(CONFIGS / "socketcan.toml")
+
+
+def cycles(lateness: list[int], work: int, rate: int = 1000) -> Cycles:
+    """Cycles that were so late and took so long [ns]; one position did not come."""
+    late = np.array(lateness, np.int64)
+    return Cycles(late, np.full(len(late), work, np.int64), 1_000_000_000 // rate, 3 * len(late) - 1)
+
 
 # What `ip -details -json link` says of an interface, shortened.
 LINK: dict[str, Any] = {
@@ -50,11 +60,11 @@ GOOD = Machine(
     clock_source="tsc",
     resolution=1e-9,
     cpu=3,
-    governor="performance",
+    governors=dict.fromkeys(range(4), "performance"),
     isolated=(2, 3),
     link=LINK,
     gathered=Gathered(1, 0),
-    ticks=(Tick(0, 20_000, 0),) * 2000,
+    cycles=cycles([20_000] * 2000, 50_000),
 )
 
 
@@ -85,7 +95,7 @@ def test_nothing_is_wrong_with_a_good_machine(config: Config) -> None:
         ({"lacking": ("SCHED_FIFO: not permitted; run as root",)}, "rights", "failure", "run as root"),
         ({"clock_source": "hpet"}, "clock", "warning", "clocksource=tsc"),
         ({"resolution": 0.004}, "clock", "failure", "CONFIG_HIGH_RES_TIMERS"),
-        ({"governor": "powersave"}, "governor", "warning", "cpupower"),
+        ({"governors": {0: "performance", 3: "schedutil"}}, "governor", "warning", "cpupower"),
         ({"isolated": ()}, "processor", "warning", "isolcpus=3"),
         ({"af_can": False}, "CAN", "failure", "modprobe can_raw"),
         ({"link": None}, "can0", "failure", "adapter"),
@@ -98,9 +108,11 @@ def test_nothing_is_wrong_with_a_good_machine(config: Config) -> None:
         ({"link": link(txqlen=10)}, "can0 queue", "warning", "txqueuelen"),
         ({"gathered": Gathered(8, 0)}, "can0 coalescing", "warning", "ethtool -C can0 rx-usecs-irq 0 rx-frames-irq 1"),
         ({"gathered": Gathered(0, 50)}, "can0 coalescing", "warning", "ip link set can0 down"),
-        ({"ticks": (Tick(0, 0, 0), *(Tick(0, 900_000, 0),) * 3)}, "lateness", "warning", "loop.rate_hz"),
-        ({"ticks": (Tick(0, 0, 0), Tick(0, 0, 1), Tick(0, 0, 0))}, "lateness", "warning", "isolate"),
-        ({"ticks": (Tick(0, 0, 6), Tick(0, 0, 5), Tick(0, 0, 0))}, "lateness", "failure", "isolate"),
+        ({"cycles": cycles([10_000] * 50, 600_000)}, "cycle", "warning", "loop.rate_hz = 500"),
+        ({"cycles": cycles([10_000] * 50, 1_100_000)}, "cycle", "failure", "loop.rate_hz = 250"),
+        ({"cycles": cycles([10_000] * 50, 90_000_000)}, "cycle", "failure", "no rate is held"),
+        ({"cycles": cycles([0, 11_000_000, 0], 0)}, "cycle", "failure", "isolate"),
+        ({"cycles": "the loop of a service runs there"}, "cycle", "warning", "end that service"),
     ],
 )
 def test_each_fault_of_a_machine_is_named_with_its_remedy(
@@ -145,7 +157,7 @@ def test_the_machine_is_judged_beside_mistakes_that_are_none_of_it(
 
     def machine(config: Config) -> Machine:
         asked.append(config)
-        return msgspec.structs.replace(GOOD, governor="powersave")
+        return msgspec.structs.replace(GOOD, governors={0: "powersave"})
 
     checks = bad(doctor.whole(tmp_path / "robot.toml", everything(tmp_path / "robot.toml"), machine))
     assert {"configuration", "the rest"} <= checks.keys()
@@ -166,8 +178,39 @@ def test_rights_are_a_failure_only_where_they_are_demanded() -> None:
 
 
 def test_missed_ticks_are_a_streak_only_in_a_row() -> None:
-    apart = (Tick(0, 0, 6), Tick(0, 0, 0), Tick(0, 0, 6))
-    assert doctor.lateness(apart, REAL).verdict == "warning"
+    """SIMULATED has watchdogs.max_overruns = 10."""
+    apart, in_a_row = [0] * 10_000, [0] * 10_000
+    apart[10] = apart[12] = in_a_row[10] = in_a_row[11] = 6_000_000
+    assert doctor_cycle.cycle(cycles(apart, 0), REAL).verdict == "warning"
+    assert doctor_cycle.cycle(cycles(in_a_row, 0), REAL).verdict == "failure"
+
+
+def test_a_period_that_is_held_is_told_with_the_highest_rate_that_would_be() -> None:
+    """88 µs late and 110 µs of work leave half of 500 µs, and not half of 250."""
+    check = doctor_cycle.cycle(cycles([88_000] * 10, 110_000), REAL)
+    assert check.verdict == "ok"
+    assert check.found == "1 kHz: cycle p99.9 110 µs, lateness p99.9 88 µs: fine; up to 2 kHz"
+
+
+def test_what_was_not_measured_is_said() -> None:
+    assert doctor_cycle.cycle("", REAL).found == "not measured: --quick"
+    assert "process 7" in doctor_cycle.cycle("a service's loop, process 7, runs", REAL).found
+
+
+@given(
+    st.lists(st.integers(0, 5_000_000), min_size=1, max_size=50),
+    st.integers(0, 5_000_000),
+    st.sampled_from([500, 1000, 4000]),
+)
+def test_the_numbers_are_those_of_the_samples(lateness: list[int], work: int, rate: int) -> None:
+    found = doctor_cycle.measured(cycles(lateness, work, rate))
+    assert found.cycles == len(lateness)
+    assert found.missed == sum(late * rate // 1_000_000_000 for late in lateness)
+    assert found.missed_in_a_row <= found.missed
+    assert found.over_us.max == pytest.approx(max(lateness) / 1e3 + work / 1e3)
+    assert found.answers_missing == 1
+    if found.up_to_hz is not None:
+        assert found.over_us.p999 <= doctor_cycle.SHARE * 1e6 / found.up_to_hz
 
 
 def test_a_virtual_interface_has_no_bitrate_to_be_wrong() -> None:
@@ -291,11 +334,70 @@ def test_without_ip_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.Monk
         probes.link("can0")
 
 
-def test_ticks_are_those_of_the_period(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(probes, "MEASURED", 0.02)
-    found = probes.ticks(0.001)
-    assert len(found) == 20
-    assert all(tick.deadline_ns > 0 and tick.lateness_ns >= 0 for tick in found)
+def test_the_bare_loop_counts_its_cycles_and_what_the_drives_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bare_loop, "TURN", 0.02)
+    shares: list[float] = []
+    found = bare_loop.measure(SIMULATED.loop, 500, 0.1, shares.append)
+    assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
+    assert len(found.lateness) == len(found.work) == 50
+    assert found.period == 2_000_000
+    assert all(found.lateness >= 0)
+    assert all(found.work > 0)
+    assert 0 < found.answers <= 150
+
+
+def test_an_interrupted_measurement_leaves_no_drives_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Kept(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: Any, **named: Any) -> None:
+            super().__init__(*arguments, **named)
+            started.append(self)
+
+    def interrupt(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", Kept)
+    with pytest.raises(KeyboardInterrupt):
+        bare_loop.measure(SIMULATED.loop, 500, 10.0, interrupt)
+    assert [process.returncode for process in started] == [0]
+
+
+def test_the_governor_of_every_processor_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "SYSTEM", tmp_path)
+    assert probes.governors() == {}
+    for cpu, name in {0: "performance", 10: "schedutil", 2: "schedutil"}.items():
+        folder = tmp_path / f"devices/system/cpu/cpu{cpu}/cpufreq"
+        folder.mkdir(parents=True)
+        (folder / "scaling_governor").write_text(f"{name}\n")
+    (tmp_path / "devices/system/cpu/cpufreq").mkdir()
+    assert probes.governors() == {0: "performance", 2: "schedutil", 10: "schedutil"}
+    check = doctor.governor(probes.governors())
+    assert (check.verdict, check.found) == ("warning", "schedutil on processor 2, 10")
+    assert check.remedy == "cpupower frequency-set --governor performance"
+
+
+def test_a_loop_on_the_same_processor_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "PROCESSES", tmp_path)
+    for pid, called, allowed in ((7, "trirail: loop", "2-3"), (8, "trirail: planner", "1"), (9, "sh", "0-3")):
+        (tmp_path / str(pid)).mkdir()
+        (tmp_path / str(pid) / "cmdline").write_bytes(called.encode() + b"\0\0")
+        (tmp_path / str(pid) / "status").write_text(f"Name:\tx\nCpus_allowed:\tf\nCpus_allowed_list:\t{allowed}\n")
+    (tmp_path / "10").mkdir()
+    assert {cpu: probes.loop_on(cpu) for cpu in range(4)} == {0: None, 1: None, 2: 7, 3: 7}
+
+
+def test_beside_a_loop_nothing_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "loop_on", lambda cpu: 7)
+    config = changed(SIMULATED, "loop", realtime="off", cpu=1)
+    assert probes.machine(config).cycles == "a service's loop, process 7, runs on processor 1"
+
+
+def test_a_quick_look_measures_nothing_and_gives_the_rights_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "loop_on", lambda cpu: None)
+    before = os.sched_getaffinity(0), os.sched_getscheduler(0)
+    assert probes.machine(SIMULATED, quick=True).cycles == ""
+    assert (os.sched_getaffinity(0), os.sched_getscheduler(0)) == before
 
 
 @pytest.mark.slow
@@ -308,6 +410,9 @@ def test_the_command(json_wanted: bool) -> None:
         said = json.loads(done.stdout)
         verdicts = {check["name"]: check["verdict"] for check in said["checks"]}
         assert verdicts["CAN"] == "ok"
+        if said["cycle"] is not None:  # another service may run here
+            assert said["cycle"]["rate_hz"] == 1000
+            assert said["cycle"]["cycles"] == 10_000
         assert (done.returncode == 0) == said["ok"] == ("failure" not in verdicts.values())
     else:
         assert "simulated: no hardware is used" in done.stdout
@@ -335,9 +440,8 @@ def test_whether_the_routers_answer_is_told() -> None:
     assert bad.remedy
 
 
-def test_the_routers_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(probes, "MEASURED", 0.02)
+def test_the_routers_are_asked() -> None:
     nobody = "tcp/127.0.0.1:1"
     config = changed(SIMULATED, "zenoh", connect=(nobody,))
     config = changed(config, "loop", realtime="off")
-    assert probes.machine(config).routers == ((nobody, "connection refused"),)
+    assert probes.machine(config, quick=True).routers == ((nobody, "connection refused"),)

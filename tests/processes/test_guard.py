@@ -309,7 +309,7 @@ def test_a_socket_lets_its_owner_and_group_in_and_nobody_else(tmp_path: Path) ->
 def test_the_doctor_tells_who_can_reach_it(served: Served, tmp_path: Path) -> None:
     def said(zenoh: Zenoh, guard: Guard | str | None = None) -> list[tuple[str, str, str]]:
         config = msgspec.structs.replace(CONFIG, zenoh=zenoh)
-        machine = Machine("", True, True, (), None, 0.0, 0, None, (), None, (), guard=guard)
+        machine = Machine("", True, True, (), None, 0.0, 0, {}, (), None, "", guard=guard)
         return [(check.name, check.verdict, check.found) for check in doctor_network.network(config, machine)]
 
     reached = "tcp/127.0.0.1:7447: every user of this machine can command"

@@ -112,28 +112,45 @@ def demo(*, stay: Annotated[bool, Flag] = False, record: Path | None = None) -> 
 
 
 @app.command
-def doctor(config: Path | None = None, /, *, json: Annotated[bool, Flag] = False) -> int:
+def doctor(
+    config: Path | None = None, /, *, quick: Annotated[bool, Flag] = False, json: Annotated[bool, Flag] = False
+) -> int:
     """Check this machine and a configuration; exit 1 only if something would keep the robot from running.
+
+    Ten seconds of it measure which rates this machine holds, by cycles that only exchange the frames.
 
     Parameters
     ----------
     config
         Configuration file; the simulated robot if absent.
+    quick
+        Leave that measurement out.
     json
-        Print one JSON object instead of words.
+        Print one JSON object instead of words, with the numbers.
     """
     from trirail.cli import probes, rail_drawing
     from trirail.cli.doctor import whole
-    from trirail.config import SIM, everything
+    from trirail.cli.doctor_cycle import measured
+    from trirail.cli.machine import Machine
+    from trirail.config import SIM, Config, everything
     from trirail.diagnosis import stops
 
     path = config or SIM
     found = everything(path)
-    checks = whole(path, found, probes.machine)
+    read: list[Machine] = []
+
+    def machine(config: Config) -> Machine:
+        with terminal.measuring("measuring cycles", show=not quick) as progress:
+            read.append(probes.machine(config, quick=quick, progress=progress))
+        return read[-1]
+
+    checks = whole(path, found, machine)
     fit = all(check.verdict != "failure" for check in checks)
     way = None if found.mistakes else stops(found.config)
     if json:
-        terminal.json({"ok": fit, "checks": msgspec.to_builtins(checks), "stops": msgspec.to_builtins(way)})
+        cycles = [measured(each.cycles) for each in read if not isinstance(each.cycles, str)]
+        content = {"checks": checks, "stops": way, "cycle": cycles[0] if cycles else None}
+        terminal.json({"ok": fit, **msgspec.to_builtins(content)})
         return 0 if fit else 1
     terminal.checks(checks)
     if way is not None:

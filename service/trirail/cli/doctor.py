@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 from trirail.cli import units
 from trirail.cli.doctor_can import can_interface
+from trirail.cli.doctor_cycle import cycle
 from trirail.cli.doctor_network import metrics, network, routers
 from trirail.cli.machine import Machine
 from trirail.config import Config, Findings, as_built, overlap
 from trirail.diagnosis import Check, diagnose, told
-from trirail.processes.clock import Tick
 
 RELIABLE_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "riscv_clocksource")
 """Clock sources that are read without leaving the processor, or its virtual machine."""
 COARSE = 1e-6
 """A clock of a coarser resolution cannot wake anybody in time [s]."""
-LATE = 0.1
-"""Share of the period by which one tick in a thousand may be late."""
+PERFORMANCE = "performance"
+"""The governor that keeps a processor at its full frequency: cpufreq of the kernel."""
 
 
 READS: Final = (
@@ -53,7 +53,7 @@ def examine(config: Config, machine: Machine, impossible: Sequence[str] = ()) ->
         kernel(machine, simulated=simulated),
         rights(machine.lacking, config.loop.realtime),
         clock(machine.clock_source, machine.resolution),
-        governor(machine.cpu, machine.governor),
+        governor(machine.governors),
         isolation(machine.cpu, machine.isolated, simulated=simulated),
         *can_interface(config, machine),
         *corrected(config),
@@ -61,7 +61,7 @@ def examine(config: Config, machine: Machine, impossible: Sequence[str] = ()) ->
         *network(config, machine),
         *routers(machine.routers),
         *metrics(config),
-        lateness(machine.ticks, config),
+        cycle(machine.cycles, config),
     ]
 
 
@@ -99,13 +99,16 @@ def clock(source: str | None, resolution: float) -> Check:
     return Check("clock", "warning", f"{source}, resolution {resolution * 1e9:g} ns", remedy)
 
 
-def governor(cpu: int, name: str | None) -> Check:
-    """A processor that sleeps or slows down wakes late."""
-    if name is None:
-        return Check("governor", "ok", f"processor {cpu} has no frequency scaling to be seen")
-    if name == "performance":
-        return Check("governor", "ok", f"processor {cpu}: performance")
-    return Check("governor", "warning", f"processor {cpu}: {name}", "cpupower frequency-set --governor performance")
+def governor(governors: Mapping[int, str]) -> Check:
+    """A processor that sleeps or slows down wakes late; any may, for the loop's neighbours run on the others."""
+    if not governors:
+        return Check("governor", "ok", "no processor has frequency scaling to be seen")
+    others = sorted({name for name in governors.values() if name != PERFORMANCE})
+    if not others:
+        return Check("governor", "ok", f"{PERFORMANCE} on every processor")
+    of = {name: ", ".join(str(cpu) for cpu, found in governors.items() if found == name) for name in others}
+    found = "; ".join(f"{name} on processor {cpus}" for name, cpus in of.items())
+    return Check("governor", "warning", found, f"cpupower frequency-set --governor {PERFORMANCE}")
 
 
 def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
@@ -124,26 +127,3 @@ def corrected(config: Config) -> list[Check]:
     section = config.correction
     words = as_built.told(section.map, section.as_built, section.backlash)
     return [] if words is None else [Check("correction", "ok", units.correction(words))]
-
-
-def lateness(ticks: Sequence[Tick], config: Config) -> Check:
-    """How late ticks come on this machine, as it is now."""
-    late = sorted(tick.lateness_ns / 1000.0 for tick in ticks)
-    missed, in_a_row = sum(tick.missed for tick in ticks), _longest_streak(ticks)
-    p50, p99, p999 = (late[min(len(late) - 1, int(share * len(late)))] for share in (0.5, 0.99, 0.999))
-    found = f"p50 {p50:.0f}, p99 {p99:.0f}, p99.9 {p999:.0f}, max {late[-1]:.0f} µs in {len(ticks)} ticks"
-    found += f", {missed} missed" if missed else ""
-    remedy = "see the lines above; end other programs, or isolate a processor; or lower loop.rate_hz"
-    if in_a_row > config.watchdogs.max_overruns:
-        return Check("lateness", "failure", f"{found}, {in_a_row} in a row: the service would stop", remedy)
-    if missed or p999 > LATE * 1e6 * config.period:
-        return Check("lateness", "warning", found, remedy)
-    return Check("lateness", "ok", found)
-
-
-def _longest_streak(ticks: Sequence[Tick]) -> int:
-    longest = streak = 0
-    for tick in ticks:
-        streak = streak + tick.missed if tick.missed else 0
-        longest = max(longest, streak)
-    return longest

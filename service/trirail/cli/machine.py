@@ -7,7 +7,7 @@ from typing import Any
 from msgspec import Struct
 
 from trirail.cli.key_folder import Issued
-from trirail.processes.clock import Tick
+from trirail.processes.bare_loop import Cycles
 from trirail.processes.guard import Guard
 
 
@@ -44,11 +44,13 @@ class Machine(Struct, frozen=True):
     """Of the monotonic clock [s]."""
     cpu: int
     """The processor that the loop would stay on."""
-    governor: str | None
+    governors: dict[int, str]
+    """How each processor's frequency is governed, of those that have any scaling."""
     isolated: tuple[int, ...]
     link: dict[str, Any] | None
     """The CAN interface as `ip -details -json link` has it."""
-    ticks: tuple[Tick, ...]
+    cycles: Cycles | str
+    """What cycles took that only exchange the frames, or why none were measured; "" where nobody asked for it."""
     passed: Passed | None = None
     """What passed on the CAN interface meanwhile."""
     gathered: Gathered | None = None

@@ -1,16 +1,19 @@
-"""Reads what trirail.cli.doctor judges: kernel, rights, clock, CAN interface, and how late ticks come."""
+"""Reads what trirail.cli.doctor judges: kernel, rights, clock, CAN interface, and what a cycle takes."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import fcntl
 import json
 import os
 import platform
+import re
 import socket
 import struct
 import subprocess
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,25 +24,41 @@ from trirail.cli.key_folder import AUTHORITY_KEY, Issued, KeyFolder
 from trirail.cli.machine import Gathered, Machine, Passed
 from trirail.config import Config, LoopTable
 from trirail.errors import ServiceError
-from trirail.processes import realtime
-from trirail.processes.clock import Tick, Ticker
+from trirail.processes import bare_loop, realtime
+from trirail.processes.bare_loop import Cycles
 from trirail.processes.guard import Guard
+from trirail.processes.interpreter import title
 
 SYSTEM = Path("/sys")
+PROCESSES = Path("/proc")
 _SIOCETHTOOL, _GCOALESCE, _COALESCE = 0x8946, 0x0E, 23
 """A request of linux/sockios.h, a command of linux/ethtool.h, and the 32-bit words of its struct ethtool_coalesce."""
-MEASURED = 2.0
-"""How long ticks are measured [s]."""
+MEASURED = 10.0
+"""How long cycles are measured [s]."""
+COUNTED = 1.0
+"""How long frames are counted where cycles are not measured [s]."""
 
 
-def machine(config: Config) -> Machine:
-    """Read everything. This process has the loop's rights, and its processor, from here on."""
-    lacking = realtime.acquire(structs.replace(config.loop, realtime=_wished(config.loop)))
-    cpu = max(os.sched_getaffinity(0)) if config.loop.cpu is None else config.loop.cpu
-    processor = SYSTEM / f"devices/system/cpu/cpu{cpu}"
+def machine(config: Config, *, quick: bool = False, progress: Callable[[float], None] | None = None) -> Machine:
+    """Read everything; `quick` measures no cycles, `progress` is told of the share of them that is done.
+
+    This process has the loop's rights for that, and no longer: whoever runs on its processor is to be left alone.
+    """
+    cpu = realtime.processor(config.loop)
+    running = loop_on(cpu)
+    measures = not quick and running is None
+    if measures:
+        bare_loop.prepare()
     channel = config.can.channel if config.can.interface == "socketcan" else ""
     before = counted(channel)
-    ticked = ticks(config.period)
+    cycles: Cycles | str = ""
+    with _rights_of(config.loop) as lacking:
+        if measures:
+            cycles = bare_loop.measure(config.loop, config.loop.rate_hz, MEASURED, progress)
+    if running is not None:
+        cycles = f"a service's loop, process {running}, runs on processor {cpu}"
+    if not measures and before is not None:
+        time.sleep(COUNTED)
     door = guard(config)
     return Machine(
         release=platform.release(),
@@ -49,10 +68,10 @@ def machine(config: Config) -> Machine:
         clock_source=_text(SYSTEM / "devices/system/clocksource/clocksource0/current_clocksource"),
         resolution=time.clock_getres(time.CLOCK_MONOTONIC),
         cpu=cpu,
-        governor=_text(processor / "cpufreq/scaling_governor"),
+        governors=governors(),
         isolated=processors(_text(SYSTEM / "devices/system/cpu/isolated") or ""),
         link=link(config.can.channel) if config.can.interface == "socketcan" else None,
-        ticks=ticked,
+        cycles=cycles,
         passed=passed(before, counted(channel)),
         gathered=gathered(channel) if channel else None,
         adapter=adapters.lacking(config.can.interface),
@@ -140,11 +159,34 @@ def passed(before: Passed | None, after: Passed | None) -> Passed | None:
     return Passed(after.seconds - before.seconds, after.frames - before.frames, after.data - before.data)
 
 
-def ticks(period: float) -> tuple[Tick, ...]:
-    """Tick for a while and do nothing else."""
-    ticker = Ticker(round(period * 1e9))
-    number = max(10, round(MEASURED / period))
-    return tuple(ticker.wait() for _ in range(number))
+def governors() -> dict[int, str]:
+    """How the frequency of each processor is governed; those without scaling are left out."""
+    files = SYSTEM.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor")
+    found = {int(file.parts[-3].removeprefix("cpu")): _text(file) for file in files}
+    return {cpu: name for cpu, name in sorted(found.items()) if name}
+
+
+def loop_on(cpu: int) -> int | None:
+    """Return the process id of a service's loop that may run on a processor; None where there is none to be seen."""
+    for process in PROCESSES.glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended meanwhile, or is hidden
+            if (process / "cmdline").read_bytes().rstrip(b"\0").decode(errors="replace") != title("loop"):
+                continue
+            allowed = re.search(r"^Cpus_allowed_list:\s*(\S+)", (process / "status").read_text(), re.MULTILINE)
+            if allowed and cpu in processors(allowed[1]):
+                return int(process.name)
+    return None
+
+
+@contextlib.contextmanager
+def _rights_of(loop: LoopTable) -> Iterator[tuple[str, ...]]:
+    """Have the loop's rights and its processor meanwhile; which of them it would lack."""
+    allowed, policy, priority = os.sched_getaffinity(0), os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield realtime.acquire(structs.replace(loop, realtime=_wished(loop)))
+    finally:
+        os.sched_setscheduler(0, policy, priority)
+        os.sched_setaffinity(0, allowed)
 
 
 def _wished(loop: LoopTable) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -124,6 +124,16 @@ def notes(reply: GoalReply) -> str:
     if reply.queued:
         said.append("waits for the goal before it")
     return f" ({', '.join(said)})" if said else ""
+
+
+@contextlib.contextmanager
+def measuring(title: str, *, show: bool = True) -> Iterator[Callable[[float], None]]:
+    """Show on standard error, where that is a terminal, how far a measurement is; no thread of it draws meanwhile."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
+    show = show and err.is_terminal
+    with Progress(*columns, console=err, transient=True, auto_refresh=False, disable=not show) as progress:
+        task = progress.add_task(title, total=1.0)
+        yield lambda share: progress.update(task, completed=share, refresh=True)
 
 
 def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> Result:

@@ -49,13 +49,13 @@ def _lock_memory(_: LoopTable) -> None:
     _call("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
 
 
-def _processor(loop: LoopTable) -> int:
-    """Return the loop's processor."""
+def processor(loop: LoopTable) -> int:
+    """Return the processor that the loop stays on."""
     return max(os.sched_getaffinity(0)) if loop.cpu is None else loop.cpu
 
 
 def _pin(loop: LoopTable) -> None:
-    os.sched_setaffinity(0, {_processor(loop)})
+    os.sched_setaffinity(0, {processor(loop)})
 
 
 def _stay_awake(_: LoopTable) -> None:
@@ -82,7 +82,7 @@ def stay_beside(loop: LoopTable) -> tuple[str, ...]:
     if loop.realtime == "off":
         return ()
     lacking = []
-    others = os.sched_getaffinity(0) - {_processor(loop)}
+    others = os.sched_getaffinity(0) - {processor(loop)}
     try:
         if others:
             os.sched_setaffinity(0, others)

@@ -1,0 +1,95 @@
+"""Judges what cycles took that only exchange the frames: at which rates this machine can hold a loop at all."""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+from trirail.config import Config
+from trirail.diagnosis import Check
+from trirail.processes.bare_loop import Cycles, Spread, spread
+
+SHARE = 0.5
+"""Of a period, after which 999 of 1000 bare cycles are to be over: the rest is for the service's own arithmetic."""
+RATES = (100, 250, 500, 1000, 2000, 4000)
+"""Rates that are looked at beside the configured one [Hz]."""
+
+
+class Measured(Struct, frozen=True):
+    """What came of the cycles, for programs; times in microseconds."""
+
+    rate_hz: int
+    cycles: int
+    lateness_us: Spread
+    """How late they began, ticks missed before them included."""
+    cycle_us: Spread
+    """From SYNC to the setpoints."""
+    over_us: Spread
+    """From the deadline until they were over: the sum of both, cycle by cycle."""
+    missed: int
+    """Ticks."""
+    missed_in_a_row: int
+    answers_missing: int
+    """Positions that did not come, of three a cycle."""
+    up_to_hz: int | None
+    """The highest rate that would be held; None where none is."""
+
+
+def measured(cycles: Cycles) -> Measured:
+    """What is to be said of cycles."""
+    over, rate = spread(cycles.lateness + cycles.work), 1_000_000_000 // cycles.period
+    missed = [int(each) for each in cycles.missed]
+    held = [each for each in {*RATES, rate} if over.p999 <= SHARE * 1e6 / each]
+    return Measured(
+        rate_hz=rate,
+        cycles=len(missed),
+        lateness_us=spread(cycles.lateness),
+        cycle_us=spread(cycles.work),
+        over_us=over,
+        missed=sum(missed),
+        missed_in_a_row=_longest_streak(missed),
+        answers_missing=3 * len(missed) - cycles.answers,
+        up_to_hz=max(held, default=None),
+    )
+
+
+def cycle(cycles: Cycles | str, config: Config) -> Check:
+    """Whether the configured period is held, as the machine is now."""
+    if isinstance(cycles, str):
+        if cycles:
+            return Check("cycle", "warning", f"not measured: {cycles}", "end that service, ask again")
+        return Check("cycle", "ok", "not measured: --quick")
+    found = measured(cycles)
+    period = 1e6 / found.rate_hz
+    said = (
+        f"{_frequency(found.rate_hz)}: cycle p99.9 {found.cycle_us.p999:.0f} µs, "
+        f"lateness p99.9 {found.lateness_us.p999:.0f} µs"
+    )
+    lost = f"{found.missed} of {found.cycles} ticks missed" if found.missed else ""
+    remedy = "see the lines above; end other programs, or isolate a processor"
+    if found.up_to_hz is None or found.up_to_hz < found.rate_hz:
+        lower = "no rate is held" if found.up_to_hz is None else f"loop.rate_hz = {found.up_to_hz} would be held"
+        remedy = f"{remedy}; {lower}"
+    if found.missed_in_a_row > config.watchdogs.max_overruns:
+        return Check(
+            "cycle", "failure", f"{said}: {lost}, {found.missed_in_a_row} in a row, the service would stop", remedy
+        )
+    if found.over_us.p999 > period:
+        return Check("cycle", "failure", f"{said}: the period of {period:.0f} µs is not held, {lost}", remedy)
+    if found.over_us.p999 > SHARE * period:
+        left = f"little is left of the period of {period:.0f} µs for the service" + (f", {lost}" if lost else "")
+        return Check("cycle", "warning", f"{said}: {left}", remedy)
+    if lost:
+        return Check("cycle", "warning", f"{said}: {lost}", remedy)
+    return Check("cycle", "ok", f"{said}: fine; up to {_frequency(found.up_to_hz or found.rate_hz)}")
+
+
+def _frequency(hertz: int) -> str:
+    return f"{hertz / 1000:g} kHz" if hertz >= 1000 else f"{hertz} Hz"
+
+
+def _longest_streak(missed: list[int]) -> int:
+    longest = streak = 0
+    for each in missed:
+        streak = streak + each if each else 0
+        longest = max(longest, streak)
+    return longest
