@@ -20,7 +20,7 @@ app = App(help="Speed, as ratios within one run: the machines this runs on are n
 def loop(
     *, seconds: float = 60.0, rates: tuple[int, ...] = (1000, 2000, 4000), runs: int = 5, json: bool = False
 ) -> None:
-    """Run the whole service, goals without pause, and time its loop beside cyclictest, at each rate for so long."""
+    """Run the whole service, goals without pause; time its loop beside cyclictest and the bare loop, at each rate."""
     import bench_loop
 
     bench_loop.main(seconds, rates, runs, json)
@@ -64,14 +64,6 @@ def frames(*, cycles: int = 3000, json: bool = False) -> None:
     import bench_frames
 
     bench_frames.main(cycles, json)
-
-
-@app.command
-def machine(*, period: float = 0.001, cycles: int = 3000, json: bool = False) -> None:
-    """Time the same work hot and cold, once in a period: what of a cycle's cost is the machine's."""
-    import bench_machine
-
-    bench_machine.main(period, cycles, json)
 
 
 @app.command

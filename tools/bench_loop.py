@@ -4,16 +4,20 @@ The service runs as a user runs it, with gateway, recorder and a client that wat
 without pause. cyclictest runs in the same minute on the same processor, one priority above the loop, in as many runs as
 lateness is compared in. The simulated drives are a process of their own, real-time on the other processor, so that a
 cycle is the loop's own; where a virtual machine stalls one of the two, the other waits for it. Faults are counted and
-reset. Where the drives cannot keep up they are inside, and their own share is timed and taken off.
+reset. Before the service and after it the bare loop runs, a cycle's frames and nothing else, as trirail doctor measures
+it, and cyclictest beside it: what it takes is the machine's share. Of a rate that the service cannot keep that is
+said.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json as json_format
+import os
 import tempfile
-import time
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +28,16 @@ from numpy.typing import NDArray
 from trirail.client.client import Robot
 from trirail.config import SIM, load
 from trirail.errors import TrirailError
+from trirail.processes import bare_loop
 from trirail.wire.records import PARTS, unpack
 from trirail.wire.vocabulary import Mode
-from trirail_drivers.cia402.drives import Cia402
-from trirail_drivers.connection.opening import simulated_bus
-from trirail_drivers.simulated import SimulatedBus
 
 QUANTILES = (50.0, 99.0, 99.9, 100.0)
 HEADER = f"{'':30}{'p50':>9}{'p99':>9}{'p99.9':>9}{'max':>9}   µs"
 MOST_FAULTS = 0.2
-"""With more faults a second drives in a process of their own cannot keep up."""
+"""With more faults a second a rate is not kept."""
+BARE = 1.0 / 6.0
+"""The bare loop runs for such a share of the service's time before it, and again after it."""
 SETTLE = 2.0
 """Goals before the measurement: what happens once has happened [s]."""
 
@@ -44,47 +48,53 @@ def measure(seconds: float, rates: tuple[int, ...], runs: int) -> dict[str, Any]
 
 
 def _of_a_rate(rate: int, seconds: float, runs: int) -> dict[str, Any]:
-    try:
-        return _measured(rate, seconds, runs, inside=False)
-    except _CannotKeepUpError as error:
-        return {**_measured(rate, seconds, runs, inside=True), "why_inside": str(error)}
+    service: dict[str, Any]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        bare = [_bare(rate, BARE * seconds, folder / "before.json")]
+        try:
+            service = _service(rate, seconds, runs, folder)
+        except (TrirailError, _NotKeptError) as error:
+            service = {"not_kept": str(error)}
+        bare.append(_bare(rate, BARE * seconds, folder / "after.json"))
+    return of_both({"rate_hz": rate, "seconds": seconds, **service}, together(bare))
 
 
-class _CannotKeepUpError(Exception):
-    """The drives in a process of their own were too slow for the rate."""
+def of_both(service: dict[str, Any], bare: dict[str, Any]) -> dict[str, Any]:
+    """What was found of a service's loop and of the bare one, and their ratios where the service kept the rate."""
+    found = {**service, "bare": bare}
+    if "not_kept" not in service:
+        pairs = {what: zip(service[what], bare[what], strict=True) for what in ("cycle", "lateness")}
+        found["to_bare"] = {what: [a / b for a, b in each] for what, each in pairs.items()}
+    return found
 
 
-def _measured(rate: int, seconds: float, runs: int, inside: bool) -> dict[str, Any]:
+class _NotKeptError(Exception):
+    """The loop could not keep the rate."""
+
+
+def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, Any]:
+    """The service's loop. Raises what kept it from the rate."""
     priority, period_us = load(SIM).loop.priority, 1_000_000 // rate
     found: list[dict[str, Any]] = []
     batches: list[NDArray[np.void]] = []
     goals = 0
-    share = _drives_share(1.0 / rate) if inside else 0.0
-    try:
-        with rig(rate, inside) as made, tempfile.TemporaryDirectory() as folder:
-            faults = Faults(made.robot)
-            without_pause(made.robot, SETTLE, faults.mend)
-            for run in range(runs):
-                beside = Beside(seconds / runs, period_us, priority, Path(folder) / f"{run}.json")
-                rows, accepted = _collect(made, seconds / runs, faults)
-                late = beside.lateness()
-                goals += accepted
-                batches.append(rows)
-                found.append(_run(rows, late, beside, period_us))
-    except TrirailError as error:
-        if inside:
-            raise
-        raise _CannotKeepUpError(str(error)) from error
+    with rig(rate) as made:
+        faults = Faults(made.robot)
+        without_pause(made.robot, SETTLE, faults.mend)
+        for run in range(runs):
+            beside = Beside(seconds / runs, period_us, priority, folder / f"{run}.json")
+            rows, accepted = _collect(made, seconds / runs, faults)
+            late = beside.lateness()
+            goals += accepted
+            batches.append(rows)
+            found.append(_run(rows, late, beside, period_us))
     told = faults.told
-    if not inside and len(told) > MOST_FAULTS * seconds:
-        raise _CannotKeepUpError(f"{len(told)} faults in {seconds:g} s, the last: {told[-1]}")
+    if len(told) > MOST_FAULTS * seconds:
+        raise _NotKeptError(f"{len(told)} faults in {seconds:g} s, the last: {told[-1]}")
     rows = np.concatenate(batches)
     parts = rows["parts_ns"] / 1000.0
     return {
-        "rate_hz": rate,
-        "drives": "inside" if inside else "own process",
-        "drives_share_us": share,
-        "seconds": seconds,
         "goals": goals,
         "faults": told,
         "beside": beside.name,
@@ -94,7 +104,30 @@ def _measured(rate: int, seconds: float, runs: int, inside: bool) -> dict[str, A
         "lost_by_the_machine": sum(run["lost_by_the_machine"] for run in found),
         "runs": found,
         "parts": {name: quantiles(parts[:, column]) for column, name in enumerate(PARTS)},
-        "cycle": quantiles(parts.sum(axis=1) - share),
+        "cycle": quantiles(parts.sum(axis=1)),
+        "lateness": quantiles(np.concatenate([_lateness(each, period_us) for each in batches])),
+    }
+
+
+def _bare(rate: int, seconds: float, result: Path) -> tuple[bare_loop.Cycles, int]:
+    """The bare loop, in a process of its own; and the ticks that the machine lost meanwhile."""
+    loop = load(SIM).loop
+    with ProcessPoolExecutor(1, get_context("spawn"), bare_loop.prepare) as alone:
+        alone.submit(os.getpid).result()  # it has compiled
+        beside = Beside(seconds, 1_000_000 // rate, loop.priority, result)
+        cycles = alone.submit(bare_loop.measure_alone, loop, rate, seconds).result()
+    return cycles, beside.ticks_lost(beside.lateness())
+
+
+def together(parts: list[tuple[bare_loop.Cycles, int]]) -> dict[str, Any]:
+    """What all runs of the bare loop took, and the ticks that the machine lost in each."""
+    return {
+        "cycles": sum(len(cycles.work) for cycles, _ in parts),
+        "answers": sum(cycles.answers for cycles, _ in parts),
+        "missed": sum(int(cycles.missed.sum()) for cycles, _ in parts),
+        "lost_by_the_machine": sum(lost for _, lost in parts),
+        "cycle": quantiles(np.concatenate([cycles.work for cycles, _ in parts]) / 1000.0),
+        "lateness": quantiles(np.concatenate([cycles.lateness for cycles, _ in parts]) / 1000.0),
     }
 
 
@@ -122,57 +155,31 @@ def _collect(made: Rig, seconds: float, faults: Faults) -> tuple[NDArray[np.void
     with made.robot.records(batches.append):
         accepted = without_pause(made.robot, seconds, faults.mend)
     if not batches:
-        raise _CannotKeepUpError("no record of a cycle came")
+        raise _NotKeptError("no record of a cycle came")
     return np.concatenate([unpack(batch) for batch in batches]), accepted
 
 
+def _lateness(rows: NDArray[np.void], period_us: int) -> NDArray[np.float64]:
+    """How late each cycle of a run was, (n,) [µs]: after missed ticks by those too."""
+    found: NDArray[np.float64] = rows["lateness_ns"] / 1000.0 + _missed(rows) * period_us
+    return found
+
+
+def _missed(rows: NDArray[np.void]) -> NDArray[np.int64]:
+    return np.diff(rows["overruns"], prepend=rows["overruns"][0])
+
+
 def _run(rows: NDArray[np.void], beside: NDArray[np.float64], of: Beside, period_us: int) -> dict[str, Any]:
-    """One run's lateness beside the machine's own: a cycle after missed ticks is late by those too."""
-    missed = np.diff(rows["overruns"], prepend=rows["overruns"][0])
-    lateness = quantiles(rows["lateness_ns"] / 1000.0 + missed * period_us)
+    """One run's lateness beside the machine's own."""
+    lateness = quantiles(_lateness(rows, period_us))
     own = quantiles(beside)
     return {
         "lateness": lateness,
         "beside": own,
         "ratio": [a / b if b else 0.0 for a, b in zip(lateness, own, strict=True)],
-        "missed": int(missed.sum()),
+        "missed": int(_missed(rows).sum()),
         "lost_by_the_machine": of.ticks_lost(beside),
     }
-
-
-def _drives_share(period: float) -> float:
-    """What simulated drives take of a cycle where they are inside, in the median [µs]."""
-    config, spent = load(SIM), [0.0]
-
-    class Timed(SimulatedBus):
-        """Adds up what its own work takes."""
-
-        def send(self, msg: Any, timeout: float | None = None) -> None:
-            began = time.perf_counter()
-            super().send(msg, timeout)
-            spent[0] += time.perf_counter() - began
-
-        def recv(self, timeout: float | None = None) -> Any:
-            began = time.perf_counter()
-            try:
-                return super().recv(timeout)
-            finally:
-                spent[0] += time.perf_counter() - began
-
-    made = simulated_bus(config.can, config.drives)
-    bus = Timed(made.drives, time.monotonic, made.faults)
-    driver, each = Cia402(bus, 100_000_000, config.drives), []
-    try:
-        driver.configure(period)
-        for _ in range(3000):
-            spent[0] = 0.0
-            driver.sync()
-            feedback = driver.read()
-            driver.write(feedback.position, (0.0, 0.0, 0.0))
-            each.append(spent[0])
-    finally:
-        driver.close()
-    return float(np.median(each) * 1e6)
 
 
 def quantiles(values: NDArray[np.float64]) -> list[float]:
@@ -191,27 +198,35 @@ def main(seconds: float, rates: tuple[int, ...], runs: int, json: bool = False) 
 
 
 def _show(found: dict[str, Any]) -> None:
-    print(
-        f"{found['rate_hz']} Hz, {found['seconds']:g} s, {found['goals']} goals at {GOALS_HZ:g} Hz, moving "
-        f"{found['moving']:.0%} of the time; drives: {found['drives']}"
-    )
-    if "why_inside" in found:
-        print(f"  in a process of their own they could not keep up: {found['why_inside']}")
-        print(f"  their own share, {found['drives_share_us']:.1f} µs in the median, is taken off the whole cycle")
-    for fault, times in Counter(found["faults"]).items():
-        print(f"  {times} times in fault, and reset: {fault}")
+    bare = found["bare"]
+    print(f"{found['rate_hz']} Hz, {found['seconds']:g} s")
+    if "not_kept" in found:
+        print(f"the service's loop cannot keep this rate here: {found['not_kept']}")
+    else:
+        print(f"{found['goals']} goals at {GOALS_HZ:g} Hz, moving {found['moving']:.0%} of the time")
+        for fault, times in Counter(found["faults"]).items():
+            print(f"  {times} times in fault, and reset: {fault}")
     print(HEADER)
-    print(line("the whole cycle", found["cycle"]))
-    for name in PARTS:
+    for what, name in (("cycle", "the whole cycle"), ("lateness", "lateness of the loop")):
+        if what in found:
+            print(line(name, found[what]))
+        print(line(f"  the bare loop: {what}", bare[what]))
+        if "to_bare" in found:
+            print(line("  ratio", found["to_bare"][what], ".2f"))
+    for name in found.get("parts", ()):
         print(line(f"  {name}", found["parts"][name]))
-    for run in found["runs"]:
-        print(line("lateness of the loop", run["lateness"]))
+    for run in found.get("runs", ()):
+        print(line("lateness of a run", run["lateness"]))
         print(line(f"  {found['beside']}", run["beside"]))
         print(line("  ratio", run["ratio"], ".2f"))
-    print(
-        f"ticks missed: {found['missed']} of {found['cycles']}; {found['beside']} lost "
-        f"{found['lost_by_the_machine']} in the same time\n"
-    )
+    for name, of in (("loop", found), ("bare loop", bare)):
+        if "missed" in of:
+            lost = of["lost_by_the_machine"]
+            print(
+                f"ticks missed, {name}: {of['missed']} of {of['cycles']}, {max(0, of['missed'] - lost)} beyond "
+                f"the {lost} that the machine lost in the same time"
+            )
+    print()
 
 
 def line(name: str, values: list[float], form: str = ".1f") -> str:

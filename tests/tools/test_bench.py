@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import bench_aims
+import bench_loop
 import bench_scrape
 import numpy as np
 import pytest
+from trirail.processes.bare_loop import Cycles
 
 ROOT = Path(__file__).parents[2]
 
@@ -48,6 +50,12 @@ def test_the_loop_is_measured_beside_the_machine() -> None:
     assert set(told["parts"]) == {"sync", "read", "mode", "motion", "kinematics", "write", "record"}
     quantiles = [50.0, 99.0, 99.9, 100.0]
     assert is_spread(told["cycle"], quantiles)
+    assert is_spread(told["lateness"], quantiles)
+    bare = told["bare"]
+    assert 0 < bare["answers"] <= 3 * bare["cycles"]
+    for what in ("cycle", "lateness"):
+        assert is_spread(bare[what], quantiles)
+        assert told["to_bare"][what] == [a / b for a, b in zip(told[what], bare[what], strict=True)]
     for run in told["runs"]:
         assert is_spread(run["lateness"], quantiles)
         assert is_spread(run["beside"], quantiles)
@@ -110,13 +118,6 @@ def test_settling_is_measured() -> None:
     assert told["settle_ms"][0] > 0.0
 
 
-def test_what_the_machine_itself_takes_is_measured() -> None:
-    told = measured("machine")
-    for part in ("arithmetic", "send_that_wakes", "send_after_it"):
-        for values in (told[part]["cold"], told[part]["hot"]):
-            assert is_spread(values, told["quantiles"])
-
-
 @pytest.mark.slow
 def test_sync_is_measured_beside_python_canopens() -> None:
     told = measured("peers")
@@ -132,3 +133,16 @@ def test_an_aim_is_met_where_no_number_is_greater() -> None:
     assert [row["met"] for name, row in rows.items() if name.startswith("frames")] == [True]
     assert [row["met"] for name, row in rows.items() if "at rest" in name] == [False]
     assert len(rows) == 2, "what was not measured is left out"
+
+
+def test_a_rate_that_is_not_kept_is_said_and_not_met(capsys: pytest.CaptureFixture[str]) -> None:
+    cycles = Cycles(np.array([10_000, 600_000]), np.array([20_000, 40_000]), 250_000, 5)
+    bare = bench_loop.together([(cycles, 1), (cycles, 0)])
+    assert (bare["cycles"], bare["answers"], bare["missed"], bare["lost_by_the_machine"]) == (4, 10, 4, 1)
+    assert bare["cycle"][-1] == 40.0
+    found = bench_loop.of_both({"rate_hz": 4000, "seconds": 1.0, "not_kept": "9 faults"}, bare)
+    assert "to_bare" not in found
+    bench_loop._show(found)
+    assert "cannot keep this rate here: 9 faults" in capsys.readouterr().out
+    (row,) = bench_aims.table({"loop": {"rates": [found]}})
+    assert (row["name"], row["measured"], row["met"]) == ("ticks missed at 4 kHz beyond the machine's", (), False)
