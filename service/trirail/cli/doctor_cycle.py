@@ -14,7 +14,7 @@ RATES = (100, 250, 500, 1000, 2000, 4000)
 """Rates that are looked at beside the configured one [Hz]."""
 
 
-class Measured(Struct, frozen=True):
+class HeldRate(Struct, frozen=True):
     """What came of the cycles, for programs; times in microseconds."""
 
     rate_hz: int
@@ -34,12 +34,12 @@ class Measured(Struct, frozen=True):
     """The highest rate that would be held; None where none is."""
 
 
-def measured(cycles: Cycles) -> Measured:
+def measured(cycles: Cycles) -> HeldRate:
     """What is to be said of cycles."""
     over, rate = spread(cycles.lateness + cycles.work), 1_000_000_000 // cycles.period
     missed = [int(each) for each in cycles.missed]
     held = [each for each in {*RATES, rate} if over.p999 <= SHARE * 1e6 / each]
-    return Measured(
+    return HeldRate(
         rate_hz=rate,
         cycles=len(missed),
         lateness_us=spread(cycles.lateness),
