@@ -120,7 +120,7 @@ def test_a_child_has_its_own_descriptors_its_name_and_no_signal_blocked(parent: 
     """Whoever held another's end of a pipe would keep its end from being seen."""
     children = {
         name: parent.child(name, "a.rrd" if name == "recorder" else None)
-        for name in ("gateway", "recorder", "loop", "planner")
+        for name in ("gateway", "recorder", "loop", "drives", "planner")
     }
     ports = {os.readlink(f"/proc/self/fd/{listening.fileno()}") for listening in parent.listening}
     shared = os.readlink(f"/proc/self/fd/{parent.heartbeats.descriptor}")
@@ -202,8 +202,8 @@ def test_a_compiler_that_dies_is_the_end_of_who_needs_it(parent: Parent) -> None
     assert loop.ready_with is None
 
 
-@pytest.mark.parametrize("name", ["loop", "planner"])
-def test_loop_and_planner_end_with_their_parent(name: str, parent: Parent) -> None:
+@pytest.mark.parametrize("name", ["loop", "drives", "planner"])
+def test_loop_drives_and_planner_end_with_their_parent(name: str, parent: Parent) -> None:
     child = parent.child(name)
     parent.until_said(child)
     assert child.process.pid is not None

@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from trirail.config import SIM, load
+from msgspec import structs
+from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
 from trirail.kinematics.compiled import FUNCTIONS
 from trirail.processes import supervisor, warm_parent
@@ -51,6 +52,7 @@ def work(child):
 
 sys.exit(fork_server.main(work))
 """
+CONFIG = load(SIM)
 TURNING = "ready(); beat_until(never)"
 RECORDING = "ready(); freeze()"
 SERVING = "ready(); beat_until(lambda: heartbeats.of('loop').count); beat_until(loop_gone)"
@@ -66,10 +68,10 @@ def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return []
 
 
-def run(told: list[str], folder: Path, **children: str) -> int:
-    for name, does in ({"planner_1": RECORDING} | children).items():
+def run(told: list[str], folder: Path, config: Config = CONFIG, /, **children: str) -> int:
+    for name, does in ({"drives_1": RECORDING, "planner_1": RECORDING} | children).items():
         (folder / name.replace("_", "-")).write_text(does)
-    return supervisor.Supervisor(load(SIM), None, lambda words, _: told.append(words)).run(lambda _: told.append("up"))
+    return supervisor.Supervisor(config, None, lambda words, _: told.append(words)).run(lambda _: told.append("up"))
 
 
 def test_a_hung_gateway_is_killed_and_started_again(told: list[str], tmp_path: Path) -> None:
@@ -228,6 +230,57 @@ def test_a_frozen_fork_server_ends_the_service_when_a_child_is_wanted(
         "the process that forks the others has died (no sign of life for 0.5 s, so it was killed): the loop stops the "
         "robot and disables the drives; ending",
     ]
+
+
+def test_simulated_drives_that_die_are_told_and_come_back_with_the_next_service_alone(
+    told: list[str], tmp_path: Path
+) -> None:
+    """The loop has them in fault; those that would take their place would stand elsewhere, and not be set up."""
+    code = run(
+        told,
+        tmp_path,
+        loop_1="ready(); beat_until(lambda: begun('planner-1')); up = time.monotonic() + 1.0; "
+        "beat_until(lambda: time.monotonic() > up); heartbeats.of('loop').rest()",
+        gateway_1=SERVING,
+        recorder_1=RECORDING,
+        drives_1="ready(); time.sleep(0.3); os.kill(os.getpid(), signal.SIGKILL)",
+    )
+    assert code == 1
+    assert told[:2] == [
+        "up",
+        "the simulated drives have died (killed by SIGKILL): the robot is in fault, and they come back with the "
+        "service's next start",
+    ]
+    assert len(told) == 3, told
+    assert not (tmp_path / "drives-2.begun").exists()
+
+
+def test_drives_that_end_since_the_loop_lets_go_of_them_are_not_told(told: list[str], tmp_path: Path) -> None:
+    """A loop that cannot set them up has closed its bus before it has ended."""
+    code = run(
+        told,
+        tmp_path,
+        loop_1="beat_until(lambda: begun('planner-1')); time.sleep(0.5); os._exit(1)",
+        gateway_1=TURNING,
+        recorder_1=RECORDING,
+        drives_1="ready(); time.sleep(0.1)",
+    )
+    assert code == 1
+    assert told == ["the loop is dead (exit code 1): it had not begun; ending"]
+
+
+@pytest.mark.parametrize("does", ["os._exit(3)", "time.sleep(0.2); os._exit(3)"])
+def test_drives_that_cannot_start_are_the_end(does: str, told: list[str], tmp_path: Path) -> None:
+    assert run(told, tmp_path, loop_1="freeze()", gateway_1="freeze()", recorder_1="freeze()", drives_1=does) == 1
+    assert told == ["the drives could not start (exit code 3)"]
+
+
+def test_a_real_bus_has_no_process_of_drives(told: list[str], tmp_path: Path) -> None:
+    on_a_bus = structs.replace(CONFIG, can=structs.replace(CONFIG.can, interface="socketcan", channel="can0"))
+    turning = "ready(); beat_until(lambda: begun('planner-1')); time.sleep(0.3); heartbeats.of('loop').rest()"
+    run(told, tmp_path, on_a_bus, loop_1=turning, gateway_1=SERVING, recorder_1=RECORDING)
+    assert told[0] == "up"
+    assert not (tmp_path / "drives-1.begun").exists()
 
 
 def test_a_runtime_folder_of_somebody_else_is_refused_in_words(

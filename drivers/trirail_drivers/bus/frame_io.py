@@ -113,6 +113,8 @@ class SocketFrames:
                 size = self._receive_timed(self._capture)
         except BlockingIOError:
             return None
+        except ConnectionError:  # it has died, with frames that it had not read
+            size = 0
         if size != CAN_FRAME.size:
             raise can.CanOperationError("the listening end is gone")
         identifier, length = HEAD.unpack_from(packet)

@@ -15,6 +15,9 @@ from trirail_drivers.bus.can_frame import CAN_FRAME
 from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.errors import BusError
 
+MOST_WAITING = 1 << 22
+"""Bytes that the kernel may keep of frames on their way, where its limit is not lower."""
+
 
 class UnixBus(can.BusABC):
     """One end of a bus over an AF_UNIX SOCK_SEQPACKET socket at the path `channel`.
@@ -131,8 +134,14 @@ class UnixBus(can.BusABC):
                     peer.send(packet)
 
 
+def widen(peer: socket.socket) -> None:
+    """Let frames wait for a peer that its machine keeps waiting: as many as the system's limit has room for."""
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_WAITING)
+
+
 def _connect(path: Path) -> socket.socket:
     peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    widen(peer)
     try:
         peer.connect(str(path))
     except OSError:

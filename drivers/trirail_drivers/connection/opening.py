@@ -18,7 +18,7 @@ from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import Clock, DriveGroup
 from trirail_drivers.protocols import PROTOCOLS
-from trirail_drivers.simulated import SimulatedBus
+from trirail_drivers.simulated import SimulatedBus, SimulatedDevice
 from trirail_drivers.simulated.carriages import Mounted
 from trirail_drivers.simulated.faults import Faults
 
@@ -79,12 +79,18 @@ def connect(
 
 def simulated_bus(section: config.Can, drives: config.Drives, clock: Clock = time.monotonic) -> SimulatedBus:
     """The three drives of a configuration on a bus of their own, at rest where `can.simulated.start` says."""
+    devices, faults = simulated_drives(section, drives)
+    return SimulatedBus(devices, clock, faults)
+
+
+def simulated_drives(section: config.Can, drives: config.Drives) -> tuple[Sequence[SimulatedDevice], Faults]:
+    """The three drives of a configuration, on no bus yet, and their faults."""
     protocol = PROTOCOLS[drives.protocol]
     starts = zip(drives.each, section.simulated.start, strict=True)
     devices = [protocol.simulated_drive(section.simulated, drives, drive, start) for drive, start in starts]
     scales = [drive.direction * drive.counts_per_metre for drive in drives.each]
     mounted = [_mounted(section.simulated.built, index, drive) for index, drive in enumerate(drives.each)]
-    return SimulatedBus(devices, clock, Faults(devices, scales, protocol.fault_frames, mounted=mounted))
+    return devices, Faults(devices, scales, protocol.fault_frames, mounted=mounted)
 
 
 def _mounted(built: Sequence[config.Built] | None, index: int, drive: config.Drive) -> Mounted:

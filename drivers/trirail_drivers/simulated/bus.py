@@ -6,12 +6,14 @@ import errno
 import time
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 
 import can
 
+from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.frames import can_id, unpacked
 from trirail_drivers.interface import Clock
 from trirail_drivers.simulated.devices import SimulatedDevice
+from trirail_drivers.simulated.exchange import Exchange
 from trirail_drivers.simulated.faults import Faults
 
 _STEP = 0.0005
@@ -34,13 +36,7 @@ class SimulatedBus(can.BusABC):
         self._clock = clock
         self._arrived: deque[can.Message] = deque()
         super().__init__(channel=self.channel_info)
-        now = clock()
-        self.faults.connect(self._arrived.append, clock)
-        everyone = range(len(self.drives))
-        self._everyone = tuple(everyone)
-        for index, drive in enumerate(self.drives):
-            others = tuple(other for other in everyone if other != index)
-            drive.connect(partial(self._from_drive, index, others), now)
+        self._exchange = Exchange(self.drives, clock, faults, self._emit)
 
     def press(self, index: int, switches: int) -> None:
         """Press switches of a slider by hand, and let go of the others: bits of its drive's digital inputs (60FDh)."""
@@ -51,61 +47,16 @@ class SimulatedBus(can.BusABC):
 
         Raises can.CanOperationError while the controller is bus-off, as the system would of its full queue.
         """
-        if msg.is_extended_id or msg.is_error_frame:
-            return
-        now = self._clock()
-        if not self.faults.idle:
-            self.faults.poll(now)
-            if self.faults.bus_off:
-                raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
-        if msg.is_remote_frame:
-            self._request(msg.arbitration_id, now)
-        else:
-            self._to_drives(self._everyone, msg.arbitration_id, bytes(msg.data))
+        if not self._exchange.receive(can_id(msg), bytes(msg.data), self._clock()):
+            raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
 
-    def _request(self, can_id: int, now: float) -> None:
-        """Bring a remote frame to every drive, unless faults have it otherwise."""
-        for index in self._everyone:
-            if self.faults.idle:
-                self.drives[index].receive_remote(can_id, now)
-            else:
-                self.faults.carry(index, True, can_id, b"", partial(self._hand_request_in, index, can_id))
-
-    def _to_drives(self, indices: Sequence[int], can_id: int, data: bytes) -> None:
-        """Bring a frame to some drives, unless faults have it otherwise."""
-        if self.faults.idle:
-            now = self._clock()
-            for index in indices:
-                self.drives[index].receive(can_id, data, now)
-        else:
-            for index in indices:
-                self.faults.carry(index, True, can_id, data, partial(self._hand_in, index, can_id))
-
-    def _hand_request_in(self, index: int, can_id: int, _data: bytes) -> None:
-        self.drives[index].receive_remote(can_id, self._clock())
-
-    def _hand_in(self, index: int, can_id: int, data: bytes) -> None:
-        self.drives[index].receive(can_id, data, self._clock())
-
-    def _from_drive(self, index: int, others: Sequence[int], can_id: int, data: bytes) -> None:
-        """Bring a drive's frame to the user and the other drives, unless faults have it otherwise."""
-        if self.faults.idle:
-            self._hand_out(others, can_id, data)
-        else:
-            self.faults.carry(index, False, can_id, data, partial(self._hand_out, others, can_id))
-
-    def _hand_out(self, others: Sequence[int], can_id: int, data: bytes) -> None:
-        self._arrived.append(can.Message(timestamp=time.time(), arbitration_id=can_id, is_extended_id=False, data=data))
-        self._to_drives(others, can_id, data)
+    def _emit(self, identifier: int, data: bytes) -> None:
+        self._arrived.append(unpacked(CAN_FRAME.pack(identifier, len(data), data), time.time()))
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         deadline = None if timeout is None else time.monotonic() + timeout
         while not self._arrived:
-            now = self._clock()
-            if not self.faults.idle:
-                self.faults.poll(now)
-            for drive in self.drives:
-                drive.poll(now)
+            self._exchange.poll(self._clock())
             if self._arrived:
                 break
             remaining = _STEP if deadline is None else deadline - time.monotonic()

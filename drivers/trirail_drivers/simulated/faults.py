@@ -10,10 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-import can
-
 from trirail_drivers import files
 from trirail_drivers.bus import canerrors
+from trirail_drivers.bus.can_frame import ERROR
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES, Clock, PowerState
 from trirail_drivers.simulated.carriages import Carriages, Mounted
@@ -36,7 +35,7 @@ _EVERY = (Frames(None, None),)
 Deliver = Callable[[bytes], None]
 
 
-def _to_nobody(_said: object) -> None:
+def _to_nobody(*_said: object) -> None:
     """Where faults are told, and frames sent, that nobody listens to."""
 
 
@@ -92,10 +91,10 @@ class Faults:
         self._order = itertools.count()
         self._clock: Clock = lambda: 0.0
         self._now = 0.0
-        self._emit: Callable[[can.Message], None] = _to_nobody
+        self._emit: Callable[[int, bytes], None] = _to_nobody
 
-    def connect(self, emit: Callable[[can.Message], None], clock: Clock) -> None:
-        """Tell where frames go that no drive sent, and what tells the time [s]."""
+    def connect(self, emit: Callable[[int, bytes], None], clock: Clock) -> None:
+        """Say where frames go that no drive sent, by identifier with flags and data, and what gives the time [s]."""
         self._emit = emit
         self._clock = clock
 
@@ -326,15 +325,14 @@ class Faults:
 
     def _babble(self, can_id: int, elapsed: float) -> None:
         for _ in range(min(MOST_BABBLED, round(BABBLED * elapsed))):
-            self._emit(can.Message(arbitration_id=can_id, is_extended_id=False, data=bytes(8)))
+            self._emit(can_id, bytes(8))
 
     def _is_talked_down(self, can_id: int) -> bool:
         """Whether a babbling node wins every arbitration against this frame."""
         return any(a.begun and a.fault.name == "babble" and can_id > a.fault.value for a in self._active)
 
     def _emit_error(self, kind: int, detail: int = 0) -> None:
-        data = bytes((0, detail, 0, 0, 0, 0, 0, 0))
-        self._emit(can.Message(arbitration_id=kind, is_extended_id=False, is_error_frame=True, data=data))
+        self._emit(kind | ERROR, bytes((0, detail, 0, 0, 0, 0, 0, 0)))
 
     def _chance(self, fault: Fault) -> bool:
         return fault.chance == 1.0 or self._random.random() < fault.chance

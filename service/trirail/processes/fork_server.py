@@ -28,11 +28,11 @@ from trirail.processes.process import Child, Order, run
 from trirail.processes.realtime import die_with_parent, name_process
 from trirail.wire.decoding import decoded, prepare
 
-MATHEMATICS = ("loop", "planner")
-"""Those that need the compiled rooms; the others are forked before these are imported."""
-WITH_PARENT: Final = {"loop": signal.SIGTERM, "planner": signal.SIGKILL}
+MATHEMATICS = ("loop", "drives", "planner")
+"""Those that need the compiled rooms, or what these need; the others are forked before these are imported."""
+WITH_PARENT: Final = {"loop": signal.SIGTERM, "drives": signal.SIGTERM, "planner": signal.SIGKILL}
 """What ends a child when this process ends, however that ends. Gateway and recorder end by themselves once the loop has
-gone, so that what it says of its end is published and on disk."""
+gone, so that what it says of its end is published and on disk; so do drives that it has, for it stops them first."""
 OF_TERMINAL: Final = (signal.SIGINT, signal.SIGHUP)
 """What a terminal sends to all of its processes: Ctrl-C, and its own end."""
 LARGEST = 4096

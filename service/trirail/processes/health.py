@@ -49,7 +49,7 @@ class Health:
 
     def look(self, processes: Mapping[str, Running]) -> None:
         """Look at all of them, in every turn of the supervisor's."""
-        self._troubles = {name: self._trouble(name, processes[name]) for name in PROCESSES}
+        self._troubles = {name: self._trouble(name, running) for name, running in processes.items()}
         self.processes = processes
         self._looked = self._clock()
 
@@ -64,7 +64,7 @@ class Health:
         return {**self._troubles, "supervisor": supervisor}
 
     def _trouble(self, name: str, running: Running) -> str:
-        silent = self._watches[name].silent()
+        silent = name in self._watches and self._watches[name].silent()
         if running.pid is None:
             return "not running"
         if not running.ready:

@@ -10,7 +10,7 @@ import mmap
 import os
 
 PROCESSES = ("loop", "gateway", "planner", "recorder")
-"""Those that beat."""
+"""Those that beat; simulated drives do so on their bus, to the loop."""
 BEAT_EVERY = 0.05
 """How often a process beats at least, while it waits for work as well [s]."""
 

@@ -10,6 +10,7 @@ from types import FrameType
 from typing import NamedTuple
 
 from trirail_drivers.bus.capture import Capture
+from trirail_drivers.config import Can
 from trirail_drivers.connection.opening import connect
 from trirail_drivers.driver.cyclic import Lender
 from trirail_drivers.interface import DriveFault, DriveGroup
@@ -224,6 +225,7 @@ class Loop:
 
 def main(
     config: Config,
+    bus: Callable[[], Can],
     ports: Ports,
     heartbeats: Heartbeats,
     ready: Callable[[object], None],
@@ -231,7 +233,8 @@ def main(
 ) -> int:
     """Run the loop's process; `ready` is called with what the loop runs without once it turns.
 
-    `rehearse` runs what must come without delay, before the drives are touched, and returns what kept it from that.
+    `bus` waits for the bus of the drives and returns it. `rehearse` runs what must come without delay, before the drives
+    are touched, and returns what kept it from that.
     """
     drives: DriveGroup | None = None
     ended_as_told = False
@@ -240,7 +243,7 @@ def main(
         unrehearsed = rehearse(config)
         ports.planner.await_peer(PLANNER_WITHIN)
         capture = Capture() if config.telemetry.capture_can else None
-        drives = connect(config.can, config.drives, capture=capture)
+        drives = connect(bus(), config.drives, capture=capture)
         drives.configure(config.period, config.limits.slider.velocity)
         lacking = (*realtime.acquire(config.loop), *unrehearsed)
         loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)

@@ -25,7 +25,7 @@ def main(config: Config, path: Path, heart: Heart, ready: Callable[[object], Non
     serving = False
     planner = MotionPlanner(config, beat)
     planner.warm_up()
-    lacking = realtime.stay_beside(config.loop)
+    lacking = realtime.stay_beside(config.loop, realtime.PLANNER_BELOW)
     link = links.connect(path, MAX_PLANNING)
     ready({"lacking": lacking})
     poll = select.poll()

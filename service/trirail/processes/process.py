@@ -10,6 +10,7 @@ import select
 import socket
 import sys
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -91,22 +92,28 @@ def run(child: Child) -> int:
 
 def _run(child: Child) -> int:
     # Each process imports what it needs and no more: the loop must not load Zenoh or Rerun, the gateway no mathematics.
-    name, config, heart = child.name, child.order.config, child.heartbeats.of(child.name)
+    name, config = child.name, child.order.config
     if name in ("loop", "planner"):
         from trirail.kinematics.compiled import tell_of_compiling
 
         tell_of_compiling(child.compiling)
+    if name == "drives":
+        from trirail.processes import drives
+
+        return drives.main(config, child.runtime, child.ready)
     if name == "loop":
-        from trirail.processes import loop
+        from trirail.processes import drives, loop
         from trirail.processes.rehearsal import rehearse
 
         gateway, recorder, planner = (socket.socket(fileno=number) for number in child.sockets)
         ports = loop.Ports(links.Port(gateway), links.Port(recorder), links.Port(planner, MAX_PLANNING))
-        return loop.main(config, ports, child.heartbeats, child.ready, rehearse)
+        bus = partial(drives.bus, config, child.runtime)
+        return loop.main(config, bus, ports, child.heartbeats, child.ready, rehearse)
     if name == "planner":
         from trirail.processes import planner as thinking
 
-        return thinking.main(config, child.runtime / name, heart, child.ready)
+        return thinking.main(config, child.runtime / name, child.heartbeats.of(name), child.ready)
+    heart = child.heartbeats.of(name)
     link = links.connect(child.runtime / name)
     if name == "gateway":
         from trirail.processes import gateway as gate

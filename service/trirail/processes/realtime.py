@@ -18,8 +18,10 @@ from trirail.processes.memory import trim
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
 
-BELOW = 10
+PLANNER_BELOW = 10
 """By so much is the planner's priority lower than the loop's."""
+DRIVES_BELOW = 5
+"""The same of simulated drives: a plan takes longer than a drive has for an answer."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -75,8 +77,8 @@ _MEASURES: tuple[tuple[str, Callable[[LoopTable], None], str], ...] = (
 )
 
 
-def stay_beside(loop: LoopTable) -> tuple[str, ...]:
-    """Keep off the loop's processor where there is another, and below its priority; return what failed, and why."""
+def stay_beside(loop: LoopTable, below: int) -> tuple[str, ...]:
+    """Keep off the loop's processor where there is another, and so much below its priority; return what failed."""
     trim()
     gc.freeze()
     if loop.realtime == "off":
@@ -86,7 +88,7 @@ def stay_beside(loop: LoopTable) -> tuple[str, ...]:
     try:
         if others:
             os.sched_setaffinity(0, others)
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(max(1, loop.priority - BELOW)))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(max(1, loop.priority - below)))
     except OSError as error:
         lacking.append(f"SCHED_FIFO: {error.strerror}")
     return tuple(lacking)

@@ -30,6 +30,8 @@ from trirail.wire.messages import Event, Level
 
 CHILDREN = ("gateway", "recorder", "loop", "planner")
 """In the order of their start: the first two need no mathematics, and come up while that is being imported."""
+CHILDREN_WITH_DRIVES = ("gateway", "recorder", "loop", "drives", "planner")
+"""The same where the drives are simulated; the loop rehearses while the drives come up, and then waits for them."""
 PORTS = ("gateway", "recorder", "planner")
 """Where the others connect to the loop, in the order of trirail.processes.loop.Ports."""
 WATCHED_BY_SYSTEMD = ("loop", "gateway")
@@ -38,6 +40,7 @@ CONSEQUENCES = {
     "gateway": "the loop stops the robot and holds",
     "planner": "the motion under way goes on, new goals are refused",
     "recorder": "the robot is not affected",
+    "drives": "the robot is in fault, and they come back with the service's next start",
 }
 """What the death of a process means for the robot."""
 START_WITHIN = 300.0
@@ -74,11 +77,12 @@ class Supervisor:
         self._record = self._order.record
         self._say = say
         self._tell = tell
+        self._names = CHILDREN_WITH_DRIVES if config.can.interface == "simulated" else CHILDREN
         self._children: dict[str, ChildProcess] = {}
         self._selector = selectors.DefaultSelector()
-        self._restarts: dict[str, list[float]] = {name: [] for name in CHILDREN}
+        self._restarts: dict[str, list[float]] = {name: [] for name in self._names}
         self._due: dict[str, float] = {}
-        self._started = dict.fromkeys(CHILDREN, 0)
+        self._started = dict.fromkeys(self._names, 0)
         self._heartbeats = Heartbeats.create()
         loop_silent = max(SILENT, LEAST_CYCLES * config.period)
         self._patience = {
@@ -114,7 +118,7 @@ class Supervisor:
             self._parent = WarmParent(self._order, self._runtime, self._heartbeats.descriptor, sockets)
             self._selector.register(self._parent, selectors.EVENT_READ)
             try:
-                for name in CHILDREN:
+                for name in self._names:
                     self._start(name)
                 self._watch(up, signals)
             finally:
@@ -160,13 +164,13 @@ class Supervisor:
                 self._watchdog.feed()
                 continue
             ready = {name: child.ready_with for name, child in self._children.items() if child.ready_with is not None}
-            if len(ready) == len(CHILDREN):
+            if len(ready) == len(self._names):
                 self._up = True
                 up(ready)
                 notify("READY=1")
                 give_back()
             elif time.monotonic() - max(began, self._went_on) > START_WITHIN:
-                missing = ", ".join(name for name in CHILDREN if name not in ready)
+                missing = ", ".join(name for name in self._names if name not in ready)
                 raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")
 
     def _look_after(self) -> None:
@@ -182,7 +186,7 @@ class Supervisor:
                 child.kill_hung(START_WITHIN)
             elif self._up and child.process.pid is None and now - child.began > FORKS_WITHIN:
                 self._parent.kill_hung(FORKS_WITHIN)
-        self._monitor.look({name: self._running(name) for name in CHILDREN})
+        self._monitor.look({name: self._running(name) for name in self._names})
         for name, watch in self._watches.items():
             watched = self._children.get(name)
             if watched is not None and watched.process.pid is not None and watch.hangs(watched.process.pid):
@@ -214,6 +218,10 @@ class Supervisor:
             return
         if child.ready_with is None and not restarts:
             self._fail("" if said_why else f"the {name} could not start ({child.how})")
+            return
+        if name == "drives":
+            if child.process.returncode:  # else the loop has let go of them, and its own end is what is told
+                self._say(f"the simulated drives have died ({child.how}): {CONSEQUENCES[name]}", "error")
             return
         now = time.monotonic()
         restarts[:] = [moment for moment in restarts if now - moment < 60.0] + [now]
@@ -267,9 +275,9 @@ class Supervisor:
         del self._children[child.name]
 
     def _end(self) -> None:
-        """End the loop first, so that the others can tell of it; then those. The planner has nothing to tell."""
+        """End the loop first, so that the others can tell of it; then those. Planner and drives have nothing to say."""
         notify("STOPPING=1")
-        self._monitor.end({name: self._running(name) for name in CHILDREN})
+        self._monitor.end({name: self._running(name) for name in self._names})
         for child in self._children.values():
             if child.process.pid is None:
                 child.process.kill()
@@ -278,9 +286,10 @@ class Supervisor:
             if not loop.process.wait(time.monotonic() + END_WITHIN):
                 self._kill_unwilling(loop)
             self._turned = self._turned or loop.ready_with is not None
-        if planner := self._children.get("planner"):  # it keeps nothing, and may be frozen or in its start
-            self._kill(planner)
-            self._forget(planner)
+        for name in ("planner", "drives"):  # they keep nothing, and may be frozen or in their start
+            if left := self._children.get(name):
+                self._kill(left)
+                self._forget(left)
         # The others end by themselves once the loop has gone and what it said is published and on disk; one that has
         # never turned has said nothing.
         by_itself = time.monotonic() + (END_WITHIN if self._turned else 0.0)

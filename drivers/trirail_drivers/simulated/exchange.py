@@ -1,0 +1,91 @@
+"""Frames between a master and simulated drives, and among these, unless faults have it otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Final
+
+from trirail_drivers.bus.can_frame import ERROR, EXTENDED, REMOTE, STANDARD_BITS
+from trirail_drivers.interface import Clock
+from trirail_drivers.simulated.devices import SimulatedDevice
+from trirail_drivers.simulated.faults import Faults
+
+_FLAGS: Final = EXTENDED | REMOTE | ERROR
+
+
+class Exchange:
+    """The drives, on no bus yet: whoever owns it brings the master's frames and the time, and has the drives' frames.
+
+    Identifiers have the flags of `struct can_frame`.
+    """
+
+    def __init__(
+        self, drives: Sequence[SimulatedDevice], clock: Clock, faults: Faults, emit: Callable[[int, bytes], None]
+    ) -> None:
+        """Switch the drives on; `faults` are those of the same drives, `emit` has the frames for the master."""
+        self._drives = tuple(drives)
+        self._faults = faults
+        self._clock = clock
+        self._emit = emit
+        now = clock()
+        faults.connect(emit, clock)
+        everyone = range(len(self._drives))
+        self._everyone = tuple(everyone)
+        for index, drive in enumerate(self._drives):
+            others = tuple(other for other in everyone if other != index)
+            drive.connect(partial(self._from_drive, index, others), now)
+
+    def receive(self, identifier: int, data: bytes, now: float) -> bool:
+        """Bring a frame of the master to every drive, at time `now` [s]; False while its controller is bus-off."""
+        if not self._faults.idle:
+            self._faults.poll(now)
+            if self._faults.bus_off:
+                return False
+        if not identifier & _FLAGS:
+            self._to_drives(self._everyone, identifier, data)
+        elif identifier & _FLAGS == REMOTE:
+            self._request(identifier & STANDARD_BITS, now)
+        return True
+
+    def poll(self, now: float) -> None:
+        """Do what is due at time `now` [s]."""
+        if not self._faults.idle:
+            self._faults.poll(now)
+        for drive in self._drives:
+            drive.poll(now)
+
+    def _request(self, can_id: int, now: float) -> None:
+        """Bring a remote frame to every drive, unless faults have it otherwise."""
+        for index in self._everyone:
+            if self._faults.idle:
+                self._drives[index].receive_remote(can_id, now)
+            else:
+                self._faults.carry(index, True, can_id, b"", partial(self._hand_request_in, index, can_id))
+
+    def _to_drives(self, indices: Sequence[int], can_id: int, data: bytes) -> None:
+        """Bring a frame to some drives, unless faults have it otherwise."""
+        if self._faults.idle:
+            now = self._clock()
+            for index in indices:
+                self._drives[index].receive(can_id, data, now)
+        else:
+            for index in indices:
+                self._faults.carry(index, True, can_id, data, partial(self._hand_in, index, can_id))
+
+    def _hand_request_in(self, index: int, can_id: int, _data: bytes) -> None:
+        self._drives[index].receive_remote(can_id, self._clock())
+
+    def _hand_in(self, index: int, can_id: int, data: bytes) -> None:
+        self._drives[index].receive(can_id, data, self._clock())
+
+    def _from_drive(self, index: int, others: Sequence[int], can_id: int, data: bytes) -> None:
+        """Bring a drive's frame to the master and the other drives, unless faults have it otherwise."""
+        if self._faults.idle:
+            self._hand_out(others, can_id, data)
+        else:
+            self._faults.carry(index, False, can_id, data, partial(self._hand_out, others, can_id))
+
+    def _hand_out(self, others: Sequence[int], can_id: int, data: bytes) -> None:
+        self._emit(can_id, data)
+        self._to_drives(others, can_id, data)
