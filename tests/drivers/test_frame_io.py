@@ -96,6 +96,16 @@ def test_a_wait_for_a_frame_ends_without_one(kind: str, way: str) -> None:
         assert time.monotonic() - began >= 0.05
 
 
+def test_an_end_that_dies_with_frames_unread_is_gone_and_stays_so() -> None:
+    """The kernel says once that the connection was reset."""
+    with over("unix", "socket") as (frames, far):
+        frames.send(Frame(0x201, b"\x06\x00"))
+        far.socket.close()
+        for _ in range(2):
+            with pytest.raises(can.CanOperationError, match="the listening end is gone"):
+                frames.receive()
+
+
 @on_every_bus
 def test_a_capture_has_every_frame_with_its_time(kind: str, way: str) -> None:
     capture = Capture()

@@ -12,6 +12,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import can
 import carriers
@@ -24,6 +25,7 @@ from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Can, Drive, Drives, Simulated
 from trirail_drivers.connection import opening
 from trirail_drivers.connection.opening import simulated_bus
+from trirail_drivers.connection.serving import serve
 from trirail_drivers.errors import BusError
 from trirail_drivers.interface import Feedback, PowerState
 
@@ -38,6 +40,8 @@ DRIVES = Drives(
     sdo_timeout=10.0,
 )
 PERIOD = 0.02
+SERVED = "served"
+"""Drives by trirail_drivers.connection.serving, which have one master."""
 WITHIN = 60.0
 """How long a slow machine may take for anything [s]."""
 
@@ -54,19 +58,22 @@ def interface() -> Iterator[str]:
         yield name
 
 
-@pytest.fixture(params=["unix", pytest.param("vcan", marks=carriers.NEEDS_VCAN)])
+@pytest.fixture(params=["unix", SERVED, pytest.param("vcan", marks=carriers.NEEDS_VCAN)])
 def section(request: pytest.FixtureRequest) -> Can:
     """A bus that is there."""
     if request.param == "vcan":
         request.getfixturevalue("interface")
         return VCAN
     folder = request.getfixturevalue("tmp_path")
-    return Can(interface="unix", channel=str(folder / "can"), simulated=SIMULATED)
+    return Can(interface="unix", channel=str(folder / request.param), simulated=SIMULATED)
 
 
 @pytest.fixture
 def drives(section: Can) -> Iterator[None]:
     """The simulated drives on it."""
+    if section.channel.endswith(SERVED):
+        yield from served(Path(section.channel), section)
+        return
     over, running = socket.socketpair()
     simulated = simulated_bus(section, DRIVES)
     wire = UnixBus(section.channel, listen=True) if section.interface == "unix" else opening.open_bus(section, DRIVES)
@@ -90,6 +97,19 @@ def drives(section: Can) -> Iterator[None]:
     thread.join()
     for part in (wire, simulated, over, running):
         part.shutdown() if isinstance(part, can.BusABC) else part.close()
+
+
+def served(path: Path, section: Can) -> Iterator[None]:
+    """The simulated drives as the service has them: they end when the driver has gone."""
+    thread = threading.Thread(target=serve, args=(path, section, DRIVES, lambda: None, lambda: None))
+    thread.start()
+    deadline = time.monotonic() + WITHIN
+    while not path.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    yield
+    thread.join(WITHIN)
+    assert not thread.is_alive()
 
 
 @pytest.fixture(params=carriers.WAYS)

@@ -1,0 +1,170 @@
+"""Simulated drives in a process of their own, as their master on the other end of the bus has them."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import can
+import pytest
+from trirail_drivers.bus import unixbus
+from trirail_drivers.bus.can_frame import CAN_FRAME, ERROR, EXTENDED, REMOTE
+from trirail_drivers.bus.unixbus import UnixBus
+from trirail_drivers.config import Can, Drive, Drives
+from trirail_drivers.connection.serving import serve
+from trirail_drivers.errors import DriveError
+
+DRIVES = Drives(
+    protocol="cia402",
+    A=Drive(node=1, counts_per_metre=1e6),
+    B=Drive(node=2, counts_per_metre=1e6),
+    C=Drive(node=3, counts_per_metre=1e6),
+)
+SECTION = Can("simulated")
+WITHIN = 30.0
+"""How long a busy machine may take for anything [s]."""
+DEVICE_TYPE = bytes.fromhex("4000100000000000")
+"""A request to read 1000h, and its answer."""
+SERVO = bytes.fromhex("4300100092010200")
+
+
+class Served:
+    """Drives that are served, and what has been said of that."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.said: list[str] = []
+        self._thread = threading.Thread(
+            target=serve,
+            args=(path, SECTION, DRIVES, lambda: self.said.append("ready"), lambda: self.said.append("connected")),
+        )
+
+    def begin(self) -> None:
+        """Serve; return when they can be connected to."""
+        self._thread.start()
+        wait_for(self.path.exists)
+
+    def over(self) -> None:
+        """Wait until they are served no more."""
+        self._thread.join(WITHIN)
+        assert not self._thread.is_alive()
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WITHIN
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    made = Served(tmp_path / "drives")
+    made.begin()
+    yield made
+    if made.said == ["ready"]:
+        UnixBus(str(made.path)).shutdown()
+    made.over()
+
+
+def frame(can_id: int, data: bytes = b"", **flags: bool) -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **flags})
+
+
+def until(bus: can.BusABC, can_id: int) -> bytes:
+    """The data of the next frame of an identifier."""
+    deadline = time.monotonic() + WITHIN
+    while time.monotonic() < deadline:
+        message = bus.recv(WITHIN)
+        if message is not None and message.arbitration_id == can_id:
+            return bytes(message.data)
+    raise AssertionError(f"no frame {can_id:X}")
+
+
+def test_they_boot_when_their_master_comes_and_answer_him_alone(served: Served) -> None:
+    assert served.said == ["ready"]
+    with UnixBus(str(served.path)) as bus:
+        assert [until(bus, 0x700 + node) for node in (1, 2, 3)] == [b"\0"] * 3
+        bus.send(frame(0x602, DEVICE_TYPE))
+        assert until(bus, 0x582) == SERVO
+        assert served.said == ["ready", "connected"]
+        with pytest.raises(DriveError):
+            UnixBus(str(served.path))
+
+
+def test_their_timers_run_without_frames(served: Served) -> None:
+    """Heartbeats, each 20 ms (1017h)."""
+    with UnixBus(str(served.path)) as bus:
+        bus.send(frame(0x601, bytes.fromhex("2b17100014000000")))
+        began = time.monotonic()
+        until(bus, 0x581)
+        assert [until(bus, 0x701) for _ in range(6)] == [b"\x7f"] * 6
+        assert time.monotonic() - began > 5 * 0.02 - 0.01
+
+
+def test_what_is_no_frame_for_a_drive_changes_nothing(served: Served) -> None:
+    with UnixBus(str(served.path)) as bus:
+        for node in (1, 2, 3):
+            until(bus, 0x700 + node)
+        request = frame(0x602, DEVICE_TYPE)
+        bus.send(frame(0x602, DEVICE_TYPE, is_extended_id=True))
+        bus.send(frame(0x602, DEVICE_TYPE, is_error_frame=True))
+        bus.send(frame(0x602, is_remote_frame=True))
+        bus.send(frame(0x000, b"\x80\x01\x00"))
+        bus.send(request)
+        answer = bus.recv(WITHIN)
+        assert answer is not None
+        assert (answer.arbitration_id, bytes(answer.data)) == (0x582, SERVO)
+
+
+def test_a_remote_frame_is_answered(served: Served) -> None:
+    """Node guarding: the state, and a bit that toggles."""
+    with UnixBus(str(served.path)) as bus:
+        until(bus, 0x701)
+        for state in (b"\x7f", b"\xff"):
+            bus.send(frame(0x701, is_remote_frame=True))
+            assert until(bus, 0x701) == state
+
+
+def test_a_master_that_does_not_read_loses_frames_and_no_more(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unixbus, "MOST_WAITING", 1)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as master:
+        master.connect(str(served.path))
+        master.settimeout(WITHIN)
+        for _ in range(500):
+            master.send(CAN_FRAME.pack(0x602, 8, DEVICE_TYPE))
+        answers = 0
+        master.settimeout(0.5)
+        try:
+            while master.recv(CAN_FRAME.size):
+                answers += 1
+        except TimeoutError:
+            pass
+        assert 0 < answers < 500
+        master.send(CAN_FRAME.pack(0x602, 8, DEVICE_TYPE))
+        assert CAN_FRAME.unpack(master.recv(CAN_FRAME.size)) == (0x582, 8, SERVO)
+
+
+@pytest.mark.parametrize("last", [b"", b"short"], ids=["hung up", "no frame"])
+def test_they_end_with_their_master(served: Served, last: bytes) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as master:
+        master.connect(str(served.path))
+        if last:
+            master.send(last)
+            served.over()
+    served.over()
+
+
+@pytest.mark.parametrize("flag", [EXTENDED, ERROR, EXTENDED | REMOTE, ERROR | REMOTE])
+def test_flags_of_a_frame_are_no_part_of_its_identifier(served: Served, flag: int) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as master:
+        master.connect(str(served.path))
+        master.settimeout(WITHIN)
+        booted = [CAN_FRAME.unpack(master.recv(CAN_FRAME.size))[0] for _ in range(3)]
+        master.send(CAN_FRAME.pack(0x701 | flag, 0, b""))
+        master.send(CAN_FRAME.pack(0x602, 8, DEVICE_TYPE))
+        assert booted == [0x701, 0x702, 0x703]
+        assert CAN_FRAME.unpack(master.recv(CAN_FRAME.size)) == (0x582, 8, SERVO)
