@@ -140,6 +140,7 @@ def test_a_killed_parent_leaves_nobody_and_a_complete_recording(name: str, servi
     with service.robot() as robot:
         in_motion(robot)
         processes = service.processes()
+        assert "drives" in processes
         os.kill(processes.pop(name), signal.SIGKILL)
         for process in processes.values():
             wait_gone(process)

@@ -60,6 +60,7 @@ class Service:
             'listen = ["tcp/127.0.0.1:7447"]': f'listen = ["{self.locator}"]',
             "live_port = 9876": "live_port = 0\ncapture_can = true",
             "max_overruns = 100 ": "max_overruns = 1000 ",  # a shared machine stalls now and then
+            "missed_positions = 100 ": "missed_positions = 1000 ",
             'directory = "recordings"': f'directory = "{folder}/recordings"',
             **changes,
         }.items():
@@ -746,6 +747,49 @@ def test_a_frozen_recorder_does_not_matter(service: Service) -> None:
     (file,) = (service.folder / "recordings").glob("*.rrd")
     cycles = read(file).records["cycle"]
     assert np.array_equal(np.diff(cycles), np.ones(len(cycles) - 1))  # what waited for it is in the file
+
+
+def test_killed_drives_are_a_fault_and_the_service_stays(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        os.kill(service.child("drives"), signal.SIGKILL)
+        state = until(robot, lambda state: state.mode == "fault")
+        (fault,) = state.faults
+        assert re.fullmatch(
+            r"CAN bus: cannot (send|receive): .*(listening end|end of the bus that listens) is gone", fault
+        )
+        service.wait_said(
+            "the simulated drives have died (killed by SIGKILL): the robot is in fault, and they come back with the "
+            "service's next start"
+        )
+        with pytest.raises(RefusedError, match="is gone"):
+            robot.reset()
+        stopped = trirail("stop", locator=service.locator)
+        assert (stopped.returncode, stopped.stderr) == (0, "")
+        assert robot.state().mode == "fault"
+        assert "drives" not in service.processes()
+    assert service.end() == 0
+    assert "Traceback" not in service.log.read_text()
+
+
+def test_frozen_drives_are_a_fault_and_do_not_hold_up_the_end(service: Service) -> None:
+    with service.robot() as robot:
+        robot.enable()
+        os.kill(service.child("drives"), signal.SIGSTOP)
+        state = until(robot, lambda state: state.mode == "fault")
+        assert re.search(r"drive [ABC]: no (heartbeat|statusword) for 0\.[34]", state.faults[0])
+    assert service.end() == 0
+    assert "Traceback" not in service.log.read_text()
+
+
+def test_drives_that_are_told_to_end_go_on_as_long_as_the_loop_has_them(service: Service) -> None:
+    with service.robot() as robot:
+        in_motion(robot)
+        os.kill(service.child("drives"), signal.SIGTERM)
+        state = until(robot, lambda state: state.mode == "holding")
+        assert state.pose[0] == pytest.approx(0.1, abs=1e-5)
+    assert service.end() == 0
+    assert "drives have died" not in service.log.read_text()
 
 
 def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> None:

@@ -233,8 +233,8 @@ def main(
 ) -> int:
     """Run the loop's process; `ready` is called with what the loop runs without once it turns.
 
-    `bus` waits for the bus of the drives and returns it. `rehearse` runs what must come without delay, before the drives
-    are touched, and returns what kept it from that.
+    `bus` waits for the drives' bus and returns it. `rehearse` runs what must come without delay, before the drives are
+    touched, and returns what kept it from that.
     """
     drives: DriveGroup | None = None
     ended_as_told = False
