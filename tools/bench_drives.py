@@ -1,4 +1,4 @@
-"""Simulated drives that listen on a bus between processes, and do nothing else: the loop is measured with them.
+"""Simulated drives on a bus between processes on which others may listen: what the loop sends is measured with them.
 
 python tools/bench_drives.py CONFIG PATH        real-time where the rights allow it, away from the loop's processor
 

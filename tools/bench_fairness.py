@@ -87,7 +87,7 @@ def measure(goals: int, rate: int = 1000) -> dict[str, Any]:
         f"{what}_{when}_ms": [] for what in ("goal", "stop") for when in ("quiet", "flooded")
     }
     flooded_for = 0.0
-    with rig(rate, inside=True) as made, flooders(made.locator) as (on, sent):
+    with rig(rate, own=True) as made, flooders(made.locator) as (on, sent):
         _each(made.robot, choice)
         for number in range(2 * ROUNDS):
             when = "flooded" if number % 2 else "quiet"

@@ -109,7 +109,7 @@ def measure(goals: int, rate: int = 1000) -> dict[str, Any]:
     chance = random.Random(3)
     with rig(rate) as made:
         if made.bus is None:
-            raise SystemExit("the drives are inside: there is no bus to look at")
+            raise SystemExit("the drives are the service's own: there is no bus to look at")
         with listener(made.bus) as heard:
             at_rest = _each(goals, made.robot, heard, chance, _at_rest)
             in_motion = _each(goals, made.robot, heard, chance, _in_motion)

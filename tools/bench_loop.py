@@ -2,7 +2,7 @@
 
 The service runs as a user runs it, with gateway, recorder and a client that watches every cycle, while goals come
 without pause. cyclictest runs in the same minute on the same processor, one priority above the loop, in as many runs as
-lateness is compared in. The simulated drives are a process of their own, real-time on the other processor, so that a
+lateness is compared in. The simulated drives are a process of the service, real-time on the other processor, so that a
 cycle is the loop's own; where a virtual machine stalls one of the two, the other waits for it. Faults are counted and
 reset. Before the service and after it the bare loop runs, a cycle's frames and nothing else, as trirail doctor measures
 it, and cyclictest beside it: what it takes is the machine's share. Of a rate that the service cannot keep that is
@@ -79,7 +79,7 @@ def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, An
     found: list[dict[str, Any]] = []
     batches: list[NDArray[np.void]] = []
     goals = 0
-    with rig(rate) as made:
+    with rig(rate, own=True) as made:
         faults = Faults(made.robot)
         without_pause(made.robot, SETTLE, faults.mend)
         for run in range(runs):

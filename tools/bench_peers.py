@@ -45,7 +45,7 @@ def measure(seconds: float) -> dict[str, Any]:
 def _trirail(seconds: float) -> list[float]:
     with rig(RATE) as made:
         if made.bus is None:
-            raise SystemExit("the drives are inside: there is no bus to look at")
+            raise SystemExit("the drives are the service's own: there is no bus to look at")
         without_pause(made.robot, 1.0)
         with listener(made.bus) as heard:
             without_pause(made.robot, seconds)
@@ -54,7 +54,7 @@ def _trirail(seconds: float) -> list[float]:
 
 def _canopen(seconds: float, real_time: bool) -> list[float]:
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
-        config, _ = configured(Path(folder), RATE, inside=False)
+        config, _ = configured(Path(folder), RATE, own=False)
         path = f"{folder}/can"
         with drives(config, path), listener(path) as heard:
             command = [sys.executable, __file__, path, str(seconds), str(int(real_time))]

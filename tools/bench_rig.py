@@ -1,4 +1,4 @@
-"""A service to be measured, its drives in a process of their own where they can keep up, and goals without pause."""
+"""A service to be measured, on its own simulated drives or on a bus where others listen, and goals without pause."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ class Rig:
         self.pid = pid
         self.locator = locator
         self.bus = bus
-        """Path of the bus between processes; None where the drives are inside the loop."""
+        """Path of the bus between processes; None where it is the service's own."""
 
 
 @contextlib.contextmanager
-def rig(rate_hz: int, inside: bool = False, metrics_port: int = 0) -> Iterator[Rig]:
-    """A service on simulated drives at a rate, enabled; `inside` keeps the drives in the loop's process."""
+def rig(rate_hz: int, own: bool = False, metrics_port: int = 0) -> Iterator[Rig]:
+    """A service on simulated drives at a rate, enabled; they are its `own`, or on a bus where others can listen."""
     with tempfile.TemporaryDirectory(prefix="trirail-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
-        config, locator = configured(folder, rate_hz, inside, metrics_port)
-        bus = None if inside else str(folder / "can")
+        config, locator = configured(folder, rate_hz, own, metrics_port)
+        bus = None if own else str(folder / "can")
         if bus is not None:
             stack.enter_context(drives(config, bus))
         service = stack.enter_context(own_service.service(config, folder / "bench.rrd"))
@@ -52,12 +52,12 @@ def rig(rate_hz: int, inside: bool = False, metrics_port: int = 0) -> Iterator[R
             robot.disable()
 
 
-def configured(folder: Path, rate_hz: int, inside: bool, metrics_port: int = 0) -> tuple[Path, str]:
+def configured(folder: Path, rate_hz: int, own: bool, metrics_port: int = 0) -> tuple[Path, str]:
     """Write the configuration; return the file, and the locator of the service."""
     config, locator = own_service.private(folder)
     text = config.read_text(encoding="utf-8")
     changes = {"rate_hz": str(rate_hz), "bitrate": str(BITRATE), "live_port": f"0\nmetrics_port = {metrics_port}"}
-    if not inside:
+    if not own:
         changes["interface"] = f'"unix"\nchannel = "{folder}/can"'
     for key, value in changes.items():
         text, found = re.subn(rf"^{key} = [^#\n]*", f"{key} = {value} ", text, flags=re.MULTILINE)

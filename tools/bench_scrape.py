@@ -33,7 +33,7 @@ AIM = 0.05
 def measure(seconds: float, rate: int = 1000) -> dict[str, Any]:
     """Measure for so many seconds; lateness in microseconds at QUANTILES."""
     port = free_port()
-    with rig(rate, inside=True, metrics_port=port) as made:
+    with rig(rate, own=True, metrics_port=port) as made:
         without_pause(made.robot, 3.0)  # what happens once has happened
         due, late, scrapes = _moving_and_scraped(made.robot, rate, seconds, port)
     near = within(due, scrapes + np.array([0.0, AFTER]))

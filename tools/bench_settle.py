@@ -20,7 +20,7 @@ WITHIN = 30.0
 def measure(goals: int, rate: int = 1000) -> dict[str, Any]:
     """Send so many goals, one after the other; return how they ended, and milliseconds and micrometres at QUANTILES."""
     chance = random.Random(SEED)
-    with rig(rate, inside=True) as made:
+    with rig(rate, own=True) as made:
         results = [
             made.robot.move_to(
                 x=chance.uniform(-0.06, 0.06), y=chance.uniform(-0.06, 0.06), phi=chance.uniform(-0.5, 0.4)
