@@ -67,7 +67,7 @@ OptionName = Annotated[str, Meta(max_length=64, pattern=r"^[A-Za-z_][A-Za-z0-9_]
 
 
 class Can(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [can]: any python-can interface, or "simulated" (three drives inside the process)."""
+    """Section [can]: any python-can interface, or "simulated" (three drives that the service brings along)."""
 
     interface: Name
     """`simulated`, or the name of a python-can interface, as `socketcan`."""
