@@ -18,7 +18,7 @@ __all__ = ["compile_no_more", "compiled", "inlined", "tell_of_compiling"]
 P = ParamSpec("P")
 R = TypeVar("R")
 
-ROOMS = ("kinematics", "motion", "control")
+ROOMS = ("kinematics", "motion", "control", "processes")
 """Where compiled functions stand: what is inlined, or fixed as a constant, goes across files and rooms."""
 
 
@@ -27,7 +27,7 @@ def _sources() -> bytes:
     files = [file for room in ROOMS for file in sorted((package / room).glob("*.py"))]
     sources = [(file.parent.name, file.read_bytes()) for file in files]
     # Constants come from any file of the kinematics; elsewhere from those that have compiled functions themselves.
-    return b"".join(source for room, source in sources if room == ROOMS[0] or b"compiled" in source)
+    return b"".join(source for room, source in sources if room == ROOMS[0] or b"@compiled(" in source)
 
 
 FINGERPRINT = hashlib.sha256(_sources()).hexdigest()

@@ -157,7 +157,7 @@ def measure_alone(loop: LoopTable, rate_hz: int, seconds: float) -> Cycles:
 def _drives(loop: LoopTable) -> Iterator[socket.socket]:
     """What stands for three drives, in a process of its own; it ends when the other end of its socket does."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    processor, priority = realtime.processor(loop), max(1, loop.priority - realtime.BELOW)
+    processor, priority = realtime.processor(loop), max(1, loop.priority - realtime.DRIVES_BELOW)
     command = python("-m", _MODULE, *(str(each) for each in (theirs.fileno(), processor, priority)))
     with ours, subprocess.Popen(command, pass_fds=[theirs.fileno()], start_new_session=True) as process:
         theirs.close()

@@ -18,12 +18,12 @@ from trirail_drivers.interface import DriveFault, DriveGroup
 from trirail.config import Config
 from trirail.control.control import Control, Given
 from trirail.control.modes import ModeEvent
-from trirail.control.quiet import Reached
 from trirail.kinematics.robot import warm_up
 from trirail.processes import realtime
 from trirail.processes.clock import Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.planner_port import PlannerLink
+from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
 from trirail.processes.reports import Reports
 from trirail.wire.links import Port

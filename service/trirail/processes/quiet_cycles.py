@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from trirail_drivers.driver.cyclic import Cyclic, Lender
 
-from trirail.control import quiet
 from trirail.control.control import Calm, Control
-from trirail.control.quiet import Reached
 from trirail.motion.paths import Path, constant
+from trirail.processes import quiet
 from trirail.processes.clock import Ticker
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
+from trirail.processes.quiet import Reached
 from trirail.processes.reports import Reports
 from trirail.wire.links import Port
 from trirail.wire.records import LONGEST, Part

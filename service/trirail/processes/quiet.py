@@ -21,7 +21,9 @@ from trirail_drivers.bus.frames import BITS
 from trirail_drivers.driver.cyclic import MOST_FRAMES
 
 from trirail.control import cycle
-from trirail.control.exchange import (
+from trirail.kinematics.arrays import Array
+from trirail.kinematics.compiled import compiled
+from trirail.processes.exchange import (
     AXES,
     EXPECTATIONS,
     FRAMES,
@@ -32,8 +34,6 @@ from trirail.control.exchange import (
     set_frames,
     take_frames,
 )
-from trirail.kinematics.arrays import Array
-from trirail.kinematics.compiled import compiled
 from trirail.wire.records import LONGEST, Part
 
 __all__ = ["COMMAND", "FOLLOW", "HOLD", "STATE", "Reached", "run"]
@@ -223,7 +223,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
 
     `kept` (n, 3) are addresses and sizes of all that a cycle changes, and of copies of it; `moment` (2,) room for a
     struct timespec, `doors` (n, 2) as poll takes them, `hearts` the counters of trirail.processes.heartbeats, `batch`
-    (n, SIZE) room for records, `made` (SIZE,) the bytes of `record`. All else as in trirail.control.cycle and exchange.
+    (n, SIZE) room for records, `made` (SIZE,) the bytes of `record`. All else as in control.cycle and exchange.
     """
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):
