@@ -100,13 +100,13 @@ class SocketFrames:
         """The next frame that has arrived, or arrives within `timeout` [s]; None where there is none left."""
         if self._handed_in:
             return self._handed_in.popleft()
-        if self._error:
-            error, self._error = self._error, 0
-            raise OSError(error, os.strerror(error))
         if timeout > 0.0:
             self._poll.poll(timeout * 1000.0)
         packet = self._packet
         try:
+            if self._error:
+                error, self._error = self._error, 0
+                raise OSError(error, os.strerror(error))
             if self._capture is None:
                 size = self._socket.recv_into(packet, 0, socket.MSG_DONTWAIT)
             else:

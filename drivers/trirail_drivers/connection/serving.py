@@ -16,7 +16,7 @@ from trirail_drivers import config
 from trirail_drivers.bus.can_frame import CAN_FRAME
 from trirail_drivers.bus.unixbus import widen
 from trirail_drivers.connection.opening import simulated_drives
-from trirail_drivers.simulated.exchange import Exchange
+from trirail_drivers.simulated.exchange import SimulatedExchange
 
 WAIT = 0.01
 """How often the drives' timers are looked at that no frame of theirs has looked at [s]."""
@@ -55,10 +55,10 @@ def serve(
             with contextlib.suppress(BlockingIOError):  # a master that does not read loses frames
                 master.send(CAN_FRAME.pack(identifier, len(data), data), socket.MSG_DONTWAIT)
 
-        _exchange(master, Exchange(devices, time.monotonic, faults, emit))
+        _exchange(master, SimulatedExchange(devices, time.monotonic, faults, emit))
 
 
-def _exchange(master: socket.socket, drives: Exchange) -> None:
+def _exchange(master: socket.socket, drives: SimulatedExchange) -> None:
     """Bring frames and the time to the drives until the master has gone."""
     packet = bytearray(CAN_FRAME.size)
     unpack, receive, clock = CAN_FRAME.unpack, master.recv_into, time.monotonic

@@ -13,7 +13,7 @@ from trirail_drivers.bus.can_frame import CAN_FRAME
 from trirail_drivers.bus.frames import can_id, unpacked
 from trirail_drivers.interface import Clock
 from trirail_drivers.simulated.devices import SimulatedDevice
-from trirail_drivers.simulated.exchange import Exchange
+from trirail_drivers.simulated.exchange import SimulatedExchange
 from trirail_drivers.simulated.faults import Faults
 
 _STEP = 0.0005
@@ -36,7 +36,7 @@ class SimulatedBus(can.BusABC):
         self._clock = clock
         self._arrived: deque[can.Message] = deque()
         super().__init__(channel=self.channel_info)
-        self._exchange = Exchange(self.drives, clock, faults, self._emit)
+        self._exchange = SimulatedExchange(self.drives, clock, faults, self._emit)
 
     def press(self, index: int, switches: int) -> None:
         """Press switches of a slider by hand, and let go of the others: bits of its drive's digital inputs (60FDh)."""

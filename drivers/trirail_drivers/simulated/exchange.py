@@ -14,7 +14,7 @@ from trirail_drivers.simulated.faults import Faults
 _FLAGS: Final = EXTENDED | REMOTE | ERROR
 
 
-class Exchange:
+class SimulatedExchange:
     """The drives, on no bus yet: whoever owns it brings the master's frames and the time, and has the drives' frames.
 
     Identifiers have the flags of `struct can_frame`.
