@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from trirail_drivers.cia402 import frames, ways
 from trirail_drivers.cia402.codes import words
 from trirail_drivers.cia402.second_node import AnswersAfter, AnswersPerSync, told
@@ -14,7 +12,7 @@ from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
-from trirail_drivers.driver.cyclic import expected
+from trirail_drivers.driver.cyclic import Row, expected
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
@@ -162,34 +160,38 @@ class Cia402Axis(Axis):
             and self.controlword == self.word(-math.inf, wanted)
         )
 
-    def lend(self, row: np.void) -> None:
-        """Write what is kept of it, where it rests, into a row of trirail_drivers.driver.cyclic.AXIS."""
-        row["position"], row["actual"], row["heard"] = self.position, self.actual, self.heard
-        row["statusword"], row["seen_clear"], row["status_heard"] = self.statusword, self.seen_clear, self.status_heard
-        row["stands_at"], row["stands_since"], row["command_age"] = (
-            self._stands_at,
-            self._stands_since,
-            self.command_age,
-        )
+    def lend(self) -> Row:
+        """Return what is kept of it, where it rests."""
+        row: Row = {
+            "position": self.position,
+            "actual": self.actual,
+            "heard": self.heard,
+            "status_heard": self.status_heard,
+            "statusword": self.statusword,
+            "seen_clear": self.seen_clear,
+            "stands_at": self._stands_at,
+            "stands_since": self._stands_since,
+            "command_age": self.command_age,
+            "counts_per_metre": self.scale.counts_per_metre,
+            "zero": self.scale.offset,
+            "velocity_per_metre": self.units.velocity_per_metre,
+            "still": max(1.0, abs(self.scale.counts_per_metre) * STILL),
+            "heard_within": self._heartbeat_timeout,
+            "status_within": MISSED_STATUSES * frames.STATUS_PERIOD,
+            "position_at": self.way.setpoints.place(0),
+            "velocity_at": self.way.setpoints.place(1),
+        }
         row["target"], row["offset"] = self.setpoint or (0, 0)
-        row["counts_per_metre"], row["zero"] = self.scale.counts_per_metre, self.scale.offset
-        row["velocity_per_metre"] = self.units.velocity_per_metre
-        row["still"] = max(1.0, abs(self.scale.counts_per_metre) * STILL)
-        row["heard_within"], row["status_within"] = self._heartbeat_timeout, MISSED_STATUSES * frames.STATUS_PERIOD
-        row["position_at"], row["velocity_at"] = self.way.setpoints.place(0), self.way.setpoints.place(1)
         self.answers.lend(row)
         self._answers_per_sync.lend(row)
+        return row
 
-    def take_back(self, row: np.void, cycles: int) -> None:
+    def take_back(self, row: Row, cycles: int) -> None:
         """Go on from there, so many whole cycles later."""
-        self.position, self.heard, self.status_heard = (
-            float(row[name]) for name in ("position", "heard", "status_heard")
-        )
-        self.actual, self.statusword, self.seen_clear, self._stands_at, self.command_age = (
-            int(row[name]) for name in ("actual", "statusword", "seen_clear", "stands_at", "command_age")
-        )
-        self._stands_since = float(row["stands_since"])
-        self.setpoint = int(row["target"]), int(row["offset"])
+        self.position, self.actual, self.heard = row["position"], row["actual"], row["heard"]
+        self.statusword, self.seen_clear, self.status_heard = row["statusword"], row["seen_clear"], row["status_heard"]
+        self._stands_at, self._stands_since = row["stands_at"], row["stands_since"]
+        self.command_age, self.setpoint = row["command_age"], (row["target"], row["offset"])
         self.answers.take_back(row)
         self._answers_per_sync.take_back(row, cycles)
 

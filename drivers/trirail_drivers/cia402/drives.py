@@ -46,6 +46,8 @@ class Cia402(Driver[Cia402Axis]):
         self._lent: Cyclic | None = None
         self._away = False
         """What is kept of the drives is lent."""
+        self._lent_with: list[tuple[int, int]] = []
+        """The controlwords and statuswords that the tables are made for."""
 
     def configure(self, period: float, fastest: float | None = None) -> None:
         """Set the drives up for a cycle of `period` seconds, read every value back, start them without power.
@@ -183,12 +185,15 @@ class Cia402(Driver[Cia402Axis]):
             return None
         lent = self._lent = self._lent or Cyclic(descriptor, self._sync, self._beats)
         lent.times[0] = self._off_by, due, self._drives.heartbeat, 0, self._wire.traffic, 0
-        for axis, row, frame in zip(self._axes, lent.axes, self._setpoints, strict=True):
-            axis.lend(row)
-            axis.way.setpoints.fill(frame, *(axis.setpoint or (0, 0)), axis.controlword)
-        lent.setpoints.fill(self._setpoints)
+        lent.write([axis.lend() for axis in self._axes])
         self._away = True
-        lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected(number)])
+        words = [(axis.controlword, axis.statusword) for axis in self._axes]
+        if words != self._lent_with:
+            self._lent_with = words
+            for axis, frame in zip(self._axes, self._setpoints, strict=True):
+                axis.way.setpoints.fill(frame, *(axis.setpoint or (0, 0)), axis.controlword)
+            lent.setpoints.fill(self._setpoints)
+            lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected(number)])
         return lent
 
     def take_back(self, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
@@ -197,7 +202,7 @@ class Cia402(Driver[Cia402Axis]):
         self._away = False
         lent, times = self._lent, self._lent.times[0]
         self._wire.traffic, self._heartbeat_due = int(times["traffic"]), float(times["beat_due"])
-        for axis, row in zip(self._axes, lent.axes, strict=True):
+        for axis, row in zip(self._axes, lent.rows(), strict=True):
             axis.take_back(row, int(times["cycles"]))
         self._wire.hand_in(lent.arrived.unpacked(arrived), error)
         if synced is not None:

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
+from trirail_drivers.driver.cyclic import Row
 from trirail_drivers.interface import DriveFault
 
 FAR: Final = 0.005
@@ -97,14 +96,14 @@ class AnswersPerSync:
         """Whether no SYNC has had two positions lately."""
         return not (self._far_in_a_row or self._with_two or self._two or self._far)
 
-    def lend(self, row: np.void) -> None:
+    def lend(self, row: Row) -> None:
         """Write what is kept of a calm one into a row of trirail_drivers.driver.cyclic.AXIS."""
         row["came"], row["newest"], row["step"] = self._came, self._newest, self._step
 
-    def take_back(self, row: np.void, cycles: int) -> None:
+    def take_back(self, row: Row, cycles: int) -> None:
         """Go on from there, so many cycles later: no SYNC has had two positions since."""
         self._cycles = (self._cycles + cycles) % COUNTED
-        self._came, self._newest, self._step = bool(row["came"]), int(row["newest"]), int(row["step"])
+        self._came, self._newest, self._step = bool(row["came"]), row["newest"], row["step"]
 
     def from_two_nodes(self) -> bool:
         """Whether the positions of the cycle that is over, with those before it, are two nodes'."""

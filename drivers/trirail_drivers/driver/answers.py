@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
+from trirail_drivers.driver.cyclic import Row
 
 
 class Answers:
@@ -57,16 +57,14 @@ class Answers:
         self.sampled = sampled
         self._prompt = not self._between and not to_the_one_before
 
-    def lend(self, row: np.void) -> None:
+    def lend(self, row: Row) -> None:
         """Write what is kept into a row of trirail_drivers.driver.cyclic.AXIS."""
         row["syncs"], row["sampled"], row["late"], row["lost"] = self.syncs, self.sampled, self.late, self.lost
         row["between"], row["prompt"] = self._between, self._prompt
 
-    def take_back(self, row: np.void) -> None:
+    def take_back(self, row: Row) -> None:
         """Go on from there."""
-        self.syncs, self.sampled, self.late, self.lost = (
-            int(row[name]) for name in ("syncs", "sampled", "late", "lost")
-        )
+        self.syncs, self.sampled, self.late, self.lost = row["syncs"], row["sampled"], row["late"], row["lost"]
         self._between, self._prompt = bool(row["between"]), bool(row["prompt"])
 
     def forgive(self) -> None:

@@ -56,6 +56,9 @@ AXIS = np.dtype(
     align=True,
 )
 """One drive."""
+_NAMES: Final = AXIS.names or ()
+Row = dict[str, Any]
+"""The same by its names: twenty numbers of an array, one by one, would take Python longer than a cycle."""
 
 EXPECTED = np.dtype(
     [
@@ -148,6 +151,14 @@ class Cyclic:
         self.setpoints = Packets(3)
         """What ends it: one frame for each drive, in their order."""
         self.arrived = Packets(MOST_FRAMES)
+
+    def write(self, rows: Sequence[Row]) -> None:
+        """Have what is kept of the three drives."""
+        self.axes[:] = [tuple(row[name] for name in _NAMES) for row in rows]
+
+    def rows(self) -> list[Row]:
+        """What is kept of the three drives."""
+        return [dict(zip(_NAMES, row, strict=True)) for row in self.axes.tolist()]
 
     def expect(self, rows: Sequence[tuple[Any, ...]]) -> None:
         """Expect these frames: rows of EXPECTED."""

@@ -21,6 +21,7 @@ from trirail.wire.records import LONGEST, Part
 from trirail.wire.vocabulary import MODES
 
 _POLLIN = 1
+_NAMES = quiet.STATE.names or ()
 _MOST = 1 << 40
 """Cycles that are run at once: more than any batch has."""
 _NOWHERE = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
@@ -91,18 +92,18 @@ class QuietCycles:
         state["gateway_seen"], state["gateway_turns"] = watch.seen, watch.turns
         self._doors[0] = self._gateway.fileno(), _POLLIN
         reached = Reached(self._call(lent, calm))
-        watch.seen, watch.turns = int(state["gateway_seen"]), int(state["gateway_turns"])
-        self._reports.batched = int(state["batched"])
-        ticker.deadline_ns = int(state["deadline_ns"])
-        self.cycles += int(state["cycle"]) - control.cycles
-        control.go_on(int(state["cycle"]), float(state["time"]))
+        left = dict(zip(_NAMES, state.item(), strict=True))  # one by one, from the array, it would take longer
+        watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
+        self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
+        self.cycles += left["cycle"] - control.cycles
+        control.go_on(left["cycle"], left["time"])
         if reached is not Reached.DONE:
-            synced = float(state["synced"]) if reached is Reached.SYNCED else None
-            self.leave(int(state["arrived"]), synced=synced, error=max(int(state["error"]), 0))
+            synced = left["synced"] if reached is Reached.SYNCED else None
+            self.leave(left["arrived"], synced=synced, error=max(left["error"], 0))
         if reached is Reached.WRITTEN:
-            self._drives.send_on(int(state["sent"]))
-        sync = int(state["parts_ns"][Part.SYNC])
-        return Newest(reached, ticker.deadline_ns, int(state["lateness_ns"]), int(state["marked_ns"]), sync)
+            self._drives.send_on(left["sent"])
+        sync = int(left["parts_ns"][Part.SYNC])
+        return Newest(reached, left["deadline_ns"], left["lateness_ns"], left["marked_ns"], sync)
 
     def leave(self, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
         """Give back to the drives what they have lent, as of trirail_drivers.driver.cyclic.Lender.take_back."""
