@@ -128,7 +128,7 @@ class Rig:
         now_ns = round(self.now * 1e9)
         given: list[Given] = [] if request is None else [(request, now_ns)]
         given += [(answer, now_ns) for answer in self.planner.answers()]
-        control.cycle(self.driver.read(), given)
+        control.cycle(self.driver.read, given)
         self.rows.append(control.setpoints.rows)
         self.seen.append([frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6])
         ledger = control.ledger

@@ -104,7 +104,7 @@ class Session:
         given: list[Given] = [] if request is None else [(request, now_ns)]
         given += [(answer, now_ns) for answer in self.planner.answers()]
         self.drives.sync()
-        self.control.cycle(self.drives.read(), given)
+        self.control.cycle(self.drives.read, given)
         record = self.control.measured.record.copy()
         record["mode"] = MODES.index(self.mode)
         self.rows.append(record)

@@ -186,9 +186,8 @@ class Session:
         given: list[Given] = [(request, now_ns) for request in requests]
         given += [(answer, now_ns) for answer in self._planner.answers()]
         self._drives.sync()
-        feedback = self._drives.read()
-        self.control.cycle(feedback, given)
-        self.measured.append(feedback.position)
+        self.control.cycle(self._drives.read, given)
+        self.measured.append(self.control.measured.feedback.position)
         self.commanded.append(self.control.commanded)
         for said in self.control.ledger.notices:
             if said.kind == "goal":

@@ -210,7 +210,7 @@ def takes_no_memory(rig: Rig) -> None:
 
     def cycle() -> None:
         drives.sync()
-        control.cycle(drives.read(), ())
+        control.cycle(drives.read)
 
     for _ in range(10):  # the followers are in step then
         cycle()

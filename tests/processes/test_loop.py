@@ -11,7 +11,8 @@ from conftest import Followers, Rig, alone, what_memory_takes
 from trirail.motion.planning import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
-from trirail.processes.loop import REQUESTS_A_CYCLE, Loop, Ports
+from trirail.processes.loop import REQUESTS_A_CYCLE, Loop
+from trirail.processes.ports import Ports
 from trirail.processes.reports import BATCHES_PER_SECOND
 from trirail.wire import links
 from trirail.wire.goals import PoseGoal
@@ -104,13 +105,20 @@ def test_every_cycle_has_its_record_and_every_event_its_number(shell: Shell) -> 
     assert [answer.event.seq for answer in said if isinstance(answer, Happened)] == [1, 2]
 
 
-def test_a_program_that_is_wrong_stops_the_robot_in_that_cycle(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("part", ["observe", "solve", "_judge_arrival", "goal_queue"])
+def test_a_program_that_is_wrong_stops_the_robot_in_that_cycle(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    """In whichever part of the cycle, and where it decides what comes next."""
     shell.enabled()
 
-    def wrong() -> None:
+    def wrong(*_given: object) -> None:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(shell.loop.control, "advance", wrong)
+    if part == "goal_queue":
+        monkeypatch.setattr(shell.loop.control.goal_queue, "think", wrong)
+    else:
+        monkeypatch.setattr(shell.loop.control, part, wrong)
     shell.cycles(1)
     assert shell.loop.control.state.mode is Mode.FAULT
     assert "a bug" in (shell.loop.control.fault or "")

@@ -9,7 +9,7 @@ import random
 import socket
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +21,8 @@ from trirail.config import Config
 from trirail.motion.planning import MotionPlanner
 from trirail.processes.clock import Ticker
 from trirail.processes.heartbeats import Heartbeats
-from trirail.processes.loop import Loop, Ports
+from trirail.processes.loop import Loop
+from trirail.processes.ports import Ports
 from trirail.wire import links
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrackGoal, VelocityGoal
 from trirail.wire.links import Port
@@ -155,7 +156,10 @@ class Session:
         self.end.send(packet)
 
     def ask(self, request: Request) -> None:
-        self.gateway.send(message(request))
+        """Send a request; a stop with haste, as the gateway does."""
+        hurries = isinstance(request, CommandRequest) and request.name.stops
+        with self.hearts.hurrying() if hurries else nullcontext():
+            self.gateway.send(message(request))
 
     def run(self, script: dict[int, list[Happening]], cycles: int = CYCLES) -> None:
         for number in range(cycles):
@@ -181,7 +185,7 @@ def _comparable(packet: bytes) -> Iterator[object]:
             event = said.event
             yield event.seq, event.cycle, event.t, event.kind, event.message, event.outcome
         else:
-            yield type(said).__name__, repr(said) if type(said).__name__ == "Status" else ""
+            yield type(said).__name__, repr(said) if type(said).__name__ in ("Status", "ControlInput") else ""
 
 
 def script(seed: int) -> dict[int, list[Happening]]:  # noqa: PLR0912, PLR0915 - what may happen, kind by kind

@@ -109,7 +109,7 @@ def _run(
     clock.step()
     drives.sync()
     control.start(drives.read())
-    control.modes.cycle = int(records["cycle"][0]) - 1
+    control.modes.cycle = int(records["cycle"][0])
     waiting = deque(given)
     made = np.zeros((len(records), 2, 3))
     modes = np.zeros(len(records), np.uint8)
@@ -119,6 +119,7 @@ def _run(
         _cycle(control, drives, planner, list(_due(waiting, control.cycles + 1)))
         made[row] = control.setpoints.rows[:2]
         modes[row] = MODES.index(control.state.mode)
+        control.conclude()
     return made, modes
 
 
@@ -126,7 +127,8 @@ def _cycle(
     control: Control, drives: DriveGroup, planner: _RecordedPlanner | LocalPlanner, given: Sequence[ControlInput]
 ) -> None:
     """Do what the loop does in a cycle after its SYNC."""
-    inputs: list[Given] = [(what.given, what.now_ns) for what in given if not isinstance(what.given, DrivesFault)]
+    said = [what for what in given if not isinstance(what.given, DrivesFault)]
+    inputs: list[Given] = [(what.given, what.now_ns) for what in said if not what.urgent]  # type: ignore[misc]
     if isinstance(planner, LocalPlanner):
         inputs += [(answer, 0) for answer in planner.answers()]
     else:
@@ -135,7 +137,11 @@ def _cycle(
         for what in given:
             if isinstance(what.given, DrivesFault):
                 drives.fail(what.given.message)
-    control.cycle(drives.read(), inputs)
+    control.decide(inputs)
+    for what in said:
+        if what.urgent:
+            control.handle(what.given, what.now_ns)  # type: ignore[arg-type]
+    control.execute(drives.read())
     control.ledger.answers.clear()
     control.ledger.notices.clear()
 

@@ -1,7 +1,8 @@
 """The robot's control, one cycle at a time, without a clock, a socket or a file.
 
-Each `cycle`: `observe` what the drives said, `handle` what is asked for, `advance` the motion and solve the sliders,
-and `write` the setpoints behind the last gate. What is to be said of it waits at the `ledger`.
+A cycle only executes: `observe` what the drives said, `solve` the sliders, `write` the setpoints behind the last gate.
+Between two cycles it `conclude`s what the one before has come to, and `decide`s what the next one executes, by what is
+asked for. What is to be said of it waits at the `ledger`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Literal, NamedTuple
 from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
 
 from trirail.config import Config, corrected_geometry
+from trirail.control import cycle
 from trirail.control.commands import Commands
 from trirail.control.feedback import Measured
 from trirail.control.goal_queue import GoalQueue
@@ -94,13 +96,12 @@ class Control:
             *(self.goal_queue, self._planner, self.measured, self.setpoints),
         )
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
-        self._run: Run | None = None
         self._found = 0
 
     @property
     def cycles(self) -> int:
         """How many cycles have been run."""
-        return self.modes.cycle
+        return self.modes.cycle - 1
 
     @property
     def state(self) -> ModeState:
@@ -116,56 +117,65 @@ class Control:
         """Return what the next cycles come to if nothing happens in them; None where something is to be done."""
         mode, runs, goal, settling = self.state.mode, self.schedule.runs, self.ledger.goal, self.measured.settling
         follows = mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed
-        busy = mode in (Mode.ENABLING, Mode.HOMING) or self.modes.entered == self.cycles
-        if busy or self.ledger.busy or len(self.ledger.goals) > 1 or not (self.goal_queue.idle and self._planner.idle):
+        stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
+        if stopped_now or self.ledger.busy or mode in (Mode.ENABLING, Mode.HOMING):
             return None
-        if len(runs) > 1 or not self.schedule.single or (mode is Mode.STOPPING and not runs):
+        if len(runs) > 1 or (mode is Mode.STOPPING and not runs):
             return None
         run = runs[0] if runs and not follows else None
         found = self._found if run is not None else 0
-        waits = mode is Mode.HOLDING or (mode is Mode.MOVING and settling.under_way and run is not None and run.arrived)
-        if found and (self.setpoints.refusal(found) or not waits):
+        if found and (cycle.refusal(found) or not self._waits(run)):
             return None
-        until = self.lease.alive_until
+        until = min(self.lease.alive_until, self.goal_queue.due(self.modes.cycle) - 1)
         if goal is not None and not goal.released:
             until = min(until, goal.alive_until)
         held = mode not in (Mode.DISABLED, Mode.FAULT)
         return Calm(run, follows, held, self._stands, found, until, settling.ends)
 
-    def go_on(self, cycle: int, time: float) -> None:
-        """Take over after calm cycles: the number of the newest one, and the time of the run's law in it [s]."""
-        self.schedule.cycle += cycle - self.cycles
-        self.modes.cycle = cycle
+    def _waits(self, run: Run | None) -> bool:
+        """Whether nothing more comes of a motion that has ended."""
+        if run is None or not run.arrived:
+            return False
+        goal = self.ledger.goal
+        target = goal is not None and goal.renewed is TrackGoal
+        return self.state.mode is Mode.MOVING and (self.measured.settling.under_way or target)
+
+    def go_on(self, newest: int, time: float, found: int | None) -> None:
+        """Take over after calm cycles: the number of the newest one, and the time of the run's law in it [s].
+
+        `found` is what the compiled call has found in that, if something comes of it.
+        """
+        self.schedule.cycle += newest - self.cycles
+        self.modes.cycle = newest + 1
         if self.schedule.runs:
             self.schedule.runs[0].time = time
+        if found is not None:
+            self.modes.cycle, self._found = newest, found
+            self.conclude()
 
-    def cycle(self, feedback: Feedback, given: Iterable[Given], mark: Callable[[Part], None] = lambda _: None) -> None:
-        """Run one cycle: what the drives said at its SYNC, and what else is given in it; then motion and setpoints.
+    def cycle(self, read: Callable[[], Feedback], given: Iterable[Given] = ()) -> None:
+        """Decide by what is given before a cycle, and run it on what is then `read` of the drives."""
+        self.decide(given)
+        self.execute(read())
+        self.conclude()
 
-        `given` is read after the drives have been; `mark` is called at the end of each part. Nothing that goes wrong
-        in it leaves the robot moving.
+    def execute(self, feedback: Feedback, mark: Callable[[Part], None] = lambda _: None) -> None:
+        """Run one cycle on what the drives said at its SYNC; `mark` is called at the end of each part.
+
+        Nothing that goes wrong in it leaves the robot moving.
         """
-        self.observe(feedback)
         try:
-            for what, now_ns in given:
-                match what:
-                    case Disturbance():
-                        self.modes.happen(ModeEvent[what.event], what.reason)
-                    case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged() | Remark():
-                        self.handle(what, now_ns)
-                    case PlannerLost():
-                        self._planner.lose(what.reason)
-                    case answer:
-                        self._planner.hear(answer)
-            mark(Part.MODE)
-            self.advance()
+            self.observe(feedback)
             mark(Part.MOTION)
             self.solve()
         except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
-            self.modes.trip(f"internal error, please report it: {error!r}", FaultCause.INTERNAL)
+            self._trip_for(error)
         mark(Part.KINEMATICS)
         self.write()
         mark(Part.WRITE)
+
+    def _trip_for(self, error: Exception) -> None:
+        self.modes.trip(f"internal error, please report it: {error!r}", FaultCause.INTERNAL)
 
     # ------------------------------------------------------------------ the cycle, in its order
 
@@ -179,7 +189,6 @@ class Control:
 
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
-        self.modes.cycle += 1
         before = self.measured.feedback
         behind = self.measured.take(feedback, self._stands)
         self._tell_warnings(feedback)
@@ -203,19 +212,90 @@ class Control:
                 )
             elif not feedback.homing:
                 self._homing_over()
-        self._judge_arrival()
-        self._commands.settle()
 
     def _tell_warnings(self, feedback: Feedback) -> None:
         """Tell what people should know of the drives: they say it in one feedback only, some in the first."""
         for warning in feedback.warnings:
             self.ledger.tell("service", "warning", warning)
 
-    def handle(self, request: Request, now_ns: int) -> None:
-        """Take a request at a time of the monotonic clock: a command at once, a goal behind those before it."""
+    def solve(self) -> None:
+        """Move the commanded motion on by one period, solve the sliders by the paper's recursion, pass the last gate.
+
+        All of that is one compiled call.
+        """
+        run = self.schedule.begin_cycle()
+        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed:
+            self._found = 0
+            self._follow_measured()
+            return
+        self._found = self.setpoints.solve(self.schedule, run)
+        if len(self.schedule.runs) > 1:
+            self.setpoints.tell_progress(*self.schedule.progress)
+        if refused := self.setpoints.refusal(self._found):
+            self.modes.trip(refused, FaultCause.LIMIT)
+
+    def write(self) -> None:
+        """Send the setpoints."""
+        self._drives.write(*self.setpoints.sent)
+
+    # ------------------------------------------------------------------ between two cycles
+
+    def conclude(self) -> None:
+        """End goals, or the motion, by what the compiled call has found in the cycle before, and what was measured."""
+        try:
+            schedule, found = self.schedule, self._found
+            if found and schedule.runs:
+                for _ in range(schedule.end_cycle(schedule.runs[0])):
+                    self.ledger.pass_on()
+            self.goal_queue.expire(self.modes.cycle)
+            self._judge_arrival()
+            moves = self.state.mode in (Mode.MOVING, Mode.STOPPING)
+            if found and moves and schedule.runs and schedule.runs[0].stands:
+                self._stand(schedule.runs[0])
+        except Exception as error:  # noqa: BLE001
+            self._trip_for(error)
+        self.modes.cycle += 1
+
+    def decide(self, given: Iterable[Given]) -> None:
+        """Decide what the next cycle executes.
+
+        Answer what is carried out, `handle` what is given, end a lease or a jog that nobody renews, and begin what is
+        planned and due.
+        """
+        try:
+            self._commands.settle()
+            for what, now_ns in given:
+                self.handle(what, now_ns)
+            self._commands.end_silent_lease()
+            released = self.ledger.release(self.modes.cycle) if self.state.mode is Mode.MOVING else None
+            if released is not None:
+                self.modes.go(ModeEvent.NOT_RENEWED, f"goal {released.id} of {released.user} is not renewed")
+            beginning = self.goal_queue.think(self.modes.cycle, self._admit, self._place)
+            if beginning is not None:
+                self.modes.go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
+        except Exception as error:  # noqa: BLE001
+            self._trip_for(error)
+
+    def handle(self, what: Request | Disturbance | PlanAnswer | PlannerLost, now_ns: int) -> None:
+        """Take in what is asked for, has happened or is planned, at a time of the monotonic clock."""
+        try:
+            match what:
+                case Disturbance():
+                    self.modes.happen(ModeEvent[what.event], what.reason)
+                case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged() | Remark():
+                    self._answer(what, now_ns)
+                case PlannerLost():
+                    self._planner.lose(what.reason)
+                case answer:
+                    self._planner.hear(answer)
+        except Exception as error:  # noqa: BLE001
+            self._trip_for(error)
+
+    def _answer(self, request: Request, now_ns: int) -> None:
+        """Take a request: a command at once, a goal behind those before it."""
         try:
             if isinstance(request, GoalRequest):
-                self.goal_queue.take(request, now_ns, self.cycles)
+                self.goal_queue.take(request, now_ns, self.modes.cycle)
             elif isinstance(request, CommandRequest):
                 self._commands.take(request)
             elif isinstance(request, PoseChanged):
@@ -226,50 +306,6 @@ class Control:
                 self.ledger.tell("refused", "warning", request.message, user=request.user)
         except RefusedError as refusal:
             self.ledger.refuse(request, refusal)
-
-    def advance(self) -> None:
-        """End a lease or a jog that nobody renews, begin what is planned, and go on to the motion of this cycle."""
-        self._commands.end_silent_lease()
-        released = self.ledger.release(self.cycles) if self.state.mode is Mode.MOVING else None
-        if released is not None:
-            self.modes.go(ModeEvent.NOT_RENEWED, f"goal {released.id} of {released.user} is not renewed")
-        beginning = self.goal_queue.think(self.cycles, self._admit, self._place)
-        if beginning is not None:
-            self.modes.go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
-        self._run = self.schedule.begin_cycle()
-
-    def solve(self) -> None:
-        """Move the commanded motion on by one period, solve the sliders by the paper's recursion, pass the last gate.
-
-        All of that is one compiled call; what it finds beside ends goals, a motion, or the robot's moving at all.
-        """
-        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed:
-            self._follow_measured()
-            return
-        schedule, run = self.schedule, self._run
-        single = schedule.single
-        found = self._found = self.setpoints.solve(schedule, run)
-        if found and run is not None:
-            for _ in range(schedule.end_cycle(run)):
-                self.ledger.pass_on()
-        self.goal_queue.expire(self.cycles)
-        if not single:
-            self.setpoints.tell_progress(*schedule.progress)
-        if found:
-            self._conclude(found)
-
-    def _conclude(self, found: int) -> None:
-        """Trip where the last gate has refused the setpoints; hold where the motion has come to rest."""
-        refused = self.setpoints.refusal(found)
-        schedule = self.schedule
-        if refused:
-            self.modes.trip(refused, FaultCause.LIMIT)
-        elif self.state.mode in (Mode.MOVING, Mode.STOPPING) and schedule.runs[0].stands:
-            self._stand(schedule.runs[0])
-
-    def write(self) -> None:
-        """Send the setpoints."""
-        self._drives.write(*self.setpoints.sent)
 
     # ------------------------------------------------------------------ what others ask of it
 
@@ -341,12 +377,12 @@ class Control:
         elif goal is None or not goal.settles:
             self.modes.go(ModeEvent.ARRIVED, "standstill")
         elif not settling.under_way:
-            settling.begin(self.cycles)
+            settling.begin(self.modes.cycle)
 
     def _judge_arrival(self) -> None:
         """End the goal whose path has ended once the robot is in position, or where that has taken too long."""
         settling = self.measured.settling
-        settled = settling.over(self.cycles)
+        settled = settling.over(self.modes.cycle)
         if settled is None:
             return
         outcome: Outcome = "done" if settled.settle is not None else "unsettled"
@@ -362,7 +398,7 @@ class Control:
                 )
             elif self._rest_at_setpoints():
                 self.modes.go(ModeEvent.POWERED, "all drives are enabled")
-        elif self.cycles - self.modes.entered > self._enable_cycles:
+        elif self.modes.cycle - self.modes.entered > self._enable_cycles:
             waiting = [
                 f"drive {name} is {state}"
                 for name, state in zip(NAMES, self.measured.feedback.state, strict=True)
@@ -403,5 +439,5 @@ class Control:
     def _follow_measured(self) -> None:
         """Command the pose that is measured, and the sliders to where they are."""
         held = self.state.mode not in (Mode.DISABLED, Mode.FAULT)
-        stopped_now = self.state.mode is Mode.FAULT and self.modes.entered == self.cycles
+        stopped_now = self.state.mode is Mode.FAULT and self.modes.entered == self.modes.cycle
         self.setpoints.follow(self.schedule, held=held, stopped_now=stopped_now)

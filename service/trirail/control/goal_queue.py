@@ -65,8 +65,20 @@ class GoalQueue:
         """Whether no goal is being planned and none waits for that."""
         return not self._waiting and not self._planner.busy
 
+    def due(self, cycle: int) -> float:
+        """Return before which cycle, `cycle` or a later one, there is something to think about, if nothing is heard."""
+        expiring = min((goal.expires for number, goal in enumerate(self._ledger.goals) if number), default=math.inf)
+        if self._planner.busy and self._planned is not None:
+            request, sent = self._planned
+            valid = request.goal.valid_for
+            expiring = min(expiring, self._alive_until(self._planned))
+            expiring = min(expiring, sent + valid / self._period if valid is not None else math.inf)
+        elif self._waiting:
+            return cycle
+        return min(math.floor(expiring) + 1 if math.isfinite(expiring) else math.inf, cycle + self._planner.due)
+
     def take(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
-        """Take a goal in a cycle, at a time of the monotonic clock; it waits for its user's turn.
+        """Take a goal before a cycle, at a time of the monotonic clock; it waits for its user's turn.
 
         What is told of a target takes the place of what has been told before and still waits.
         """

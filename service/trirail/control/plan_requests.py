@@ -102,9 +102,18 @@ class PlanRequests:
         return self._goal is not None
 
     @property
-    def idle(self) -> bool:
-        """Whether there is no goal to be planned and no rate to be changed."""
-        return self._goal is None and self._change is None
+    def due(self) -> float:
+        """In how many cycles there is something to think about, if nothing is heard: 0 for now."""
+        if self._goal is None:
+            return math.inf if self._change is None else 0
+        asked, answer, now = self._asked, self._answer, self._schedule.cycle
+        if self._change is not None or self._lost is not None or asked is None:
+            return 0
+        if isinstance(answer, Planned) and answer.first is not None:
+            return answer.first - now
+        if answer is not None or asked.version != self._schedule.version:
+            return 0
+        return max(0, math.floor(BUSY / self._period) - round(self.silence / self._period))
 
     @property
     def silence(self) -> float:

@@ -40,7 +40,7 @@ _GO_ON = (
 
 
 class Transitions:
-    """The robot's mode, and since when it is in it; `cycle` is the control's count of cycles."""
+    """The robot's mode, and since when it is in it; `cycle` is the number of that under way, or to come."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Transitions:
         self._goal_queue = goal_queue
         self._measured = measured
         self._setpoints = setpoints
-        self.cycle = 0
+        self.cycle = 1
         self.state: ModeState = DISABLED
         self.fault: str | None = None
         """The first reason, since the last reset."""

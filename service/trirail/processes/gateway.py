@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 
 import msgspec
@@ -76,6 +77,7 @@ class Gateway:
         guard: Guard,
         log: Callable[[Event], None] = lambda _: None,
         measured: Callable[[msgspec.Struct], None] = lambda _: None,
+        hurrying: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
         self._log = log
         self._robot = config.robot.name
@@ -92,7 +94,7 @@ class Gateway:
         self._refusals = Refusals(link, self._replies)
         self._inbox = Inbox(opened, self._robot, self._refusals.too_much)
         self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._tell, self._inbox.wake)
-        self._requests = Requests(config, link, guard, self._replies, self._last_words)
+        self._requests = Requests(config, link, guard, self._replies, self._last_words, hurrying)
         self._commands = CommandReader(
             self._robot, self._requests, self._replies, self._states, self._inbox, self._refusals.refuse
         )
@@ -281,15 +283,17 @@ def main(
     ready: Callable[[object], None],
     log: Callable[[Event], None],
     measured: Callable[[msgspec.Struct], None],
+    hurrying: Callable[[], AbstractContextManager[None]],
 ) -> int:
     """Run the gateway's process.
 
-    `ready` is called once it can be reached, `log` with each event, `measured` each second if there are metrics.
+    `ready` is called once it can be reached, `log` with each event, `measured` each second if there are metrics;
+    what is sent to the loop `hurrying` is taken in the cycle in which it comes.
     """
     sys.setswitchinterval(SWITCH_EVERY)
     guard = Guard(config)
     with guard.open() as opened:
-        gateway = Gateway(config, link, beat, opened, guard, log, measured)
+        gateway = Gateway(config, link, beat, opened, guard, log, measured, hurrying)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
 
         def is_ready() -> None:

@@ -1,4 +1,4 @@
-"""Heartbeats between the service's processes: a counter for each, in memory that they share.
+"""Heartbeats between the service's processes, and haste: counters in memory that they share.
 
 To beat and to look cost 0.1 µs, and nothing can wait: no packet stands in a queue behind another one, and a process
 that is frozen fills no buffer. A process beats in the thread that does its work, so that a hung one does not.
@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import mmap
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 PROCESSES = ("loop", "gateway", "planner", "recorder")
 """Those that beat; simulated drives do so on their bus, to the loop."""
+HASTE = len(PROCESSES)
+"""Where behind theirs the count of hastes stands."""
 BEAT_EVERY = 0.05
 """How often a process beats at least, while it waits for work as well [s]."""
 
@@ -39,6 +43,16 @@ class Heartbeats:
         """Return the counter of one of PROCESSES."""
         return Heart(self._counts, PROCESSES.index(process))
 
+    @contextmanager
+    def hurrying(self) -> Iterator[None]:
+        """Have the loop take what is sent meanwhile in the cycle in which it comes: a stop must not wait for the next.
+
+        It counts before and after: whenever the loop looks, it finds a haste that it has not seen, or the packet.
+        """
+        self._counts[HASTE] += 1
+        yield
+        self._counts[HASTE] += 1
+
 
 class Heart:
     """The counter of one process."""
@@ -59,6 +73,20 @@ class Heart:
     def count(self) -> int:
         """How often it has beaten; 0 while no beat is to be expected."""
         return self._counts[self._place]
+
+
+class Haste:
+    """The loop's look at whether somebody hurries."""
+
+    def __init__(self, heartbeats: Heartbeats) -> None:
+        self._counts = heartbeats.counts
+        self.seen = 0
+        """The count when it was last looked at."""
+
+    def hurried(self) -> bool:
+        """Whether somebody has, since this was last asked."""
+        before, self.seen = self.seen, self._counts[HASTE]
+        return self.seen != before
 
 
 class Watch:

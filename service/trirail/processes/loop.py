@@ -5,9 +5,8 @@ from __future__ import annotations
 import itertools
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from types import FrameType
-from typing import NamedTuple
 
 from trirail_drivers.bus.capture import Capture
 from trirail_drivers.config import Can
@@ -21,12 +20,12 @@ from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import warm_up
 from trirail.processes import realtime
 from trirail.processes.clock import Tick, Ticker
-from trirail.processes.heartbeats import Heartbeats, Watch
+from trirail.processes.heartbeats import Haste, Heartbeats, Watch
 from trirail.processes.planner_port import PlannerLink
+from trirail.processes.ports import Ports
 from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
 from trirail.processes.reports import Reports
-from trirail.wire.links import Port
 from trirail.wire.packets import (
     Disturbance,
     DrivesFault,
@@ -48,14 +47,6 @@ SHUTDOWN = 3.0
 """How long a controlled stop may take before the drives are left to their own quick stop [s]."""
 
 
-class Ports(NamedTuple):
-    """Where the processes beside the loop connect."""
-
-    gateway: Port
-    recorder: Port
-    planner: Port
-
-
 class Loop:
     """Ties control, drives, ticks and the neighbours together; every cycle is `cycle`."""
 
@@ -75,6 +66,7 @@ class Loop:
         self._gateway = ports.gateway
         self._planner = PlannerLink(ports.planner)
         self._period = config.period
+        self._period_ns = round(config.period * 1e9)
         self._max_overruns = config.watchdogs.max_overruns
 
         self.control = Control(config, drives, self._planner)
@@ -85,13 +77,14 @@ class Loop:
         self._overruns = 0
         self._late_streak = 0
         self._heart = heartbeats.of("loop")
+        self._haste = Haste(heartbeats)
         self._gateway_timeout = config.watchdogs.gateway_timeout
         patience = max(LEAST_PATIENCE, round(self._gateway_timeout * config.loop.rate_hz))
         self._gateway_watch = Watch(heartbeats.of("gateway"), patience)
         self._gateway_frozen = False
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
-            beside = self._reports, heartbeats, ports.gateway, self._gateway_watch
+            beside = self._reports, heartbeats, ports, self._gateway_watch, self._haste
             self._quiet = QuietCycles(self.control, drives, *beside)
         self._fault: DriveFault | None = None
         self._marked_ns = 0
@@ -117,7 +110,7 @@ class Loop:
         return self._quiet.cycles if self._quiet is not None else 0
 
     def turn(self, ticker: Ticker) -> None:
-        """Run the cycles in which nothing happens, and then one in which something does, or to the end of a batch."""
+        """Run the cycles in which nothing happens, or one in which something does; then decide what comes next."""
         quiet, newest = self._quiet, None
         disturbed = self.ending or self._late_streak or self._gateway_frozen or not self._planner.idle
         if quiet is not None and not disturbed:
@@ -129,10 +122,13 @@ class Loop:
         elif newest.reached is Reached.WAITED:
             self.cycle(ticker.tick())
         elif newest.reached is Reached.SYNCED:
-            self._marked_ns, self._parts_ns[Part.SYNC] = newest.marked_ns, newest.sync_ns
+            self._marked_ns = newest.marked_ns
+            self._parts_ns[Part.SYNC], self._parts_ns[Part.RECORD] = newest.sync_ns, newest.record_ns
             self._go_on(Tick(newest.deadline_ns, newest.lateness_ns, 0))
-        elif self._reports.full and quiet is not None:
-            self._flush()
+        elif quiet is not None and (newest.called or self._reports.full):
+            if newest.called:
+                self._decide(newest.deadline_ns + self._period_ns)
+            self._flush_full()
             quiet.add(Part.RECORD)
 
     def cycle(self, tick: Tick) -> None:
@@ -143,27 +139,44 @@ class Loop:
         self._go_on(tick)
 
     def _go_on(self, tick: Tick) -> None:
-        """Run what a cycle is from its SYNC on."""
+        """Run what a cycle is from its SYNC on: the setpoints leave before anything is decided that can wait."""
+        now_ns = tick.deadline_ns + tick.lateness_ns
+        if self._haste.hurried() or self._gateway.ended:
+            self._handle_urgent(self._requests(), now_ns)
         feedback = self._drives.read()
         self._mark(Part.READ)
-        self.control.cycle(feedback, self._given_in(tick, feedback.fault), self._mark)
-        if self._reports.record(tick, self._overruns, self._parts_ns):
-            self._flush()
-        self._reports.pass_on()
+        self._handle_urgent(self._watch(tick, feedback.fault), now_ns)
+        self._mark(Part.MODE)
+        self.control.execute(feedback, self._mark)
+        self._reports.record(tick, self._overruns, self._parts_ns)
+        self.control.conclude()
+        self._decide(tick.deadline_ns + self._period_ns)
+        self._flush_full()
         self._mark(Part.RECORD)
+
+    def _handle_urgent(self, given: Iterable[Request | Disturbance], now_ns: int) -> None:
+        """Have what is given its effect in this very cycle: stops, and what has happened."""
+        for what in given:
+            self._reports.note(now_ns, what, urgent=True)
+            self.control.handle(what, now_ns)
+
+    def _decide(self, now_ns: int) -> None:
+        """Decide what comes at the next tick, which is due at that time, by what has been asked for and planned."""
+        self.control.decide(self._noted(now_ns))
+        self._reports.listen()
+        self._reports.pass_on()
+
+    def _noted(self, now_ns: int) -> Iterator[Given]:
+        """Yield what gateway and planner have sent, and keep it for the recorder."""
+        for what in itertools.chain(self._requests(), self._planner.answers()):
+            self._reports.note(now_ns, what)
+            yield what, now_ns
 
     def _mark(self, part: Part) -> None:
         """Note how long a part of the cycle has taken, at its end."""
         now = time.perf_counter_ns()
         self._parts_ns[part] = min(now - self._marked_ns, LONGEST)
         self._marked_ns = now
-
-    def _given_in(self, tick: Tick, fault: DriveFault | None) -> Iterator[Given]:
-        """Yield what the control is given in a cycle, and keep it for the recorder."""
-        now_ns = tick.deadline_ns + tick.lateness_ns
-        for what in itertools.chain(self._watch(tick, fault), self._requests(), self._planner.answers()):
-            self._reports.note(now_ns, what)
-            yield what, now_ns
 
     def _requests(self) -> Iterator[Request]:
         """Take what the gateway has sent: as much as comes in a cycle, and no more than a cycle has time for.
@@ -215,6 +228,10 @@ class Loop:
         control = self.control
         stands = control.state.mode in (Mode.DISABLED, Mode.FAULT) and not control.measured.powered
         return stands or (control.cycles - self._ending_since) * self._period > SHUTDOWN
+
+    def _flush_full(self) -> None:
+        if self._reports.full:
+            self._flush()
 
     def _flush(self) -> None:
         """Give a sign of life, pass the batch on, and take new peers."""

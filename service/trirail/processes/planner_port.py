@@ -24,8 +24,8 @@ class PlannerLink:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is awaited, nor to be said."""
-        return self._awaited is None and self._unsent is None
+        """Whether there is nothing to be said that the planner does not say itself."""
+        return self._unsent is None
 
     def ask(self, request: PlanRequest) -> None:
         """Send a request; what cannot be sent is said in the next cycle."""
@@ -37,14 +37,16 @@ class PlannerLink:
             self._awaited = request.number
 
     def answers(self) -> Iterator[PlanAnswer | PlannerLost]:
-        """Yield what there is to be given to the control in this cycle; nothing is read that was not asked for."""
+        """Yield what there is to be given to the control; what was not asked for is left aside."""
         if self._unsent is not None:
             unsent, self._unsent = self._unsent, None
             yield PlannerLost(unsent)
-        for _ in range(0 if self._awaited is None else ANSWERS_A_CYCLE):
+        for _ in range(ANSWERS_A_CYCLE):
             packet = self._port.receive()
             if packet is None:
                 break
+            if self._awaited is None:
+                continue
             try:
                 answer = decode_plan_answer(packet)
             except msgspec.DecodeError as error:  # one that says such things is started again
@@ -60,7 +62,5 @@ class PlannerLink:
             yield PlannerLost("the planner has died")
 
     def accept(self) -> None:
-        """Notice a planner that has gone, and take one that comes anew."""
-        if self._port.connected and self._awaited is None:
-            self._port.receive()
+        """Take a planner that comes anew."""
         self._port.accept()

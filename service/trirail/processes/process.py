@@ -18,6 +18,7 @@ import msgspec
 from trirail.config import Config
 from trirail.errors import TrirailError
 from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.ports import Ports
 from trirail.wire import links
 from trirail.wire.decoding import prepare
 from trirail.wire.messages import Event
@@ -106,7 +107,7 @@ def _run(child: Child) -> int:
         from trirail.processes.rehearsal import rehearse
 
         gateway, recorder, planner = (socket.socket(fileno=number) for number in child.sockets)
-        ports = loop.Ports(links.Port(gateway), links.Port(recorder), links.Port(planner, MAX_PLANNING))
+        ports = Ports(links.Port(gateway), links.Port(recorder), links.Port(planner, MAX_PLANNING))
         bus = partial(drives.bus, config, child.runtime)
         return loop.main(config, bus, ports, child.heartbeats, child.ready, rehearse)
     if name == "planner":
@@ -118,7 +119,7 @@ def _run(child: Child) -> int:
     if name == "gateway":
         from trirail.processes import gateway as gate
 
-        return gate.main(config, link, heart.beat, child.ready, child.log, child.measured)
+        return gate.main(config, link, heart.beat, child.ready, child.log, child.measured, child.heartbeats.hurrying)
     from trirail.processes import recording
 
     return recording.main(config, child.order.record, link, heart, child.ready, child.measured)

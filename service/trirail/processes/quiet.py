@@ -1,8 +1,9 @@
 """Cycles in which nothing happens, as one compiled call: it goes on from cycle to cycle until Python is needed.
 
 Wait, SYNC, what has arrived, `observe`, `command`, `hold` or `follow`, the last gate, setpoints, record. A cycle where
-anything is not as it was in the one before leaves no trace: what it has changed is put back, and Python runs it as all
-cycles were run that are not quiet, from its SYNC on. So nothing is decided here.
+the drives say anything but positions, where somebody hurries or has gone, or where the last gate refuses, leaves no
+trace: what it has changed is put back, and Python runs it from its SYNC on. What can wait until its setpoints have
+left is left to Python behind it. So nothing is decided here.
 
 A wait that a signal interrupts goes on to its deadline; Python's handlers run when the call has returned, which is at
 the end of a batch of records at the latest.
@@ -34,6 +35,7 @@ from trirail.processes.exchange import (
     set_frames,
     take_frames,
 )
+from trirail.processes.heartbeats import HASTE
 from trirail.wire.records import LONGEST, Part
 
 __all__ = ["COMMAND", "FOLLOW", "HOLD", "STATE", "Reached", "run"]
@@ -58,6 +60,8 @@ _ENDED: Final = -1
 _FLAGS: Final = 0x40 | 0x4000
 """MSG_DONTWAIT, MSG_NOSIGNAL."""
 _FRAME: Final = 16
+_GONE: Final = (0x008 | 0x010) << 16
+"""POLLERR and POLLHUP of poll.h, where poll leaves them."""
 _SECOND: Final = 1_000_000_000
 
 
@@ -88,6 +92,7 @@ STATE = np.dtype(
         ("marked_ns", "<i8"),  # when its newest part ended
         ("cycle", "<i8"),
         ("until", "<i8"),  # the last cycle that may be run
+        ("due", "<i8"),  # the cycle behind which something is to be decided
         ("overruns", "<i8"),
         ("parts_ns", "<i4", len(Part)),
         ("mode", "u1"),  # as in a record
@@ -95,7 +100,7 @@ STATE = np.dtype(
         ("held", "u1"),  # as of trirail.control.cycle.follow
         ("stands", "u1"),  # as of trirail.control.cycle.observe
         ("in_sliders", "u1"),  # of the path
-        ("found", "<i8"),  # what trirail.control.cycle.command is to find
+        ("found", "<i8"),  # what trirail.control.cycle.command has found
         ("time", "<f8"),  # of the law [s], and the rate that it leads to
         ("target", "<f8"),
         ("course", "<f8", 3),  # trirail.motion.runs.Course
@@ -104,6 +109,8 @@ STATE = np.dtype(
         ("step", "<f8"),  # as of trirail.control.cycle.follow
         ("settles", "u1"),  # whether a goal waits for the robot to be in position, and until which cycle
         ("timeout", "<i8"),
+        ("haste", "<u8"),  # the count of hastes when it was last looked at
+        ("called", "u1"),  # whether there is something to decide behind the newest cycle
         ("gateway_seen", "<u8"),  # trirail.processes.heartbeats.Watch
         ("gateway_turns", "<i8"),
         ("gateway_patience", "<i8"),
@@ -222,15 +229,16 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     """Run cycles; return how far the newest has come: Reached.
 
     `kept` (n, 3) are addresses and sizes of all that a cycle changes, and of copies of it; `moment` (2,) room for a
-    struct timespec, `doors` (n, 2) as poll takes them, `hearts` the counters of trirail.processes.heartbeats, `batch`
-    (n, SIZE) room for records, `made` (SIZE,) the bytes of `record`. All else as in control.cycle and exchange.
+    struct timespec, `doors` (n, 2) as poll takes them, the gateway's first, `hearts` the counters of
+    trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made` (SIZE,) the bytes of `record`. All else as
+    in control.cycle and exchange.
     """
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):
         s.deadline_ns += s.period_ns
         _wait(state, moment)
         now = _now_ns(state, moment)
-        s.marked_ns, s.arrived, s.sent, s.error = now, 0, 0, 0
+        s.marked_ns, s.arrived, s.sent, s.error, s.called = now, 0, 0, 0, 0
         s.lateness_ns = now - s.deadline_ns
         if s.lateness_ns >= s.period_ns:
             return Reached.WAITED
@@ -283,7 +291,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         called = _poll(doors.ctypes.data, np.uint64(len(doors)), 0) != 0
         count = hearts[s.gateway_place]  # as trirail.processes.heartbeats.Watch looks at it
         turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
-        if behind or in_position or called or turns > s.gateway_patience:
+        hurried = hearts[HASTE] != s.haste or doors[0, 1] & _GONE != 0
+        if behind or hurried or turns > s.gateway_patience:
             _copy(kept, 0, 1)
             return Reached.SYNCED
         _mark(state, moment, Part.MODE)
@@ -303,11 +312,12 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             code = 0
             cycle.follow(legs, feedback, jumps, s.held != 0, False, s.step, motion, sliders, backlash, record)
         late = _now_ns(state, moment) / 1e9 - s.synced > s.period
-        if code != s.found or late or not set_frames(setpoints, axes, sliders[0]):
+        if cycle.refusal(code) or late or not set_frames(setpoints, axes, sliders[0]):
             _copy(kept, 0, 1)
             return Reached.SYNCED
         _mark(state, moment, Part.KINEMATICS)
 
+        s.called, s.found = in_position or called or code != s.found or s.cycle + 1 >= s.due, code
         s.arrived, s.time, s.gateway_seen, s.gateway_turns = 0, time, count, turns
         s.sent = max(_sendmmsg(bus, departures.ctypes.data, np.uint32(3), _FLAGS), 0)
         for i in range(s.sent):
@@ -324,6 +334,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         _mark(state, moment, Part.RECORD)
         if s.sent < 3:
             return Reached.WRITTEN
+        if s.called:
+            return Reached.DONE
     return Reached.DONE
 
 

@@ -13,10 +13,10 @@ from trirail.control.control import Calm, Control
 from trirail.motion.paths import Path, constant
 from trirail.processes import quiet
 from trirail.processes.clock import Ticker
-from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
+from trirail.processes.heartbeats import HASTE, PROCESSES, Haste, Heartbeats, Watch
+from trirail.processes.ports import Ports
 from trirail.processes.quiet import Reached
 from trirail.processes.reports import Reports
-from trirail.wire.links import Port
 from trirail.wire.records import LONGEST, Part
 from trirail.wire.vocabulary import MODES
 
@@ -24,6 +24,8 @@ _POLLIN = 1
 _NAMES = quiet.STATE.names or ()
 _MOST = 1 << 40
 """Cycles that are run at once: more than any batch has."""
+_NEVER = 1 << 62
+"""No cycle."""
 _NOWHERE = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
 """A path for compiled code where there is none."""
 
@@ -38,25 +40,37 @@ class Newest(NamedTuple):
     """When its newest part ended."""
     sync_ns: int
     """How long its SYNC took."""
+    record_ns: int
+    """How long the record of the one before it took, and all that was decided with that."""
+    called: bool
+    """Whether somebody has something to say, or something is to be said."""
 
 
 class QuietCycles:
     """Holds what the compiled call needs. `run` is to be called between two cycles, while nothing is under way."""
 
     def __init__(
-        self, control: Control, drives: Lender, reports: Reports, hearts: Heartbeats, gateway: Port, watch: Watch
+        self,
+        control: Control,
+        drives: Lender,
+        reports: Reports,
+        hearts: Heartbeats,
+        ports: Ports,
+        watch: Watch,
+        haste: Haste,
     ) -> None:
         self.cycles = 0
         """So many have been run."""
         self._control = control
         self._drives = drives
         self._reports = reports
-        self._gateway = gateway
+        self._ports = ports
         self._watch = watch
-        self._hearts = np.frombuffer(hearts.counts, np.uint64)[: len(PROCESSES)]
+        self._haste = haste
+        self._hearts = np.frombuffer(hearts.counts, np.uint64)[: HASTE + 1]
         self._state = np.zeros(1, quiet.STATE)
         self._moment = np.zeros(2, np.int64)
-        self._doors = np.zeros((1, 2), np.int32)
+        self._doors = np.zeros((len(ports), 2), np.int32)
         self._lent: Cyclic | None = None
         self._calm: Calm | None = None
         self._nothing = np.zeros(1)
@@ -76,34 +90,33 @@ class QuietCycles:
         At the end of a batch the next call goes on, if nothing has been said meanwhile.
         """
         control, state = self._control, self._state[0]
-        over = self._calm is not None and self._calm.until <= control.cycles
-        if over or control.ledger.busy:
-            self.leave()
-        if not (self._reports.idle and self._gateway.calm and (self._lent is not None or self._borrow())):
+        if not (self._reports.idle and self._ports.gateway.calm and (self._lent is not None or self._borrow())):
             self.leave()
             return None
         lent, calm, watch = self._lent, self._calm, self._watch
         assert lent is not None
         assert calm is not None
         state["injected_ns"], state["overruns"], state["deadline_ns"] = ticker.come(), overruns, ticker.deadline_ns
-        most = 1 if state["injected_ns"] >= 0 else _MOST
-        state["until"] = int(min(calm.until, control.cycles + most))
+        state["until"] = control.cycles + (1 if state["injected_ns"] >= 0 else _MOST)
         state["batched"] = self._reports.batched
-        state["gateway_seen"], state["gateway_turns"] = watch.seen, watch.turns
-        self._doors[0] = self._gateway.fileno(), _POLLIN
+        state["gateway_seen"], state["gateway_turns"], state["haste"] = watch.seen, watch.turns, self._haste.seen
+        for door, port in zip(self._doors, self._ports, strict=True):
+            door[:] = port.fileno(), _POLLIN
         reached = Reached(self._call(lent, calm))
         left = dict(zip(_NAMES, state.item(), strict=True))  # one by one, from the array, it would take longer
         watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
         self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
         self.cycles += left["cycle"] - control.cycles
-        control.go_on(left["cycle"], left["time"])
-        if reached is not Reached.DONE:
+        called = bool(left["called"]) and reached is not Reached.SYNCED
+        if called or reached is not Reached.DONE:
             synced = left["synced"] if reached is Reached.SYNCED else None
             self.leave(left["arrived"], synced=synced, error=max(left["error"], 0))
+        control.go_on(left["cycle"], left["time"], left["found"] if called else None)
         if reached is Reached.WRITTEN:
             self._drives.send_on(left["sent"])
-        sync = int(left["parts_ns"][Part.SYNC])
-        return Newest(reached, left["deadline_ns"], left["lateness_ns"], left["marked_ns"], sync)
+        parts = left["parts_ns"]
+        took = int(parts[Part.SYNC]), int(parts[Part.RECORD])
+        return Newest(reached, left["deadline_ns"], left["lateness_ns"], left["marked_ns"], *took, called)
 
     def leave(self, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
         """Give back to the drives what they have lent, as of trirail_drivers.driver.cyclic.Lender.take_back."""
@@ -132,6 +145,7 @@ class QuietCycles:
         state["source"] = quiet.FOLLOW if calm.follows else quiet.HOLD if run is None else quiet.COMMAND
         state["cycle"], state["mode"] = self._control.cycles, MODES.index(self._control.state.mode)
         state["held"], state["stands"], state["found"] = calm.held, calm.stands, calm.found
+        state["due"] = int(min(calm.until, _NEVER))
         state["settles"] = calm.settles_by is not None
         state["timeout"] = calm.settles_by or 0
         runs = self._control.schedule.runs

@@ -10,6 +10,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 from msgspec import structs
@@ -22,7 +23,8 @@ from trirail.config import Config
 from trirail.motion.planning import MotionPlanner
 from trirail.processes.clock import Ticker
 from trirail.processes.heartbeats import Heartbeats
-from trirail.processes.loop import Loop, Ports
+from trirail.processes.loop import Loop
+from trirail.processes.ports import Ports
 from trirail.wire import links
 from trirail.wire.goals import VelocityGoal
 from trirail.wire.links import PacketLink, Port
@@ -147,7 +149,8 @@ class _Rehearsal:
 
     def _order(self, name: Command) -> None:
         self._tickets += 1
-        self._send(CommandRequest(self._tickets, "", name))
+        with self._heartbeats.hurrying() if name.stops else nullcontext():
+            self._send(CommandRequest(self._tickets, "", name))
 
     def _send(self, request: Request) -> None:
         if self._gateway is not None:

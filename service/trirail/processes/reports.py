@@ -72,20 +72,19 @@ class Reports:
         self._recorded = False
         self._unrecorded = ""
 
-    def note(self, now_ns: int, given: GivenInput) -> None:
-        """Keep what the control is given in this cycle, for the recorder."""
+    def note(self, now_ns: int, given: GivenInput, *, urgent: bool = False) -> None:
+        """Keep what the control is given before the next cycle or, `urgent`, in the one under way: for the recorder."""
         self._inputs += 1
-        self._given.append(ControlInput(self._inputs, self._control.cycles, now_ns, given))
+        self._given.append(ControlInput(self._inputs, self._control.modes.cycle, now_ns, given, urgent))
 
-    def record(self, tick: Tick, overruns: int, parts_ns: Sequence[int]) -> bool:
-        """Append this cycle's record; return whether the batch is full, and to be flushed."""
+    def record(self, tick: Tick, overruns: int, parts_ns: Sequence[int]) -> None:
+        """Append the newest cycle's record."""
         control = self._control
-        ticks = control.cycles, tick.deadline_ns, tick.lateness_ns, overruns
+        ticks = control.modes.cycle, tick.deadline_ns, tick.lateness_ns, overruns
         HEAD.pack_into(self._made, 0, *ticks, *parts_ns, MODES.index(control.state.mode))
         begin = 1 + self.batched * SIZE
         self._batch[begin : begin + SIZE] = self._made
         self.batched += 1
-        return self.full
 
     @property
     def full(self) -> bool:
@@ -110,7 +109,7 @@ class Reports:
             self._send_answers()
 
     def flush(self) -> None:
-        """Send the batch, take new peers, and what was kept for them; listen to the recorder."""
+        """Send the batch, take new peers, and what was kept for them."""
         if self.batched:
             batch = self._batch[: 1 + self.batched * SIZE]
             self.batched = 0
@@ -120,7 +119,6 @@ class Reports:
             for frames in self._capture.take():
                 self._recorder.send(bytes((Kind.FRAMES,)) + frames)
         self._measure_bus_load()
-        self._listen()
         self.accept_peers()
         self._send_events()
 
@@ -142,7 +140,7 @@ class Reports:
             self._weighed_at += cycles
             self._publish_status()
 
-    def _listen(self) -> None:
+    def listen(self) -> None:
         """Tell everyone what the recorder has to say, and if it has gone."""
         packet = self._recorder.receive()
         if self._recorder.take_lost() and self._recorded:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 import uuid
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple
 
 import msgspec
@@ -45,11 +46,21 @@ class _Waiting(NamedTuple):
 class Requests:
     """Gives goals and commands to the loop, and its answers to those who asked. Each has a ticket, by which it ends."""
 
-    def __init__(self, config: Config, link: PacketLink, guard: Guard, replies: Replies, last_words: LastWords) -> None:
+    def __init__(
+        self,
+        config: Config,
+        link: PacketLink,
+        guard: Guard,
+        replies: Replies,
+        last_words: LastWords,
+        hurrying: Callable[[], AbstractContextManager[None]],
+    ) -> None:
+        """`hurrying` has the loop take what is sent in it in the cycle in which it comes."""
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
         self._home_within = REPLY_WITHIN + sum(homing)
         self._takeover = config.control.takeover
         self._link = link
+        self._hurrying = hurrying
         self._guard = guard
         self._replies = replies
         self._last_words = last_words
@@ -105,7 +116,9 @@ class Requests:
         if not name.stops:
             self._check_under_way(user)
         request = self._request(user, name, content)
-        if not self._link.send(message(request)):
+        with self._hurrying() if name.stops else nullcontext():
+            sent = self._link.send(message(request))
+        if not sent:
             raise RefusedError(RefusalCode.BUSY, "too many requests at once: send it again")
         self._commands[request.ticket] = user
         within = self._home_within if name is Command.HOME else REPLY_WITHIN

@@ -70,6 +70,11 @@ class PacketLink:
             raise Closed
         return packet
 
+    @property
+    def ended(self) -> bool:
+        """Whether the peer has gone; what it has sent before may still be there."""
+        return any(events & (select.POLLHUP | select.POLLERR) for _, events in self._arrivals.poll(0))
+
     def close(self) -> None:
         """Let the peer see the end."""
         self._socket.close()
@@ -115,6 +120,11 @@ class Port:
     def calm(self) -> bool:
         """Whether no peer has gone of whom nobody has asked yet."""
         return not self._lost
+
+    @property
+    def ended(self) -> bool:
+        """Whether the peer has gone, and that has not been found by receiving or sending yet."""
+        return self._link is not None and self._link.ended
 
     def fileno(self) -> int:
         """The peer's descriptor; -1 where there is none."""

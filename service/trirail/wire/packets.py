@@ -195,6 +195,8 @@ class ControlInput(Struct, frozen=True, tag="Input"):  # as recordings have it
     now_ns: int
     """The monotonic clock then: how old a goal was."""
     given: GivenInput
+    urgent: bool = False
+    """Whether it was given behind the cycle's SYNC; else before it, with all that was decided then."""
 
 
 class Unrecorded(Struct, frozen=True, tag=True):
