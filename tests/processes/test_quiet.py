@@ -17,6 +17,7 @@ import can
 import numpy as np
 import pytest
 from conftest import CONFIG
+from msgspec import structs
 from trirail.config import Config
 from trirail.motion.planning import MotionPlanner
 from trirail.processes.clock import Ticker
@@ -34,6 +35,7 @@ from trirail_drivers.bus.can_frame import CAN_FRAME
 from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.connection.opening import simulated_bus
+from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus
 
@@ -47,9 +49,6 @@ NEVER_MIND = ("parts_ns",)
 GENTLE = ("pose", "pose", "pose", "move", "jog", "track", "order")
 ROUGH = ("frame", "fault", "time")
 """What may happen in a session: the latter end most of it by a fault."""
-
-
-FAULTS = ("silent for 0.004", "fault 2310", "drop tpdo2 for 0.002", "emcy 8110", "stuck for 0.05")
 
 
 class Happening(NamedTuple):
@@ -83,6 +82,7 @@ class Session:
         self.beats = True
         self.sent: list[bytes] = []
         self.held: list[bytes] = []
+        self.setting_up = False
         self.holds = False
         """Whether what the drives say is kept for the next cycle."""
         self._stack = ExitStack()
@@ -96,8 +96,10 @@ class Session:
         self.end, _ = listening.accept()
         self.end.setblocking(False)
         self.bus = bus
-        driver = PROTOCOLS[config.drives.protocol].driver(bus, config.can.bitrate, config.drives, self.clock)
+        driver = PROTOCOLS[config.drives.protocol].driver(bus, config.can.bitrate, config.drives, self.clock_of_driver)
+        self.setting_up = True
         driver.configure(config.period, config.limits.slider.velocity)
+        self.setting_up = False
         names = ("gateway", "recorder", "planner")
         ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))
         self.gateway, self.recorder, self.planner = (links.connect(folder / name, MAX_PLANNING) for name in names)
@@ -113,6 +115,12 @@ class Session:
 
     def clock(self) -> float:
         return self.now_ns / 1e9
+
+    def clock_of_driver(self) -> float:
+        """The same; while drives are set up it goes on when it is looked at."""
+        if self.setting_up:
+            self.pass_time(STEP_NS)
+        return self.clock()
 
     def close(self) -> None:
         self._stack.close()
@@ -188,7 +196,23 @@ def _comparable(packet: bytes) -> Iterator[object]:
             yield type(said).__name__, repr(said) if type(said).__name__ in ("Status", "ControlInput") else ""
 
 
-def script(seed: int) -> dict[int, list[Happening]]:  # noqa: PLR0912, PLR0915 - what may happen, kind by kind
+def odrives() -> Config:
+    """The same robot on ODrives, of which a metre is so many turns."""
+    each = {
+        name: structs.replace(drive, counts_per_metre=25.0)
+        for name, drive in zip(NAMES, CONFIG.drives.each, strict=True)
+    }
+    return structs.replace(CONFIG, drives=structs.replace(CONFIG.drives, protocol="odrive", **each))
+
+
+CONFIGS = {"cia402": CONFIG, "odrive": odrives()}
+FAULTS = {
+    "cia402": ("silent for 0.004", "fault 2310", "drop tpdo2 for 0.002", "emcy 8110", "stuck for 0.05"),
+    "odrive": ("silent for 0.004", "fault 2", "stuck for 0.05"),
+}
+
+
+def script(seed: int, protocol: str = "cia402") -> dict[int, list[Happening]]:  # noqa: PLR0912, PLR0915 - what may happen, kind by kind
     """What happens in a session: often much at once, and often nothing for long."""
     chance = random.Random(seed)
     tickets = iter(range(1, 10_000))
@@ -249,9 +273,7 @@ def script(seed: int) -> dict[int, list[Happening]]:  # noqa: PLR0912, PLR0915 -
                     at(number, lambda session, frame=frames[kind]: session.inject(frame))  # type: ignore[misc]
             case "fault":
                 axis = chance.choice("ABC")
-                line = chance.choice(
-                    ("silent for 0.004", "fault 2310", "drop tpdo2 for 0.002", "emcy 8110", "stuck for 0.05")
-                )
+                line = chance.choice(FAULTS[protocol])
                 at(number, lambda session, line=f"{axis} {line}": session.drives.faults.add(line))  # type: ignore[misc]
                 order(number + 150, Command.RESET)
                 order(number + 170, Command.ENABLE)
@@ -265,16 +287,18 @@ def script(seed: int) -> dict[int, list[Happening]]:  # noqa: PLR0912, PLR0915 -
     return happens
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_quiet_cycles_are_those_of_python_to_the_last_bit(seed: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("protocol", "seed"), [("cia402", seed) for seed in range(12)] + [("odrive", seed) for seed in range(6)]
+)
+def test_quiet_cycles_are_those_of_python_to_the_last_bit(protocol: str, seed: int, tmp_path: Path) -> None:
     """Frames on the bus, records and events; and most cycles were quiet, so there was something to compare."""
     told = []
     for quiet in (True, False):
         folder = tmp_path / str(quiet)
         folder.mkdir()
-        session = Session(CONFIG, folder, quiet=quiet)
+        session = Session(CONFIGS[protocol], folder, quiet=quiet)
         try:
-            session.run(script(seed))
+            session.run(script(seed, protocol))
         finally:
             session.close()
         told.append((session.sent, session.heard))

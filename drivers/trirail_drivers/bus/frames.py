@@ -39,6 +39,12 @@ class Frame:
         self.packed = bytearray(CAN_FRAME.pack(identifier | REMOTE * remote, len(data), data))
         """`struct can_frame`."""
 
+    @classmethod
+    def of(cls, packed: bytes) -> Frame:
+        """Return a `struct can_frame` as a frame."""
+        identifier, length, data = CAN_FRAME.unpack(packed)
+        return cls(identifier & STANDARD_BITS, data[:length], remote=bool(identifier & REMOTE))
+
     def fill(self, layout: Struct, *values: int) -> None:
         """Give it other data, of the same length; struct.error where the layout cannot hold a value."""
         layout.pack_into(self.packed, DATA_AT, *values)

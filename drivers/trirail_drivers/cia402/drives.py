@@ -20,7 +20,7 @@ from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.cia402.objects import means
 from trirail_drivers.cia402.one_drive import HAS_POWER
 from trirail_drivers.cia402.strangers import Strangers
-from trirail_drivers.driver.cyclic import Cyclic
+from trirail_drivers.driver.cyclic import Cyclic, packets
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
@@ -43,7 +43,6 @@ class Cia402(Driver[Cia402Axis]):
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
-        self._lent: Cyclic | None = None
         self._away = False
         """What is kept of the drives is lent."""
         self._lent_with: list[tuple[int, int]] = []
@@ -171,11 +170,6 @@ class Cia402(Driver[Cia402Axis]):
                 axis.setpoints_late += 1
         self._command()
 
-    @property
-    def traffic(self) -> int:
-        """See trirail_drivers.interface.DriveGroup."""
-        return int(self._lent.times[0]["traffic"]) if self._away and self._lent is not None else super().traffic
-
     def lend(self) -> Cyclic | None:
         """The tables of a cycle, where every drive rests in what it was asked for and nothing else is to be done."""
         due, descriptor = self._heartbeat_due, self._wire.descriptor
@@ -183,8 +177,10 @@ class Cia402(Driver[Cia402Axis]):
             return None
         if self._stopped_in_this_cycle or not all(axis.rests(_asked_of(axis, self._wanted)) for axis in self._axes):
             return None
-        lent = self._lent = self._lent or Cyclic(descriptor, self._sync, self._beats)
-        lent.times[0] = self._off_by, due, self._drives.heartbeat, 0, self._wire.traffic, 0
+        if self._lent is None:
+            self._lent = Cyclic(descriptor, packets([self._sync]), packets(self._beats), packets(self._setpoints))
+        lent, beats = self._lent, len(self._beats)
+        lent.times[0] = self._off_by, due, self._drives.heartbeat, beats, 0, 0, 0, self._wire.traffic, 0
         lent.write([axis.lend() for axis in self._axes])
         self._away = True
         words = [(axis.controlword, axis.statusword) for axis in self._axes]
@@ -216,9 +212,7 @@ class Cia402(Driver[Cia402Axis]):
         """Send the setpoints in the tables that the bus has not taken, one at a time."""
         assert self._lent is not None
         for axis, packed in zip(self._axes[first:], self._lent.setpoints.frames[first:], strict=True):
-            frame = axis.way.setpoints.frame()
-            frame.packed[:] = packed.tobytes()
-            axis.setpoints_lost += not self._wire.send(frame)
+            axis.setpoints_lost += not self._wire.send(Frame.of(packed.tobytes()))
 
     def enable(self, alone: str | None = None) -> None:
         """Begin to power up, all drives or one `alone`; the following writes carry it out, the states tell when.

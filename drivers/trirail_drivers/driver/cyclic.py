@@ -41,12 +41,20 @@ AXIS = np.dtype(
         ("stands_at", "<i8"),  # counts where the slider has been, and since when [s]
         ("stands_since", "<f8"),
         ("command_age", "<i8"),  # SYNCs since it was sent a command
-        ("target", "<i8"),  # position and velocity that were sent last, in its units
+        ("target", "<i8"),  # position and velocity that were sent last, in its units, where these are whole
         ("offset", "<i8"),
+        ("wanted", "<f8", 2),  # setpoint that was written last [m], [m/s]
+        ("sent", "<f8", 2),  # and what the last SYNC has sent of it, where setpoints wait for one
+        ("in_force", "<f8"),  # position that the bus has taken last [m]
         # What stays as it is.
+        ("floats", "u1"),  # whether positions are 32-bit floats; else whole counts
+        ("waits", "u1"),  # whether setpoints go with the next SYNC; else at once
+        ("follows_within", "<f8"),  # how far it may be from where it is to be [m]; infinite where nobody watches that
         ("counts_per_metre", "<f8"),
         ("zero", "<f8"),  # slider position at zero counts [m]
         ("velocity_per_metre", "<f8"),
+        ("velocity_step", "<f8"),  # by which that is divided
+        ("velocity_bytes", "<i8"),
         ("still", "<f8"),  # counts within which a slider stands
         ("heard_within", "<f8"),  # how old that may be [s]
         ("status_within", "<f8"),
@@ -80,7 +88,10 @@ TIMES = np.dtype(
         ("due", "<f8"),  # when the driver has to do something else itself [s]
         ("beat_due", "<f8"),  # when the service's own signs of life are due [s], and how often they are
         ("beat_period", "<f8"),
+        ("beats", "<i8"),  # so many of them go at once, and which is the next
+        ("next_beat", "<i8"),
         ("unsent", "<i8"),  # so many of them, the last ones, the bus has not taken
+        ("begun", "<i8"),  # frames that begin the newest cycle, and that the bus has taken
         ("traffic", "<i8"),  # bits that have passed the bus
         ("cycles", "<i8"),  # whole cycles
     ],
@@ -118,6 +129,12 @@ class Packets:
             vector[:] = frame.ctypes.data, CAN_FRAME.size
             header[2:4] = vector.ctypes.data, 1
 
+    def part(self, first: int, end: int) -> Packets:
+        """Return some of them, which stay the same."""
+        part = Packets.__new__(Packets)
+        part.frames, part._vectors, part.headers = self.frames[first:end], self._vectors, self.headers[first:end]
+        return part
+
     def fill(self, frames: Iterable[Frame]) -> None:
         """Have these frames."""
         for row, frame in zip(self.frames, frames, strict=True):
@@ -133,28 +150,38 @@ class Packets:
         return found
 
 
+def packets(frames: Sequence[Frame]) -> Packets:
+    """Return frames as packets."""
+    made = Packets(len(frames))
+    made.fill(frames)
+    return made
+
+
 class Cyclic:
     """The tables of three drives, made once, and filled in each time that they are lent."""
 
-    def __init__(self, descriptor: int, sync: Frame, beats: Sequence[Frame]) -> None:
+    def __init__(self, descriptor: int, begin: Packets, beats: Packets, setpoints: Packets, history: int = 0) -> None:
+        """`history`: so many setpoints are kept of those that were sent."""
         self.descriptor = descriptor
         """The bus: a socket of `struct can_frame`, one a packet."""
         self.axes: NDArray[np.void] = np.zeros(3, AXIS)
         self.times: NDArray[np.void] = np.zeros(1, TIMES)
         self.expected: NDArray[np.void] = np.zeros(0, EXPECTED)
-        self.begin = Packets(1)
+        self.begin = begin
         """What begins a cycle."""
-        self.begin.fill([sync])
-        self.beats = Packets(len(beats))
-        """What goes behind that from time to time, that the drives know the service to live."""
-        self.beats.fill(beats)
-        self.setpoints = Packets(3)
-        """What ends it: one frame for each drive, in their order."""
+        self.beats = beats
+        """What goes behind that from time to time: that the drives know the service to live, what they are asked."""
+        self.setpoints = setpoints
+        """One frame for each drive, in their order."""
+        self.end = setpoints.headers
+        """What ends a cycle: those, or none of them where they go with what begins the next."""
+        self.history = np.full((history, 3), np.nan)
+        """Positions that the drives were to have reached at each SYNC, the newest last [m]; NaN where none was sent."""
         self.arrived = Packets(MOST_FRAMES)
 
     def write(self, rows: Sequence[Row]) -> None:
         """Have what is kept of the three drives."""
-        self.axes[:] = [tuple(row[name] for name in _NAMES) for row in rows]
+        self.axes[:] = [tuple(row.get(name, 0) for name in _NAMES) for row in rows]
 
     def rows(self) -> list[Row]:
         """What is kept of the three drives."""

@@ -14,6 +14,7 @@ from trirail_drivers import config
 from trirail_drivers.bus import load
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.refusals import SetUpDrive, told
 from trirail_drivers.driver.scaling import Scale, scale_of
 from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection
@@ -53,6 +54,9 @@ class Driver(ABC, Generic[AnyAxis]):
         """When the drives must have lost their power [s]; inf where that was not asked for, or has been told of."""
         self._asked = ""
         """By what that was asked for."""
+        self._lent: Cyclic | None = None
+        self._away = False
+        """Whether somebody else runs the cycles, by those tables."""
         self._closed = False
 
     def _tell(self, made: Sequence[SetUpDrive], means: Callable[[str], str]) -> None:
@@ -66,7 +70,7 @@ class Driver(ABC, Generic[AnyAxis]):
     @property
     def traffic(self) -> int:
         """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
-        return self._wire.traffic
+        return int(self._lent.times[0]["traffic"]) if self._away and self._lent is not None else self._wire.traffic
 
     @property
     def told(self) -> tuple[DriveFault | None, ...]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.cyclic import Row, expected
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.odrive import frames
@@ -56,6 +58,58 @@ class OdriveAxis(Axis):
         self._initialised = False
         self._restarted = False
         self._result: int = ProcedureResult.SUCCESS
+
+    def rests(self, wanted: AxisState | None) -> bool:
+        """Whether nothing is to be done for it, nor found out, as long as its frames say nothing new."""
+        in_state = wanted is not None and self.requested is wanted and self.state == wanted and self.obeys
+        well = self.told and not self.errors and self.event is None and self.reset_until == -math.inf
+        follows = self.powered_up or wanted is AxisState.IDLE
+        return in_state and well and follows and self.answers.missed == 0 and math.isfinite(self.position)
+
+    def lend(self) -> Row:
+        """Return what is kept of it, where it rests."""
+        row: Row = {
+            "position": self.position,
+            "heard": self.heard,
+            "status_heard": 0.0,
+            "stands_since": 0.0,
+            "floats": True,
+            "counts_per_metre": self.scale.counts_per_metre,
+            "zero": self.scale.offset,
+            "velocity_per_metre": self.scale.counts_per_metre,
+            "velocity_step": frames.VELOCITY_STEP,
+            "velocity_bytes": 2,
+            "still": math.inf,
+            "heard_within": self._heartbeat_timeout,
+            "status_within": math.inf,
+            "position_at": 0,
+            "velocity_at": 4,
+        }
+        self.answers.lend(row)
+        return row
+
+    def take_back(self, row: Row) -> None:
+        """Go on from there."""
+        self.position, self.heard = row["position"], row["heard"]
+        self.answers.take_back(row)
+
+    def expected(self, number: int) -> list[tuple[Any, ...]]:
+        """The frames that say nothing new of it, as rows of trirail_drivers.driver.cyclic.EXPECTED; it has a number."""
+
+        def of(command: int) -> int:
+            return frames.identifier(self.node, command)
+
+        beat, decides = frames.BEAT.pack(0, self.state, self._result, 0), frames.BEAT.pack(0xFFFFFFFF, 0xFF, 0xFF, 0)
+        nothing, any_of_it = bytes(frames.ESTIMATES.size), b"\xff" * frames.ERRORS.size
+        return [
+            expected(of(frames.GET_ENCODER_ESTIMATES), number, nothing, nothing, position_at=0),
+            expected(of(frames.HEARTBEAT), number, beat, decides, lives=True),
+            expected(of(frames.GET_ERROR), number, bytes(frames.ERRORS.size), any_of_it),
+        ]
+
+    def input_pos(self, position: float, velocity: float) -> bytes:
+        """Set_Input_Pos of a setpoint [m], [m/s]; OverflowError or struct.error where it holds none such."""
+        return frames.input_pos(self.scale.exact(position), self.scale.counts_per_metre * velocity)
 
     def on_version(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
         """Get_Version."""

@@ -11,7 +11,6 @@ clocks, none or two of them in a cycle now and then, and nobody could tell their
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections import deque
@@ -19,11 +18,13 @@ from collections import deque
 import can
 
 from trirail_drivers import config
+from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import frames, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
+from trirail_drivers.odrive.lending import Tables
 from trirail_drivers.odrive.protections import means
 from trirail_drivers.odrive.setpoints import SetpointSender
 
@@ -52,10 +53,12 @@ class Odrive(Driver[OdriveAxis]):
             ):
                 self._wire.listen(frames.identifier(axis.node, number), axis, handler)
         self._requests = tuple(frames.request(axis.node, frames.GET_ENCODER_ESTIMATES) for axis in self._axes)
-        self._error_requests = itertools.cycle(frames.request(axis.node, frames.GET_ERROR) for axis in self._axes)
+        self._error_requests = tuple(frames.request(axis.node, frames.GET_ERROR) for axis in self._axes)
+        self._next_request = 0
         self._errors_due: float | None = None
         self._enabled = False
         self._setpoints = SetpointSender(self._axes, self._wire, drives.quick_stop_deceleration)
+        self._tables: Tables | None = None
         self._due: deque[Triple | None] = deque([None] * drives.missed_positions, maxlen=drives.missed_positions)
         """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
 
@@ -93,7 +96,8 @@ class Odrive(Driver[OdriveAxis]):
             axis.answers.sync_sent()
         if now >= self._errors_due:
             self._errors_due = now + frames.ERROR_PERIOD
-            self._wire.send(next(self._error_requests))
+            self._wire.send(self._error_requests[self._next_request])
+            self._next_request = (self._next_request + 1) % len(self._error_requests)
 
     def read(self) -> Feedback:
         """Take in every frame that has arrived."""
@@ -106,6 +110,9 @@ class Odrive(Driver[OdriveAxis]):
             if fault is not None:
                 self._wire.fail(fault)
         self._watch_stopping(now)
+        return self._feedback()
+
+    def _feedback(self) -> Feedback:
         a, b, c = self._axes
         on = self._enabled
         return Feedback(
@@ -132,6 +139,43 @@ class Odrive(Driver[OdriveAxis]):
         if self._clock() - self._synced > self._period:
             for axis in self._axes:
                 axis.setpoints_late += 1
+
+    def lend(self) -> Cyclic | None:
+        """The tables of a cycle, where every drive rests in what it was asked for and nothing else is to be done."""
+        descriptor, due, sender = self._wire.descriptor, self._errors_due, self._setpoints
+        if descriptor is None or due is None or not self._wire.calm or sender.stopping:
+            return None
+        if self._enabled and (sender.sent is None or sender.written is None):
+            return None
+        if not all(axis.rests(self._wanted(axis)) for axis in self._axes):
+            return None
+        if self._tables is None:
+            self._tables = Tables(descriptor, self._axes, self._error_requests, self._requests, len(self._due))
+        lent = self._lent = self._tables.cyclic
+        traffic, asks = self._wire.traffic, (1, self._next_request)
+        lent.times[0] = self._off_by, due, frames.ERROR_PERIOD, *asks, 0, 0, traffic, 0
+        self._tables.fill(sender, self._due, follow=self._enabled, within=self._drives.following_error)
+        self._away = True
+        return lent
+
+    def take_back(self, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
+        """Go on from what the tables hold: see trirail_drivers.driver.cyclic.Lender."""
+        assert self._tables is not None
+        self._away = False
+        lent = self._tables.cyclic
+        times = lent.times[0]
+        self._wire.traffic, self._errors_due = int(times["traffic"]), float(times["beat_due"])
+        self._next_request = int(times["next_beat"])
+        self._tables.empty(self._setpoints, self._due)
+        self._wire.hand_in(lent.arrived.unpacked(arrived), error)
+        if synced is not None:
+            self._wire.begin()
+            self._synced = synced
+            self._tables.send_on(self._wire, self._setpoints)
+        return self._feedback()
+
+    def send_on(self, first: int) -> None:
+        """Do nothing: setpoints go with the next SYNC."""
 
     def enable(self, alone: str | None = None) -> None:
         """Begin to power up, all drives or one `alone`, after the setpoints of the next SYNC; the states tell when.

@@ -29,9 +29,9 @@ class SetpointSender:
         self._axes = axes
         self._wire = wire
         self._deceleration = deceleration
-        self._next: tuple[Triple, Triple] | None = None
+        self.written: tuple[Triple, Triple] | None = None
         """Setpoints to be sent at the next SYNC."""
-        self._in_force: list[float] = []
+        self.in_force: list[float] = []
         """Positions that the bus has taken last [m]."""
         self._braking: float | None = None
         """Time since a quick stop has brought the setpoints to a standstill [s]; None where none is under way."""
@@ -44,14 +44,14 @@ class SetpointSender:
     def begin(self) -> None:
         """Forget what was sent before the drives are to get power."""
         self._braking = self.sent = None
-        self._in_force = []
+        self.in_force = []
 
     def take(self, position: Triple, velocity: Triple) -> OdriveAxis | None:
         """Take what is to be sent at the next SYNC; the axis whose message cannot hold it, if there is one."""
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             if not _is_sendable(axis, metres, rate):
                 return axis
-        self._next = position, velocity
+        self.written = position, velocity
         return None
 
     def step(self, enabled: bool) -> None:
@@ -59,8 +59,8 @@ class SetpointSender:
         if self._braking is not None:
             self._brake()
         # Without power none is sent: a drive that has missed losing it is to stay where the ramp has ended.
-        if self._next is not None and (enabled or self.stopping):
-            self._send(*self._next)
+        if self.written is not None and (enabled or self.stopping):
+            self._send(*self.written)
 
     def stop(self) -> None:
         """Begin to lead the drives down the ramp, now; they must have been sent setpoints."""
@@ -68,10 +68,10 @@ class SetpointSender:
             return
         self._braking = 0.0
         # The position in force stays; what the drives are to run on with is less from now on.
-        a, b, c = self._in_force
+        a, b, c = self.in_force
         _, slower = self._braked(self.sent[1])
         self._send((a, b, c), slower)
-        self._next = None
+        self.written = None
 
     def abandon(self) -> None:
         """Lead the drives down the ramp no longer."""
@@ -80,11 +80,11 @@ class SetpointSender:
     def _send(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints; each is in force when it arrives."""
         self.sent = sent = position, velocity
-        self._in_force = self._in_force or list(position)
+        self.in_force = self.in_force or list(position)
         for number, (axis, metres, rate) in enumerate(zip(self._axes, position, velocity, strict=True)):
-            data = frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
+            data = axis.input_pos(metres, rate)
             if self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
-                self._in_force[number] = metres
+                self.in_force[number] = metres
             else:
                 axis.setpoints_lost += 1
             if self.sent is not sent:
@@ -99,7 +99,7 @@ class SetpointSender:
         if self.sent is None or self._braking is None:
             return
         _, velocity = self.sent
-        self._next = self._braked(velocity)
+        self.written = self._braked(velocity)
         if any(velocity):
             return
         self._braking += self.period
@@ -110,14 +110,14 @@ class SetpointSender:
         """Setpoints one period further down the ramp from those in force, of this velocity."""
         (a, da), (b, db), (c, dc) = (
             braked(place, rate, self._deceleration, self.period)
-            for place, rate in zip(self._in_force, velocity, strict=True)
+            for place, rate in zip(self.in_force, velocity, strict=True)
         )
         return (a, b, c), (da, db, dc)
 
 
 def _is_sendable(axis: OdriveAxis, metres: float, rate: float) -> bool:
     try:
-        frames.input_pos(axis.scale.exact(metres), axis.scale.counts_per_metre * rate)
+        axis.input_pos(metres, rate)
     except (ValueError, OverflowError, struct.error):
         return False
     return math.isfinite(metres)  # a float that is not a number is packed like any other

@@ -6,6 +6,7 @@ EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct can_frame`. What 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -80,6 +81,15 @@ def _take_position(axis: Any, counts: int, now: float) -> bool:
     return _come(axis)
 
 
+@compiled()
+def _take_turns(axis: Any, turns: float) -> bool:
+    """Take a position in that is no whole number; False where it is none, or as of _take_position."""
+    if axis.came or not math.isfinite(turns):
+        return False
+    axis.came, axis.position = True, turns / axis.counts_per_metre + axis.zero
+    return _come(axis)
+
+
 @compiled(i8(FRAMES, i8, EXPECTATIONS, AXES, TIMINGS, f8))
 def take_frames(
     frames: NDArray[np.uint8],
@@ -107,8 +117,11 @@ def take_frames(
                 return i
         axis = axes[row.axis]
         if row.position_at != NOWHERE:
-            counts = _signed(_number(frame, DATA_AT + row.position_at, 4))
-            if not _take_position(axis, counts, now):
+            at = DATA_AT + row.position_at
+            if axis.floats:
+                if not _take_turns(axis, float(frames[i, at : at + 4].view(np.float32)[0])):
+                    return i
+            elif not _take_position(axis, _signed(_number(frame, at, 4)), now):
                 return i
         if row.status_at != NOWHERE:
             axis.statusword = _number(frame, DATA_AT + row.status_at, 2)
@@ -121,31 +134,46 @@ def take_frames(
 
 
 @compiled()
-def begin_cycle(axes: NDArray[np.void]) -> None:
-    """Note that the SYNC has been sent."""
+def begin_cycle(axes: NDArray[np.void], history: Array, taken: int) -> None:
+    """Note that the SYNC has been sent, with so many setpoints where these wait for one."""
+    if len(history):
+        history[:-1] = history[1:]
     for i in range(3):
-        axes[i].syncs += 1
-        axes[i].between = False
-        axes[i].command_age += 1
+        axis = axes[i]
+        axis.syncs += 1
+        axis.between = False
+        axis.command_age += 1
+        if len(history):
+            history[-1, i] = axis.sent[0]
+        if axis.waits:
+            axis.sent[0], axis.sent[1] = axis.wanted[0], axis.wanted[1]
+            if i < taken:
+                axis.in_force = axis.wanted[0]
 
 
-@compiled(i8(AXES, TIMINGS, f8))
-def end_read(axes: NDArray[np.void], times: NDArray[np.void], now: float) -> int:
-    """Note that the frames of a cycle are in; return whether every drive has told all that it should, in time."""
+@compiled(i8(AXES, TIMINGS, f8[:, ::1], f8))
+def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, now: float) -> int:
+    """Note that the frames of a cycle are in; return whether every drive has told all that it should, and follows."""
     for i in range(3):
         axis = axes[i]
         axis.between, axis.came = True, False
-        missed = axis.syncs - axis.sampled - (not axis.prompt)
-        if missed or now - axis.heard > axis.heard_within or now - axis.status_heard > axis.status_within:
+        age = axis.syncs - axis.sampled
+        if age - (not axis.prompt) or now - axis.heard > axis.heard_within:
             return False
+        if now - axis.status_heard > axis.status_within:
+            return False
+        if len(history) and math.isfinite(axis.follows_within):
+            due = history[len(history) - 1 - min(age, len(history) - 1), i]
+            if not abs(due - axis.position) <= axis.follows_within:
+                return False
     in_time: bool = now < times[0].due
     return in_time
 
 
 @compiled()
-def _put(frame: NDArray[np.uint8], at: int, number: int) -> None:
-    """Write 32 bits, little-endian."""
-    for i in range(4):
+def _put(frame: NDArray[np.uint8], at: int, number: int, size: int) -> None:
+    """Write so many bytes, little-endian."""
+    for i in range(size):
         frame[DATA_AT + at + i] = (number >> (8 * i)) & 0xFF
 
 
@@ -154,15 +182,23 @@ def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -
     """Write setpoints, rows of positions [m] and velocities [m/s], into their frames; False where one does not fit."""
     for i in range(3):
         axis = axes[i]
-        counts = np.rint(axis.counts_per_metre * (sent[0, i] - axis.zero))
-        if not abs(counts) <= INT32_MAX:
-            return False
-        axis.target, axis.offset = np.int64(counts), 0
-        _put(frames[i], axis.position_at, axis.target)
+        counts = axis.counts_per_metre * (sent[0, i] - axis.zero)
+        if axis.floats:
+            at = DATA_AT + axis.position_at
+            frames[i, at : at + 4].view(np.float32)[0] = counts
+            if not math.isfinite(frames[i, at : at + 4].view(np.float32)[0]):
+                return False
+        else:
+            counts = np.rint(counts)
+            if not abs(counts) <= INT32_MAX:
+                return False
+            axis.target, axis.offset = np.int64(counts), 0
+            _put(frames[i], axis.position_at, axis.target, 4)
         if axis.velocity_at != NOWHERE:
-            offset = np.rint(axis.velocity_per_metre * sent[1, i])
-            if not abs(offset) <= INT32_MAX:
+            offset = np.rint(axis.velocity_per_metre * sent[1, i] / axis.velocity_step)
+            if not abs(offset) <= (1 << (8 * axis.velocity_bytes - 1)) - 1:
                 return False
             axis.offset = np.int64(offset)
-            _put(frames[i], axis.velocity_at, axis.offset)
+            _put(frames[i], axis.velocity_at, axis.offset, axis.velocity_bytes)
+        axis.wanted[0], axis.wanted[1] = sent[0, i], sent[1, i]
     return True

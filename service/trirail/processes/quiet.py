@@ -179,9 +179,9 @@ def _receive(state: NDArray[np.void], moment: NDArray[np.int64], bus: int, heade
 
 @compiled(
     i8(
-        *(_STATE, i8[:, ::1], i8[::1], i8, FRAMES, u8[:, ::1], u8[:, ::1]),
+        *(_STATE, i8[:, ::1], i8[::1], i8, FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
-        *(EXPECTATIONS, AXES, TIMINGS, _DOORS, u8[::1], FRAMES),
+        *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], _DOORS, u8[::1], FRAMES),
         *(cycle.LEGS, cycle.BOUND, cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
         *(cycle.MOTION, cycle.SLIDERS, cycle.KEPT, f8[::1], cycle.FEEDBACKS, f8[:, ::1], types.b1[::1], f8[:, ::1]),
         *(cycle.MONITORED, cycle.RECORD, u1[::1]),
@@ -195,6 +195,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     bus: int,
     arrived: NDArray[np.uint8],
     arrivals: NDArray[np.uint64],
+    starts: NDArray[np.uint8],
     begin: NDArray[np.uint64],
     signs: NDArray[np.uint8],
     beats: NDArray[np.uint64],
@@ -203,6 +204,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     expected: NDArray[np.void],
     axes: NDArray[np.void],
     times: NDArray[np.void],
+    history: Array,
     doors: NDArray[np.int32],
     hearts: NDArray[np.uint64],
     batch: NDArray[np.uint8],
@@ -253,19 +255,26 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         ):
             _copy(kept, 0, 1)
             return Reached.WAITED
-        if _sendmmsg(bus, begin.ctypes.data, np.uint32(1), _FLAGS) != 1:
+        begun = _sendmmsg(bus, begin.ctypes.data, np.uint32(len(begin)), _FLAGS)
+        if begun < 1:
             _copy(kept, 0, 1)
             return Reached.WAITED
-        begin_cycle(axes)
-        times[0].traffic += BITS[0]
+        begin_cycle(axes, history, begun)
+        times[0].begun = begun
+        for i in range(begun):
+            times[0].traffic += BITS[starts[i, LENGTH_AT]]
         s.synced, s.arrived = t, 0
+        if begun < len(begin):
+            return Reached.SYNCED
         if t >= times[0].beat_due:
             times[0].beat_due = t + times[0].beat_period
-            gone = max(_sendmmsg(bus, beats.ctypes.data, np.uint32(len(beats)), _FLAGS), 0)
-            times[0].unsent = len(beats) - gone
+            first, number = times[0].next_beat, times[0].beats
+            times[0].next_beat = (first + number) % len(beats)
+            gone = max(_sendmmsg(bus, beats[first:].ctypes.data, np.uint32(number), _FLAGS), 0)
+            times[0].unsent = number - gone
             for i in range(gone):
-                times[0].traffic += BITS[signs[i, LENGTH_AT]]
-            if gone < len(beats):
+                times[0].traffic += BITS[signs[first + i, LENGTH_AT]]
+            if gone < number:
                 return Reached.SYNCED
         _mark(state, moment, Part.SYNC)
 
@@ -275,7 +284,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         if s.error != 0 or number >= MOST_FRAMES or take_frames(arrived, number, expected, axes, times, t) < number:
             _copy(kept, 0, 1)
             return Reached.SYNCED
-        if not end_read(axes, times, t):
+        if not end_read(axes, times, history, t):
             _copy(kept, 0, 1)
             return Reached.SYNCED
         _mark(state, moment, Part.READ)
@@ -319,7 +328,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
 
         s.called, s.found = in_position or called or code != s.found or s.cycle + 1 >= s.due, code
         s.arrived, s.time, s.gateway_seen, s.gateway_turns = 0, time, count, turns
-        s.sent = max(_sendmmsg(bus, departures.ctypes.data, np.uint32(3), _FLAGS), 0)
+        s.sent = max(_sendmmsg(bus, departures.ctypes.data, np.uint32(len(departures)), _FLAGS), 0)
         for i in range(s.sent):
             times[0].traffic += BITS[setpoints[i, LENGTH_AT]]
         _mark(state, moment, Part.WRITE)
@@ -332,7 +341,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         batch[s.batched] = made
         s.batched += 1
         _mark(state, moment, Part.RECORD)
-        if s.sent < 3:
+        if s.sent < len(departures):
             return Reached.WRITTEN
         if s.called:
             return Reached.DONE

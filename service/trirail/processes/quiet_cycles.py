@@ -162,14 +162,15 @@ class QuietCycles:
             kept = (
                 *(measured.numbers, measured.written, measured.backlash, measured.jumping),
                 *(measured.settling.monitored, measured.record, schedule.motion, setpoints.sliders),
-                *(setpoints.found, lent.axes, lent.times, self._nothing),
+                *(setpoints.found, lent.axes, lent.times, lent.history, self._nothing),
             )
             self._kept, self._rooms = quiet.copies(kept)
         self._kept[-1, 0] = furthest.ctypes.data
         given: tuple[Any, ...] = (
             *(self._state, self._kept, self._moment, lent.descriptor),
-            *(lent.arrived.frames, lent.arrived.headers, lent.begin.headers, lent.beats.frames, lent.beats.headers),
-            *(lent.setpoints.frames, lent.setpoints.headers, lent.expected, lent.axes, lent.times),
+            *(lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
+            *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
+            *(lent.expected, lent.axes, lent.times, lent.history),
             *(self._doors, self._hearts, self._reports.batch, measured.legs, setpoints.bounds, path.knots, path.pieces),
             *(path.tools, law.knots, law.pieces, furthest, schedule.motion, setpoints.sliders, measured.backlash),
             *(setpoints.found, measured.numbers, measured.written, measured.jumping, measured.room),
