@@ -4,19 +4,24 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 
-.PHONY: demo test hil explore chaos soak ci-packages bench clean
+.PHONY: demo check test test-all hil explore chaos soak ci-packages bench clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
 
-test: export PYTHONHASHSEED = 0
-test: $(READY)  ## everything that decides: lint, format, types, import contracts, tests
+check: $(READY)  ## lint, format, types and import contracts alone
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
-	$(VENV)/bin/pytest --numprocesses auto --dist worksteal -m "not slow and not viewer"
-	$(VENV)/bin/pytest -m "slow or viewer"
+
+test test-all: export PYTHONHASHSEED = 0
+test: check  ## before each commit, five minutes: lint, format, types, import contracts, tests of every room, whole services
+	$(VENV)/bin/pytest --numprocesses auto --dist worksteal --effort 0.1 -m "core or not (slow or viewer or long or alone)"
+
+test-all: check  ## everything that decides: the same with every test and every example
+	$(VENV)/bin/pytest --numprocesses auto --dist worksteal -m "not alone"
+	$(VENV)/bin/pytest -m alone
 
 hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; installs what that needs, as root on Debian
 	$(VENV)/bin/python -m pip install --quiet --group hil

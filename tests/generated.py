@@ -2,7 +2,8 @@
 
 Hypothesis tests are generated, and so are those that draw from a seed: @pytest.mark.generated(0, 1, 2) on a test with
 an argument `seed` has it run with each of these, or with as many fresh ones. What exploring finds stays: as @example(…)
-of a hypothesis test, as one more seed of the others.
+of a hypothesis test, as one more seed of the others. --effort=0.1 tries a tenth of the examples and of the seeds, for
+`make test`: also these are the same at every run.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ EXAMPLES = ".explore"
 settings.register_profile("gate", deadline=None, derandomize=True, database=None, suppress_health_check=CHECKS)
 settings.load_profile("gate")
 
+FEWEST = 3
+"""So many examples are tried, however little effort is asked for."""
+
 RUNS = pytest.StashKey[int]()
 """How often the body of a test has run."""
 
@@ -36,7 +40,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options of tools/explore.py."""
     group = parser.getgroup("generated tests")
     group.addoption("--explore", type=int, metavar="SEED", help="generated tests alone, with new examples by this seed")
-    group.addoption("--effort", type=int, default=1, metavar="N", help="so many times the examples")
+    group.addoption("--effort", type=float, default=1.0, metavar="X", help="so many times the examples and the seeds")
     group.addoption("--found", type=Path, metavar="FILE", help="add a line of JSON for each test to this file")
 
 
@@ -67,16 +71,23 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     marker = metafunc.definition.get_closest_marker("generated")
     if marker is None or not marker.args:
         return
-    seeds, explore = list(marker.args), metafunc.config.getoption("explore")
+    explore, effort = metafunc.config.getoption("explore"), metafunc.config.getoption("effort")
+    number = max(1, round(len(marker.args) * effort))
+    seeds = list(marker.args[:number])
     if explore is not None:
         chance = random.Random(f"{explore} {metafunc.definition.nodeid}")
-        seeds = [chance.randrange(2**32) for _ in seeds * metafunc.config.getoption("effort")]
+        seeds = [chance.randrange(2**32) for _ in range(number)]
     metafunc.parametrize("seed", seeds)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave what is generated, in an order of its own, if it is explored."""
-    explore = config.getoption("explore")
+    """Set how many examples are tried; if these are explored, leave what is generated, in an order of its own."""
+    explore, effort = config.getoption("explore"), config.getoption("effort")
+    if effort != 1.0:
+        for test in {_function(item) for item in items if _hypothesis(item)}:
+            given = test._hypothesis_internal_use_settings
+            examples = max(min(FEWEST, given.max_examples), round(given.max_examples * effort))
+            test._hypothesis_internal_use_settings = settings(given, max_examples=examples)
     if explore is None:
         return
     kept = [item for item in items if _hypothesis(item) or item.get_closest_marker("generated")]
@@ -88,17 +99,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Have a hypothesis test try more examples, and count them."""
+    """Have a hypothesis test that is explored draw new examples, and count them."""
     item.stash[RUNS] = 0
     if item.config.getoption("explore") is None or not _hypothesis(item):
         return
-    assert isinstance(item, pytest.Function)
-    test = getattr(item.obj, "__func__", item.obj)
+    test = _function(item)
     test.hypothesis.inner_test = _counted(item, test.hypothesis.inner_test)
     given = test._hypothesis_internal_use_settings
-    more = given.max_examples * item.config.getoption("effort")
     seed(item.config.getoption("explore"))(test)  # without a database, but for the next line
-    test._hypothesis_internal_use_settings = settings(given, max_examples=more)
+    test._hypothesis_internal_use_settings = given
 
 
 @pytest.hookimpl(wrapper=True)
@@ -133,6 +142,11 @@ def finding(error: BaseException, drawn: int | None) -> dict[str, str]:
 
 def _hypothesis(item: pytest.Item) -> bool:
     return isinstance(item, pytest.Function) and is_hypothesis_test(item.obj)
+
+
+def _function(item: pytest.Item) -> Any:
+    assert isinstance(item, pytest.Function)
+    return getattr(item.obj, "__func__", item.obj)
 
 
 def _counted(item: pytest.Item, body: Callable[..., object]) -> Callable[..., object]:

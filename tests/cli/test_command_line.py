@@ -82,6 +82,7 @@ def test_help_shows_groups_and_examples(run: Run) -> None:
     assert "trirail goto 30mm 20mm 10deg --wait" in run("goto", "--help")[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("line", "said"),
     [
@@ -114,6 +115,7 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
         assert said in found["message"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("line", "code", "said"),
     [

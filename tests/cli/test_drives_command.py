@@ -59,6 +59,7 @@ def test_drives_that_tell_nothing(tmp_path: Path) -> None:
         run("drives", "save", str(tmp_path), "--config", str(tmp_path / "odrive.toml"))
 
 
+@pytest.mark.long
 def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("drives", "save", str(tmp_path)) == 0
     assert "drive C, node 3: 67 parameters in" in capsys.readouterr().out

@@ -174,6 +174,7 @@ def test_the_workspace_in_words(capsys: pytest.CaptureFixture[str]) -> None:
     assert "-0.00" not in words
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("angles", ["", "--phi 0", "--deg --phi -100 -20 0 20 40"])
 def test_the_plot_is_a_picture(angles: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "workspace.png"
@@ -187,6 +188,7 @@ def test_the_plot_is_a_picture(angles: str, tmp_path: Path, capsys: pytest.Captu
     assert colourful.mean() > 0.02  # slices and strip, not only lines
 
 
+@pytest.mark.long
 def test_a_plot_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(TrirailError, match=r"cannot draw to .*Format 'xyz' is not supported"):
         call(f"workspace --phi 0 --plot {tmp_path / 'a.xyz'}")

@@ -92,6 +92,7 @@ def test_events_are_told_once_and_in_order_whatever_comes_again(noisy: Robot) ->
     assert told[-1] == NEWEST.seq
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [Robot, AsyncRobot])
 def test_the_environment_says_which_robot_and_where_as_in_a_shell(
     kind: type[Robot | AsyncRobot], monkeypatch: pytest.MonkeyPatch, tmp_path: Path

@@ -26,6 +26,8 @@ from trirail_drivers import config
 from trirail_drivers.interface import NAMES, PowerState
 from trirail_drivers.simulated import SimulatedBus, SimulatedDrive
 
+pytestmark = pytest.mark.long
+
 HOMING = config.Homing(method=19, speed_switch=0.02, speed_zero=0.005, acceleration=0.5, timeout=10.0)
 ODRIVE_COUNTS = 200.0
 
@@ -118,6 +120,7 @@ def odrives() -> Config:
     return msgspec.structs.replace(robot, drives=msgspec.structs.replace(robot.drives, protocol="odrive"))
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     "robot", [CONFIG, with_drives(CONFIG, direction=-1), odrives()], ids=["sim", "reversed", "odrive"]
 )

@@ -161,6 +161,7 @@ def errors(config: Config, number: int) -> list[float]:
     return found
 
 
+@pytest.mark.long
 def test_errors_of_fifty_micrometres_become_five(corrected: Config) -> None:
     found = errors(corrected, 40)
     assert max(found) <= GOOD

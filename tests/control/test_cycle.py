@@ -174,6 +174,7 @@ IN_USE = 4096
 """Bytes that a cycle may have in use for a moment: numbers and tuples, no array, no buffer, no list that grows."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "goal", [None, PoseGoal(0.1, 0.02, 0.1, speed=0.02), SlidersGoal((0.08, 0.0, 0.0), speed=0.02)]
 )
@@ -186,6 +187,7 @@ def test_a_cycle_that_changes_nothing_takes_no_memory(rig: Rig, goal: Any) -> No
     alone(lambda: takes_no_memory(rig))
 
 
+@pytest.mark.long
 def test_a_cycle_in_which_a_goal_waits_to_settle_takes_no_memory(rig: Rig) -> None:
     rig.enable()
     rig.send("g1", PoseGoal(0.01, 0.0, 0.0))

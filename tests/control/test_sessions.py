@@ -122,6 +122,7 @@ def test_raising_a_rate_that_is_still_falling_goes_on_along_the_path(lower: floa
     assert_within_limits(session.config, session.records)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("then", ["stop", "disable", "lost"])
 @pytest.mark.parametrize("later", [0, 3, 40])
 def test_a_queue_that_is_paused_and_then_stopped_has_no_goal_to_pass_on_to(then: str, later: int) -> None:

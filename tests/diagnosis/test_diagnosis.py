@@ -72,6 +72,7 @@ def test_nothing_false_is_said_of_what_is_shipped(path: Path) -> None:
     assert wrong(path) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_every_number_that_is_spoilt_is_told(path: Path, tmp_path: Path) -> None:
     raw = tomllib.loads(path.read_text())

@@ -179,6 +179,7 @@ def multicast(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_drives_of_another_process_by_udp_multicast(tmp_path: Path) -> None:
     """python-can's own bus between processes: set-up by SDO, then setpoints and positions by PDO."""
     path = multicast(tmp_path)
@@ -253,6 +254,7 @@ class SerialLineAdapter:
         self._drives.send(can.Message(arbitration_id=int(command[1:4], 16), data=data, is_extended_id=False))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("taken", [b"\r", b"z\r"])
 def test_slcan_whose_adapter_acknowledges_every_frame(taken: bytes) -> None:
     """Set up, powered and led over 300 cycles: each hears the answers to its own SYNC, and no backlog grows."""

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import can
 import numpy as np
 import pytest
+from _pytest.mark import ParameterSet
 from conftest import CONFIG, Rig, changed
 from drivers.test_homing import incremental
 from trirail.config import Config
@@ -219,6 +220,11 @@ STOP_HOMING = [
 """Faults of the drive that is being homed."""
 
 
+def tried(mode: str, *more: object) -> ParameterSet:
+    """Begin in this mode: of all of them, `make test` has motion alone."""
+    return pytest.param(mode, *more, marks=() if mode == "moving" else pytest.mark.long)
+
+
 @pytest.fixture
 def mode() -> str:
     """Without a mode to begin in."""
@@ -234,7 +240,7 @@ def rig(mode: str) -> Iterator[Cia402Rig]:
 
 @pytest.mark.parametrize(
     ("mode", "case"),
-    [*((mode, case) for case in STOP for mode in MODES), *(("homing", case) for case in STOP_HOMING)],
+    [*(tried(mode, case) for case in STOP for mode in MODES), *(tried("homing", case) for case in STOP_HOMING)],
     ids=lambda value: value.line if isinstance(value, Case) else value,
 )
 def test_a_fault_stops_all_three_drives(rig: Cia402Rig, case: Case, mode: str) -> None:
@@ -302,7 +308,7 @@ GO_ON = [
 ]
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", [*map(tried, MODES)])
 @pytest.mark.parametrize("line", GO_ON)
 def test_what_does_not_stop_the_robot(rig: Cia402Rig, line: str, mode: str) -> None:
     begun = MODES[mode]

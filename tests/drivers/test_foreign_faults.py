@@ -13,6 +13,8 @@ from trirail_drivers.cia402.codes import words
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
 
+pytestmark = pytest.mark.long
+
 
 class Named(NamedTuple):
     """One way to drive, by a make and how it differs from its dictionary."""
@@ -226,6 +228,7 @@ def test_a_restart_is_noticed(rig: Rig) -> None:
     assert "drive A: has restarted" in stopped_within(rig, 1)
 
 
+@pytest.mark.core
 def test_a_drives_own_fault_stops_all(rig: Rig) -> None:
     rig.nodes[2].fail(0x4310)
     assert "drive C: emergency 0x4310 (drive too hot)" in stopped_within(rig, 2)

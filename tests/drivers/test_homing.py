@@ -30,6 +30,8 @@ from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from trirail_drivers.simulated.faults import Faults
 
+pytestmark = pytest.mark.long
+
 PERIOD = CONFIG.period
 HOMES = (-0.01, 0.012, 0.02)
 """Where the sliders' switches are [m]."""
@@ -155,6 +157,7 @@ def one_drive_late(message: can.Message) -> float:
     return 0.4 * PERIOD if message.arbitration_id == frames.TPDO2 + 2 else 0.0
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("method", [19, 37])
 @pytest.mark.parametrize("delay", [None, part_of_a_cycle, a_cycle, one_drive_late])

@@ -114,11 +114,13 @@ def check(folder: Path, key: tuple[int, int], types: Iterable[int] = (), **keys:
         rig.drives.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("key", PROFILE, ids=lambda key: f"{key[0]:04X}:{key[1]}")
 def test_a_look_and_the_set_up_come_to_one_verdict(key: tuple[int, int], tmp_path: Path) -> None:
     check(tmp_path, key, (INTEGER16, INTEGER64, *([REAL32] if key != (0x6061, 0) else [])), homing=HOMING)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("key", COMMUNICATION, ids=lambda key: f"{key[0]:04X}:{key[1]}")
 def test_a_look_and_the_set_up_come_to_one_verdict_of_the_bus(key: tuple[int, int], tmp_path: Path) -> None:
     check(tmp_path, key)

@@ -22,6 +22,7 @@ from drivers.test_faults import (
     FaultRig,
     assert_goes_on,
     assert_stops_until_reset,
+    tried,
 )
 from drivers.test_odrive import odrives
 from trirail.config import Config
@@ -331,7 +332,7 @@ def begin(rig: OdriveRig, mode: str, line: str) -> Begin:
 
 @pytest.mark.parametrize(
     ("mode", "case"),
-    [(mode, case) for case in STOP for mode in case.modes if mode in NOT_HOMING],
+    [tried(mode, case) for case in STOP for mode in case.modes if mode in NOT_HOMING],
     ids=lambda value: value.line if isinstance(value, Case) else value,
 )
 def test_a_fault_stops_all_three_drives(rig: OdriveRig, case: Case, mode: str) -> None:
@@ -364,7 +365,7 @@ GO_ON = [
 ]
 
 
-@pytest.mark.parametrize("mode", NOT_HOMING)
+@pytest.mark.parametrize("mode", [*map(tried, NOT_HOMING)])
 @pytest.mark.parametrize("line", GO_ON)
 def test_what_does_not_stop_the_robot(rig: OdriveRig, line: str, mode: str) -> None:
     begun = begin(rig, mode, line)
@@ -373,7 +374,7 @@ def test_what_does_not_stop_the_robot(rig: OdriveRig, line: str, mode: str) -> N
     assert {state for states in rig.states_of.values() for _, state in states[1:]} == {AxisState.CLOSED_LOOP_CONTROL}
 
 
-@pytest.mark.parametrize("mode", NOT_HOMING)
+@pytest.mark.parametrize("mode", [*map(tried, NOT_HOMING)])
 @pytest.mark.parametrize("line", ["A drop set_axis_state", "all drop set_axis_state"])
 def test_a_drive_that_keeps_its_power_stays_at_the_end_of_the_ramp_and_is_named(
     rig: OdriveRig, line: str, mode: str
@@ -400,7 +401,7 @@ def test_a_drive_that_keeps_its_power_stays_at_the_end_of_the_ramp_and_is_named(
     rig.assert_no_jump()
 
 
-@pytest.mark.parametrize("mode", NOT_HOMING)
+@pytest.mark.parametrize("mode", [*map(tried, NOT_HOMING)])
 def test_drives_whose_service_is_gone_are_disarmed_by_their_watchdogs(rig: OdriveRig, mode: str) -> None:
     begin(rig, mode, "error-passive")
     for _ in range(DEAF):
@@ -411,7 +412,7 @@ def test_drives_whose_service_is_gone_are_disarmed_by_their_watchdogs(rig: Odriv
     assert {drive.disarm_reason for drive in rig.odrives} == {frames.Error.WATCHDOG_TIMER_EXPIRED}
 
 
-@pytest.mark.parametrize("mode", IN_MOTION)
+@pytest.mark.parametrize("mode", [*map(tried, IN_MOTION)])
 @pytest.mark.parametrize("line", ["bus-off for 0.005", "bus-off for 0.02", "bus-off for 0.06", "queue full for 0.02"])
 def test_a_bus_that_comes_back_within_the_ramp_makes_no_drive_jump(rig: OdriveRig, line: str, mode: str) -> None:
     """By what the drives have heard, rather than by what was sent."""

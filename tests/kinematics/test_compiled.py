@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from trirail.kinematics import compiled
 
+pytestmark = pytest.mark.long
+
 COUNT = """
 from trirail.kinematics import closure
 functions = closure.inverse_into, closure.inverse_batch, closure.forward_into, closure.forward_batch
@@ -46,6 +48,7 @@ def test_a_second_start_compiles_nothing() -> None:
     assert run(COUNT, root) == "0 0 0 0"
 
 
+@pytest.mark.core
 def test_an_edit_of_inlined_code_is_noticed(room: Path, tmp_path: Path) -> None:
     """The constant is in one file, the function that is kept on disk in another, which does not change."""
     (room / "closure.py").write_text(

@@ -72,6 +72,7 @@ KINDS: dict[str, Goal] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("override", [0.3, 1.0, 2.0])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_platforms_limits_bind_every_kind_at_every_override(kind: str, override: float) -> None:
@@ -375,6 +376,7 @@ TAKEN = (0.3, 1.0, 1.0 + 1e-9, -1.0)
 """Shares of the platform's limits at which a jog is taken."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("beyond", [1.001, -1.001, 2.0, 40.0, -1000.0])
 @pytest.mark.parametrize("axis", range(3))
 def test_a_jog_above_the_platforms_velocity_is_refused_and_one_that_is_not_taken(axis: int, beyond: float) -> None:
@@ -450,6 +452,7 @@ def test_at_override_zero_a_goal_has_no_expected_end(rig: Rig, goal: Goal) -> No
         assert answer.duration == math.inf
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("override", "speed"), [(2.0, 0.5), (0.5, 1.0), (0.3, 0.5), (1.5, 0.3)])
 @pytest.mark.parametrize("wait", [60, 150, 250])
 def test_a_goal_that_preempts_at_an_override_goes_on_as_the_robot_moves(

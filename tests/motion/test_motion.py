@@ -102,6 +102,7 @@ def test_no_later_than_ruckig_itself(rig: Rig, end: tuple[float, float, float]) 
     assert taken <= math.ceil((bare((0.0, 0.0, 0.0), end) + dwell) / PERIOD) + 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("config", [CONFIG, SLOW], ids=["as shipped", "slow sliders"])
 def test_the_corners_of_the_workspace(config: Config) -> None:
     rig = Rig(config)
@@ -138,6 +139,7 @@ def test_the_very_end_of_a_sliders_travel(rig: Rig, leg: int, beyond: float) -> 
         assert "platform" in refusal(answer).message or "passive" in refusal(answer).message
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("coordinate", "end"), [(0, 0), (0, 1), (1, 1)])
 @pytest.mark.parametrize("at", [1.38, 1.40, 1.42, 1.44])  # of these at most one peak can be where it is looked anyway
 def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(rig: Rig, at: float, coordinate: int, end: int) -> None:
@@ -483,6 +485,7 @@ def only_from_rest(goals: Goals, goal: PlannedGoal, schedule: Schedule, rate: fl
     return PLAIN_SET_OUT(goals, goal, schedule, rate)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("config", "first", "second"),
     [

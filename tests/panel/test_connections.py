@@ -25,6 +25,8 @@ from trirail.panel.tab import UNDER_WAY
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+pytestmark = pytest.mark.long
+
 PATIENCE = 20.0
 
 

@@ -14,6 +14,7 @@ import pytest
 from processes.test_service import (
     END_WITHIN,
     UP_WITHIN,
+    ColdService,
     Service,
     again,
     assert_stopped_smoothly,
@@ -197,7 +198,7 @@ def test_nothing_is_imported_from_the_folder_it_is_started_in(tmp_path: Path, mo
     for name in ("msgspec", "numpy", "zenoh", "rerun", "trirail", "signal"):
         (folder / f"{name}.py").write_text(f"open('{folder}/run', 'a').write('{name}')\nraise SystemExit(9)\n")
     monkeypatch.chdir(folder)
-    with Service(tmp_path) as service:
+    with ColdService(tmp_path) as service:
         service.wait_up()
         assert service.end() == 0
         assert not (folder / "run").exists()

@@ -201,6 +201,7 @@ def test_credentials_that_are_no_good_are_told_before_anybody_is_asked(served: S
         robot(served, name)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["late", "early", "foreign"])
 def test_the_robot_itself_opens_to_none_of_them(served: Served, name: str) -> None:
     config, folder, *_ = served
@@ -209,6 +210,7 @@ def test_the_robot_itself_opens_to_none_of_them(served: Served, name: str) -> No
         zenoh_session.open_client(config.zenoh.listen[0], credentials)
 
 
+@pytest.mark.long
 def test_nobody_without_a_certificate_opens_a_session(served: Served) -> None:
     address = served[0].zenoh.listen[0].removeprefix("tls/")
     for protocol in ("tls", "tcp"):
@@ -216,6 +218,7 @@ def test_nobody_without_a_certificate_opens_a_session(served: Served) -> None:
             zenoh_session.open_client(f"{protocol}/{address}")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["eva", "elsewhere", "foreign"])
 def test_nobody_passes_himself_off_as_the_robot(served: Served, tmp_path: Path, name: str) -> None:
     """Neither with a user's certificate, nor with a robot's for another address, nor with another authority's."""

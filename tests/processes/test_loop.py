@@ -134,6 +134,7 @@ def test_the_bus_load_is_measured(shell: Shell) -> None:
     assert measured == pytest.approx(shell.rig.driver.bus_load, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("in_motion", [False, True])
 def test_a_cycle_that_changes_nothing_takes_no_memory(shell: Shell, in_motion: bool) -> None:
     """With a gateway that gives signs of life, and records that go to it and to the recorder."""

@@ -264,6 +264,7 @@ def test_metrics_are_those_of_the_collector_and_all_else_is_not_found(local: tup
     assert get(f"{url}/")[0] == get(f"{url}/metrics/../etc/passwd")[0] == 404
 
 
+@pytest.mark.long
 def test_connections_that_say_nothing_keep_nobody_out(local: tuple[str, Health]) -> None:
     url, _ = local
     address = ("127.0.0.1", int(url.rpartition(":")[2]))

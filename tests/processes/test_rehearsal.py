@@ -31,6 +31,7 @@ def modes(monkeypatch: pytest.MonkeyPatch) -> list[Mode]:
     return seen
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_stop_quick_stop_fault_and_a_lost_gateway_are_rehearsed(path: Path, modes: list[Mode]) -> None:
     before = os.listdir("/proc/self/fd")

@@ -28,6 +28,8 @@ from trirail.wire import zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.vocabulary import Role
 
+pytestmark = pytest.mark.long
+
 ROBOTS = ("demo", "other")
 LOCAL = ("127.0.0.1", "localhost")
 WITHIN = 20.0
@@ -220,6 +222,7 @@ def test_a_robot_says_why_it_has_no_router_and_obeys_nobody_in_its_place(net: Ne
         assert demo.guard.linked(demo.session) == set()
 
 
+@pytest.mark.core
 def test_a_link_to_the_router_comes_and_goes(net: Net) -> None:
     with Robot(net, "demo") as demo:
         for there in (True, False):

@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Self
+from typing import IO, Any, Self
 from urllib.parse import urlsplit
 
 import edsfiles
@@ -42,11 +42,14 @@ from trirail.wire.zenoh_session import open_client
 from trirail_drivers.cia402 import frames
 from trirail_drivers.interface import MissingProtection
 from trirail_drivers.odrive import frames as odrive_frames
+from warm import WarmProcess, start
 
 pytestmark = pytest.mark.slow
 
 UP_WITHIN = 100.0
 END_WITHIN = 20.0
+
+Process = WarmProcess | subprocess.Popen[bytes]
 
 
 class Service:
@@ -70,7 +73,11 @@ class Service:
         path.write_text(text)
         self.log = folder / "service.log"
         with self.log.open("wb") as log:
-            self.process = run(path, stdout=log, stderr=subprocess.STDOUT)
+            self.process = self.start(path, log)
+
+    def start(self, path: Path, log: IO[bytes]) -> Process:
+        """Start it, by a fork."""
+        return start("run", str(path), output=log)
 
     def __enter__(self) -> Self:
         return self
@@ -114,8 +121,12 @@ class Service:
         return [(frame.arbitration_id, bytes(frame.data)) for frame in CanutilsLogReader(log)]
 
 
-def run(*arguments: object, **options: Any) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(python("-m", "trirail", "run", *map(str, arguments)), **options)
+class ColdService(Service):
+    """One that is started by its command, with an interpreter of its own."""
+
+    def start(self, path: Path, log: IO[bytes]) -> Process:
+        """Start it, as a user does."""
+        return subprocess.Popen(python("-m", "trirail", "run", str(path)), stdout=log, stderr=log)
 
 
 def trirail(*arguments: object, locator: str = "") -> subprocess.CompletedProcess[str]:
@@ -125,7 +136,7 @@ def trirail(*arguments: object, locator: str = "") -> subprocess.CompletedProces
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
 
 
-def wait_readable(process: subprocess.Popen[bytes], seconds: float) -> None:
+def wait_readable(process: Process, seconds: float) -> None:
     """Wait for a process to end, for so long at most."""
     pidfd = os.pidfd_open(process.pid)
     with selectors.DefaultSelector() as selector:
@@ -175,11 +186,19 @@ def service(tmp_path: Path) -> Iterator[Service]:
         yield started
 
 
+@pytest.fixture
+def cold_service(tmp_path: Path) -> Iterator[Service]:
+    with ColdService(tmp_path) as started:
+        started.wait_up()
+        yield started
+
+
 # ---------------------------------------------------------------------- the way it is meant to be used
 
 
-def test_a_session(service: Service) -> None:
-    with service.robot() as robot:
+@pytest.mark.core
+def test_a_session(cold_service: Service) -> None:
+    with cold_service.robot() as robot:
         info = robot.info()
         assert info.robot == "demo"
         assert [leg["name"] for leg in info.geometry] == ["A", "B", "C"]
@@ -201,8 +220,8 @@ def test_a_session(service: Service) -> None:
         assert [event.seq for event in events] == list(range(1, len(events) + 1))
         outcomes = [event.outcome for event in events if event.kind == "goal"]
         assert outcomes == ["rejected", "done", "preempted", "done"]
-    assert service.end() == 0
-    sent = service.frames()
+    assert cold_service.end() == 0
+    sent = cold_service.frames()
     assert {identifier for identifier, _ in sent} <= {
         frames.NMT,
         frames.SYNC,
@@ -328,6 +347,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Service, 
         assert service.end() == 0
 
 
+@pytest.mark.core
 def test_bad_commands(shared: tuple[Service, Robot, zenoh.Session]) -> None:
     _, robot, session = shared
     (reply,) = session.get("trirail/demo/cmd/eve/dance")
@@ -402,6 +422,7 @@ def test_the_client_tells_of_a_target_and_its_end_brakes(shared: tuple[Service, 
     assert silent.result.outcome == "done"
 
 
+@pytest.mark.core
 def test_every_kind_of_goal(shared: tuple[Service, Robot, zenoh.Session], tmp_path: Path) -> None:
     service, robot, _ = shared
     assert robot.move_sliders(0.01, 0.0, -0.01).wait(timeout=10.0).outcome == "done"
@@ -585,6 +606,7 @@ def test_the_service_is_seen_alive(shared: tuple[Service, Robot, zenoh.Session])
 # ---------------------------------------------------------------------- ends, asked for and not
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_in_motion_is_a_controlled_stop(service: Service, number: int) -> None:
     with service.robot() as robot:
@@ -613,6 +635,7 @@ def again(service: Service) -> Robot:
         assert time.monotonic() < deadline
 
 
+@pytest.mark.core
 def test_a_killed_gateway_is_a_controlled_stop(service: Service) -> None:
     with service.robot() as robot:
         in_motion(robot)
@@ -683,6 +706,7 @@ def test_a_killed_recorder_does_not_matter(service: Service) -> None:
     assert len(list((service.folder / "recordings").glob("*.rrd"))) == 2
 
 
+@pytest.mark.core
 def test_a_fault_is_kept_apart(service: Service) -> None:
     with service.robot() as robot:
         in_motion(robot)
@@ -749,6 +773,7 @@ def test_a_frozen_recorder_does_not_matter(service: Service) -> None:
     assert np.array_equal(np.diff(cycles), np.ones(len(cycles) - 1))  # what waited for it is in the file
 
 
+@pytest.mark.core
 def test_killed_drives_are_a_fault_and_the_service_stays(service: Service) -> None:
     with service.robot() as robot:
         in_motion(robot)
@@ -904,6 +929,7 @@ def test_nobody_there(tmp_path: Path) -> None:
     assert "start what is to answer there, trirail run or trirail router, or name another address" in failed.stderr
 
 
+@pytest.mark.alone  # the demo has a port of the machine
 def test_the_demo_never_drives_another_service(tmp_path: Path) -> None:
     locator = "tcp/127.0.0.1:7447"
     other = Service(tmp_path, **{f"unixsock-stream/{tmp_path}/zenoh": locator})
@@ -919,6 +945,7 @@ def test_the_demo_never_drives_another_service(tmp_path: Path) -> None:
         assert other.end() == 0
 
 
+@pytest.mark.alone  # the demo has a port of the machine
 def test_the_demo(tmp_path: Path) -> None:
     shown = trirail("demo", "--record", tmp_path / "demo.rrd")
     assert shown.returncode == 0, shown.stderr + shown.stdout

@@ -13,6 +13,8 @@ from trirail.errors import ServiceError
 from trirail.kinematics.compiled import FUNCTIONS
 from trirail.processes import supervisor, warm_parent
 
+pytestmark = pytest.mark.long
+
 SERVER = """
 import os, signal, sys, time
 from pathlib import Path
@@ -146,6 +148,7 @@ def test_what_hangs_beside_the_loop_is_killed_and_started_again(
     ]
 
 
+@pytest.mark.core
 def test_those_that_end_because_the_loop_ends_are_not_started_again(told: list[str], tmp_path: Path) -> None:
     code = run(
         told,

@@ -316,6 +316,7 @@ os._exit(0)
 """
 
 
+@pytest.mark.long
 def test_after_a_disk_that_failed_the_recording_goes_on_in_another_file(tmp_path: Path) -> None:
     command = [sys.executable, "-c", LIMITED, str(tmp_path)]
     done = subprocess.run(

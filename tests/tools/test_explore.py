@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 from explore import Summary
 
+pytestmark = pytest.mark.long
+
 TESTS = Path(__file__).parents[1]
 SOME = """
 import json

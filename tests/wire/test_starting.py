@@ -48,6 +48,7 @@ def test_what_is_no_endpoint_is_starting_nowhere(endpoint: str) -> None:
     assert not is_starting(endpoint)
 
 
+@pytest.mark.long
 def test_a_client_says_so_and_one_that_was_killed_is_starting_no_more() -> None:
     endpoint = "tcp/127.0.0.1:17361"
     program = f"from trirail.wire.starting import Starting; s = Starting([{endpoint!r}]); print(flush=True); input()"
