@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import product
 
-import pytest
 from conftest import CONFIG
 from trirail.config import geometry
 from trirail.control.completion import still_powered, verdict
@@ -28,72 +28,69 @@ def saying(
     return measured
 
 
-def one(state: PowerState, index: int) -> Measured:
-    """Two drives without power, and one in this state."""
-    states = [OFF, OFF, OFF]
-    states[index] = state
-    return saying(*states)
+def one_of_three() -> Iterator[tuple[str, PowerState, Measured]]:
+    """Two drives without power, and one, which is named, in any state."""
+    for index, state in product(range(3), P):
+        states = [OFF, OFF, OFF]
+        states[index] = state
+        yield "ABC"[index], state, saying(*states)
 
 
-@pytest.mark.parametrize("mode", Mode)
-def test_enable_is_over_when_the_robot_is_no_longer_powering_up(mode: Mode) -> None:
-    said = verdict(Command.ENABLE, mode, WHY if mode is Mode.FAULT else None, saying(), settled=True)
-    expected = {Mode.ENABLING: NOT_YET, Mode.FAULT: WHY, Mode.DISABLED: "disabled while powering up"}
-    assert said == expected.get(mode, DONE)
+def said(name: Command, mode: Mode, measured: Measured, why: str | None = None, settled: bool = True) -> str | None:
+    return verdict(name, mode, why, measured, settled=settled)
 
 
-@pytest.mark.parametrize(("mode", "index", "state"), [*product(Mode, range(3), P)])
-def test_disable_is_over_when_the_robot_stands_and_no_drive_can_move(mode: Mode, index: int, state: P) -> None:
-    can_move = state in CAN_MOVE
-    expected = NOT_YET if can_move or mode is Mode.STOPPING else DONE
-    assert verdict(Command.DISABLE, mode, None, one(state, index), settled=True) == expected
-    assert verdict(Command.QUICK_STOP, mode, None, one(state, index), settled=True) == (NOT_YET if can_move else DONE)
+def test_enable_is_over_when_the_robot_is_no_longer_powering_up() -> None:
+    other = {Mode.ENABLING: NOT_YET, Mode.FAULT: WHY, Mode.DISABLED: "disabled while powering up"}
+    for mode in Mode:
+        latched = WHY if mode is Mode.FAULT else None
+        assert said(Command.ENABLE, mode, saying(), latched) == other.get(mode, DONE), mode
 
 
-@pytest.mark.parametrize("name", [Command.DISABLE, Command.QUICK_STOP])
-def test_a_drive_that_keeps_its_power_in_the_end_fails_the_command(name: Command) -> None:
+def test_disable_and_quick_stop_are_over_when_no_drive_can_move() -> None:
+    for mode, (_, state, measured) in product(Mode, one_of_three()):
+        over = NOT_YET if state in CAN_MOVE else DONE
+        assert said(Command.QUICK_STOP, mode, measured) == over, (mode, state)
+        over = NOT_YET if mode is Mode.STOPPING else over
+        assert said(Command.DISABLE, mode, measured) == over, (mode, state)
+
+
+def test_a_drive_that_keeps_its_power_in_the_end_fails_the_command() -> None:
     late, silent = DriveFault("B", "timeout", 0, "it has not stopped"), DriveFault("B", "silent", 0, WHY)
-    assert verdict(name, Mode.FAULT, WHY, saying(OFF, ON, OFF, fault=late), settled=True) == "it has not stopped"
-    assert verdict(name, Mode.FAULT, WHY, saying(OFF, ON, OFF, fault=silent), settled=True) is NOT_YET
-    assert verdict(Command.STOP, Mode.STOPPING, WHY, saying(OFF, ON, OFF, fault=late), settled=True) is NOT_YET
+    for name in (Command.DISABLE, Command.QUICK_STOP):
+        assert said(name, Mode.FAULT, saying(OFF, ON, OFF, fault=late), WHY) == "it has not stopped"
+        assert said(name, Mode.FAULT, saying(OFF, ON, OFF, fault=silent), WHY) is NOT_YET
+    assert said(Command.STOP, Mode.STOPPING, saying(OFF, ON, OFF, fault=late), WHY) is NOT_YET
 
 
-@pytest.mark.parametrize("name", [Command.STOP, Command.PAUSE, Command.RELEASE])
-@pytest.mark.parametrize("mode", Mode)
-def test_a_stop_is_over_when_the_robot_stands(name: Command, mode: Mode) -> None:
-    expected = NOT_YET if mode is Mode.STOPPING else DONE
-    assert verdict(name, mode, None, saying(ON, ON, ON), settled=True) == expected
+def test_a_stop_is_over_when_the_robot_stands() -> None:
+    for name, mode in product((Command.STOP, Command.PAUSE, Command.RELEASE), Mode):
+        assert said(name, mode, saying(ON, ON, ON)) == (NOT_YET if mode is Mode.STOPPING else DONE), (name, mode)
 
 
-@pytest.mark.parametrize("homed", [*product((False, True), repeat=3)])
-@pytest.mark.parametrize("mode", Mode)
-def test_home_is_done_when_every_drive_is_homed(mode: Mode, homed: tuple[bool, bool, bool]) -> None:
-    measured = saying(ON, ON, ON, homed=homed)
-    under_way = mode in (Mode.HOMING, Mode.STOPPING)
-    without = {None: "stopped before every drive was homed", WHY: WHY}
-    for latched, why in without.items():
-        expected = NOT_YET if under_way else DONE if all(homed) else why
-        assert verdict(Command.HOME, mode, latched, measured, settled=True) == expected
+def test_home_is_done_when_every_drive_is_homed() -> None:
+    for mode, a, b, c in product(Mode, *[(False, True)] * 3):
+        measured = saying(ON, ON, ON, homed=(a, b, c))
+        for latched, why in {None: "stopped before every drive was homed", WHY: WHY}.items():
+            over = NOT_YET if mode in (Mode.HOMING, Mode.STOPPING) else DONE if a and b and c else why
+            assert said(Command.HOME, mode, measured, latched) == over, (mode, a, b, c)
 
 
-@pytest.mark.parametrize("name", [Command.RESUME, Command.OVERRIDE, Command.ACQUIRE])
-@pytest.mark.parametrize("mode", Mode)
-def test_what_changes_the_rate_or_the_lease_is_done_at_once(name: Command, mode: Mode) -> None:
-    assert verdict(name, mode, None, saying(ON, ON, ON), settled=False) == DONE
+def test_what_changes_the_rate_or_the_lease_is_done_at_once() -> None:
+    for name, mode in product((Command.RESUME, Command.OVERRIDE, Command.ACQUIRE), Mode):
+        assert said(name, mode, saying(ON, ON, ON), settled=False) == DONE, (name, mode)
 
 
-@pytest.mark.parametrize(("settled", "index", "state"), [*product((False, True), range(3), P)])
-def test_reset_is_done_when_the_drives_had_time_and_none_is_in_fault(settled: bool, index: int, state: P) -> None:
-    measured = one(state, index)
-    faulty = state in (P.FAULT, P.FAULT_REACTION_ACTIVE)
-    expected = DONE if settled and not faulty else NOT_YET
-    assert verdict(Command.RESET, Mode.DISABLED, None, measured, settled=settled) == expected
-    assert verdict(Command.RESET, Mode.FAULT, WHY, measured, settled=settled) == f"the cause is still there: {WHY}"
+def test_reset_is_done_when_the_drives_had_time_and_none_is_in_fault() -> None:
+    for settled, (_, state, measured) in product((False, True), one_of_three()):
+        faulty = state in (P.FAULT, P.FAULT_REACTION_ACTIVE)
+        over = DONE if settled and not faulty else NOT_YET
+        assert said(Command.RESET, Mode.DISABLED, measured, settled=settled) == over, (settled, state)
+        assert said(Command.RESET, Mode.FAULT, measured, WHY, settled) == f"the cause is still there: {WHY}"
 
 
-@pytest.mark.parametrize(("index", "state"), [*product(range(3), P)])
-def test_still_powered_names_the_drives_that_can_move(index: int, state: P) -> None:
-    states, _, advice = still_powered(one(state, index), WHY).partition(" by what it said last: ")
-    assert (states == f"drive {'ABC'[index]} is {state}") == (state in CAN_MOVE)
-    assert (states == "") == (state not in CAN_MOVE)
-    assert advice == f"send reset again when the drives stand (fault: {WHY})"
+def test_still_powered_names_the_drives_that_can_move() -> None:
+    for drive, state, measured in one_of_three():
+        states, _, advice = still_powered(measured, WHY).partition(" by what it said last: ")
+        assert states == (f"drive {drive} is {state}" if state in CAN_MOVE else "")
+        assert advice == f"send reset again when the drives stand (fault: {WHY})"
