@@ -5,15 +5,37 @@ Speed is a ratio within one run, for the machines that this runs on are not alik
 
 from __future__ import annotations
 
+import json as json_format
 import os
 import signal
 import sys
+from collections.abc import Iterator
+from typing import Any
 
 from cyclopts import App
 
 app = App(help="Speed, as ratios within one run: the machines this runs on are not alike.")
 
 # Each command imports what it measures: `frames` runs in an emulated machine too, where an import takes its time.
+
+
+def report(found: dict[str, Any], json: bool) -> None:
+    """Print what was measured, as one JSON object or in lines; a list of numbers is at the `quantiles`."""
+    print(json_format.dumps(found) if json else "\n".join(lines(found)))
+
+
+def lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
+    """Yield it line by line."""
+    for name, value in found.items():
+        parts = value if isinstance(value, list) and any(isinstance(part, dict) for part in value) else [value]
+        for part in parts:
+            if isinstance(part, dict):
+                yield f"{indent}{name}"
+                yield from lines(part, indent + "  ")
+            else:
+                numbers = part if isinstance(part, list | tuple) else [part]
+                shown = (f"{number:.4g}" if isinstance(number, float) else str(number) for number in numbers)
+                yield f"{indent}{name:{max(1, 32 - len(indent))}} {' / '.join(shown)}"
 
 
 @app.command
@@ -23,39 +45,37 @@ def loop(
     """Run the whole service, goals without pause; time its loop beside cyclictest and the bare loop, at each rate."""
     import bench_loop
 
-    bench_loop.main(seconds, rates, runs, json)
+    report(bench_loop.measure(seconds, rates, runs), json)
 
 
 @app.command
 def latency(*, goals: int = 100, json: bool = False) -> None:
     """Time from a goal's put to the first setpoint that it changes on the bus, at rest and in motion."""
     import bench_latency
+    import bench_rig
 
-    bench_latency.main(goals, json)
+    with bench_rig.rig(1000) as made:
+        report(bench_latency.measure(made, goals), json)
 
 
 @app.command
 def settle(*, goals: int = 100, json: bool = False) -> None:
     """Time from the end of a goal's path until the robot is measured to be there, on simulated drives."""
+    import bench_rig
     import bench_settle
 
-    bench_settle.main(goals, json)
+    with bench_rig.rig(1000, own=True) as made:
+        report(bench_settle.measure(made, goals), json)
 
 
 @app.command
 def fairness(*, goals: int = 1000, json: bool = False) -> None:
     """Time until one user's goals and stops are answered, quiet and while another floods, and the ratio of the two."""
     import bench_fairness
+    import bench_rig
 
-    bench_fairness.main(goals, json)
-
-
-@app.command
-def fleet(*, gateways: int = 98, seconds: float = 10.0, stops: int = 200, faults: int = 10, json: bool = False) -> None:
-    """Two whole services and robots that stand for whole ones behind a router: what is seen when, and what it costs."""
-    import bench_fleet
-
-    bench_fleet.main(gateways, seconds, stops, faults, json)
+    with bench_rig.rig(1000, own=True) as made:
+        report(bench_fairness.measure(made, goals), json)
 
 
 @app.command
@@ -63,7 +83,7 @@ def frames(*, cycles: int = 3000, json: bool = False) -> None:
     """Time one cycle's frames by python-can, and on the bus's own socket."""
     import bench_frames
 
-    bench_frames.main(cycles, json)
+    report(bench_frames.measure(cycles), json)
 
 
 @app.command
@@ -71,15 +91,15 @@ def peers(*, seconds: float = 15.0, json: bool = False) -> None:
     """Measure the intervals of SYNC beside python-canopen's, on the same bus."""
     import bench_peers
 
-    bench_peers.main(seconds, json)
+    report(bench_peers.measure(seconds), json)
 
 
 @app.command
-def planning(*, json: bool = False) -> None:
+def planning(*, goals: int = 1500, json: bool = False) -> None:
     """Time the planning of goals."""
     import bench_planning
 
-    bench_planning.main(json)
+    report(bench_planning.measure(goals), json)
 
 
 @app.command
@@ -87,7 +107,7 @@ def kinematics(*, json: bool = False) -> None:
     """Time the recursion against a straightforward numpy port of the paper's matrices."""
     import bench_kinematics
 
-    bench_kinematics.main(json)
+    report(bench_kinematics.measure(), json)
 
 
 @app.command
@@ -95,15 +115,7 @@ def recorder(*, seconds: float = 60.0, json: bool = False) -> None:
     """Run the whole service on simulated drives, moving, and measure what its recorder takes, watched and not."""
     import bench_recorder
 
-    bench_recorder.main(seconds, json)
-
-
-@app.command
-def scrape(*, seconds: float = 120.0, json: bool = False) -> None:
-    """Lateness with a scrape of the metrics each second: of all cycles, and without those around the scrapes."""
-    import bench_scrape
-
-    bench_scrape.main(seconds, json)
+    report(bench_recorder.measure(seconds), json)
 
 
 @app.command
@@ -111,7 +123,7 @@ def start(*, json: bool = False) -> None:
     """Time the start of a service on simulated drives, and weigh its processes."""
     import bench_start
 
-    bench_start.main(json)
+    report(bench_start.measure(), json)
 
 
 @app.command(name="all")

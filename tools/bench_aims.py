@@ -27,13 +27,12 @@ COMMANDS = {
 """The measurements, with what they take: together under ten minutes."""
 BRIEF = {
     "fairness": ("--goals", "20"),
-    "fleet": ("--gateways", "4", "--seconds", "1", "--stops", "5", "--faults", "1"),
     "frames": ("--cycles", "50"),
     "latency": ("--goals", "3"),
     "loop": ("--rates", "1000", "--seconds", "2", "--runs", "1"),
     "peers": ("--seconds", "1"),
+    "planning": ("--goals", "50"),
     "recorder": ("--seconds", "2"),
-    "scrape": ("--seconds", "5"),
     "settle": ("--goals", "3"),
 }
 """What they take for a look."""
@@ -164,7 +163,10 @@ def _show(results: Results) -> None:
         else:
             print(f"{found['rate_hz']} Hz are not kept here: {found['not_kept']}")
     if "settle" in results:
-        print("settling, p50 / p99 / max [ms]: " + " / ".join(f"{ms:.0f}" for ms in results["settle"]["settle_ms"]))
+        print(
+            "settling, p50 / p99 / p99.9 / max [ms]: "
+            + " / ".join(f"{ms:.0f}" for ms in results["settle"]["settle_ms"])
+        )
     if "peers" in results:
         off = results["peers"]["deviation_us"]
         print("SYNC's interval off its period, p99.9 [µs]: " + ", ".join(f"{k} {v[2]:.0f}" for k, v in off.items()))

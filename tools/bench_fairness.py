@@ -9,7 +9,6 @@ that the goal is accepted, the last one, of a robot that stands, that the stop i
 from __future__ import annotations
 
 import contextlib
-import json as json_format
 import multiprocessing
 import os
 import random
@@ -19,13 +18,11 @@ from collections.abc import Callable, Iterator
 from multiprocessing.synchronize import Event
 from typing import Any
 
-import numpy as np
 import zenoh
-from bench_rig import rig
+from bench_rig import QUANTILES, Rig, quantiles
 from trirail.client.client import Robot
 from trirail.wire import zenoh_session
 
-QUANTILES = (50.0, 99.0, 100.0)
 FLOODERS = 2
 SESSIONS = 8
 """Of each of them."""
@@ -80,34 +77,34 @@ def flooders(locator: str) -> Iterator[tuple[Event, Any]]:
             process.join()
 
 
-def measure(goals: int, rate: int = 1000) -> dict[str, Any]:
+def measure(made: Rig, goals: int, rounds: int = ROUNDS) -> dict[str, Any]:
     """Measure so many goals and stops, half of them flooded; return milliseconds at QUANTILES."""
     choice = random.Random(7)
     took: dict[str, list[float]] = {
         f"{what}_{when}_ms": [] for what in ("goal", "stop") for when in ("quiet", "flooded")
     }
     flooded_for = 0.0
-    with rig(rate, own=True) as made, flooders(made.locator) as (on, sent):
+    with flooders(made.locator) as (on, sent):
         _each(made.robot, choice)
-        for number in range(2 * ROUNDS):
+        for number in range(2 * rounds):
             when = "flooded" if number % 2 else "quiet"
             if number % 2:
                 on.set()
             began = time.monotonic()
             time.sleep(SETTLE)
-            for _ in range(max(1, goals // (2 * ROUNDS))):
+            for _ in range(max(1, goals // (2 * rounds))):
                 goal, stop = _each(made.robot, choice)
                 took[f"goal_{when}_ms"].append(1e3 * goal)
                 took[f"stop_{when}_ms"].append(1e3 * stop)
             flooded_for += (time.monotonic() - began) * (number % 2)
             on.clear()
         messages = sent.value / flooded_for
-    spread = {key: [float(value) for value in np.percentile(values, QUANTILES)] for key, values in took.items()}
+    spread = {key: quantiles(values) for key, values in took.items()}
     ratios = {
         f"{what}_p99_ratio": spread[f"{what}_flooded_ms"][1] / spread[f"{what}_quiet_ms"][1]
         for what in ("goal", "stop")
     }
-    return {"rate_hz": rate, "quantiles": QUANTILES, "messages_per_second": messages, **spread, **ratios}
+    return {"quantiles": QUANTILES, "messages_per_second": messages, **spread, **ratios}
 
 
 def _each(robot: Robot, choice: random.Random) -> tuple[float, float]:
@@ -122,18 +119,3 @@ def _timed(do: Callable[[], object]) -> float:
     began = time.monotonic()
     do()
     return time.monotonic() - began
-
-
-def main(goals: int, json: bool = False) -> None:
-    """Print the measurements as a table, or as one JSON object."""
-    measured = measure(goals)
-    if json:
-        print(json_format.dumps(measured))
-        return
-    print(f"until ann is answered, quiet and under eve's {measured['messages_per_second']:.0f} messages a second [ms]")
-    print(f"{'':24}{'p50':>8}{'p99':>8}{'max':>8}")
-    for what in ("goal", "stop"):
-        for when in ("quiet", "flooded"):
-            values = measured[f"{what}_{when}_ms"]
-            print(f"{f'{what}, {when}':24}" + "".join(f"{value:8.2f}" for value in values))
-    print(f"p99, flooded to quiet: goal {measured['goal_p99_ratio']:.2f}, stop {measured['stop_p99_ratio']:.2f}")

@@ -7,7 +7,6 @@ bus is the kernel's virtual one where that can be made, else python-can's Socket
 from __future__ import annotations
 
 import contextlib
-import json as json_format
 import os
 import socket
 import subprocess
@@ -23,7 +22,6 @@ from trirail_drivers.bus.frames import Frame
 from trirail_drivers.cia402 import frames as layout
 from trirail_drivers.interface import NAMES
 
-CYCLES = 3000
 AIM = 10.0
 """What one cycle's frames may cost [µs]."""
 NODES = range(1, 1 + len(NAMES))
@@ -56,7 +54,7 @@ class Listener:
         self.heard += 1
 
 
-def measure(cycles: int = CYCLES) -> dict[str, Any]:
+def measure(cycles: int) -> dict[str, Any]:
     """Return microseconds of one cycle's frames, each way, and their ratio."""
     with _bus() as (kind, bus, far):
         # What both have to do with a frame is the same, so it is left to the cycle: here are the frames alone.
@@ -134,16 +132,3 @@ def _vcan() -> tuple[str, Callable[[], object]]:
     ip("add", name, "type", "vcan")
     ip("set", name, "up")
     return name, lambda: ip("delete", name)
-
-
-def main(cycles: int = CYCLES, json: bool = False) -> None:
-    """Print the measurements as a table, or as one JSON object."""
-    measured = measure(cycles)
-    if json:
-        print(json_format.dumps(measured))
-        return
-    print(f"one cycle's frames, {measured['bus']}: 4 sent, 3 received, found empty twice [µs]")
-    for name, key in (("python-can's send and receive", "python_can_us"), ("packed, on its socket", "socket_us")):
-        spread = measured[key]
-        print(f"  {name:<32}" + "".join(f"{quantile:>6} {value:8.1f}" for quantile, value in spread.items()))
-    print(f"  {measured['ratio']:.1f} times; the aim is {AIM:g} µs")

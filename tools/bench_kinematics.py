@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
 import math
 import timeit
 from collections.abc import Callable
@@ -95,25 +94,3 @@ def _seconds(call: Callable[[], object]) -> float:
     timer = timeit.Timer(call)
     number, _ = timer.autorange()
     return min(timer.repeat(repeat=5, number=number)) / number
-
-
-def main(json: bool = False) -> None:
-    """Print the measurements as a table, or as one JSON object."""
-    measured = measure()
-    if json:
-        print(json_format.dumps(measured))
-        return
-    print("one pose: positions, velocities, accelerations of all joints    µs   faster")
-    for name, key in (
-        ("numpy port of the paper's matrices", "numpy_port"),
-        ("inverse()", "inverse"),
-        ("inverse_into(), as the loop calls it", "inverse_into"),
-    ):
-        faster = measured["numpy_port_us"] / measured[f"{key}_us"]
-        print(f"  {name:<58}{measured[f'{key}_us']:>8.2f}{faster:>8.0f}x")
-    print(f"one pose: forward_into(){measured['forward_into_us']:>44.2f}")
-    print(f"batch on one core: {measured['batch_million_poses_per_s']:.2f} million poses/s")
-
-
-if __name__ == "__main__":
-    main()

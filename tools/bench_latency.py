@@ -8,7 +8,6 @@ which the drives' process passes them on; a goal's time is that before the clien
 from __future__ import annotations
 
 import contextlib
-import json as json_format
 import random
 import socket
 import threading
@@ -16,8 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import numpy as np
-from bench_rig import rig
+from bench_rig import QUANTILES, Rig, quantiles
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
 from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED
@@ -27,7 +25,6 @@ from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import frames as layout
 from trirail_drivers.interface import NAMES
 
-QUANTILES = (50.0, 99.0, 100.0)
 SETPOINTS = {layout.RPDO2 + node for node in range(1, 1 + len(NAMES))}
 STEADY = 20
 """Feed-forward that changes by less is that of a cruise: rounding, at 1e7 counts per metre [counts/s]."""
@@ -104,20 +101,16 @@ Measured = Callable[[Robot, Listener, random.Random], float | None]
 """What measures one goal: seconds, None where it changed nothing."""
 
 
-def measure(goals: int, rate: int = 1000) -> dict[str, Any]:
+def measure(made: Rig, goals: int) -> dict[str, Any]:
     """Send so many goals at rest, and as many in motion; return milliseconds at QUANTILES."""
     chance = random.Random(3)
-    with rig(rate) as made:
-        if made.bus is None:
-            raise SystemExit("the drives are the service's own: there is no bus to look at")
-        with listener(made.bus) as heard:
-            at_rest = _each(goals, made.robot, heard, chance, _at_rest)
-            in_motion = _each(goals, made.robot, heard, chance, _in_motion)
+    with listener(made.bus) as heard:
+        at_rest = _each(goals, made.robot, heard, chance, _at_rest)
+        in_motion = _each(goals, made.robot, heard, chance, _in_motion)
     return {
-        "rate_hz": rate,
         "quantiles": QUANTILES,
-        "at_rest_ms": _spread(at_rest),
-        "in_motion_ms": _spread(in_motion),
+        "at_rest_ms": quantiles([1e3 * value for value in at_rest if value is not None]),
+        "in_motion_ms": quantiles([1e3 * value for value in in_motion if value is not None]),
         "goals": goals,
         "without_effect": at_rest.count(None) + in_motion.count(None),
     }
@@ -149,7 +142,7 @@ def _at_rest(robot: Robot, heard: Listener, chance: random.Random) -> float | No
     put = time.time()
     goal = robot.move_to(x=-END + chance.uniform(0.0, 0.004), y=chance.uniform(-0.004, 0.004), phi=0.0)
     time.sleep(WITHIN)
-    found = _first_change(heard.setpoints(), put)
+    found = first_change(heard.setpoints(), put)
     goal.wait(10.0)
     return found
 
@@ -165,13 +158,13 @@ def _in_motion(robot: Robot, heard: Listener, chance: random.Random) -> float | 
     put = time.time()
     goal = robot.move_to(x=-side * END, y=0.0, phi=0.0)
     time.sleep(WITHIN)
-    found = _first_change(heard.setpoints(), put)
+    found = first_change(heard.setpoints(), put)
     with contextlib.suppress(TrirailError):
         goal.wait(10.0)
     return found
 
 
-def _first_change(setpoints: list[Setpoint], put: float) -> float | None:
+def first_change(setpoints: list[Setpoint], put: float) -> float | None:
     """Seconds from the put to the first setpoint with another feed-forward than before; None if there is none."""
     steady = {one.identifier: one.velocity for one in setpoints if one.t <= put}
     for one in setpoints:
@@ -180,27 +173,3 @@ def _first_change(setpoints: list[Setpoint], put: float) -> float | None:
         if abs(one.velocity - steady[one.identifier]) > STEADY:
             return one.t - put if one.t - put <= WITHIN else None
     return None
-
-
-def _spread(seconds: list[float | None]) -> list[float]:
-    known = [1e3 * value for value in seconds if value is not None]
-    if not known:
-        raise SystemExit("no goal had an effect")
-    return [float(value) for value in np.percentile(known, QUANTILES)]
-
-
-def main(goals: int, json: bool = False) -> None:
-    """Print the measurements as a table, or as one JSON object."""
-    measured = measure(goals)
-    if json:
-        print(json_format.dumps(measured))
-        return
-    print(f"goal put to first changed setpoint on the bus, {measured['rate_hz']} Hz, {goals} goals each [ms]")
-    print(f"{'':12}{'p50':>8}{'p99':>8}{'max':>8}")
-    for name, key in (("at rest", "at_rest_ms"), ("in motion", "in_motion_ms")):
-        print(f"{name:12}" + "".join(f"{value:8.2f}" for value in measured[key]))
-    if measured["without_effect"]:
-        print(
-            f"{measured['without_effect']} goals are left out: they changed nothing within {WITHIN:g} s, "
-            f"or the machine stalled the drives into a fault"
-        )

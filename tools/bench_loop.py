@@ -12,10 +12,8 @@ said.
 from __future__ import annotations
 
 import contextlib
-import json as json_format
 import os
 import tempfile
-from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -23,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from bench_beside import Beside
-from bench_rig import GOALS_HZ, Rig, rig, without_pause
+from bench_rig import QUANTILES, Rig, quantiles, rig, without_pause
 from numpy.typing import NDArray
 from trirail.client.client import Robot
 from trirail.config import SIM, load
@@ -32,8 +30,6 @@ from trirail.processes import bare_loop
 from trirail.wire.records import PARTS, unpack
 from trirail.wire.vocabulary import Mode
 
-QUANTILES = (50.0, 99.0, 99.9, 100.0)
-HEADER = f"{'':30}{'p50':>9}{'p99':>9}{'p99.9':>9}{'max':>9}   µs"
 MOST_FAULTS = 0.2
 """With more faults a second a rate is not kept."""
 BARE = 1.0 / 6.0
@@ -180,55 +176,3 @@ def _run(rows: NDArray[np.void], beside: NDArray[np.float64], of: Beside, period
         "missed": int(_missed(rows).sum()),
         "lost_by_the_machine": of.ticks_lost(beside),
     }
-
-
-def quantiles(values: NDArray[np.float64]) -> list[float]:
-    """The values at QUANTILES."""
-    return [float(value) for value in np.percentile(values, QUANTILES)]
-
-
-def main(seconds: float, rates: tuple[int, ...], runs: int, json: bool = False) -> None:
-    """Print the measurements as a table, or as one JSON object."""
-    measured = measure(seconds, rates, runs)
-    if json:
-        print(json_format.dumps(measured))
-        return
-    for found in measured["rates"]:
-        _show(found)
-
-
-def _show(found: dict[str, Any]) -> None:
-    bare = found["bare"]
-    print(f"{found['rate_hz']} Hz, {found['seconds']:g} s")
-    if "not_kept" in found:
-        print(f"the service's loop cannot keep this rate here: {found['not_kept']}")
-    else:
-        print(f"{found['goals']} goals at {GOALS_HZ:g} Hz, moving {found['moving']:.0%} of the time")
-        for fault, times in Counter(found["faults"]).items():
-            print(f"  {times} times in fault, and reset: {fault}")
-    print(HEADER)
-    for what, name in (("cycle", "the whole cycle"), ("lateness", "lateness of the loop")):
-        if what in found:
-            print(line(name, found[what]))
-        print(line(f"  the bare loop: {what}", bare[what]))
-        if "to_bare" in found:
-            print(line("  ratio", found["to_bare"][what], ".2f"))
-    for name in found.get("parts", ()):
-        print(line(f"  {name}", found["parts"][name]))
-    for run in found.get("runs", ()):
-        print(line("lateness of a run", run["lateness"]))
-        print(line(f"  {found['beside']}", run["beside"]))
-        print(line("  ratio", run["ratio"], ".2f"))
-    for name, of in (("loop", found), ("bare loop", bare)):
-        if "missed" in of:
-            lost = of["lost_by_the_machine"]
-            print(
-                f"ticks missed, {name}: {of['missed']} of {of['cycles']}, {max(0, of['missed'] - lost)} beyond "
-                f"the {lost} that the machine lost in the same time"
-            )
-    print()
-
-
-def line(name: str, values: list[float], form: str = ".1f") -> str:
-    """A row of a table under HEADER."""
-    return f"{name:30}" + "".join(f"{value:9{form}}" for value in values)

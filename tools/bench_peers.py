@@ -6,7 +6,6 @@ third party there, and takes the kernel's time of arrival. python-canopen runs a
 
 from __future__ import annotations
 
-import json as json_format
 import os
 import shutil
 import signal
@@ -19,12 +18,11 @@ from typing import Any
 
 import numpy as np
 from bench_latency import listener
-from bench_rig import configured, drives, rig, without_pause
+from bench_rig import QUANTILES, configured, drives, quantiles, rig, without_pause
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import frames as layout
 
 RATE = 1000
-QUANTILES = (50.0, 99.0, 99.9, 100.0)
 PRIORITY = 80
 
 
@@ -44,8 +42,6 @@ def measure(seconds: float) -> dict[str, Any]:
 
 def _trirail(seconds: float) -> list[float]:
     with rig(RATE) as made:
-        if made.bus is None:
-            raise SystemExit("the drives are the service's own: there is no bus to look at")
         without_pause(made.robot, 1.0)
         with listener(made.bus) as heard:
             without_pause(made.robot, seconds)
@@ -66,8 +62,7 @@ def _deviations(arrivals: list[float]) -> list[float]:
     """How far the intervals are from the period, without sign [µs]."""
     if len(arrivals) < RATE // 10:
         raise SystemExit(f"only {len(arrivals)} SYNCs arrived")
-    deviations = np.abs(np.diff(arrivals) - 1.0 / RATE) * 1e6
-    return [float(value) for value in np.percentile(deviations, QUANTILES)]
+    return quantiles(np.abs(np.diff(arrivals) - 1.0 / RATE) * 1e6)
 
 
 def _linuxcnc() -> str:
@@ -75,19 +70,6 @@ def _linuxcnc() -> str:
     if shutil.which("halrun") is None:
         return "not installed (Debian's package is linuxcnc-uspace): no servo thread to compare with"
     return "installed: run its latency-histogram beside this, it measures its servo thread itself"
-
-
-def main(seconds: float, json: bool = False) -> None:
-    """Print the measurements as a table, or as one JSON object."""
-    measured = measure(seconds)
-    if json:
-        print(json_format.dumps(measured))
-        return
-    print(f"SYNC at a receiver, {RATE} Hz for {seconds:g} s each: how far its interval is from the period [µs]")
-    print(f"{'':32}{'p50':>9}{'p99':>9}{'p99.9':>9}{'max':>9}")
-    for name, values in measured["deviation_us"].items():
-        print(f"{name:32}" + "".join(f"{value:9.1f}" for value in values))
-    print(f"LinuxCNC's servo thread: {measured['linuxcnc']}")
 
 
 def _send_sync(path: str, seconds: float, real_time: bool) -> None:

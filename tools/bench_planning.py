@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json as json_format
 import random
 import time
 from collections import deque
 from collections.abc import Callable
 
-import bench_time_optimal
 import numpy as np
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from trirail.config import SIM, geometry, load
@@ -18,7 +16,6 @@ from trirail.motion.runs import rest
 from trirail.motion.schedule import Schedule
 from trirail.wire.goals import PlannedGoal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
 
-GOALS = 1500
 AIM = 5000.0
 """What a goal should take at most [µs]."""
 LEAD = 3
@@ -26,8 +23,8 @@ LEAD = 3
 SEED = 4
 
 
-def main(json: bool) -> None:
-    """Plan goals from rest and from motion, one after the other, and print what a step takes."""
+def measure(number: int) -> dict[str, object]:
+    """Plan so many goals of each kind from rest and from motion, one after the other; what one takes, microseconds."""
     config = load(SIM)
     goals = Goals(geometry(config.geometry), config.limits, config.period)
     kinds: dict[str, Callable[[random.Random], PlannedGoal]] = {
@@ -42,24 +39,14 @@ def main(json: bool) -> None:
     for kind, make in kinds.items():
         schedule, rnd = Schedule(rest((0.0, 0.0, 0.0)), config.period), random.Random(SEED)
         times = []
-        for _ in range(GOALS):
+        for _ in range(number):
             times.append(_plan(goals, schedule, make(rnd)))
             for _ in range(rnd.randrange(1, 300)):
                 schedule.advance()
         results[kind] = dict(
             zip(("p50", "p99", "max"), np.percentile(np.array(times) * 1e6, (50, 99, 100)).tolist(), strict=True)
         )
-    bare = _bare(config.period)
-    weak = bench_time_optimal.measure()
-    if json:
-        print(json_format.dumps({"goal_us": results, "ruckig_alone_us": bare, "aim_us": AIM, "weak_sliders": weak}))
-        return
-    print(f"planning a goal beside the loop, processor time [µs]; the aim is {AIM:g}")
-    for kind, found in results.items():
-        p50, p99, greatest = found.values()
-        print(f"{kind:<10} p50 {p50:5.0f}  p99 {p99:5.0f}  max {greatest:5.0f}")
-    print(f"Ruckig alone, for one pose from rest: {bare:.1f} µs; the rest is the look along the path")
-    bench_time_optimal.report(weak)
+    return {"goal_us": results, "ruckig_alone_us": _bare(config.period), "aim_us": AIM}
 
 
 def _pose(rnd: random.Random) -> tuple[float, float, float]:

@@ -7,14 +7,13 @@ cycle of the loop in the same seconds.
 
 from __future__ import annotations
 
-import json as json_format
 import os
 import socket
 import tempfile
 import time
 from pathlib import Path
 
-from moving import keep_moving
+from bench_rig import without_pause
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.config import load
@@ -39,9 +38,9 @@ def measure(seconds: float) -> dict[str, dict[str, float]]:
             recorder, loop = (child(service.pid, name) for name in ("recorder", "loop"))
 
             def taken() -> dict[str, float]:
-                keep_moving(robot, 3.0)  # until all that happens once has happened
+                without_pause(robot, 3.0)  # until all that happens once has happened
                 before = _state(recorder, loop, recording, robot)
-                keep_moving(robot, seconds / 2.0)
+                without_pause(robot, seconds / 2.0)
                 after = _state(recorder, loop, recording, robot)
                 return _rates([b - a for a, b in zip(before, after, strict=True)], rate)
 
@@ -81,25 +80,3 @@ def _cpu(process: int) -> float:
     """Return the processor time that a process has taken, in the kernel too [s] (proc(5), stat)."""
     fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS
-
-
-def main(seconds: float, json: bool = False) -> None:
-    """Print the measurements as lines, or as one JSON object."""
-    measured = measure(seconds)
-    if json:
-        print(json_format.dumps(measured))
-        return
-    for status, found in measured.items():
-        of = found.__getitem__
-        print(
-            f"{status}: the loop turned at {of('rate'):.0f} Hz for {of('seconds'):.0f} s, "
-            f"{of('rate_to_wanted'):.0%} of its rate"
-        )
-        print(
-            f"  processor {of('cpu'):7.2%} of a core, {of('cpu_to_limit'):.2f} of the limit; "
-            f"{of('cpu_per_cycle_us'):.1f} µs a cycle, {of('cpu_to_loop'):.2f} of the loop's"
-        )
-        print(
-            f"  disk    {of('bytes_per_second') / 1e6:7.3f} MB/s, at the full rate {of('disk_to_limit'):.2f} of the "
-            f"limit; {of('bytes_per_cycle'):.0f} bytes a cycle"
-        )

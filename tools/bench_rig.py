@@ -11,7 +11,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
@@ -24,39 +27,47 @@ BITRATE = 8_000_000
 """Of a bus without a wire: the load of no real one keeps a rate from being measured [bit/s]."""
 
 
-class Rig:
+QUANTILES = (50.0, 99.0, 99.9, 100.0)
+
+
+class Rig(NamedTuple):
     """A running service and a client of it."""
 
-    def __init__(self, robot: Robot, pid: int, bus: str | None, locator: str) -> None:
-        self.robot = robot
-        self.pid = pid
-        self.locator = locator
-        self.bus = bus
-        """Path of the bus between processes; None where it is the service's own."""
+    robot: Robot
+    locator: str
+    bus: str
+    """Path of the bus between processes; "" where it is the service's own."""
+
+
+def quantiles(values: list[float] | NDArray[np.float64]) -> list[float]:
+    """The values at QUANTILES."""
+    if not len(values):
+        raise SystemExit("there is nothing to measure")
+    return [float(value) for value in np.percentile(values, QUANTILES)]
 
 
 @contextlib.contextmanager
-def rig(rate_hz: int, own: bool = False, metrics_port: int = 0) -> Iterator[Rig]:
+def rig(rate_hz: int, own: bool = False) -> Iterator[Rig]:
     """A service on simulated drives at a rate, enabled; they are its `own`, or on a bus where others can listen."""
     with tempfile.TemporaryDirectory(prefix="trirail-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
-        config, locator = configured(folder, rate_hz, own, metrics_port)
-        bus = None if own else str(folder / "can")
-        if bus is not None:
+        config, locator = configured(folder, rate_hz, own)
+        bus = "" if own else str(folder / "can")
+        if bus:
             stack.enter_context(drives(config, bus))
-        service = stack.enter_context(own_service.service(config, folder / "bench.rrd"))
+        stack.enter_context(own_service.service(config, folder / "bench.rrd"))
         robot = stack.enter_context(Robot("demo", locator, user="bench"))
         robot.enable()
-        yield Rig(robot, service.pid, bus, locator)
+        yield Rig(robot, locator, bus)
         with contextlib.suppress(TrirailError):  # it may be in fault, which is told elsewhere
             robot.disable()
 
 
-def configured(folder: Path, rate_hz: int, own: bool, metrics_port: int = 0) -> tuple[Path, str]:
+def configured(folder: Path, rate_hz: int, own: bool) -> tuple[Path, str]:
     """Write the configuration; return the file, and the locator of the service."""
     config, locator = own_service.private(folder)
     text = config.read_text(encoding="utf-8")
-    changes = {"rate_hz": str(rate_hz), "bitrate": str(BITRATE), "live_port": f"0\nmetrics_port = {metrics_port}"}
+    changes = {"rate_hz": str(rate_hz), "bitrate": str(BITRATE)}
     if not own:
         changes["interface"] = f'"unix"\nchannel = "{folder}/can"'
     for key, value in changes.items():
@@ -83,11 +94,8 @@ def drives(config: Path, bus: str) -> Iterator[None]:
 def without_pause(robot: Robot, seconds: float, refused: Callable[[], None] = lambda: None) -> int:
     """Send goal after goal, GOALS_HZ a second, for so long; return how many were taken. `refused` is told of others."""
     choice, accepted = random.Random(1), 0
-    shown = sys.stderr.isatty()
     due = began = time.monotonic()
-    while (now := time.monotonic()) < began + seconds:
-        if shown:
-            print(f"\r{began + seconds - now:4.0f} s left ", end="", file=sys.stderr, flush=True)
+    while time.monotonic() < began + seconds:
         x, y, phi = (choice.uniform(-span, span) for span in SPAN)
         try:
             robot.move_to(x=x, y=y, phi=phi)
@@ -96,6 +104,4 @@ def without_pause(robot: Robot, seconds: float, refused: Callable[[], None] = la
             refused()
         due += 1.0 / GOALS_HZ
         time.sleep(max(0.0, due - time.monotonic()))
-    if shown:
-        print("\r", end="", file=sys.stderr)
     return accepted

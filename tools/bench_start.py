@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
 import os
 import tempfile
 import time
@@ -57,14 +56,3 @@ def _memory(pid: int) -> float:
     """Return the memory of a process, with its share of what it has in common with others (PSS) [1e6 bytes]."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="utf-8").splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("Pss:")) * 1024e-6
-
-
-def main(json: bool = False) -> None:
-    """Measure, and print it."""
-    found = measure()
-    if json:
-        print(json_format.dumps(found))
-        return
-    print(f"up after {found['up']:.2f} s, {found['processor']:.2f} s of processor; memory {found['megabytes']:.0f} MB")
-    for name, one in found["processes"].items():
-        print(f"  {name:12} {one['megabytes']:6.0f} MB   at rest {one['share']:5.1%} of a processor")

@@ -69,7 +69,8 @@ def test_a_stop_is_over_when_the_robot_stands() -> None:
 
 
 def test_home_is_done_when_every_drive_is_homed() -> None:
-    for mode, a, b, c in product(Mode, *[(False, True)] * 3):
+    either = (False, True)
+    for mode, a, b, c in product(Mode, either, either, either):
         measured = saying(ON, ON, ON, homed=(a, b, c))
         for latched, why in {None: "stopped before every drive was homed", WHY: WHY}.items():
             over = NOT_YET if mode in (Mode.HOMING, Mode.STOPPING) else DONE if a and b and c else why
