@@ -42,7 +42,7 @@ CONFIG = msgspec.structs.replace(SHIPPED, drives=msgspec.structs.replace(SHIPPED
 _STATE = tempfile.TemporaryDirectory(prefix="trirail-tests-")
 os.environ["STATE_DIRECTORY"] = _STATE.name  # the poses that somebody has taught on this machine are no test's
 
-pytest_plugins = ["generated"]
+pytest_plugins = ["generated", "parsed_eds"]
 
 
 def changed(config: Config, **simulated: object) -> Config:
