@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import message_schemas
 import pytest
 from jsonschema import Draft202012Validator
+from refusals import refused_as
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError, ServiceError
@@ -85,9 +86,8 @@ def test_a_pose_is_taught_without_power_and_gone_to(robot: Robot) -> None:
     assert at(robot) == pytest.approx((0.0, 0.05, 0.0), abs=1e-5)
     assert {name: pose.taught for name, pose in robot.poses().items()} == {"park": False, "pick": True, "rest": True}
     goal = robot.move_to_named("rest", speed=0.1)
-    with pytest.raises(RefusedError, match="teach a pose when it stands") as refused:
+    with refused_as(RefusalCode.MOVING):
         robot.teach("pick")
-    assert refused.value.code is RefusalCode.MOVING
     goal.cancel()
     with pytest.raises(RefusedError, match="no pose 'nowhere': `trirail poses` lists those that there are"):
         robot.move_to_named("nowhere")
@@ -118,9 +118,8 @@ def test_a_taught_pose_that_the_robot_cannot_reach_any_more_is_refused_where_it_
     (place.state / "demo/poses.json").write_text('{"far": [0.3, 0.0, 0.0]}', encoding="utf-8")
     with place.service(), Robot("demo", place.locator) as robot:
         robot.enable()
-        with pytest.raises(RefusedError, match=r"platform x: position 300 mm is beyond its limit 150 mm") as refused:
+        with refused_as(RefusalCode.OUT_OF_WORKSPACE):
             robot.move_to_named("far")
-        assert refused.value.code is RefusalCode.OUT_OF_WORKSPACE
 
 
 @pytest.mark.parametrize("wrong", ["state", "configuration"])

@@ -27,10 +27,11 @@ import numpy as np
 import pytest
 import zenoh
 from can import CanutilsLogReader
+from refusals import refused_as
 from trirail.cli.remote_view import RemoteView
 from trirail.client.client import Robot
 from trirail.config import SIM, load
-from trirail.errors import RefusedError, ServiceError
+from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.processes.interpreter import child, processes, python
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import read
@@ -203,7 +204,7 @@ def test_a_session(cold_service: Service) -> None:
         assert info.robot == "demo"
         assert [leg["name"] for leg in info.geometry] == ["A", "B", "C"]
         assert robot.state().mode == "disabled"
-        with pytest.raises(RefusedError, match="send enable first"):
+        with refused_as(RefusalCode.NOT_ENABLED):
             robot.move_to(x=0.0, y=0.0, phi=0.1)
         robot.enable()
         goal = robot.move_to(x=0.02, y=-0.01, phi=0.1, id="g1")
@@ -412,7 +413,7 @@ def test_the_client_tells_of_a_target_and_its_end_brakes(shared: tuple[Service, 
                 break
     assert track.result is not None
     assert track.result.outcome == "stopped"
-    with pytest.raises(RefusedError, match="the track is over"):
+    with refused_as(RefusalCode.JOG_OVER):
         track.update((0.0, 0.0, 0.0))
     assert robot.state().mode == "holding"
     with robot.track(timeout=0.05) as silent:
