@@ -24,7 +24,7 @@ from processes.test_service import Service, until
 from trirail.client.client import Robot
 from trirail.wire.state import State
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]  # a hand's signs of life have to be in time, through a browser
 
 FAR = 0.1
 """Where a jog to the right would be at a limit: far from where one comes that is ended by the dead man [m]."""

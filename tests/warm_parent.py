@@ -1,0 +1,224 @@
+"""The warm process: forks `trirail` with arguments, for tests: python warm_parent.py CONTROL, as warm.py starts it.
+
+On CONTROL, a SEQPACKET socket, it takes requests, each with the descriptor of a socket where it says the process id and
+how that ended, and the one of what the program prints to. The fork server of a service is forked as well, from its
+supervisor before that has a thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import io
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import traceback
+from typing import Final, NamedTuple, NoReturn
+from unittest.mock import patch
+
+from setproctitle import setproctitle
+
+LARGEST: Final = 1 << 17
+"""Bytes of a request."""
+SOCKETS: Final = 16
+"""So many descriptors may go with one."""
+
+
+class Warm:
+    """Forks programs on request, says how they end, and keeps each one's number until that is heard."""
+
+    def __init__(self, control: socket.socket) -> None:
+        self._control = control
+        self._poll = select.poll()
+        self._poll.register(control, select.POLLIN)
+        self._running: dict[int, tuple[int, socket.socket]] = {}
+        """By pidfd: process id, and where its end is told."""
+        self._over: dict[int, tuple[int, socket.socket]] = {}
+        """By the descriptor where its end has been told: process id."""
+
+    def serve(self) -> None:
+        """Serve until nobody can ask any more."""
+        while True:
+            for descriptor, _ in self._poll.poll():
+                if descriptor in self._running:
+                    self._tell(descriptor)
+                elif descriptor in self._over:
+                    self._forget(descriptor)
+                elif not self._receive():
+                    return
+
+    def end(self) -> None:
+        """End what is left."""
+        for pid, _ in self._running.values():
+            os.kill(pid, signal.SIGTERM)
+
+    def _receive(self) -> bool:
+        packet, descriptors, _, _ = socket.recv_fds(self._control, LARGEST, 2)
+        if not packet:
+            return False
+        voice, output = descriptors
+        pid = os.fork()
+        if pid == 0:
+            self._control.close()
+            for pidfd, (_, other) in self._running.items():
+                os.close(pidfd)
+                other.close()
+            os.close(voice)
+            _program(json.loads(packet), output)
+        os.close(output)
+        told = socket.socket(fileno=voice)
+        told.send(str(pid).encode())
+        pidfd = os.pidfd_open(pid)
+        self._running[pidfd] = pid, told
+        self._poll.register(pidfd, select.POLLIN)
+        return True
+
+    def _tell(self, pidfd: int) -> None:
+        pid, voice = self._running.pop(pidfd)
+        ended = os.waitid(os.P_PIDFD, pidfd, os.WEXITED | os.WNOWAIT)
+        assert ended is not None
+        self._poll.unregister(pidfd)
+        os.close(pidfd)
+        with contextlib.suppress(BrokenPipeError):
+            voice.send(str(ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status).encode())
+        self._over[voice.fileno()] = pid, voice
+        self._poll.register(voice, 0)  # till it is hung up
+
+    def _forget(self, descriptor: int) -> None:
+        pid, voice = self._over.pop(descriptor)
+        self._poll.unregister(descriptor)
+        voice.close()
+        os.waitpid(pid, 0)
+
+
+def _program(request: dict[str, object], output: int) -> NoReturn:
+    """Be `trirail` with these arguments."""
+    code: object = 1
+    try:
+        arguments, folder, environment = request["arguments"], request["folder"], request["environment"]
+        assert isinstance(arguments, list)
+        assert isinstance(folder, str)
+        assert isinstance(environment, dict)
+        os.chdir(folder)
+        os.environ.clear()
+        os.environ.update(environment)
+        os.dup2(output, sys.stdout.fileno())
+        os.dup2(output, sys.stderr.fileno())
+        os.close(output)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        sys.argv = ["trirail", *arguments]
+        helper = _fork_helper()
+        from trirail.__main__ import main
+
+        with patch("trirail.processes.warm_parent.subprocess.Popen", functools.partial(ForkServer, helper)):
+            main()
+        code = 0
+    except SystemExit as ended:
+        code = ended.code
+    except BaseException:  # noqa: BLE001 - nothing of this process may return into that of the parent
+        traceback.print_exc()
+    _leave(code)
+
+
+def _leave(code: object) -> NoReturn:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code if isinstance(code, int) else 0 if code is None else 1)
+
+
+# ---------------------------------------------------------------------- a service's fork server
+
+
+class Helper(NamedTuple):
+    """A process that becomes the fork server when it is asked."""
+
+    pid: int
+    control: socket.socket
+
+
+def _fork_helper() -> Helper:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    pid = os.fork()
+    if pid:
+        theirs.close()
+        return Helper(pid, ours)
+    ours.close()
+    code: object = 1
+    try:
+        code = _fork_server(theirs)
+    except BaseException:  # noqa: BLE001 - as above
+        traceback.print_exc()
+    _leave(code)
+
+
+def _fork_server(control: socket.socket) -> int:
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # the service may have been asked to end before it asks
+    packet, descriptors, _, _ = socket.recv_fds(control, LARGEST, SOCKETS)
+    control.close()
+    if not packet:
+        return 0  # a program that is no service
+    order, *passed = descriptors
+    from trirail.processes import fork_server
+
+    sys.stdin = io.TextIOWrapper(os.fdopen(order, "rb"))
+    sys.argv = ["", json.loads(packet)["runtime"], *map(str, passed)]
+    os.environ.update(json.loads(packet)["environment"])
+    return fork_server.main()
+
+
+class ForkServer:
+    """In the place of Popen: the process that was forked before the supervisor had a thread."""
+
+    def __init__(
+        self, helper: Helper, command: list[str], *, stdin: int, pass_fds: list[int], env: dict[str, str]
+    ) -> None:
+        reading, writing = os.pipe()
+        runtime = command[command.index("-m") + 2]
+        request = json.dumps({"runtime": runtime, "environment": env}).encode()
+        socket.send_fds(helper.control, [request], [reading, *pass_fds])
+        os.close(reading)
+        self.stdin = os.fdopen(writing, "wb")
+        self._pid = helper.pid
+        self._code: int | None = None
+
+    def wait(self) -> int:
+        """Return its exit code."""
+        if self._code is None:
+            self._code = os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
+        return self._code
+
+    def kill(self) -> None:
+        """Kill it, if it has not ended."""
+        if self._code is None:
+            os.kill(self._pid, signal.SIGKILL)
+
+
+def main() -> None:
+    """Load what services need, and fork them."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # who runs the tests ends it
+    setproctitle("warm parent of services")  # it looks for where its title is once, with the environment as it was
+    from trirail.cli import commands  # noqa: F401 - what is imported here nobody else has to
+    from trirail.processes import compiling, fork_server, supervisor  # noqa: F401 - as above
+
+    if not compiling.load():
+        compiling.compile_all(lambda _: None)
+    gc.collect()
+    gc.freeze()
+    with socket.socket(fileno=int(sys.argv[1])) as control:
+        warm = Warm(control)
+        try:
+            warm.serve()
+        finally:
+            warm.end()
+
+
+if __name__ == "__main__":
+    main()
