@@ -14,7 +14,7 @@ from trirail.errors import RefusedError
 from trirail.motion.goals import Goals
 from trirail.motion.runs import rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.goals import PlannedGoal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
+from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
 
 AIM = 5000.0
 """What a goal should take at most [µs]."""
@@ -27,7 +27,7 @@ def measure(number: int) -> dict[str, object]:
     """Plan so many goals of each kind from rest and from motion, one after the other; what one takes, microseconds."""
     config = load(SIM)
     goals = Goals(geometry(config.geometry), config.limits, config.period)
-    kinds: dict[str, Callable[[random.Random], PlannedGoal]] = {
+    kinds: dict[str, Callable[[random.Random], Goal]] = {
         "pose": lambda rnd: PoseGoal(*_pose(rnd)),
         "sliders": lambda rnd: SlidersGoal((rnd.uniform(-0.1, 0.1), rnd.uniform(-0.1, 0.1), rnd.uniform(-0.1, 0.1))),
         "velocity": lambda rnd: VelocityGoal(
@@ -53,7 +53,7 @@ def _pose(rnd: random.Random) -> tuple[float, float, float]:
     return rnd.uniform(-0.06, 0.06), rnd.uniform(-0.06, 0.06), rnd.uniform(-0.5, 0.4)
 
 
-def _plan(goals: Goals, schedule: Schedule, goal: PlannedGoal) -> float:
+def _plan(goals: Goals, schedule: Schedule, goal: Goal) -> float:
     """Plan a goal, and begin with it where it is accepted; return how long planning took [s]."""
     began = time.thread_time()
     try:

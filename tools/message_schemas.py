@@ -39,6 +39,8 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "info": (state.Info, "The reply to a query on info."),
 }
 """By file: the type, and where the message is met."""
+MODULES = (*(sys.modules[kind.__module__] for kind in goals.KINDS), messages, state)
+"""Where the types in them are."""
 
 
 def schemas() -> dict[str, str]:
@@ -55,7 +57,7 @@ def schemas() -> dict[str, str]:
                     {"const": code, "description": f"{code.meaning}; {code.remedy}"} for code in RefusalCode
                 ]
                 continue
-            told = next(getattr(module, struct) for module in (goals, messages, state) if hasattr(module, struct))
+            told = next(getattr(module, struct) for module in MODULES if hasattr(module, struct))
             on_the_wire = {field.name: field.encode_name for field in msgspec.structs.fields(told)}
             for field, text in docstrings.fields(told).items():
                 definition["properties"][on_the_wire[field]]["description"] = text

@@ -47,7 +47,7 @@ def test_an_accepted_goal_is_answered_with_what_was_planned() -> None:
     ledger.begin(asked("g", ticket=7), AT_ONCE, 100.0, math.inf)
     assert ledger.answers == [Accepted(7, "g", 1.5, 1.2, True, False)]
     assert ledger.goal is not None
-    assert ledger.goal[:5] == ("g", "ann", None, 0.01, 100.0)
+    assert ledger.goal[:5] == ("g", "ann", PoseGoal, 0.01, 100.0)
     assert ended(ledger) == []
 
 

@@ -113,7 +113,7 @@ class Progress:
         runs = control.schedule.runs
         end = runs[0].course.end if runs else 0.0  # another one where a goal is to blend with it, or is no more
         waits = control.override == 0.0 or control.state.paused or len(runs) != 1 or now >= 1.0
-        if waits or under_way is not goal or under_way is None or under_way.renewed is not None or end != ends:
+        if waits or under_way is not goal or under_way is None or under_way.kind.renewed or end != ends:
             self._seen = under_way, end, now, cycle
             return
         assert now >= best - 1e-9, (cycle, under_way.id, best, now)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from trirail.config import Config, FramesTable
 from trirail.errors import RefusedError
 from trirail.motion.frames import NamedFrames
+from trirail.motion.goals import meant
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode
@@ -46,7 +47,7 @@ def arrive(rig: Rig, name: str, goal: Goal) -> Pose:
 def test_a_move_is_along_the_axes_of_its_frame_about_its_tool(
     place: Pose, step: Pose, frame: str, tool: str | tuple[float, float] | None
 ) -> None:
-    goal = NamedFrames(TABLE).planned(MoveGoal(*step, frame=frame, tool=tool, speed=0.5), lambda _: place)
+    goal = meant(MoveGoal(*step, frame=frame, tool=tool, speed=0.5), NamedFrames(TABLE), lambda _: place)
     assert isinstance(goal, PoseGoal)
     u, v = TABLE.tool["camera"] if tool == "camera" else tool if isinstance(tool, tuple) else (0.0, 0.0)
     begins = complex(place[0], place[1]) + turned(u, v, place[2])
@@ -59,7 +60,7 @@ def test_a_move_is_along_the_axes_of_its_frame_about_its_tool(
 
 @given(STEPS, TOOLS)
 def test_a_pose_in_a_work_frame_is_where_the_frame_is(pose: Pose, tool: str | tuple[float, float] | None) -> None:
-    goal = NamedFrames(TABLE).planned(PoseGoal(*pose, frame="part", tool=tool), lambda _: pose)
+    goal = meant(PoseGoal(*pose, frame="part", tool=tool), NamedFrames(TABLE), lambda _: pose)
     assert isinstance(goal, PoseGoal)
     assert complex(goal.x, goal.y) == pytest.approx(complex(0.02, 0.01) + turned(pose[0], pose[1], math.pi / 2.0))
     assert goal.phi == pytest.approx(math.pi / 2.0 + pose[2])
@@ -68,7 +69,7 @@ def test_a_pose_in_a_work_frame_is_where_the_frame_is(pose: Pose, tool: str | tu
 @pytest.mark.parametrize("angle", [-2.0, 0.0, 1e-9, 1.0, math.pi])
 def test_a_frame_may_be_turned_by_any_angle(angle: float) -> None:
     table = FramesTable(work={"part": (0.02, 0.01, angle)})
-    goal = NamedFrames(table).planned(PoseGoal(0.03, -0.01, 0.1, frame="part"), lambda _: (0.0, 0.0, 0.0))
+    goal = meant(PoseGoal(0.03, -0.01, 0.1, frame="part"), NamedFrames(table), lambda _: (0.0, 0.0, 0.0))
     assert isinstance(goal, PoseGoal)
     assert complex(goal.x, goal.y) == pytest.approx(complex(0.02, 0.01) + turned(0.03, -0.01, angle))
 
@@ -95,7 +96,7 @@ def test_a_name_that_there_is_not_is_refused_with_those_that_there_are(goal: Goa
 
 def test_without_tools_a_point_is_asked_for() -> None:
     with pytest.raises(RefusedError, match=r"give a point, \[u, v\]"):
-        NamedFrames(FramesTable()).planned(PoseGoal(0.0, 0.0, 0.0, tool="camera"), lambda _: (0.0, 0.0, 0.0))
+        meant(PoseGoal(0.0, 0.0, 0.0, tool="camera"), NamedFrames(FramesTable()), lambda _: (0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(

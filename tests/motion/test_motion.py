@@ -25,7 +25,6 @@ from trirail.motion.schedule import Schedule
 from trirail.wire.goals import (
     Goal,
     OwnLimits,
-    PlannedGoal,
     PoseGoal,
     SlidersGoal,
     TrackGoal,
@@ -478,7 +477,7 @@ def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
 PLAIN_SET_OUT = Goals._set_out
 
 
-def only_from_rest(goals: Goals, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
+def only_from_rest(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
     """Plan from no motion, so that the robot stops first."""
     if not schedule.commanded.at_rest:
         raise TOO_FAST_IN_MOTION
@@ -500,7 +499,7 @@ def test_of_two_ways_the_sooner_is_taken(
     """From the same motion, with lower limits or after a stop: each where the other is not to be had, and then both."""
     plain_stop_first = Goals._stop_first
 
-    def no_stop(goals: Goals, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
+    def no_stop(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
         raise TOO_FAST_IN_MOTION
 
     def asked(wait: int, way: str) -> tuple[Rig, Answer]:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator, ValidationError
 from trirail.client import own_service
 from trirail.errors import RefusalCode
-from trirail.wire import goals, messages, zenoh_session
+from trirail.wire import goals, zenoh_session
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -56,7 +56,7 @@ def test_every_message_has_a_schema() -> None:
     """A type that is added to the messages is described, in a file of its own or within one."""
     structs = {
         name
-        for module in (goals, messages)
+        for module in message_schemas.MODULES
         for name, kind in vars(module).items()
         if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and kind.__module__ == module.__name__
     }

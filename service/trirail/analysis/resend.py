@@ -22,7 +22,7 @@ from trirail_drivers.interface import Triple
 from trirail.client.client import GoalHandle, Robot
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry.reading import Recording
-from trirail.wire.goals import Goal, TrackGoal
+from trirail.wire.goals import Goal
 from trirail.wire.messages import Event, Override, Stop
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.records import unpack
@@ -141,8 +141,8 @@ def _send(
             if isinstance(given, GoalRequest):
                 renamed[given.id] = f"{given.id[:50]}-{suffix}"
                 goal = msgspec.structs.replace(given.goal, id=renamed[given.id])
-                if isinstance(goal, TrackGoal) and goal.time is not None:  # as old as it was then
-                    goal = msgspec.structs.replace(goal, time=time.time() - given.age)
+                if goal.time is not None:  # as old as it was then
+                    goal = goal.at(time.time() - given.age)
                 goals[given.id] = robot.send(_given(goal), renamed[given.id])
                 say(f"goal {given.id}: {goals[given.id].expected}")
             elif isinstance(given, CommandRequest) and given.name not in _LEASE:

@@ -63,7 +63,7 @@ class Commands:
             return
         action = self._modes.check(event).action
         goal = self._ledger.goal
-        if event is ModeEvent.PAUSE and goal is not None and goal.renewed is not None:
+        if event is ModeEvent.PAUSE and goal is not None and goal.kind.renewed:
             event = ModeEvent.STOP  # nobody would be at the key, nor where the target was, when it is resumed
         if action is Action.POWER_UP:
             self._setpoints.check_rest()

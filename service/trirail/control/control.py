@@ -29,7 +29,6 @@ from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import take_up
-from trirail.wire.goals import TrackGoal
 from trirail.wire.messages import FaultDetail, Outcome
 from trirail.wire.packets import (
     CommandRequest,
@@ -325,7 +324,7 @@ class Control:
         last, goal = self.schedule.last, self.ledger.goal
         if goal is None or last is None:
             return None
-        if goal.renewed is not None:
+        if goal.kind.renewed:
             return goal.target
         x, y, phi = last.destination(self.commanded.pose)
         return (x, y, phi)
@@ -353,7 +352,7 @@ class Control:
                 "from where the robot is measured to be",
             )
         last, goal = self.schedule.last, self.ledger.goal
-        if last is None or goal is None or goal.renewed is not None:
+        if last is None or goal is None or goal.kind.renewed:
             return self.commanded.pose
         return last.end(self.commanded.pose)
 
@@ -372,8 +371,8 @@ class Control:
         goal, settling = self.ledger.goal, self.measured.settling
         if not run.arrived:
             self.modes.go(ModeEvent.STANDSTILL, "standstill")
-        elif self.state.mode is Mode.MOVING and goal is not None and goal.renewed is TrackGoal:
-            return  # it waits for its target to move on, for as long as it is renewed
+        elif self.state.mode is Mode.MOVING and goal is not None and goal.kind.waits_at_end:
+            return  # it waits for what renews it
         elif goal is None or not goal.settles:
             self.modes.go(ModeEvent.ARRIVED, "standstill")
         elif not settling.under_way:

@@ -7,15 +7,15 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from msgspec import structs
-
 from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger, Withdrawal
 from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.frames import NamedFrames, Place
+from trirail.motion.frames import NamedFrames
+from trirail.motion.goal_motion import Place
+from trirail.motion.goals import meant
 from trirail.motion.schedule import Schedule
-from trirail.wire.goals import PlannedGoal, PoseGoal, RenewedGoal, TrackGoal, VelocityGoal
+from trirail.wire.goals import Goal
 from trirail.wire.messages import Outcome
 from trirail.wire.packets import GoalRequest
 
@@ -80,13 +80,13 @@ class GoalQueue:
     def take(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
         """Take a goal before a cycle, at a time of the monotonic clock; it waits for its user's turn.
 
-        What is told of a target takes the place of what has been told before and still waits.
+        A renewal that comes often takes the place of the one before it that still waits.
         """
         age = (now_ns - request.received_ns) * 1e-9 / self._period
         sent = _Sent(request, cycle - age)
         if self.idle:
             self._served.clear()
-        if isinstance(request.goal, TrackGoal) and self._ledger.renewed_by(request):
+        if request.goal.frequent and self._ledger.renewed_by(request):
             before = next((other for other in self._waiting if self._ledger.renewed_by(other.request)), None)
             if before is not None:
                 self._waiting.remove(before)
@@ -179,25 +179,23 @@ class GoalQueue:
             ledger.withdraw(request, "stopped", request.withdrawn)
             return
         self._lease.check(request.user)
-        if isinstance(goal, VelocityGoal) and not any((goal.x, goal.y, goal.phi)) and not ledger.renewed_by(request):
-            raise RefusedError(
-                RefusalCode.NO_VELOCITY, "a jog of no velocity moves nothing: give it one along x, y or phi"
-            )
+        if not ledger.renewed_by(request):
+            goal.check_beginning()
         moving = admit()
         self._check_age(sent, cycle)
-        planned = self._timed(self._frames.planned(goal, place), sent, cycle)
-        blend = ledger.goals[-1].blend if moving and ledger.goals and isinstance(planned, PoseGoal) else None
+        planned = self._timed(meant(goal, self._frames, place), sent, cycle)
+        blend = ledger.goals[-1].blend if moving and ledger.goals and goal.follows else None
         if blend is not None and len(ledger.goals) > self._queue:
             text = f"{self._queue} goals are waiting already (motion.queue): send it when one has ended"
             raise RefusedError(RefusalCode.QUEUE_FULL, text, value=len(ledger.goals), limit=self._queue)
         self._planner.plan(planned, blend)
 
-    def _timed(self, planned: PlannedGoal, sent: _Sent, cycle: int) -> PlannedGoal:
+    def _timed(self, planned: Goal, sent: _Sent, cycle: int) -> Goal:
         """Return a goal with its time as the schedule counts it. Raises RefusedError where that is too far from now.
 
         The setpoints of the schedule's cycle, which is commanded now, are taken up at this cycle's SYNC: that is now.
         """
-        if not isinstance(planned, TrackGoal):
+        if not planned.timed:
             return planned
         ago = (cycle - sent.known_since(self._period)) * self._period
         if ago > FURTHEST >= abs(sent.request.age):
@@ -212,7 +210,7 @@ class GoalQueue:
                 f"the target is said to be there {when}, by the clock of this machine: {FURTHEST:g} s at most is taken"
             )
             raise RefusedError(RefusalCode.WRONG_TIME, text, value=ago, limit=math.copysign(FURTHEST, ago))
-        return structs.replace(planned, time=self._schedule.cycle * self._period - ago)
+        return planned.at(self._schedule.cycle * self._period - ago)
 
     def _tell_busy(self, request: GoalRequest) -> None:
         """Tell everyone, once until it has said something, that a goal waits for a planner that is busy."""
@@ -234,8 +232,7 @@ class GoalQueue:
 
     def _alive_until(self, sent: _Sent) -> float:
         """Return the cycle in which a goal ends that nobody renews; infinite for those that need not be."""
-        goal = sent.request.goal
-        return sent.cycle + goal.timeout / self._period if isinstance(goal, RenewedGoal) else math.inf
+        return sent.cycle + sent.request.goal.timeout / self._period
 
     def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: str) -> None:
         """End a goal that waits, and those behind it."""

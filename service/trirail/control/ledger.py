@@ -13,7 +13,7 @@ from trirail.control.in_position import Settled
 from trirail.control.notices import REMEMBERED_IDS, Notice
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.goals import MoveGoal, PoseGoal, RenewedGoal, TrackGoal, TrajectoryGoal, VelocityGoal
+from trirail.wire.goals import Goal
 from trirail.wire.messages import FaultDetail, Level, Outcome
 from trirail.wire.packets import (
     Accepted,
@@ -44,8 +44,7 @@ class ActiveGoal(NamedTuple):
 
     id: str
     user: str
-    renewed: type[RenewedGoal] | None
-    """Of which kind the goals are that renew it: a jog by velocities, a track by targets; None for all others."""
+    kind: type[Goal]
     blend: float | None
     """How far from its end the next goal may begin [m]; None where that preempts it."""
     expires: float
@@ -65,10 +64,10 @@ class ActiveGoal(NamedTuple):
 
 
 class _Ended(NamedTuple):
-    """How a goal has ended; `renewed` and `bound` as of an ActiveGoal, the latter where a jog has ended at it."""
+    """How a goal has ended; `bound` as of an ActiveGoal, where a jog has ended at it."""
 
     user: str
-    renewed: type[RenewedGoal] | None
+    kind: type[Goal]
     outcome: Outcome
     reason: str
     bound: str | None
@@ -109,7 +108,7 @@ class Ledger:
         goal_id = request.id
         running = any(goal.id == goal_id for goal in self.goals)
         ended = self._ended.get(goal_id)
-        if ended is not None and (ended.renewed, ended.user) == (type(request.goal), request.user):
+        if ended is not None and ended.kind.renewed and (ended.kind, ended.user) == (type(request.goal), request.user):
             raise ended.over(goal_id)
         if ended is not None or (running and not self.renewed_by(request)):
             raise RefusedError(RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has been used: every goal needs its own")
@@ -149,42 +148,39 @@ class Ledger:
             self._renew(request, taken)
             return
         goal, last = request.goal, self.goals[-1] if self.goals else None
-        passes = at_end and last is not None and last.blend is not None and isinstance(goal, PoseGoal | MoveGoal)
+        passes = at_end and last is not None and last.blend is not None and goal.follows
         if not taken.queued and not passes:
             self.end("preempted", f"preempted by goal {request.id}")
-        blend = goal.blend if isinstance(goal, PoseGoal | MoveGoal) else None
-        renewed = _renewed(request)
-        settles = goal.settle if isinstance(goal, TrajectoryGoal) else renewed is None
-        self.goals.append(ActiveGoal(request.id, request.user, renewed, blend, expires, alive_until, settles=settles))
+        begun = ActiveGoal(request.id, request.user, type(goal), goal.blend, expires, alive_until, settles=goal.settle)
+        self.goals.append(begun)
         if passes:
             self.pass_on()
-        if renewed is not None:
+        if goal.renewed:
             self._renew(request, taken)
 
     def _renew(self, request: GoalRequest, taken: AcceptedPlan) -> None:
         """Take in what was told of the goal under way; where a target is out of reach, everyone is to know."""
         goal, told = request.goal, self.goals[0]
-        target = (goal.x, goal.y, goal.phi) if isinstance(goal, TrackGoal) else None
-        if target is not None and taken.bound not in (None, told.bound):
+        if goal.target is not None and taken.bound not in (None, told.bound):
             text = f"the target of goal {told.id} is beyond the limit of {taken.bound}: the robot waits there"
             self.tell("service", "warning", text, user=told.user)
-        bound = taken.bound or (told.bound if target is not None else None)  # a limit is told of once
-        self.goals[0] = told._replace(bound=bound, target=target, lag=taken.lag)
+        bound = taken.bound or (told.bound if goal.target is not None else None)  # a limit is told of once
+        self.goals[0] = told._replace(bound=bound, target=goal.target, lag=taken.lag)
 
     def pass_on(self) -> None:
         """The first goal is reached, and the one that waited for it has begun."""
         goal = self.goals.popleft()
-        self._ending(goal.id, goal.user, goal.renewed, "done", f"passed on the way to goal {self.goals[0].id}")
+        self._ending(goal.id, goal.user, goal.kind, "done", f"passed on the way to goal {self.goals[0].id}")
 
     def end(self, outcome: Outcome, reason: str, but: int = 0, settled: Settled | None = None) -> None:
         """End the goals, but so many of the first."""
         kept = [self.goals.popleft() for _ in range(min(but, len(self.goals)))]
         while self.goals:
             goal = self.goals.popleft()
-            at_limit = outcome == "done" and not goal.released and goal.renewed is VelocityGoal
+            at_limit = outcome == "done" and not goal.released and not goal.kind.waits_at_end
             bound = goal.bound if at_limit else None
             words = f"at the limit of {bound}" if bound else reason
-            self._ending(goal.id, goal.user, goal.renewed, outcome, words, bound, settled)
+            self._ending(goal.id, goal.user, goal.kind, outcome, words, bound, settled)
         self.goals.extend(kept)
 
     def withdraw(self, request: GoalRequest, outcome: Withdrawal, reason: str) -> None:
@@ -193,7 +189,7 @@ class Ledger:
             Refused(request.ticket, RefusalCode(outcome), f"goal {request.id} {outcome} before it began: {reason}")
         )
         if not self.renewed_by(request):
-            self._ending(request.id, request.user, _renewed(request), outcome, reason)
+            self._ending(request.id, request.user, type(request.goal), outcome, reason)
 
     def is_all_of(self, user: str | None) -> bool:
         """Whether the goals and commands under way that need the lease are all a user's."""
@@ -204,7 +200,7 @@ class Ledger:
     def refuse(self, request: Request, refusal: RefusedError) -> None:
         """Answer that a request is not carried out. A goal that is refused has ended; a used id has its own ending.
 
-        Everyone is told, of a track's renewals once: hundreds may follow before their sender hears of it.
+        Everyone is told, of renewals that come often once: hundreds may follow before their sender hears of it.
         """
         if isinstance(request, RefusedRequest | PoseChanged | Remark):
             return
@@ -213,7 +209,7 @@ class Ledger:
         if isinstance(request, CommandRequest):
             self.tell("refused", "warning", f"{request.name} refused: {text}", user=request.user)
             return
-        if isinstance(request.goal, TrackGoal):
+        if request.goal.frequent:
             before, self._refused = self._refused, (request.id, refusal.code)
             if before == self._refused:
                 return
@@ -223,10 +219,10 @@ class Ledger:
             outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
             if self.renewed_by(request):
                 self.tell("refused", "warning", text, user=request.user)
-                if isinstance(request.goal, VelocityGoal):  # whoever asked for that is not to have the old one either
+                if not request.goal.frequent:  # whoever asked for that is not to have the old one either
                     self.keep_alive(request, -math.inf)
             else:
-                self._ending(request.id, request.user, _renewed(request), outcome, text)
+                self._ending(request.id, request.user, type(request.goal), outcome, text)
 
     def renewed_by(self, request: GoalRequest) -> bool:
         """Whether it renews the goal that is under way; only its own user can."""
@@ -234,14 +230,15 @@ class Ledger:
         return (
             goal is not None
             and (goal.id, goal.user) == (request.id, request.user)
-            and type(request.goal) is goal.renewed
+            and request.goal.renewed
+            and type(request.goal) is goal.kind
         )
 
     def _ending(
         self,
         goal_id: str,
         user: str,
-        renewed: type[RenewedGoal] | None,
+        kind: type[Goal],
         outcome: Outcome,
         reason: str,
         bound: str | None = None,
@@ -250,7 +247,7 @@ class Ledger:
         if goal_id in self._ended:  # by what also withdraws its renewals
             return
         level = _LEVELS.get(outcome, "info")
-        self._ended[goal_id] = _Ended(user, renewed, outcome, reason, bound)
+        self._ended[goal_id] = _Ended(user, kind, outcome, reason, bound)
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]
         words = f"goal {goal_id} {outcome}: {reason}"
@@ -300,10 +297,6 @@ class Ledger:
     ) -> None:
         """Note something that everyone is to know."""
         self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, goal, user, fault=fault))
-
-
-def _renewed(request: GoalRequest) -> type[RenewedGoal] | None:
-    return type(request.goal) if isinstance(request.goal, RenewedGoal) else None
 
 
 def _not_renewed(goal_id: str) -> RefusedError:

@@ -26,7 +26,7 @@ from trirail.motion.runs import STILL, MotionState, Run, nominal, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import planned_limits
 from trirail.motion.time_scaling import TimeScaling
-from trirail.wire.goals import PlannedGoal, TrackGoal
+from trirail.wire.goals import Goal
 from trirail.wire.planning import Extended, NotPlanned, PlanAnswer, Planned, PlanRequest
 
 LEADS = (0.003, 0.012, 0.048)
@@ -82,7 +82,7 @@ class PlanRequests:
         self._port = port
         self._schedule = schedule
         self._leads = [max(LEAST_LEAD, math.ceil(lead / self._period)) for lead in LEADS]
-        self._goal: PlannedGoal | None = None
+        self._goal: Goal | None = None
         self._blend: float | None = None
         self._number = 0
         self._asked: PlanRequest | None = None
@@ -94,7 +94,7 @@ class PlanRequests:
         self._since: int | None = None
         self._change: RateChange | None = None
         self._greatest_rate = math.inf
-        """Of the motion under way: what follows a target is not to be ahead of it."""
+        """Of the goal under way."""
 
     @property
     def busy(self) -> bool:
@@ -133,7 +133,7 @@ class PlanRequests:
         nowhere.take(deque([unpack_run(self._legs, pack_run(Run(self._legs, path, constant(1.0), 1.0)))]))
         RateChange(self._scaling, nowhere, 0.0, self._period).step()
 
-    def plan(self, goal: PlannedGoal, blend: float | None = None) -> None:
+    def plan(self, goal: Goal, blend: float | None = None) -> None:
         """Have a goal planned: to preempt the motion under way, or to follow it from within `blend` [m] of its end."""
         self._goal, self._blend, self._times, self._since = goal, blend, 0, None
         self._asked = self._answer = self._lost = None
@@ -191,7 +191,7 @@ class PlanRequests:
         if change is not None and (self._asked is None or change.lowers) and change.step():
             self._change = None
 
-    def _ask(self, goal: PlannedGoal) -> None:
+    def _ask(self, goal: Goal) -> None:
         """Ask for the goal's motion from the one under way; RefusedError when that has been asked too often."""
         if self._times == len(self._leads):
             text = f"its motion came too late {self._times} times, or the motion under way changed: send the goal again"
@@ -205,7 +205,7 @@ class PlanRequests:
             self._revision,
             schedule.cycle,
             self._lead(goal),
-            min(self.override, _greatest_rate(goal)),
+            min(self.override, goal.greatest_rate),
             (_triple(pose), _triple(velocity), _triple(acceleration)),
             tuple(map(pack_run, schedule.runs)),
             goal,
@@ -215,12 +215,12 @@ class PlanRequests:
         self._since = self._since if self._since is not None else schedule.cycle
         self._port.ask(self._asked)
 
-    def _lead(self, goal: PlannedGoal) -> int:
-        """Return in how many cycles a motion is to begin: of a target, which is told of often, as the last one came."""
+    def _lead(self, goal: Goal) -> int:
+        """Return in how many cycles a motion is to begin: of a goal that is renewed often, as the last one came."""
         lead = self._leads[self._times]
         if self._times:
             return max(lead, SLACK * self._took)
-        return max(lead, self._took + 1) if isinstance(goal, TrackGoal) else lead
+        return max(lead, self._took + 1) if goal.frequent else lead
 
     def _take(self, answer: PlanAnswer) -> AcceptedPlan | None:
         """Carry out what the planner has decided, once its time has come; ask anew where it does not fit any more."""
@@ -246,7 +246,7 @@ class PlanRequests:
             self._asked = None
             return None
         schedule.take(runs)
-        self._change, self._greatest_rate = None, _greatest_rate(self._goal)
+        self._change, self._greatest_rate = None, self._goal.greatest_rate if self._goal else math.inf
         if run.target != min(self.override, self._greatest_rate):
             self.run_at(self.override)
         return AcceptedPlan(
@@ -291,11 +291,6 @@ class PlanRequests:
         schedule.append(extended.s, path)
         duration = schedule.remaining if run.target else math.inf
         return AcceptedPlan(duration, extended.slowed, stops_first=False, queued=True)
-
-
-def _greatest_rate(goal: PlannedGoal | None) -> float:
-    """Return the greatest rate at which a goal's motion is run: a target has a time of its own."""
-    return 1.0 if isinstance(goal, TrackGoal) else math.inf
 
 
 def _same(one: MotionState, other: MotionState) -> bool:

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from trirail.config import Limits
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry
+from trirail.motion import kinds
 from trirail.motion.feasibility import Checker
+from trirail.motion.frames import NamedFrames
+from trirail.motion.goal_motion import GoalMotion, Place
 from trirail.motion.limits import Bounds
 from trirail.motion.paths import HALVINGS, Path, constant
 from trirail.motion.planner import TOO_FAST_IN_MOTION, Plan, Planner
-from trirail.motion.quintic import Point
-from trirail.motion.ruckig_call import Kinodynamic
-from trirail.motion.runs import NO_TOOL, MotionState, Run, nominal, rest, stretched
+from trirail.motion.runs import MotionState, Run, nominal, rest, stretched
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import TimeScaling
-from trirail.motion.tracking import Tracker
-from trirail.wire.goals import PlannedGoal, PoseGoal, SlidersGoal, TrackGoal, TrajectoryGoal, VelocityGoal
+from trirail.wire.goal_kind import import_all
+from trirail.wire.goals import Goal
 
 SLOWEST = 0.05
 """Where the time along a path runs slower than this, a new goal is planned from a standstill."""
@@ -29,6 +30,15 @@ SLOWER = 1.3
 """How much slower a path is made that an override makes too fast."""
 SLOWED = 12
 """How often: 1.3 to the power of 12 is 23 times."""
+
+import_all(kinds)
+MOTIONS: dict[type[Goal], type[GoalMotion[Any]]] = {made.kind: made for made in GoalMotion.__subclasses__()}
+"""How goals are planned, by kind."""
+
+
+def meant(goal: Goal, frames: NamedFrames, place: Place) -> Goal:
+    """Return the goal that the planner is to be asked for. Raises RefusedError for a name that there is not."""
+    return MOTIONS[type(goal)].meant(goal, frames, place)
 
 
 class PlannedMotion(NamedTuple):
@@ -71,16 +81,16 @@ class Goals:
         self._checker = checker
         self._period = period
         self._planner = Planner(geometry, limits.platform, limits.slider, bounds, checker, period)
-        self._tracker = Tracker(self._planner, Kinodynamic(*checker.platform_limits.T.tolist()), bounds, checker)
+        self._motions = {kind: made(self._planner) for kind, made in MOTIONS.items()}
         self.time_scaling = TimeScaling(geometry, checker, period)
 
-    def plan(self, goal: PlannedGoal, schedule: Schedule, rate: float, lead: int) -> PlannedMotion:
+    def plan(self, goal: Goal, schedule: Schedule, rate: float, lead: int) -> PlannedMotion:
         """Return the motion to a goal, its time to run at `rate`, from the commanded state of the motion under way.
 
         Where the robot moves, it begins so many cycles later: as asked for, or with a lower speed or after a stop on
         the old path, whichever arrives sooner. Raises RefusedError.
         """
-        self._check(goal)
+        self._motions[type(goal)].check(goal)
         moves = bool(schedule.runs) and not (schedule.commanded.at_rest and schedule.runs[0].stands)
         later = schedule.ahead(lead) if moves else schedule
         first = later.cycle if moves else None
@@ -101,21 +111,21 @@ class Goals:
         best = min((motion for motion in (sooner, stopping) if motion), key=lambda motion: motion.duration)
         return best._replace(first=first)
 
-    def append(self, goal: PoseGoal, run: Run, blend: float, lead: int) -> Extension:
-        """Return the way to a pose from within `blend` [m] of where a run's path ends.
+    def append(self, goal: Goal, run: Run, blend: float, lead: int) -> Extension:
+        """Return the way to a goal from within `blend` [m] of where a run's path ends.
 
         It begins in motion where the sliders can do that, else at rest at the end. Raises RefusedError.
         """
-        self._check(goal)
+        self._motions[type(goal)].check(goal)
         at, end = self._seam(run, blend, lead), run.path.duration
         if at < end:
             try:
-                plan = self._to_pose(goal, nominal(run.path, at))
+                plan = self._plan(goal, nominal(run.path, at), 1.0, 0.0)
                 if self._fits(run, at, plan.path):
                     return Extension(at, plan.path, plan.slowed)
             except RefusedError:
                 pass
-        plan = self._to_pose(goal, rest(nominal(run.path, end).pose))
+        plan = self._plan(goal, rest(nominal(run.path, end).pose), 1.0, 0.0)
         for _ in range(SLOWED):
             if self._fits(run, end, plan.path):
                 return Extension(end, plan.path, plan.slowed)
@@ -125,17 +135,7 @@ class Goals:
             RefusalCode.NO_PLAN, "no motion follows at this override: send the goal again when it is lower"
         )
 
-    def _check(self, goal: PlannedGoal) -> None:
-        """Refuse what can be reached from nowhere."""
-        if isinstance(goal, PoseGoal):
-            self._planner.check_pose((goal.x, goal.y, goal.phi), tool_of(goal))
-            self._limits(goal)
-        elif isinstance(goal, SlidersGoal):
-            self._planner.check_sliders(goal.position)
-        elif isinstance(goal, VelocityGoal):
-            self._planner.check_velocity((goal.x, goal.y, goal.phi))
-
-    def _set_out(self, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
+    def _set_out(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
         """Plan from the commanded motion."""
         start, begins = schedule.commanded, schedule.cycle * self._period
         if start.at_rest:
@@ -156,7 +156,7 @@ class Goals:
                 return PlannedMotion(run, duration, plan.slowed, bound=plan.bound, lag=plan.lag)
         raise TOO_FAST_IN_MOTION
 
-    def _stop_first(self, goal: PlannedGoal, schedule: Schedule, rate: float) -> PlannedMotion:
+    def _stop_first(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
         """Plan from where the motion under way can be stopped."""
         stop, law = schedule.runs[0].copy(), None
         if stop.target != 0.0:
@@ -170,36 +170,9 @@ class Goals:
         duration = left + run.ends if rate else math.inf
         return PlannedMotion(run, duration, plan.slowed, stops_first=True, stop=law, bound=plan.bound, lag=plan.lag)
 
-    def _plan(self, goal: PlannedGoal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan from a state of motion; where a target is asks when that is [s], and at which rate the path is run."""
-        planner = self._planner
-        match goal:
-            case PoseGoal():
-                return self._to_pose(goal, start)
-            case SlidersGoal():
-                return planner.to_sliders(start, goal.position, goal.speed)
-            case VelocityGoal():
-                return planner.jog(start, (goal.x, goal.y, goal.phi), goal.timeout)
-            case TrackGoal():
-                return self._to_target(goal, start, rate or 1.0, begins)
-            case TrajectoryGoal():
-                points = [Point(p.t, (p.x, p.y, p.phi), p.velocity, p.acceleration) for p in goal.points]
-                return planner.follow(start, points, goal.stretch)
-
-    def _to_pose(self, goal: PoseGoal, start: MotionState) -> Plan:
-        target = goal.x, goal.y, goal.phi
-        return self._planner.to_pose(start, target, goal.speed, self._limits(goal), tool_of(goal))
-
-    def _to_target(self, goal: TrackGoal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan to a target as it is when the path begins, in the path's own time."""
-        late = begins - goal.time if goal.time is not None else 0.0
-        pose = [at + late * v for at, v in zip((goal.x, goal.y, goal.phi), goal.velocity, strict=True)]
-        plan = self._tracker.follow(start, pose, [v / rate for v in goal.velocity], goal.timeout)
-        return plan._replace(lag=self._planner.nearness(start.pose, pose))
-
-    def _limits(self, goal: PoseGoal) -> Kinodynamic | None:
-        own = goal.limits
-        return self._planner.lowered(own.velocity, own.acceleration, own.jerk) if own else None
+    def _plan(self, goal: Goal, start: MotionState, rate: float, begins: float) -> Plan:
+        """Plan from a state of motion, in which a path begins that is run at a rate, at a time of the loop's [s]."""
+        return self._motions[type(goal)].plan(goal, start, rate, begins)
 
     def _seam(self, run: Run, blend: float, lead: int) -> float:
         """Return the time along a run's path from which on it is within `blend` of its end [s], and not yet passed."""
@@ -227,10 +200,3 @@ class Goals:
         if not math.isfinite(last):  # it is to stop before: it will go on at full speed at most, or be looked at anew
             law, first, last = constant(1.0), s, longer.path.duration
         return self._checker.look(longer.path, law, first, last, nominal(run.path, s).pose).within_limits
-
-
-def tool_of(goal: PoseGoal) -> tuple[float, float]:
-    """Return the point of the platform that a planned pose is of; its name is known where the goal came in."""
-    if isinstance(goal.tool, str):
-        raise TypeError(f"tool {goal.tool!r} of a planned goal is no point")
-    return goal.tool or NO_TOOL

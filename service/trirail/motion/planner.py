@@ -68,13 +68,13 @@ class Planner:
     ) -> None:
         self._legs = geometry.packed()
         self._most = Kinodynamic(platform.velocity, platform.acceleration, platform.jerk)
-        self._platform = Kinodynamic(*checker.platform_limits.T.tolist())
+        self.platform = Kinodynamic(*checker.platform_limits.T.tolist())
         self._centre = checker.centre_limits
         self._sliders = Kinodynamic(*([ROOM * limit] * 3 for limit in checker.slider_limits.tolist()))
         self._checked_sliders = Kinodynamic(*([limit] * 3 for limit in checker.slider_limits.tolist()))
         self._travel = slider.position
-        self._bounds = bounds
-        self._checker = checker
+        self.bounds = bounds
+        self.checker = checker
         self._period = period
         self._solver = Solver()
         # How far the platform's edges are: what a turn by one radian moves at most.
@@ -85,7 +85,7 @@ class Planner:
 
         The pose is that of a tool, (u, v) in the platform's frame [m]; the workspace that of the platform's centre.
         """
-        if violation := self._bounds.pose(of_centre(rest(target), tool).pose):
+        if violation := self.bounds.pose(of_centre(rest(target), tool).pose):
             raise RefusedError(
                 RefusalCode.OUT_OF_WORKSPACE,
                 f"the goal is out of the workspace: {violation}",
@@ -124,7 +124,7 @@ class Planner:
                     text = "limits.{} of {} is {}: the robot's limit is {}".format(name, coordinate, *shown)
                     raise RefusedError(RefusalCode.ABOVE_LIMIT, text, value=value, limit=limit)
         return Kinodynamic(
-            *(np.minimum(own or planned, planned).tolist() for own, planned in zip(asked, self._platform, strict=True))
+            *(np.minimum(own or planned, planned).tolist() for own, planned in zip(asked, self.platform, strict=True))
         )
 
     def to_pose(
@@ -145,7 +145,7 @@ class Planner:
         where it leaves the workspace, or where it cannot be slowed since it starts in motion.
         """
         self.check_pose(target, tool)
-        return self._to_rest(start, of_tool(start, tool), target, limits or self._platform, speed, tool=tool)
+        return self._to_rest(start, of_tool(start, tool), target, limits or self.platform, speed, tool=tool)
 
     def to_sliders(self, start: MotionState, target: Sequence[float], speed: float = 1.0) -> Plan:
         """Plan to rest at slider positions, straight in slider space from rest; as to_pose otherwise."""
@@ -163,24 +163,24 @@ class Planner:
         inside.
         """
         share, hold, bound = 1.0, FASTEST_OVERRIDE * timeout, None
-        for value, limit in zip(velocity, self._platform.velocity, strict=True):
+        for value, limit in zip(velocity, self.platform.velocity, strict=True):
             if abs(value) * share > limit:
                 share = limit / abs(value)
         for _ in range(JOGS):
             ramp, brake, path = self._jog(start, [share * value for value in velocity], hold)
-            found = self._checker.look(path, constant(1.0), 0.0, path.duration, start.pose)
+            found = self.checker.look(path, constant(1.0), 0.0, path.duration, start.pose)
             if found.fits or (found.within_limits and not start.at_rest):
                 return Plan(path, 1.0 / share, bound)
             if math.isnan(found.leaves_at):
                 share *= ROOM / found.excess
                 continue
-            bound = self._checker.bound(path, found.leaves_at, start.pose)
+            bound = self.checker.bound(path, found.leaves_at, start.pose)
             if hold > 0.0:
                 hold = max(0.0, found.leaves_at - ramp - brake)  # to rest where it would have been out of reach
             else:
                 share /= 2.0
         path = self.to_velocity(start, STILL)
-        if not self._checker.bears(self._checker.whole(path, start.pose)):
+        if not self.checker.bears(self.checker.whole(path, start.pose)):
             raise TOO_FAST_IN_MOTION
         return Plan(path, bound=bound)
 
@@ -191,7 +191,7 @@ class Planner:
         """
         check_ends(points, start)
         path = quintic(points, start.pose)
-        worst = self._checker.whole(path, start.pose)
+        worst = self.checker.whole(path, start.pose)
         slower = excess(worst)
         if slower <= 1.0:
             return Plan(path)
@@ -208,7 +208,7 @@ class Planner:
 
     def to_velocity(self, start: MotionState, velocity: Sequence[float]) -> Path:
         """Return the quickest way to a velocity within the platform's limits, not looked at. Raises RefusedError."""
-        return self._solver.to_velocity(start, velocity, self._platform)
+        return self._solver.to_velocity(start, velocity, self.platform)
 
     def nearness(self, pose: Sequence[float], target: Sequence[float]) -> float:
         """Return how far a point of the platform is at most from where it is to be [m]."""
@@ -230,7 +230,7 @@ class Planner:
         """Plan from `begin`, the platform's motion `start` as that of the sliders or of a tool."""
         if start.at_rest:
             path = self._solver.to_rest(begin, target, limits, in_sliders, tool)
-            slower = max(1.0 / speed, excess(self._checker.whole(path, start.pose)))
+            slower = max(1.0 / speed, excess(self.checker.whole(path, start.pose)))
             if slower * speed > 1.0:
                 quickest = self._quickest(path, limits, path.duration / speed, start.pose)
                 if quickest is not None and quickest.duration < slower * path.duration:
@@ -242,8 +242,8 @@ class Planner:
         for _ in range(TRIES):
             lower = Kinodynamic(*(np.array(limits) * shares[:, None]).tolist())
             path = self._solver.to_rest(begin, target, lower, in_sliders, tool)
-            worst = self._checker.whole(path, start.pose)
-            if self._checker.bears(worst):
+            worst = self.checker.whole(path, start.pose)
+            if self.checker.bears(worst):
                 return Plan(path, speed / float(shares.min()))
             shares = shares * np.clip(ROOM / worst.max(axis=0), GENTLEST, 1.0)
         raise TOO_FAST_IN_MOTION
@@ -253,7 +253,7 @@ class Planner:
 
         None where there is none, or none that fits.
         """
-        others = self._platform if path.in_sliders else self._checked_sliders
+        others = self.platform if path.in_sliders else self._checked_sliders
         quickest = time_optimal(self._legs, path, limits, others, self._centre, pose)
         if quickest is None:
             return None
@@ -270,7 +270,7 @@ class Planner:
         """
         for _ in range(LOOKS):
             slow = stretched(path, factor)
-            found = excess(self._checker.whole(slow, pose))
+            found = excess(self.checker.whole(slow, pose))
             if found <= 1.0:
                 return slow, factor
             factor *= found * A_HAIR_MORE

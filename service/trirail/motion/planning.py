@@ -15,12 +15,11 @@ import msgspec
 
 from trirail.config import Config, corrected_geometry
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.goals import Extension, Goals, PlannedMotion
+from trirail.motion.goals import MOTIONS, Extension, Goals, PlannedMotion
 from trirail.motion.packing import pack_path, pack_run, unpack_run
 from trirail.motion.runs import MotionState
 from trirail.motion.schedule import Schedule
 from trirail.motion.take_up import planned_limits
-from trirail.wire.goals import PoseGoal, SlidersGoal, TrackGoal
 from trirail.wire.planning import Extended, NotPlanned, PackedRun, PlanAnswer, Planned, PlanRequest
 
 
@@ -70,8 +69,7 @@ class MotionPlanner:
         """Plan a motion of each kind: what runs for the first time is slow."""
         start = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         runs: tuple[PackedRun, ...] = ()
-        pose, blended = PoseGoal(0.02, 0.01, 0.1), PoseGoal(-0.01, 0.0, 0.0, blend=0.01)
-        for goal in (pose, blended, SlidersGoal((0.01, 0.0, 0.0)), TrackGoal(0.0, 0.0, 0.0, (0.01, 0.0, 0.0), 0.0)):
+        for goal in (goal for motion in MOTIONS.values() for goal in motion.examples):
             answer = self.plan(PlanRequest(0, 0, self._revision, 0, 2, 1.0, start, runs, goal))
             if isinstance(answer, Planned):
                 runs = (answer.run,)
@@ -80,7 +78,7 @@ class MotionPlanner:
         if request.revision != self._revision:
             raise RefusedError(RefusalCode.INTERNAL, "the planner has another geometry or other limits than the loop")
         runs = deque(unpack_run(self._legs, run) for run in request.runs)
-        if request.blend is not None and isinstance(request.goal, PoseGoal) and runs:
+        if request.blend is not None and runs:
             return self._goals.append(request.goal, runs[-1], request.blend, request.lead)
         schedule = Schedule(MotionState(*request.commanded), self._period)
         schedule.cycle, schedule.runs = request.cycle, runs

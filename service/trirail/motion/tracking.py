@@ -16,8 +16,7 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
 from trirail.errors import RefusedError
 from trirail.kinematics.arrays import Array
-from trirail.motion.feasibility import Checker, Look
-from trirail.motion.limits import Bounds
+from trirail.motion.feasibility import Look
 from trirail.motion.paths import Path, constant
 from trirail.motion.planner import GENTLEST, ROOM, TOO_FAST_IN_MOTION, Plan, Planner
 from trirail.motion.quintic import Point, between
@@ -52,11 +51,9 @@ class _Aim(NamedTuple):
 class Tracker:
     """Plans to follow moving targets, within the limits of platform and sliders."""
 
-    def __init__(self, planner: Planner, platform: Kinodynamic, bounds: Bounds, checker: Checker) -> None:
-        self._planner = planner
-        self._platform = platform
-        self._bounds = bounds
-        self._checker = checker
+    def __init__(self, planner: Planner) -> None:
+        self._planner, self._platform = planner, planner.platform
+        self._bounds, self._checker = planner.bounds, planner.checker
         self._ruckig = Ruckig(3)
 
     def follow(self, start: MotionState, pose: Sequence[float], velocity: Sequence[float], hold: float) -> Plan:

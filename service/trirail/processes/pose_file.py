@@ -14,7 +14,7 @@ from trirail_drivers.errors import FileError
 
 from trirail.errors import ServiceError
 from trirail.wire.decoding import decoded, prepare
-from trirail.wire.goals import Coordinates, PoseName
+from trirail.wire.goal_kind import Coordinates, PoseName
 
 NAME = "poses.json"
 

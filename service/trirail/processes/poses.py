@@ -22,7 +22,8 @@ from trirail.kinematics.geometry import travels
 from trirail.processes.incoming import Incoming
 from trirail.processes.pose_file import PoseFile, state_directory
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.goals import Coordinates, Goal, NamedGoal, PoseGoal
+from trirail.wire.goals import Coordinates, Goal, NamedGoal
+from trirail.wire.kinds.pose import pose_in_place_of
 from trirail.wire.messages import ErrorReply, NoContent
 from trirail.wire.packets import PoseChanged, Remark
 from trirail.wire.state import NamedPose, NamedPoses
@@ -119,8 +120,7 @@ class Poses:
         pose = (self._configured.get(goal.name) or self._taught.get(goal.name)) if isinstance(goal, NamedGoal) else None
         if pose is None:
             return goal
-        same = {name: getattr(goal, name) for name in ("id", "speed", "valid_for", "limits", "blend")}
-        return PoseGoal(*pose, **same)
+        return pose_in_place_of(goal, *pose)
 
     def take(self, incoming: Incoming) -> None:
         """Take a query on …/teach or …/forget. Raises RefusedError."""

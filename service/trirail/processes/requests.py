@@ -18,7 +18,7 @@ from trirail.processes.guard import Guard
 from trirail.processes.incoming import Incoming
 from trirail.processes.last_words import LastWords
 from trirail.processes.replies import Replies
-from trirail.wire.goals import Goal, TrackGoal
+from trirail.wire.goals import Goal
 from trirail.wire.links import PacketLink
 from trirail.wire.messages import AcquireLease, ErrorReply, Override, ReleaseLease, Stop
 from trirail.wire.packets import CommandRequest, GoalRequest, message
@@ -85,9 +85,8 @@ class Requests:
         self.backlog.check_room(user, incoming.size)
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
-        told_of = goal.time if isinstance(goal, TrackGoal) else None
         waited = (time.monotonic_ns() - incoming.arrived_ns) * 1e-9
-        age = time.time() - waited - told_of if told_of is not None else 0.0
+        age = time.time() - waited - goal.time if goal.time is not None else 0.0
         self.backlog.add(incoming, GoalRequest(self._tickets, user, goal_id, goal, incoming.arrived_ns, age=age))
         self.send_goals()
 

@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode
-from trirail.wire.goals import Identifier, check_fields
+from trirail.wire.goal_kind import Identifier, check_fields
 from trirail.wire.vocabulary import Command
 
 LOWEST_OVERRIDE = 1.0

@@ -11,7 +11,7 @@ from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.decoding import decoder, prepare
-from trirail.wire.goals import PlannedGoal
+from trirail.wire.goals import Goal
 
 
 class PackedPath(Struct, frozen=True, array_like=True):
@@ -55,7 +55,9 @@ class PlanRequest(Struct, frozen=True):
     """The platform's pose, velocity and acceleration now."""
     runs: tuple[PackedRun, ...]
     """The motion under way, and what follows it."""
-    goal: PlannedGoal
+    goal: Goal
+    """As trirail.motion.goals.meant has it: its tools are points, its poses those of the base frame, its times the
+    loop's."""
     blend: float | None = None
     """How far from the end of the last run this goal may follow it [m]; None where it preempts the motion."""
 

@@ -1,0 +1,55 @@
+"""To a pose, straight in pose space where the start allows."""
+
+from __future__ import annotations
+
+from msgspec import structs
+
+from trirail.config import BASE, PLATFORM
+from trirail.errors import RefusalCode, RefusedError
+from trirail.motion.frames import NamedFrames, rotated
+from trirail.motion.goal_motion import GoalMotion, Place
+from trirail.motion.planner import Plan
+from trirail.motion.ruckig_call import Kinodynamic
+from trirail.motion.runs import NO_TOOL, MotionState
+from trirail.wire.goals import PoseGoal
+
+
+class PoseMotion(GoalMotion[PoseGoal]):
+    """A pose goal's."""
+
+    kind = PoseGoal
+    examples = PoseGoal(0.02, 0.01, 0.1), PoseGoal(-0.01, 0.0, 0.0, blend=0.01)
+
+    @staticmethod
+    def meant(goal: PoseGoal, frames: NamedFrames, place: Place) -> PoseGoal:
+        """Return a pose in the base frame."""
+        del place
+        if goal.frame == PLATFORM:
+            raise RefusedError(
+                RefusalCode.UNKNOWN_FRAME, "a pose in the platform's own frame is no place: send a move in that frame"
+            )
+        x0, y0, turned = frames.frame(goal.frame)
+        dx, dy = rotated(goal.x, goal.y, turned)
+        there = {"x": x0 + dx, "y": y0 + dy, "phi": turned + goal.phi}
+        return structs.replace(goal, **there, tool=frames.tool(goal.tool), frame=BASE)
+
+    def check(self, goal: PoseGoal) -> None:
+        """Refuse a pose out of the workspace, and limits above the platform's."""
+        self._planner.check_pose((goal.x, goal.y, goal.phi), _tool(goal))
+        self._limits(goal)
+
+    def plan(self, goal: PoseGoal, start: MotionState, rate: float, begins: float) -> Plan:
+        """Plan to rest at the pose."""
+        del rate, begins
+        return self._planner.to_pose(start, (goal.x, goal.y, goal.phi), goal.speed, self._limits(goal), _tool(goal))
+
+    def _limits(self, goal: PoseGoal) -> Kinodynamic | None:
+        own = goal.limits
+        return self._planner.lowered(own.velocity, own.acceleration, own.jerk) if own else None
+
+
+def _tool(goal: PoseGoal) -> tuple[float, float]:
+    """Return the point of the platform that a planned pose is of; its name is known where the goal came in."""
+    if isinstance(goal.tool, str):
+        raise TypeError(f"tool {goal.tool!r} of a planned goal is no point")
+    return goal.tool or NO_TOOL

@@ -1,0 +1,27 @@
+"""After a moving target: trirail.motion.tracking."""
+
+from __future__ import annotations
+
+from trirail.motion.goal_motion import GoalMotion
+from trirail.motion.planner import Plan, Planner
+from trirail.motion.runs import MotionState
+from trirail.motion.tracking import Tracker
+from trirail.wire.kinds.track import TrackGoal
+
+
+class TrackMotion(GoalMotion[TrackGoal]):
+    """A track's."""
+
+    kind = TrackGoal
+    examples = (TrackGoal(0.0, 0.0, 0.0, (0.01, 0.0, 0.0), 0.0),)
+
+    def __init__(self, planner: Planner) -> None:
+        super().__init__(planner)
+        self._tracker = Tracker(planner)
+
+    def plan(self, goal: TrackGoal, start: MotionState, rate: float, begins: float) -> Plan:
+        """Plan to the target as it is when the path begins, in the path's own time."""
+        rate, late = rate or 1.0, begins - goal.time if goal.time is not None else 0.0
+        pose = [at + late * v for at, v in zip(goal.target, goal.velocity, strict=True)]
+        plan = self._tracker.follow(start, pose, [v / rate for v in goal.velocity], goal.timeout)
+        return plan._replace(lag=self._planner.nearness(start.pose, pose))
