@@ -28,7 +28,7 @@ from trirail.motion.paths import FOR_EVER, Path, constant
 from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, Mode, Override
 from trirail_drivers.cia402 import frames
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import Feedback, Triple
@@ -76,6 +76,11 @@ def delay_answers(bus: can.BusABC, delay: Delay, clock: Callable[[], float]) -> 
 
 FRAMES = 25
 """How deep a stack is looked into for who has allocated."""
+
+
+def carried(name: str, rate: float | None) -> Override | None:
+    """What a command carries: the rate, 1 being full speed, where it is override; else nothing."""
+    return Override(100.0 * (1.0 if rate is None else rate)) if name == Command.OVERRIDE else None
 
 
 class Rig:
@@ -152,7 +157,7 @@ class Rig:
     def command(self, name: str, value: float | None = None) -> Answer:
         """Send a command and run until it is answered."""
         ticket = next(self._tickets)
-        self.cycle(CommandRequest(ticket, "ann", Command(name), value))
+        self.cycle(CommandRequest(ticket, "ann", Command(name), carried(name, value)))
         self.until(lambda: self._answered(ticket))
         return self.answers[-1]
 
@@ -184,7 +189,7 @@ class Rig:
 
     def order(self, name: str, value: float | None = None) -> None:
         """Send a command in this cycle and do not wait for its answer."""
-        self.cycle(CommandRequest(next(self._tickets), "ann", Command(name), value))
+        self.cycle(CommandRequest(next(self._tickets), "ann", Command(name), carried(name, value)))
 
     def _answered(self, ticket: int) -> bool:
         return bool(self.answers) and getattr(self.answers[-1], "ticket", None) == ticket

@@ -10,12 +10,13 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import docstrings
 import msgspec
 from trirail.errors import RefusalCode
-from trirail.wire import goals, messages, state
+from trirail.wire import goals, messages, state, vocabulary
+from trirail.wire.vocabulary import Command, NoContent
 
 FOLDER = Path(messages.__file__).parent / "schemas"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -24,10 +25,11 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "goal": (goals.Goal, "What is sent to goal/<user>: a goal of one of the kinds."),
     "goal-reply": (messages.GoalReply, "The reply to a goal that is accepted."),
     **{
-        f"command-{name}": (kind, f"The content{', if any,' * (type(None) in get_args(kind))} of cmd/<user>/{name}.")
-        for name, kind in messages.CONTENT.items()
+        f"command-{name}": (name.accepts, f"The content{', if any,' * name.content.optional} of cmd/<user>/{name}.")
+        for name in Command
+        if name.content is not NoContent
     },
-    "command": (messages.NoContent, "The content, if any, of the other commands."),
+    "command": (NoContent, "The content, if any, of the other commands."),
     "command-reply": (messages.CommandReply, "The reply to a command that has been carried out."),
     "error-reply": (messages.ErrorReply, "The error reply to a goal or command that is refused, or that fails."),
     "state": (state.State, "What is published on state."),
@@ -39,7 +41,7 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "info": (state.Info, "The reply to a query on info."),
 }
 """By file: the type, and where the message is met."""
-MODULES = (*(sys.modules[kind.__module__] for kind in goals.KINDS), messages, state)
+MODULES = (*(sys.modules[kind.__module__] for kind in goals.KINDS), vocabulary, messages, state)
 """Where the types in them are."""
 
 

@@ -20,7 +20,7 @@ from trirail.telemetry.reading import Line, Recording
 from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Request
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import Command, CommandContent, Stop
 
 
 class Heard:
@@ -33,8 +33,8 @@ class Heard:
         self.log.append(f"send {name[:-7]}")
         return Ending(name, self)
 
-    def command(self, name: str, content: bytes | None = None) -> None:
-        assert content is None
+    def command(self, name: str, content: CommandContent) -> None:
+        assert content == Stop()
         self.log.append(name)
 
 

@@ -9,8 +9,8 @@ import msgspec
 import pytest
 from trirail.client.lease import SIGNS, Lease
 from trirail.errors import RefusalCode, RefusedError, ServiceError
-from trirail.wire.messages import AcquireLease, CommandReply, ReleaseLease
-from trirail.wire.vocabulary import Command
+from trirail.wire.messages import CommandReply
+from trirail.wire.vocabulary import AcquireLease, Command, ReleaseLease
 
 OVER = RefusedError(RefusalCode.LEASE_OVER, "it is over")
 

@@ -24,8 +24,8 @@ from trirail.client.outgoing import number, seconds
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import boundary
 from trirail.wire.goals import Goal, OwnLimits, TrajectoryGoal, TrajectoryPoint, VelocityGoal
-from trirail.wire.messages import CONTENT, AcquireLease, CommandReply, Event, GoalReply, ReleaseLease, Stop
-from trirail.wire.vocabulary import Command
+from trirail.wire.messages import CommandReply, Event, GoalReply
+from trirail.wire.vocabulary import AcquireLease, Command, ReleaseLease, Stop
 from trirail.wire.zenoh_session import open_service
 
 ENDED = Event(seq=1, t=0.0, cycle=0, time=1.0, kind="goal", level="info", message="so it ended", outcome="done")
@@ -55,7 +55,7 @@ class Taken:
                     self._end(goal.id)
             else:
                 command = Command(rest[-1])
-                content = boundary.decode(payload, CONTENT[command], "not that") if payload else None
+                content = boundary.decode(payload, command.accepts, "not that") if payload else None
                 self.said.append(content)
                 if isinstance(content, Stop):
                     self._end(content.goal)

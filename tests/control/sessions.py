@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-from conftest import CONFIG
+from conftest import CONFIG, carried
 from numpy.typing import NDArray
 from trirail.config import Config
 from trirail.control.control import Control, Given
@@ -129,7 +129,7 @@ class Session:
 
     def order(self, name: Command, value: float | None = None) -> None:
         """Send a command in the next cycle."""
-        self.cycle(CommandRequest(next(self._tickets), "ann", name, value))
+        self.cycle(CommandRequest(next(self._tickets), "ann", name, carried(name, value)))
 
     def send(self, name: str, goal: Goal) -> None:
         """Send a goal in the next cycle."""

@@ -12,13 +12,14 @@ from conftest import CONFIG, Rig
 from trirail.cli.commands import app
 from trirail.client.client import Robot
 from trirail.config import geometry
-from trirail.control.completion import verdict
+from trirail.control.commands import EFFECTS
+from trirail.control.completion import CommandProgress
 from trirail.control.feedback import Measured
 from trirail.control.modes import ModeEvent
 from trirail.wire import packets
-from trirail.wire.messages import CONTENT, CommandReply
+from trirail.wire.messages import CommandReply
 from trirail.wire.packets import Confirmed, Refused
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, CommandContent, Mode, NoContent, Override
 from trirail_drivers.interface import Feedback, PowerState
 
 GUIDE = Path(__file__).parents[2] / "service/README.md"
@@ -35,15 +36,15 @@ def test_in_every_mode_there_is_a_rule_when_a_command_is_carried_out(name: Comma
     off = PowerState.SWITCH_ON_DISABLED
     measured = Measured(geometry(CONFIG.geometry).packed(), CONFIG.period, 1e-3)
     measured.start(Feedback((0.0, 0.0, 0.0), (off, off, off), None))
-    assert isinstance(verdict(name, mode, "why", measured, settled=True), str | None)
+    assert isinstance(EFFECTS[name].rule(CommandProgress(mode, "why", measured, settled=True)), str | None)
 
 
-def test_what_is_no_command_is_not_judged_as_one(rig: Rig) -> None:
-    with pytest.raises(AssertionError):
-        verdict("dance", Mode.HOLDING, None, rig.control.measured, settled=True)  # type: ignore[arg-type]
-    odd = packets.encode(packets.CommandRequest(1, "ann", "dance"))  # type: ignore[arg-type]
-    with pytest.raises(msgspec.ValidationError, match="dance"):
-        packets.decode_request(odd)
+def test_a_request_that_is_no_commands_or_carries_what_it_does_not_take_is_not_decoded() -> None:
+    request = msgspec.msgpack.decode(packets.encode(packets.CommandRequest(1, "ann", Command.OVERRIDE, Override(50.0))))
+    assert packets.decode_request(msgspec.msgpack.encode(request)).content == Override(50.0)
+    for wrong, why in (({"name": "dance"}, "dance"), ({"name": "stop"}, "percent"), ({"value": 0.5}, "value")):
+        with pytest.raises(msgspec.ValidationError, match=why):
+            packets.decode_request(msgspec.msgpack.encode(request | wrong))
 
 
 @every_command
@@ -63,7 +64,7 @@ def test_a_client_has_a_method_for_every_command(name: Command) -> None:
         def __init__(self) -> None:
             pass
 
-        def command(self, name: str, content: bytes | None = None) -> CommandReply:
+        def command(self, name: str, content: CommandContent | bytes | None = None) -> CommandReply:
             sent.append(name)
             return CommandReply(name, "holding")
 
@@ -81,8 +82,8 @@ def test_the_command_line_has_every_command_and_helps_with_it(name: Command) -> 
 
 @every_command
 def test_what_a_command_may_carry_has_a_type_words_and_a_schema(name: Command) -> None:
-    assert (name in CONTENT) == (name.content != "no content")
-    assert (name in CONTENT) == (message_schemas.FOLDER / f"command-{name}.json").exists()
+    assert (name.content is NoContent) == (name.content.words == "no content")
+    assert (name.content is not NoContent) == (message_schemas.FOLDER / f"command-{name}.json").exists()
 
 
 def test_the_guide_names_every_command() -> None:

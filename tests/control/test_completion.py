@@ -7,7 +7,8 @@ from itertools import product
 
 from conftest import CONFIG
 from trirail.config import geometry
-from trirail.control.completion import still_powered, verdict
+from trirail.control.commands import EFFECTS
+from trirail.control.completion import CommandProgress, still_powered
 from trirail.control.feedback import Measured
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.interface import DriveFault, Feedback, PowerState
@@ -37,7 +38,7 @@ def one_of_three() -> Iterator[tuple[str, PowerState, Measured]]:
 
 
 def said(name: Command, mode: Mode, measured: Measured, why: str | None = None, settled: bool = True) -> str | None:
-    return verdict(name, mode, why, measured, settled=settled)
+    return EFFECTS[name].rule(CommandProgress(mode, why, measured, settled))
 
 
 def test_enable_is_over_when_the_robot_is_no_longer_powering_up() -> None:

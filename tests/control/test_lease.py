@@ -9,13 +9,13 @@ from typing import Literal, NamedTuple
 
 import msgspec
 import pytest
-from conftest import CONFIG, Rig
+from conftest import CONFIG, Rig, carried
 from trirail.config import ControlTable
 from trirail.control.lease import REMEMBERED_IDS, LeaseArbiter
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.goals import Goal, PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused, Request
-from trirail.wire.vocabulary import Command, LeasePolicy, Mode
+from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, LeasePolicy, Mode, ReleaseLease
 
 REQUIRED = msgspec.structs.replace(CONFIG, control=ControlTable(lease="required"))
 EVERYBODYS = {"stop", "quick_stop", "disable", "acquire", "release"}
@@ -23,6 +23,13 @@ FAR = PoseGoal(x=0.05, y=0.0, phi=0.0)
 JOG = VelocityGoal(x=0.01, y=0.0, phi=0.0, timeout=10.0)
 HELD = 1000
 """Cycles of a lease's usual time-out."""
+
+
+def said_with(name: str, lease: str | None, timeout: float, force: bool) -> CommandContent | None:
+    """What a command carries that may be about a lease."""
+    if name == Command.ACQUIRE:
+        return AcquireLease(lease, timeout, force=force)
+    return ReleaseLease(lease) if name == Command.RELEASE else carried(name, None)
 
 
 class Users:
@@ -36,7 +43,7 @@ class Users:
         self, user: str, name: str, lease: str | None = None, *, timeout: float = 1.0, force: bool = False
     ) -> Answer:
         ticket = next(self._tickets)
-        self.rig.cycle(CommandRequest(ticket, user, Command(name), lease=lease, timeout=timeout, force=force))
+        self.rig.cycle(CommandRequest(ticket, user, Command(name), said_with(name, lease, timeout, force)))
         return self._answer(ticket)
 
     def send(self, user: str, name: str, goal: Goal = FAR) -> Answer:
@@ -211,13 +218,13 @@ def test_who_does_not_hold_the_lease_releases_nothing_and_is_told_so(users: User
 def test_ids_of_leases_that_are_over_are_remembered_each_users_own_and_not_for_ever() -> None:
     lease = LeaseArbiter("optional", 0.001)
     for number in range(REMEMBERED_IDS + 1):
-        lease.acquire(CommandRequest(1, "ann", Command.ACQUIRE, lease=f"l{number}"), 0)
-        lease.release(CommandRequest(1, "ann", Command.RELEASE))
+        lease.acquire("ann", AcquireLease(f"l{number}"), 0)
+        lease.release("ann", ReleaseLease())
     with pytest.raises(RefusedError, match="lease released by ann: acquire a new one"):
-        lease.acquire(CommandRequest(1, "ann", Command.ACQUIRE, lease="l1"), 0)
-    lease.acquire(CommandRequest(1, "bob", Command.ACQUIRE, lease="l1"), 0)
-    lease.release(CommandRequest(1, "bob", Command.RELEASE))
-    lease.acquire(CommandRequest(1, "ann", Command.ACQUIRE, lease="l0"), 0)
+        lease.acquire("ann", AcquireLease("l1"), 0)
+    lease.acquire("bob", AcquireLease("l1"), 0)
+    lease.release("bob", ReleaseLease())
+    lease.acquire("ann", AcquireLease("l0"), 0)
     assert lease.user == "ann"
 
 
@@ -332,7 +339,7 @@ class Crowd:
         self._command(user, Command.ACQUIRE, self._last[user], force=force)
 
     def _command(self, user: str, name: Command, lease: str = "", *, force: bool = False) -> None:
-        request = CommandRequest(next(self._numbers), user, name, lease=lease, timeout=TIMEOUT, force=force)
+        request = CommandRequest(next(self._numbers), user, name, said_with(name, lease, TIMEOUT, force))
         if name in (Command.ACQUIRE, Command.RELEASE):
             act = "force" if force else str(name)
             self.model.ask(act, user, lease, self.rig.control.cycles + 1)

@@ -17,7 +17,7 @@ from trirail.config.as_built import AsBuilt, geometry_of
 from trirail.kinematics.robot import inverse
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrackGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import CommandRequest
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, Mode, Stop
 
 GOALS, GOALS_EXPLORED = 250, 20_000
 KINDS = ("pose", "pose", "pose", "sliders", "velocity", "track", "trajectory")
@@ -95,7 +95,7 @@ def meddle(chance: random.Random, session: Session, goal: str) -> None:
     else:
         (what,) = chance.choices(ORDERS, WEIGHTS)
         if what == "cancel":
-            session.cycle(CommandRequest(10**9 + len(session.answers), "ann", Command.STOP, goal=goal))
+            session.cycle(CommandRequest(10**9 + len(session.answers), "ann", Command.STOP, Stop(goal)))
         else:
             session.order(Command(what), chance.choice(RATES) if what == "override" else None)
 

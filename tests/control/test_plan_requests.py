@@ -34,7 +34,7 @@ from trirail.wire.planning import (
     encode,
 )
 from trirail.wire.sizes import MAX_PACKET, MAX_POINTS
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, Mode, Override, Stop
 
 PERIOD = CONFIG.period
 BUSY = round(0.5 / PERIOD)
@@ -196,7 +196,7 @@ def test_a_planner_that_has_died_is_said_at_once(rig: Rig, meddler: Meddler) -> 
 def test_a_planner_that_dies_while_nobody_waits_for_it_any_more_costs_no_goal(rig: Rig, meddler: Meddler) -> None:
     meddler.change = lambda _: []
     rig.post("g1", PoseGoal(0.05, 0.0, 0.0))
-    rig.cycle(CommandRequest(99, "ann", Command.STOP, goal="g1"))
+    rig.cycle(CommandRequest(99, "ann", Command.STOP, Stop("g1")))
     assert rig.outcomes() == [("g1", "stopped")]
     meddler.waiting.append((0, PlannerLost("the planner has died")))
     rig.cycles(2)
@@ -563,7 +563,7 @@ def test_an_override_that_never_ends_changing_keeps_no_goal_for_ever(rig: Rig, m
     moving(rig)
     rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
     for number in range(300):
-        rig.cycle(CommandRequest(5000 + number, "eve", Command.OVERRIDE, 0.5 + 0.5 * (number % 2)))
+        rig.cycle(CommandRequest(5000 + number, "eve", Command.OVERRIDE, Override(50.0 + 50.0 * (number % 2))))
     assert "g2" in dict(rig.outcomes()) or rig.control.ledger.goal is not None
     rig.command("override", 1.0)
     rig.until(rig.holds)

@@ -17,7 +17,7 @@ from trirail.motion.paths import constant
 from trirail.motion.time_scaling import SHARES, TimeScaling
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
 from trirail.wire.packets import CommandRequest
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, Mode, Stop
 
 PATHS: tuple[Goal, ...] = (PoseGoal(0.1, 0.0, 0.0), PoseGoal(0.05, -0.08, 0.5), SlidersGoal((0.05, -0.03, 0.08)))
 EVENTS = ("pause", "resume", "override", "stop", "preempt", "cancel")
@@ -58,7 +58,7 @@ def happen(session: Session, event: str, chance: random.Random) -> None:
         case "preempt":
             session.send(f"p{len(session.rows)}", chance.choice(OTHERS))
         case "cancel":
-            session.cycle(CommandRequest(10**6 + len(session.rows), "ann", Command.STOP, goal="g"))
+            session.cycle(CommandRequest(10**6 + len(session.rows), "ann", Command.STOP, Stop("g")))
         case _:
             session.order(Command(event))
 

@@ -11,7 +11,7 @@ from trirail.config import Config
 from trirail.control.modes import ModeEvent
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
-from trirail.wire.vocabulary import Command, FaultCause, Mode
+from trirail.wire.vocabulary import Command, FaultCause, Mode, Override, Stop
 
 PERIOD = CONFIG.period
 NEVER = 10**9
@@ -129,7 +129,7 @@ def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow:
 
 def test_stop_of_the_running_goal_stops_the_robot_and_what_waits(slow: Rig) -> None:
     planned(slow, FAR, "g1")
-    slow.cycle(CommandRequest(99, "ann", Command.STOP, goal="running"))
+    slow.cycle(CommandRequest(99, "ann", Command.STOP, Stop("running")))
     slow.until(slow.holds)
     assert slow.outcomes() == [("running", "stopped"), ("g1", "stopped")]
 
@@ -138,7 +138,7 @@ def test_stop_of_the_running_goal_stops_the_robot_and_what_waits(slow: Rig) -> N
 def test_stop_of_a_goal_that_has_not_begun_leaves_the_others(slow: Rig, waiting: str) -> None:
     planned(slow, FAR, "g1")
     slow.post("g2", PoseGoal(0.0, 0.03, 0.0))
-    slow.cycle(CommandRequest(99, "ann", Command.STOP, goal="g1" if waiting == "planned" else "g2"))
+    slow.cycle(CommandRequest(99, "ann", Command.STOP, Stop("g1" if waiting == "planned" else "g2")))
     assert (
         isinstance(answer_to(slow, 99), Confirmed) or slow.until(lambda: isinstance(answer_to(slow, 99), Confirmed)) < 3
     )
@@ -159,7 +159,7 @@ def test_stop_of_one_of_several_goals_that_wait_for_the_planner_is_of_that_one_a
     places = {"g1": 0.01, "g2": 0.02, "g3": 0.03, "g4": 0.04}
     for goal, x in places.items():
         slow.post(goal, PoseGoal(x, 0.0, 0.0))
-    slow.cycle(CommandRequest(99, "ann", Command.STOP, goal=name))
+    slow.cycle(CommandRequest(99, "ann", Command.STOP, Stop(name)))
     slow.until(lambda: answer_to(slow, 99) is not None)
     assert isinstance(answer_to(slow, 99), Refused if name == "never" else Confirmed)
     slow.until(lambda: slow.holds() and slow.control.goal_queue.idle)
@@ -172,7 +172,7 @@ def test_a_goal_that_has_ended_cannot_be_stopped(rig: Rig) -> None:
     rig.enable()
     rig.goal("g1", 0.01, 0.0, 0.0)
     rig.until(rig.holds)
-    rig.cycle(CommandRequest(99, "ann", Command.STOP, goal="g1"))
+    rig.cycle(CommandRequest(99, "ann", Command.STOP, Stop("g1")))
     answer = answer_to(rig, 99)
     assert isinstance(answer, Refused)
     assert answer.code == "no_goal"
@@ -455,9 +455,9 @@ def play(rig: Rig, steps: list[tuple[object, int]]) -> None:
     """Send all of it without waiting for any answer."""
     for number, (what, wait) in enumerate(steps, start=1):
         if isinstance(what, float):
-            rig.cycle(CommandRequest(number, "ann", Command.OVERRIDE, what))
+            rig.cycle(CommandRequest(number, "ann", Command.OVERRIDE, Override(100.0 * what)))
         elif what == "cancel":
-            rig.cycle(CommandRequest(number, "ann", Command.STOP, goal=f"g{number - 1}"))
+            rig.cycle(CommandRequest(number, "ann", Command.STOP, Stop(f"g{number - 1}")))
         elif isinstance(what, str):
             rig.cycle(CommandRequest(number, "ann", Command(what)))
         else:

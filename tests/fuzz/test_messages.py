@@ -25,12 +25,12 @@ from trirail.wire import boundary, links, packets, records, text, zenoh_session
 from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal
 from trirail.wire.goals import TrajectoryPoint as Point
 from trirail.wire.links import Port, TooLarge
-from trirail.wire.messages import CommandReply, Event, Override, Stop
+from trirail.wire.messages import CommandReply, Event
 from trirail.wire.packets import Accepted, GoalRequest, Happened, RefusedRequest
 from trirail.wire.records import DTYPE, SIZE
 from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_PACKET, MAX_POINTS
 from trirail.wire.state import Info, State
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Mode, Override, Stop
 
 KINDS: tuple[Any, ...] = (Goal, Stop | None, Override, State, Event, Info, CommandReply)
 ENCODINGS = ("", "zenoh/bytes", "application/json;v=1", boundary.JSON, boundary.MSGPACK)

@@ -33,7 +33,7 @@ from trirail.wire.goals import (
     VelocityGoal,
 )
 from trirail.wire.packets import Accepted, Answer, CommandRequest, GoalRequest
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, Mode, Stop
 
 MEDIUM = slower(CONFIG, velocity=0.3, acceleration=4.5, jerk=120.0)
 """Sliders for which the platform's motions are a little too fast."""
@@ -281,7 +281,7 @@ def test_what_waits_no_more_slows_nothing(rig: Rig) -> None:
     rig.command("override", 2.0)
     rig.cycles(50)
     assert rig.control.schedule.runs[0].target == pytest.approx(1.0, rel=1e-3)
-    rig.cycle(CommandRequest(99, "ann", Command.STOP, goal="fast"))
+    rig.cycle(CommandRequest(99, "ann", Command.STOP, Stop("fast")))
     rig.until(lambda: rig.control.schedule.runs[0].target > 1.9, 50)
     rig.until(rig.holds)
     assert rig.outcomes() == [("fast", "stopped"), ("slow", "done")]
@@ -349,11 +349,11 @@ def test_a_waiting_goal_can_be_stopped_alone(rig: Rig) -> None:
     rig.enable()
     for number, pose in enumerate(SQUARE):
         rig.send(f"q{number}", PoseGoal(*pose, blend=0.01))
-    rig.cycle(CommandRequest(99, "ann", Command.STOP, goal="q2"))
+    rig.cycle(CommandRequest(99, "ann", Command.STOP, Stop("q2")))
     rig.until(rig.holds)
     assert sorted(rig.outcomes()) == [("q0", "done"), ("q1", "done"), ("q2", "stopped"), ("q3", "stopped")]
     assert rig.control.commanded.pose == pytest.approx(SQUARE[1], abs=1e-9)
-    rig.cycle(CommandRequest(100, "ann", Command.STOP, goal="q2"))
+    rig.cycle(CommandRequest(100, "ann", Command.STOP, Stop("q2")))
     assert refusal(rig.answers[-1]).code == "no_goal"
     assert_within_limits(rig)
 

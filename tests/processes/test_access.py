@@ -13,7 +13,7 @@ import zenoh
 from certificates import ROLES, tls_config, user
 from trirail.config import Config
 from trirail.wire import zenoh_session
-from trirail.wire.access import COMMANDS, access_control, least_role
+from trirail.wire.access import access_control, least_role
 from trirail.wire.credentials import Credentials
 from trirail.wire.vocabulary import Command, Role
 
@@ -267,10 +267,6 @@ def test_what_is_tried_does_pass_where_it_is_allowed(
 ) -> None:
     line = connect(config, folder, stack, "una", opened_but_for(access_control("demo", ROLES)))
     assert line.passed(flow, message) >= {"state", "goal/bob", "cmd/ME/reset", "alive", "role/bob", "../other/state"}
-
-
-def test_every_command_has_a_least_role() -> None:
-    assert set(COMMANDS) == set(Command)
 
 
 @pytest.mark.parametrize("key", ["info", "poses", *(key for key in KEYS if "/ME" in key and "dance" not in key)])

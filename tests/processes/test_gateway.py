@@ -34,7 +34,7 @@ from trirail.wire.packets import (
     Welcome,
 )
 from trirail.wire.state import Info
-from trirail.wire.vocabulary import Command, Role
+from trirail.wire.vocabulary import AcquireLease, Command, Override, Role
 from trirail_drivers.interface import MissingProtection
 
 
@@ -97,7 +97,7 @@ def accepted(gateway: Gateway, ticket: int) -> None:
 def test_every_command_is_passed_on(rig: Rig, name: Command) -> None:
     gateway, link = rig
     command(gateway, name, b'{"percent": 50}' if name is Command.OVERRIDE else b"")
-    assert link.sent == [CommandRequest(1, "ann", name, 0.5 if name is Command.OVERRIDE else None)]
+    assert link.sent == [CommandRequest(1, "ann", name, Override(50.0) if name is Command.OVERRIDE else None)]
 
 
 @pytest.mark.parametrize("name", Command)
@@ -107,7 +107,7 @@ def test_what_a_command_does_not_take_is_refused_with_what_it_takes(rig: Rig, na
     *carried_out, said = link.sent
     assert [one.name for one in carried_out if isinstance(one, CommandRequest)] == [name] * (name in EVERYBODYS_STOPS)
     assert isinstance(said, RefusedRequest)
-    assert said.message.startswith(f"{name} takes {name.content}: ")
+    assert said.message.startswith(f"{name} takes {name.content.words}: ")
 
 
 def test_a_command_that_there_is_not_is_refused_with_those_that_there_are(rig: Rig) -> None:
@@ -235,7 +235,7 @@ def test_the_lease_is_taken_over_by_a_role_that_may(rig: Rig, monkeypatch: pytes
     monkeypatch.setattr(gateway._guard, "role", lambda _: role)
     command(gateway, "acquire", b'{"id": "l", "timeout": 0.5, "force": true}')
     if role is Role.MAINTAINER:
-        assert link.sent == [CommandRequest(1, "ann", Command.ACQUIRE, lease="l", timeout=0.5, force=True)]
+        assert link.sent == [CommandRequest(1, "ann", Command.ACQUIRE, AcquireLease("l", 0.5, force=True))]
     else:
         said = "ann is a operator at demo: taking the lease over needs maintainer"
         assert link.sent == [RefusedRequest("ann", said)]

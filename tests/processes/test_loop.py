@@ -37,7 +37,7 @@ from trirail.wire.packets import (
 from trirail.wire.planning import MAX_PLANNING, Planned, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_TEXT
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Command, Mode, Override
 from trirail_drivers.interface import DriveGroup
 
 
@@ -358,7 +358,7 @@ def test_a_stop_behind_a_flood_of_commands_is_carried_out_while_they_arrive(shel
     shell.cycles(100)
     assert shell.mode() is Mode.MOVING
     for ticket in range(100, 200):
-        shell.gateway.send(message(CommandRequest(ticket, "eve", Command.OVERRIDE, 1.0)))
+        shell.gateway.send(message(CommandRequest(ticket, "eve", Command.OVERRIDE, Override(100.0))))
     shell.gateway.send(message(CommandRequest(200, "ann", Command.STOP)))
     shell.cycles(100 // REQUESTS_A_CYCLE + 1)
     assert shell.mode() is Mode.STOPPING
@@ -458,7 +458,7 @@ def test_a_planner_that_floods_the_loop_is_not_read(shell: Shell) -> None:
 def test_an_answer_to_what_was_asked_before_is_not_the_last(shell: Shell) -> None:
     """The motion has changed since: what was asked from it is answered, and then what was asked from the new one."""
     sent_in_motion(shell)
-    shell.gateway.send(message(CommandRequest(4, "ann", Command.OVERRIDE, 0.8)))
+    shell.gateway.send(message(CommandRequest(4, "ann", Command.OVERRIDE, Override(80.0))))
     shell.cycles(3)
     asked = [decode_plan_request(packet) for packet in shell.received(shell.planner)]
     assert len(asked) == 2

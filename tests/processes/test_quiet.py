@@ -16,7 +16,7 @@ from typing import NamedTuple
 import can
 import numpy as np
 import pytest
-from conftest import CONFIG
+from conftest import CONFIG, carried
 from msgspec import structs
 from trirail.config import Config
 from trirail.motion.planning import MotionPlanner
@@ -222,8 +222,8 @@ def script(seed: int, protocol: str = "cia402") -> dict[int, list[Happening]]:  
         happens.setdefault(number, []).append(Happening(does))
 
     def order(number: int, name: Command, value: float | None = None) -> None:
-        ticket = next(tickets)
-        at(number, lambda session: session.ask(CommandRequest(ticket, "ann", name, value)))
+        ticket, content = next(tickets), carried(name, value)
+        at(number, lambda session: session.ask(CommandRequest(ticket, "ann", name, content)))
 
     def send(number: int, goal: Goal, name: str | None = None) -> None:
         ticket = next(tickets)

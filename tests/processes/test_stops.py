@@ -90,8 +90,8 @@ class Played:
         if isinstance(request, GoalRequest):
             self._packets.append(packets.message(Accepted(request.ticket, request.id, 1.0, 1.0, False, False)))
         elif isinstance(request, CommandRequest):
-            under_way = request.goal is None or any(
-                isinstance(each, GoalRequest) and each.id == request.goal for each in self.sent
+            under_way = getattr(request.content, "goal", None) is None or any(
+                isinstance(each, GoalRequest) and each.id == request.content.goal for each in self.sent
             )
             no = Refused(request.ticket, RefusalCode.NO_GOAL, "not under way")
             self._packets.append(
@@ -154,7 +154,10 @@ def test_each_message_is_answered_once_and_numbers_decide_which_goals_begin(
     of_all = [n for n in acted if played.messages[n].content != CONTENTS[2] or played.messages[n].name != "stop"]  # type: ignore[union-attr]
     for place, sent in enumerate(played.sent):
         if isinstance(sent, GoalRequest) and sent.withdrawn is None:
-            before = sum(isinstance(each, CommandRequest) and each.goal is None for each in played.sent[:place])
+            before = sum(
+                isinstance(each, CommandRequest) and getattr(each.content, "goal", None) is None
+                for each in played.sent[:place]
+            )
             later = sum(number > played.goals[sent.id] for number in of_all)
             assert before <= len(of_all) - later
     one = {"bob-1"} if len(acted) > len(of_all) else set()

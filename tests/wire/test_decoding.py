@@ -25,8 +25,9 @@ from trirail.client.client import Robot
 from trirail.errors import RefusedError
 from trirail.wire import boundary
 from trirail.wire.goals import Goal, TrackGoal, TrajectoryGoal
-from trirail.wire.messages import AcquireLease, CommandReply, ErrorReply, Event, GoalReply, RoleReply
+from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply, RoleReply
 from trirail.wire.state import Info, NamedPoses, RobotSummary, State
+from trirail.wire.vocabulary import AcquireLease
 
 def content(kind, tag):
     # The last field first: it is the last that msgspec comes to know of.

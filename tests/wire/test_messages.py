@@ -19,7 +19,7 @@ from trirail.wire.goals import (
     TrajectoryPoint,
     VelocityGoal,
 )
-from trirail.wire.messages import AcquireLease, Override
+from trirail.wire.vocabulary import AcquireLease, Override
 
 POINTS = (TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(1.0, 0.01, 0.0, 0.0))
 GOOD: dict[type[Any], dict[str, Any]] = {

@@ -23,10 +23,10 @@ from trirail.client.client import GoalHandle, Robot
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry.reading import Recording
 from trirail.wire.goals import Goal
-from trirail.wire.messages import Event, Override, Stop
+from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.records import unpack
-from trirail.wire.vocabulary import MODES, Command, Mode
+from trirail.wire.vocabulary import MODES, Command, CommandContent, Mode, Stop
 
 NEAR = 1e-3
 """How far the sliders may stand from where the session began [m]."""
@@ -157,10 +157,11 @@ def _given(goal: Goal) -> Callable[[str], Goal]:
     return lambda _: goal
 
 
-def _content(request: CommandRequest, renamed: dict[str, str]) -> bytes | None:
-    if request.value is not None:
-        return msgspec.json.encode(Override(100.0 * request.value))
-    return msgspec.json.encode(Stop(renamed.get(request.goal, request.goal))) if request.goal is not None else None
+def _content(request: CommandRequest, renamed: dict[str, str]) -> CommandContent:
+    content: CommandContent = request.content
+    if isinstance(content, Stop) and content.goal is not None:
+        return Stop(renamed.get(content.goal, content.goal))
+    return content
 
 
 def _await(goals: Iterable[GoalHandle]) -> None:

@@ -16,9 +16,9 @@ from cyclopts import CycloptsError, Parameter, validators
 from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
 from trirail.cli.options import poses as poses_of_robot
-from trirail.wire.messages import LONGEST_LEASE, SHORTEST_LEASE, CommandReply
+from trirail.wire.messages import CommandReply
 from trirail.wire.text import check_name, check_new_pose
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import LONGEST_LEASE, SHORTEST_LEASE, Command, Mode
 
 if TYPE_CHECKING:
     from trirail.client.client import GoalHandle, Robot

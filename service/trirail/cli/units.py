@@ -16,9 +16,9 @@ import msgspec
 from cyclopts import Parameter, Token
 
 from trirail.wire.decoding import converted, prepare
-from trirail.wire.messages import LOWEST_OVERRIDE, Override
 from trirail.wire.state import CorrectionTold
 from trirail.wire.text import NAME_RULE, NUMBER, comma_hint, is_name, quoted
+from trirail.wire.vocabulary import LOWEST_OVERRIDE, Override
 
 prepare(Override)
 

@@ -25,16 +25,16 @@ from trirail.client.async_track import AsyncTrack
 from trirail.client.client import HOME_WITHIN, Robot, address, identity, result_of
 from trirail.client.connection import REPLY_WITHIN
 from trirail.client.goal import GoalHandle
-from trirail.client.outgoing import content_message, goal_message, seconds
+from trirail.client.outgoing import content_message, goal_message, id_of, seconds
 from trirail.client.track import Taker
 from trirail.client.trajectory import check_arrived
 from trirail.errors import RefusedError, ServiceError
 from trirail.wire.goals import Goal
-from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, Stop
+from trirail.wire.messages import CommandReply, Event, GoalReply
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.stop_door import STOPS
 from trirail.wire.text import check_name, check_new_pose
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
 
 P = ParamSpec("P")
 
@@ -50,7 +50,7 @@ class _Draft:
     def send(self, make: Callable[[str], Goal], id: str | None = None) -> None:  # noqa: A002 - as Robot's
         self.goal = make, id
 
-    def command(self, name: Command, content: bytes | None = None) -> None:
+    def command(self, name: Command, content: CommandContent | bytes | None = None) -> None:
         self.order = name, content
 
 
@@ -165,9 +165,9 @@ class AsyncRobot:
 
         return AsyncTrack(self.send, post, goal_id, timeout)
 
-    async def send(self, make: Callable[[str], Goal], id: str | None = None) -> AsyncGoalHandle:  # noqa: A002
-        """Send the goal that `make` makes for an id, as Robot.send does."""
-        goal_id = id or uuid.uuid4().hex[:12]
+    async def send(self, make: Goal | Callable[[str], Goal], id: str | None = None) -> AsyncGoalHandle:  # noqa: A002
+        """Send a goal, or the one that `make` makes for an id, as Robot.send does."""
+        goal_id = id or id_of(make)
         content = goal_message(make, goal_id)
         renews = goal_id in self._goals  # a jog: what it has is not forgotten or stopped for one renewal's sake
         goal = self._goals.setdefault(goal_id, AsyncGoalHandle(goal_id, self.command))
@@ -183,12 +183,13 @@ class AsyncRobot:
             raise
         return goal
 
-    async def command(self, name: str, content: bytes | None = None) -> CommandReply:
+    async def command(self, name: str, content: CommandContent | bytes | None = None) -> CommandReply:
         """Send a command by its name on the wire, as Robot.command does."""
+        payload = content_message(name, content)
         if name in STOPS:
-            return await self._connection.stop(self.user, name, content, REPLY_WITHIN)
+            return await self._connection.stop(self.user, name, payload, REPLY_WITHIN)
         within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
-        return await self._connection.ask(("cmd", self.user, name), CommandReply, content, within)
+        return await self._connection.ask(("cmd", self.user, name), CommandReply, payload, within)
 
     def lease(self, *, force: bool = False, timeout: float = 1.0) -> AsyncLease:
         """Have the robot for oneself while the context lasts, as Robot.lease does.
@@ -200,7 +201,7 @@ class AsyncRobot:
 
     async def acquire(self, lease: AcquireLease | None = None) -> CommandReply:
         """Take the lease, or keep it by one sign of life; `lease` keeps it for as long as signs come."""
-        return await self.command(Command.ACQUIRE, content_message(Command.ACQUIRE, lambda: lease) if lease else None)
+        return await self.command(Command.ACQUIRE, lease)
 
     async def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""

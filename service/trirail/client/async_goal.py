@@ -14,8 +14,8 @@ from trirail.client.goal import LETTING_GO, STANDS_WITHIN, AcceptedGoal, Result,
 from trirail.client.outgoing import number, seconds
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, VelocityGoal
-from trirail.wire.messages import GoalReply, Stop
-from trirail.wire.vocabulary import Command
+from trirail.wire.messages import GoalReply
+from trirail.wire.vocabulary import Command, Stop
 
 
 class AsyncGoalHandle(AcceptedGoal):

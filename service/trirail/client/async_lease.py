@@ -13,8 +13,8 @@ import msgspec
 from trirail.client.lease import SIGNS
 from trirail.client.outgoing import number, seconds
 from trirail.errors import TrirailError
-from trirail.wire.messages import AcquireLease, CommandReply, ReleaseLease
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.messages import CommandReply
+from trirail.wire.vocabulary import AcquireLease, Command, Mode, ReleaseLease
 
 
 class AsyncLease:

@@ -22,7 +22,7 @@ import zenoh
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import GoalHandle, Jog, Result
 from trirail.client.lease import Lease
-from trirail.client.outgoing import content_message, goal_message, number, seconds
+from trirail.client.outgoing import content_message, goal_message, id_of, number, seconds
 from trirail.client.track import Taker, Track
 from trirail.client.trajectory import Points, check_arrived, first_pose, points_of
 from trirail.errors import RefusalCode, RefusedError, ServiceError
@@ -38,12 +38,12 @@ from trirail.wire.goals import (
     Tool,
     TrajectoryGoal,
 )
-from trirail.wire.messages import AcquireLease, CommandReply, Event, GoalReply, Override
+from trirail.wire.messages import CommandReply, Event, GoalReply
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.stop_door import STOPS
 from trirail.wire.text import check_name, check_new_pose, quoted
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override
 
 __all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot", "Track"]
 
@@ -270,9 +270,9 @@ class Robot:
 
         return Track(self.send, post, goal_id, timeout)
 
-    def send(self, make: Callable[[str], Goal], id: str | None = None) -> GoalHandle:  # noqa: A002
-        """Send the goal that `make` makes for an id, a trirail.wire.goals.Goal; return once it is accepted."""
-        goal_id = id or uuid.uuid4().hex[:12]
+    def send(self, make: Goal | Callable[[str], Goal], id: str | None = None) -> GoalHandle:  # noqa: A002
+        """Send a trirail.wire.goals.Goal, or the one that `make` makes for an id; return once it is accepted."""
+        goal_id = id or id_of(make)
         content = goal_message(make, goal_id)
         goal = GoalHandle(goal_id, self.command)
         with self._goals_lock:
@@ -324,7 +324,7 @@ class Robot:
 
     def override(self, percent: float) -> None:
         """Let this motion and those to come run at a share of full speed, 0 or 1 to 200 %, within the limits."""
-        self.command(Command.OVERRIDE, content_message(Command.OVERRIDE, lambda: Override(number(percent, "override"))))
+        self.command(Command.OVERRIDE, Override(number(percent, "override")))
 
     def lease(self, *, force: bool = False, timeout: float = 1.0) -> Lease:
         """Have the robot for oneself while the context lasts: only this user's goals and commands move it.
@@ -341,22 +341,23 @@ class Robot:
 
     def acquire(self, lease: AcquireLease | None = None) -> CommandReply:
         """Take the lease, or keep it by one sign of life; `lease` keeps it for as long as signs come."""
-        return self.command(Command.ACQUIRE, content_message(Command.ACQUIRE, lambda: lease) if lease else None)
+        return self.command(Command.ACQUIRE, lease)
 
     def release(self) -> None:
         """Give the lease back that this user holds, whichever of his clients keeps it; return when the robot stands."""
         self.command(Command.RELEASE)
 
-    def command(self, name: str, content: bytes | None = None) -> CommandReply:
+    def command(self, name: str, content: CommandContent | bytes | None = None) -> CommandReply:
         """Send a command by its name on the wire; return once the service confirms that it has been carried out.
 
-        `content` is its JSON, where it has any: one of trirail.wire.messages.CONTENT. What stops the robot is asked for
-        at the service's door for stops as well, which others' connections keep nobody out of.
+        `content` is of the type that trirail.wire.vocabulary.Command has for it, or that as JSON. What stops the robot
+        is asked for at the service's door for stops as well, which others' connections keep nobody out of.
         """
+        payload = content_message(name, content)
         if name in STOPS:
-            return self._connection.stop(self.user, name, content, REPLY_WITHIN)
+            return self._connection.stop(self.user, name, payload, REPLY_WITHIN)
         within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
-        return self._connection.ask(("cmd", self.user, name), CommandReply, content, within)
+        return self._connection.ask(("cmd", self.user, name), CommandReply, payload, within)
 
     def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""

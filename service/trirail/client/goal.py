@@ -13,8 +13,8 @@ import msgspec
 from trirail.client.outgoing import number, seconds
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, VelocityGoal
-from trirail.wire.messages import GoalReply, Residual, Stop
-from trirail.wire.vocabulary import Command
+from trirail.wire.messages import GoalReply, Residual
+from trirail.wire.vocabulary import Command, Stop
 
 STANDS_WITHIN = 10.0
 """How long the end of a jog may take beyond its own time-out [s]."""

@@ -12,8 +12,8 @@ import msgspec
 
 from trirail.client.outgoing import number, seconds
 from trirail.errors import TrirailError
-from trirail.wire.messages import AcquireLease, CommandReply, ReleaseLease
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.messages import CommandReply
+from trirail.wire.vocabulary import AcquireLease, Command, Mode, ReleaseLease
 
 SIGNS = 4
 """Signs of life in each time-out: so many may be lost, but one."""

@@ -10,17 +10,18 @@ import math
 import operator
 import sys
 import threading
+import uuid
 from collections.abc import Callable
 from typing import Any
 
 import msgspec
+from msgspec import structs
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
 from trirail.wire.goals import Goal
-from trirail.wire.messages import CONTENT
 from trirail.wire.text import quoted
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import Command, CommandContent
 
 
 def message(make: Callable[[], msgspec.Struct], kind: Any, what: str) -> bytes:
@@ -33,14 +34,22 @@ def message(make: Callable[[], msgspec.Struct], kind: Any, what: str) -> bytes:
     return payload
 
 
-def goal_message(make: Callable[[str], Goal], goal_id: str) -> bytes:
-    """Return the goal that `make` makes for an id, as JSON. Raises RefusedError for one that cannot be."""
-    return message(lambda: make(goal_id), Goal, "not a goal")
+def id_of(goal: Goal | Callable[[str], Goal]) -> str:
+    """Return the id that a goal has, or a new one."""
+    return (goal.id if isinstance(goal, Goal) else None) or uuid.uuid4().hex[:12]
 
 
-def content_message(command: Command, make: Callable[[], msgspec.Struct]) -> bytes:
-    """Return what a command carries, as JSON. Raises RefusedError for what it cannot."""
-    return message(make, CONTENT[command], f"not for {command}")
+def goal_message(make: Goal | Callable[[str], Goal], goal_id: str) -> bytes:
+    """Return a goal with an id, or the one that `make` makes for it, as JSON. RefusedError for one that cannot be."""
+    with_id = (lambda: structs.replace(make, id=goal_id)) if isinstance(make, Goal) else (lambda: make(goal_id))
+    return message(with_id, Goal, "not a goal")
+
+
+def content_message(name: str, content: CommandContent | bytes | None) -> bytes | None:
+    """Return what a command carries, as JSON; None for nothing. Raises RefusedError for what it cannot."""
+    if content is None or isinstance(content, bytes):
+        return content
+    return message(lambda: content, Command(name).accepts, f"not for {name}")
 
 
 def number(value: object, what: str) -> float:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 from trirail.config import Config
-from trirail.control.completion import still_powered, verdict
+from trirail.control import completion
+from trirail.control.completion import CommandProgress, Rule, still_powered
 from trirail.control.feedback import Measured
 from trirail.control.goal_queue import GoalQueue
 from trirail.control.lease import LeaseArbiter, LeaseChange
@@ -46,21 +50,23 @@ class Commands:
 
     def take(self, request: CommandRequest) -> None:
         """Begin to carry out a command. Raises RefusedError where that may not be."""
-        if request.name in (Command.ACQUIRE, Command.RELEASE):
-            self._take_lease(request)
-            return
         if not request.name.everybodys:
             self._lease.check(request.user)
-        if request.name is Command.OVERRIDE:
-            self._take_override(request)
-            return
-        event = ModeEvent[request.name.name]
-        if event is ModeEvent.HOME and not self._can_home:
-            raise RefusedError(RefusalCode.NOTHING_TO_HOME, "absolute encoders: there is nothing to home")
-        reason = f"{request.name} by {request.user}"
-        if request.goal is not None and self._goal_queue.stop_alone(request.goal, reason):
-            self._ledger.undertake(request, self._modes.cycle)
-            return
+        EFFECTS[request.name].begin(self, request)
+        self._ledger.undertake(request, self._modes.cycle)
+
+    def settle(self) -> None:
+        """Answer the commands that are carried out, or cannot be any more."""
+        self._ledger.settle(self._verdict, self._modes.state.mode)
+
+    def end_silent_lease(self) -> None:
+        """End a lease that its holder does not renew."""
+        if (over := self._lease.silent(self._modes.cycle)) is not None:
+            self._change_lease(over)
+
+    def _change_mode(self, request: CommandRequest) -> None:
+        """Let the mode's event of the same name happen."""
+        event, reason = ModeEvent[request.name.name], _reason(request)
         action = self._modes.check(event).action
         goal = self._ledger.goal
         if event is ModeEvent.PAUSE and goal is not None and goal.kind.renewed:
@@ -76,32 +82,35 @@ class Commands:
         else:
             self._modes.go(event, reason)
             self._modes.withdraw(event, reason)
-        self._ledger.undertake(request, self._modes.cycle)
 
-    def settle(self) -> None:
-        """Answer the commands that are carried out, or cannot be any more."""
-        self._ledger.settle(self._verdict, self._modes.state.mode)
+    def _stop(self, request: CommandRequest) -> None:
+        """Stop the robot, or one goal, where that has not begun, alone."""
+        goal = request.content.goal
+        if goal is None or not self._goal_queue.stop_alone(goal, _reason(request)):
+            self._change_mode(request)
 
-    def end_silent_lease(self) -> None:
-        """End a lease that its holder does not renew."""
-        if (over := self._lease.silent(self._modes.cycle)) is not None:
-            self._change_lease(over)
+    def _home(self, request: CommandRequest) -> None:
+        """Home the drives."""
+        if not self._can_home:
+            raise RefusedError(RefusalCode.NOTHING_TO_HOME, "absolute encoders: there is nothing to home")
+        self._change_mode(request)
 
-    def _take_override(self, request: CommandRequest) -> None:
+    def _override(self, request: CommandRequest) -> None:
         """Let this motion and those to come run at another rate."""
-        rate = self._planner.override = request.value if request.value is not None else 1.0
+        rate = self._planner.override = request.content.percent / 100.0
         if self._modes.state.mode is Mode.MOVING:
             self._planner.run_at(rate)
         self._ledger.tell("service", "info", f"override {rate:.0%} by {request.user}", user=request.user)
-        self._ledger.undertake(request, self._modes.cycle)
 
-    def _take_lease(self, request: CommandRequest) -> None:
-        """Let a user have the lease, keep it, or give it back."""
-        acquires = request.name is Command.ACQUIRE
-        change = self._lease.acquire(request, self._modes.cycle) if acquires else self._lease.release(request)
+    def _acquire(self, request: CommandRequest) -> None:
+        """Let a user have the lease, or keep it."""
+        change = self._lease.acquire(request.user, request.content, self._modes.cycle)
         if change is not None:
             self._change_lease(change)
-        self._ledger.undertake(request, self._modes.cycle)
+
+    def _release(self, request: CommandRequest) -> None:
+        """Let a user give the lease back."""
+        self._change_lease(self._lease.release(request.user, request.content))
 
     def _change_lease(self, change: LeaseChange) -> None:
         """Tell who holds the lease from now on; what others have under way stops, and does not begin any more."""
@@ -112,6 +121,33 @@ class Commands:
             self._modes.withdraw(ModeEvent.STOP, change.message)
 
     def _verdict(self, name: Command, since: int) -> str | None:
-        """Say what has become of a command that came in a cycle: trirail.control.completion.verdict."""
+        """Say what has become of a command that came in a cycle, as a Rule does."""
         settled = self._modes.cycle - since >= self._settle_cycles
-        return verdict(name, self._modes.state.mode, self._modes.fault, self._measured, settled=settled)
+        return EFFECTS[name].rule(CommandProgress(self._modes.state.mode, self._modes.fault, self._measured, settled))
+
+
+class Effect(NamedTuple):
+    """What a command does, and by which rule it is carried out."""
+
+    rule: Rule
+    begin: Callable[[Commands, CommandRequest], None] = Commands._change_mode
+
+
+EFFECTS: dict[Command, Effect] = {
+    Command.ENABLE: Effect(completion.powered_up),
+    Command.DISABLE: Effect(completion.powered_down),
+    Command.STOP: Effect(completion.standing, Commands._stop),
+    Command.QUICK_STOP: Effect(completion.unpowered),
+    Command.RESET: Effect(completion.cleared),
+    Command.HOME: Effect(completion.homed, Commands._home),
+    Command.PAUSE: Effect(completion.standing),
+    Command.RESUME: Effect(completion.at_once),
+    Command.OVERRIDE: Effect(completion.at_once, Commands._override),
+    Command.ACQUIRE: Effect(completion.at_once, Commands._acquire),
+    Command.RELEASE: Effect(completion.standing, Commands._release),
+}
+"""Every command's."""
+
+
+def _reason(request: CommandRequest) -> str:
+    return f"{request.name} by {request.user}"

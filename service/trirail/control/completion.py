@@ -2,47 +2,77 @@
 
 from __future__ import annotations
 
-from typing import assert_never
+from collections.abc import Callable
+from typing import NamedTuple
 
 from trirail_drivers.interface import NAMES, PowerState
 
 from trirail.control.feedback import CAN_MOVE, Measured
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import Mode
 
 _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 
 
-def verdict(name: Command, mode: Mode, latched: str | None, measured: Measured, *, settled: bool) -> str | None:
-    """Return "" when a command is carried out, None while it is not, else why it never will be.
+class CommandProgress(NamedTuple):
+    """What there is to judge a command by."""
 
-    `latched` is the reason of the fault, if there is one. `settled` tells whether the drives have had the time that
-    they may take to leave their fault state.
-    """
-    fault = measured.feedback.fault
-    if name in (Command.DISABLE, Command.QUICK_STOP) and fault is not None and fault.cause == "timeout":
-        return fault.message
-    match name:
-        case Command.ENABLE:
-            if mode is Mode.ENABLING:
-                return None
-            return "" if mode not in (Mode.FAULT, Mode.DISABLED) else latched or "disabled while powering up"
-        case Command.DISABLE:
-            return None if mode is Mode.STOPPING or measured.powered else ""
-        case Command.STOP | Command.PAUSE | Command.RELEASE:
-            return None if mode is Mode.STOPPING else ""
-        case Command.HOME:
-            if mode in (Mode.HOMING, Mode.STOPPING):
-                return None
-            return "" if measured.homed else latched or "stopped before every drive was homed"
-        case Command.RESUME | Command.OVERRIDE | Command.ACQUIRE:
-            return ""
-        case Command.RESET:
-            if mode is Mode.FAULT:
-                return f"the cause is still there: {latched}"
-            return "" if settled and not any(state in _FAULTY for state in measured.feedback.state) else None
-        case Command.QUICK_STOP:
-            return None if measured.powered else ""
-    assert_never(name)
+    mode: Mode
+    latched: str | None
+    """The reason of the fault, if there is one."""
+    measured: Measured
+    settled: bool
+    """Whether the drives have had the time that they may take to leave their fault state."""
+
+
+Rule = Callable[[CommandProgress], str | None]
+"""Returns "" when a command is carried out, None while it is not, else why it never will be."""
+
+
+def at_once(_: CommandProgress) -> str:
+    """It is carried out when it has come."""
+    return ""
+
+
+def standing(now: CommandProgress) -> str | None:
+    """The robot has come to rest."""
+    return None if now.mode is Mode.STOPPING else ""
+
+
+def powered_up(now: CommandProgress) -> str | None:
+    """The drives have power, and the robot holds."""
+    if now.mode is Mode.ENABLING:
+        return None
+    return "" if now.mode not in (Mode.FAULT, Mode.DISABLED) else now.latched or "disabled while powering up"
+
+
+def powered_down(now: CommandProgress) -> str | None:
+    """The robot has come to rest, and no drive has power."""
+    return _timed_out(now) or (None if now.mode is Mode.STOPPING or now.measured.powered else "")
+
+
+def unpowered(now: CommandProgress) -> str | None:
+    """No drive has power."""
+    return _timed_out(now) or (None if now.measured.powered else "")
+
+
+def homed(now: CommandProgress) -> str | None:
+    """It is known where every slider is."""
+    if now.mode in (Mode.HOMING, Mode.STOPPING):
+        return None
+    return "" if now.measured.homed else now.latched or "stopped before every drive was homed"
+
+
+def cleared(now: CommandProgress) -> str | None:
+    """Neither the robot nor a drive is in fault."""
+    if now.mode is Mode.FAULT:
+        return f"the cause is still there: {now.latched}"
+    return "" if now.settled and not any(state in _FAULTY for state in now.measured.feedback.state) else None
+
+
+def _timed_out(now: CommandProgress) -> str:
+    """Return what a drive says that does not do as it was told in time."""
+    fault = now.measured.feedback.fault
+    return fault.message if fault is not None and fault.cause == "timeout" else ""
 
 
 def still_powered(measured: Measured, latched: str | None) -> str:

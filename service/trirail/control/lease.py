@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.messages import Level
-from trirail.wire.packets import CommandRequest
-from trirail.wire.vocabulary import LeasePolicy
+from trirail.wire.vocabulary import AcquireLease, LeasePolicy, ReleaseLease
 
 REMEMBERED_IDS = 1000
 """Leases that have ended and do not come back by a late sign of life; older ones are forgotten."""
@@ -66,32 +65,32 @@ class LeaseArbiter:
                 RefusalCode.LEASED, f"{self._held.user} holds the lease: only his goals and commands count"
             )
 
-    def acquire(self, request: CommandRequest, cycle: int) -> LeaseChange | None:
+    def acquire(self, user: str, lease: AcquireLease, cycle: int) -> LeaseChange | None:
         """Let a user have the lease; None for a sign of life of who has it. Raises RefusedError."""
-        user, before = request.user, self._held
-        if request.lease is not None and (why := self._over.get((user, request.lease))) is not None:
+        before = self._held
+        if lease.id is not None and (why := self._over.get((user, lease.id))) is not None:
             raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: acquire a new one")
-        again = before is not None and (before.user, before.id) == (user, request.lease)
+        again = before is not None and (before.user, before.id) == (user, lease.id)
         change = None if again else LeaseChange("info", f"lease acquired by {user}")
         if before is not None and not again:
-            if not request.force:
+            if not lease.force:
                 whose = "another client of the same user" if before.user == user else before.user
                 problem = f"{whose} holds the lease: wait until it is free, or take it over"
                 raise RefusedError(RefusalCode.LEASED, problem)
             change = self._end("warning", f"lease taken over by {user} from {before.user}")
-        self._held = _Held(user, request.lease, request.timeout, cycle + round(request.timeout / self._period))
+        self._held = _Held(user, lease.id, lease.timeout, cycle + round(lease.timeout / self._period))
         return change
 
-    def release(self, request: CommandRequest) -> LeaseChange:
+    def release(self, user: str, lease: ReleaseLease) -> LeaseChange:
         """Let a user give his lease back. Raises RefusedError where he has none, or not that one."""
         held = self._held
-        if held is not None and held.user == request.user and request.lease in (None, held.id):
+        if held is not None and held.user == user and lease.id in (None, held.id):
             return self._end("info", f"lease released by {held.user}")
-        if request.lease is not None and (why := self._over.get((request.user, request.lease))) is not None:
+        if lease.id is not None and (why := self._over.get((user, lease.id))) is not None:
             raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: there is nothing to release")
         if held is None:
             raise RefusedError(RefusalCode.NO_LEASE, "nobody holds the lease: there is nothing to release")
-        whose = "another client of the same user" if held.user == request.user else held.user
+        whose = "another client of the same user" if held.user == user else held.user
         raise RefusedError(RefusalCode.LEASED, f"{whose} holds the lease, and only its holder can release it")
 
     def silent(self, cycle: int) -> LeaseChange | None:

@@ -1,10 +1,8 @@
-"""CommandReader as they come to the gateway: what stops the robot is carried out even where it cannot be read."""
+"""Commands as they come to the gateway: what stops the robot is carried out even where it cannot be read."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-
-import msgspec
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.inbox import Inbox
@@ -13,10 +11,10 @@ from trirail.processes.replies import Replies
 from trirail.processes.requests import Requests
 from trirail.processes.state import StateMaker
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, NoContent, Stop
+from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.stop_door import STOPS
 from trirail.wire.text import quoted
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import Command, CommandContent, Stop
 
 
 class CommandReader:
@@ -58,7 +56,7 @@ class CommandReader:
 
     def _read(self, incoming: Incoming, user: str, name: Command) -> None:
         try:
-            content = incoming.content(CONTENT.get(name, NoContent | None), f"{name} takes {name.content}")
+            content = incoming.content(name.accepts, f"{name} takes {name.content.words}")
         except RefusedError as refusal:
             if name not in STOPS:
                 raise
@@ -82,7 +80,7 @@ class CommandReader:
         """Note that a command has been carried out."""
         self._of_unread.discard(ticket)
 
-    def _carry_out(self, incoming: Incoming, user: str, name: Command, content: msgspec.Struct | None) -> None:
+    def _carry_out(self, incoming: Incoming, user: str, name: Command, content: CommandContent | None) -> None:
         goal = content.goal if isinstance(content, Stop) else None
         reason = f"{name} by {user}"
         backlog = self._requests.backlog

@@ -13,7 +13,7 @@ from trirail.processes.descriptors import disconnect
 from trirail.processes.stop_addresses import SOCKET_MODE
 from trirail.processes.stop_door import Answer, StopDoor
 from trirail.wire import tls, zenoh_session
-from trirail.wire.access import COMMANDS, access_control
+from trirail.wire.access import access_control
 from trirail.wire.credentials import Credentials, with_role
 from trirail.wire.dialling import why_not
 from trirail.wire.endpoints import ReachableBy, reach, same_port, socket_file, tcp_address
@@ -67,7 +67,7 @@ class Guard:
             user, command = command_of(request, self._robot)
             if self._credentials is not None and user != shown:
                 raise RefusedError(RefusalCode.NOT_ALLOWED, f"{quoted(shown) or 'nobody'} cannot send as {user}")
-            self.check(user, COMMANDS[command], command)
+            self.check(user, command.role, command)
             take(request, answer)
 
         secured = None if self._credentials is None else tls.server(self._credentials)

@@ -24,11 +24,11 @@ from trirail.processes.pose_file import PoseFile, state_directory
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Coordinates, Goal, NamedGoal
 from trirail.wire.kinds.pose import pose_in_place_of
-from trirail.wire.messages import ErrorReply, NoContent
+from trirail.wire.messages import ErrorReply
 from trirail.wire.packets import PoseChanged, Remark
 from trirail.wire.state import NamedPose, NamedPoses
 from trirail.wire.text import check_name, check_new_pose
-from trirail.wire.vocabulary import MODES, Mode
+from trirail.wire.vocabulary import MODES, Mode, NoContent
 
 MOST = 1000
 """Poses that may be kept."""

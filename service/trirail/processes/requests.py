@@ -20,9 +20,9 @@ from trirail.processes.last_words import LastWords
 from trirail.processes.replies import Replies
 from trirail.wire.goals import Goal
 from trirail.wire.links import PacketLink
-from trirail.wire.messages import AcquireLease, ErrorReply, Override, ReleaseLease, Stop
+from trirail.wire.messages import ErrorReply
 from trirail.wire.packets import CommandRequest, GoalRequest, message
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import AcquireLease, Command, CommandContent
 
 AHEAD = 3
 """Goals of one user that the loop has at once: one that is planned, the next one, and one more, which takes the next
@@ -107,14 +107,17 @@ class Requests:
 
     # ------------------------------------------------------------------ commands
 
-    def command(self, incoming: Incoming, user: str, name: Command, content: msgspec.Struct | None) -> int:
+    def command(self, incoming: Incoming, user: str, name: Command, content: CommandContent | None) -> int:
         """Give a command to the loop; return its ticket.
 
         Raises RefusedError where it has too many, or the user's role forbids it.
         """
         if not name.stops:
             self._check_under_way(user)
-        request = self._request(user, name, content)
+        if isinstance(content, AcquireLease) and content.force:
+            self._guard.check(user, self._takeover, "taking the lease over")
+        self._tickets += 1
+        request = CommandRequest(self._tickets, user, name, content)
         with self._hurrying() if name.stops else nullcontext():
             sent = self._link.send(message(request))
         if not sent:
@@ -131,22 +134,6 @@ class Requests:
             raise RefusedError(RefusalCode.BUSY, f"{own} commands of {user} are under way already: send fewer")
         if len(self._commands) >= UNDER_WAY_OF_ALL:
             raise RefusedError(RefusalCode.BUSY, f"{len(self._commands)} commands are under way already: send fewer")
-
-    def _request(self, user: str, name: Command, content: msgspec.Struct | None) -> CommandRequest:
-        """Make of a command and what it carries what the loop takes. Raises RefusedError for what a role forbids."""
-        self._tickets += 1
-        match content:
-            case Override(percent):
-                return CommandRequest(self._tickets, user, name, percent / 100.0)
-            case Stop(goal):
-                return CommandRequest(self._tickets, user, name, goal=goal)
-            case AcquireLease(lease, timeout, force):
-                if force:
-                    self._guard.check(user, self._takeover, "taking the lease over")
-                return CommandRequest(self._tickets, user, name, lease=lease, timeout=timeout, force=force)
-            case ReleaseLease(lease):
-                return CommandRequest(self._tickets, user, name, lease=lease)
-        return CommandRequest(self._tickets, user, name)
 
     # ------------------------------------------------------------------ answers
 

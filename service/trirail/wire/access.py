@@ -18,20 +18,6 @@ GOALS = Role.OPERATOR
 """The least role that may send goals."""
 POSES = Role.MAINTAINER
 """The least role that may teach and remove poses."""
-COMMANDS: dict[Command, Role] = {
-    Command.STOP: Role.VIEWER,
-    Command.ENABLE: Role.OPERATOR,
-    Command.DISABLE: Role.OPERATOR,
-    Command.QUICK_STOP: Role.OPERATOR,
-    Command.PAUSE: Role.OPERATOR,
-    Command.RESUME: Role.OPERATOR,
-    Command.OVERRIDE: Role.OPERATOR,
-    Command.ACQUIRE: Role.OPERATOR,
-    Command.RELEASE: Role.OPERATOR,
-    Command.RESET: Role.MAINTAINER,
-    Command.HOME: Role.MAINTAINER,
-}
-"""The least role that may send each command."""
 
 PUBLISHED = ("state", "summary", "event", "records")
 """What the robot alone publishes."""
@@ -45,7 +31,7 @@ def least_role(*parts: str) -> Role:
         return GOALS
     if parts[0] in ("teach", "forget"):
         return POSES
-    return COMMANDS[Command(parts[2])] if parts[0] == "cmd" else Role.VIEWER
+    return Command(parts[2]).role if parts[0] == "cmd" else Role.VIEWER
 
 
 def access_control(robot: str, users: Mapping[str, Role], router: str | None = None) -> dict[str, Any]:
@@ -139,7 +125,7 @@ def _of_every_user(robot: str) -> Iterator[_Rule]:
 
 def _of_user(robot: str, user: str, role: Role) -> Iterator[_Rule]:
     """Yield what has a user's name in its key."""
-    commands = [key(robot, "cmd", user, command) for command, least in COMMANDS.items() if role.includes(least)]
+    commands = [key(robot, "cmd", user, command) for command in Command if role.includes(command.role)]
     yield _rule(f"{user} commands", "ingress", ("query",), *commands)
     if role.includes(POSES):
         poses = [key(robot, name, user, "*") for name in ("teach", "forget")]

@@ -14,10 +14,11 @@ import msgspec
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.decoding import decoder, prepare
 from trirail.wire.goals import Goal
-from trirail.wire.messages import CONTENT, CommandReply, ErrorReply, Event, GoalReply, NoContent, RoleReply
+from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply, RoleReply
 from trirail.wire.sizes import MAX_MESSAGE
 from trirail.wire.state import Info, NamedPose, NamedPoses, RobotSummary, State
 from trirail.wire.text import check_name, printable, quoted
+from trirail.wire.vocabulary import Command
 
 JSON, MSGPACK, BINARY = "application/json", "application/msgpack", "application/octet-stream"
 _READ_AS = {
@@ -32,7 +33,7 @@ _READ_AS = {
 
 _NULL = {JSON: b"null", MSGPACK: b"\xc0"}
 
-prepare(Goal, NoContent | None, *CONTENT.values(), GoalReply, CommandReply, RoleReply, ErrorReply)
+prepare(Goal, *(command.accepts for command in Command), GoalReply, CommandReply, RoleReply, ErrorReply)
 prepare(State, Event, Info, NamedPose, NamedPoses, RobotSummary)
 
 

@@ -1,84 +1,20 @@
-"""What clients and service say to each other over Zenoh beside goals: commands, replies, events. SI units and radians.
+"""What clients and service say to each other over Zenoh beside goals: replies, events. SI units and radians.
 
-The state, and what is answered on …/info, are in trirail.wire.state. JSON by default, msgpack where the encoding
-says so.
+Commands are in trirail.wire.vocabulary; the state, and what is answered on …/info, in trirail.wire.state. JSON by
+default, msgpack where the encoding says so.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-from msgspec import Meta, Struct
+from msgspec import Struct
 from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode
-from trirail.wire.goal_kind import Identifier, check_fields
-from trirail.wire.vocabulary import Command
-
-LOWEST_OVERRIDE = 1.0
-"""Least share of full speed at which motions run, but for 0, at which they stand [%]."""
 
 Level = Literal["info", "warning", "error"]
 Outcome = Literal["done", "rejected", "preempted", "stopped", "expired", "faulted", "unsettled"]
-
-
-class Override(Struct, frozen=True, forbid_unknown_fields=True):
-    """The content of the command override: the share of full speed at which motions run."""
-
-    percent: Annotated[float, Meta(ge=0.0, le=200.0)]
-    """0, at which motions stand, or 1 to 200 % of full speed, within the limits."""
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        if 0.0 < self.percent < LOWEST_OVERRIDE:
-            raise ValueError(f"percent is {self.percent}: 0, or {LOWEST_OVERRIDE:g} to 200 are taken")
-
-
-class Stop(Struct, frozen=True, forbid_unknown_fields=True):
-    """The content, if any, of the command stop: which goal is to be stopped, wherever it is, and no other."""
-
-    goal: Identifier | None = None
-    """Its id; none for the robot as a whole."""
-
-
-SHORTEST_LEASE, LONGEST_LEASE = 0.1, 10.0
-"""Time-outs of a lease [s]."""
-LeaseTimeout = Annotated[float, Meta(ge=SHORTEST_LEASE, le=LONGEST_LEASE)]
-
-
-class AcquireLease(Struct, frozen=True, forbid_unknown_fields=True):
-    """The content, if any, of the command acquire. The same one again, within its timeout, is a sign of life."""
-
-    id: Identifier | None = None
-    """A new one for every lease, the same in every sign of life: a lease that has ended does not come back by one.
-    Without it, each one asks anew."""
-    timeout: LeaseTimeout = 1.0
-    """Real time after which a lease without a sign of life ends, with a controlled stop [s]."""
-    force: bool = False
-    """Take it over from who holds it, by a role of [control] `takeover`."""
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-
-class ReleaseLease(Struct, frozen=True, forbid_unknown_fields=True):
-    """The content, if any, of the command release: which lease is given back."""
-
-    id: Identifier | None = None
-    """As in its acquire; without it the user's own, whichever that is."""
-
-
-class NoContent(Struct, frozen=True, forbid_unknown_fields=True):
-    """The content of the other commands."""
-
-
-CONTENT: dict[Command, Any] = {
-    Command.OVERRIDE: Override,
-    Command.STOP: Stop | None,
-    Command.ACQUIRE: AcquireLease | None,
-    Command.RELEASE: ReleaseLease | None,
-}
-"""What commands carry, with None where they may come without; those that are not here, NoContent | None."""
 
 
 class GoalReply(Struct, frozen=True):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Any
 
 from msgspec import Struct, msgpack, structs
 from trirail_drivers.interface import Counts, MissingProtection, Triple
 
 from trirail.errors import RefusalCode
-from trirail.wire.decoding import decoder, prepare
+from trirail.wire.decoding import converted, decoder, prepare
 from trirail.wire.goals import Goal
 from trirail.wire.messages import Event, Level
 from trirail.wire.planning import PlanAnswer
@@ -41,22 +42,18 @@ class GoalRequest(Struct, frozen=True, tag=True):
     """How old what it says was when it came, of a track's target: negative where that is ahead [s]."""
 
 
-class CommandRequest(Struct, frozen=True, tag=True):
-    """Gateway to loop: a command."""
+class CommandRequest(Struct, frozen=True, forbid_unknown_fields=True, tag=True):
+    """Gateway to loop: a command, with what it carries."""
 
     ticket: int
     user: str
     name: Command
-    value: float | None = None
-    """The rate, for override: 1 is full speed."""
-    goal: str | None = None
-    """The one goal that is to be stopped, for stop."""
-    lease: str | None = None
-    """Its id, for acquire and release."""
-    timeout: float = 1.0
-    """For how long a sign of life is good, for acquire [s]."""
-    force: bool = False
-    """Whether the lease is taken over from who holds it, for acquire; the gateway has seen to it that the user may."""
+    content: Any = None
+    """Of the command's own type, also where it came without."""
+
+    def __post_init__(self) -> None:
+        if self.content is None or isinstance(self.content, dict):  # as it is decoded
+            structs.force_setattr(self, "content", converted(self.content or {}, self.name.content))
 
 
 class RefusedRequest(Struct, frozen=True, tag=True):
@@ -208,7 +205,7 @@ class Unrecorded(Struct, frozen=True, tag=True):
 RecorderSaid = Remark | Unrecorded
 Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Status | ControlInput
 
-prepare(Request, Answer, RecorderSaid)
+prepare(Request, Answer, RecorderSaid, *(command.content for command in Command))
 encode = msgpack.Encoder().encode
 decode_request = decoder(Request, packed=True).decode
 decode_answer = decoder(Answer, packed=True).decode
