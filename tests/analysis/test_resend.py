@@ -33,7 +33,7 @@ class Heard:
         self.log.append(f"send {name[:-7]}")
         return Ending(name, self)
 
-    def command(self, name: str, content: CommandContent) -> None:
+    def command(self, name: str, content: CommandContent | bytes) -> None:
         assert content == Stop()
         self.log.append(name)
 

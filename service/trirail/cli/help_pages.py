@@ -51,6 +51,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
             "trirail goto pick --wait",
         ),
         "move": ("trirail move 5mm 0 0 --frame platform", "trirail move 0 0 1deg --tool 20mm 0 --wait"),
+        "goal": ("""trirail goal '{"kind": "sliders", "position": [0.02, 0, -0.01]}' --wait""",),
         "sliders": ("trirail sliders 20mm 0 -10mm --wait",),
         "jog": (
             "trirail jog",

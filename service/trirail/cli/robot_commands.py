@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import itertools
 from collections import deque
 from collections.abc import Callable
@@ -16,6 +17,8 @@ from cyclopts import CycloptsError, Parameter, validators
 from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
 from trirail.cli.options import poses as poses_of_robot
+from trirail.wire import boundary
+from trirail.wire.goals import Goal
 from trirail.wire.messages import CommandReply
 from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.vocabulary import LONGEST_LEASE, SHORTEST_LEASE, Command, Mode
@@ -135,6 +138,23 @@ def move(
         origin: Literal["commanded", "measured"] = "measured" if measured else "commanded"
         goal = robot.move(x=dx, y=dy, phi=angle, speed=speed, tool=tool, frame=frame, origin=origin)
         return _follow(service, robot, goal, wait, f"by {units.pose((dx, dy, angle))}")
+
+
+def goal(content: str, /, *, wait: Annotated[bool, Flag] = False, service: Service = HERE) -> int:
+    """Send a goal of any kind, as JSON.
+
+    Parameters
+    ----------
+    content
+        Its kind and what it says, as on the wire, in SI units and radians.
+    wait
+        Show the progress; exit 0 only when the robot has arrived.
+    """
+    from trirail.client.client import Robot
+
+    meant: Goal = boundary.decode(content.encode(), Goal, "not a goal")
+    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+        return _follow(service, robot, robot.send(meant), wait, str(meant.__struct_config__.tag))
 
 
 def sliders(
@@ -425,21 +445,27 @@ def _show_event(service: Service, event: Event) -> None:
         terminal.event(event)
 
 
-COMMANDS = (goto, move, sliders, jog, follow, teach, forget, poses, status, watch, events)
+COMMANDS = (goto, move, goal, sliders, jog, follow, teach, forget, poses, status, watch, events)
 """Those with parameters of their own, in the order in which the help lists them; the others are made by `telling`."""
 
 
 def telling(name: Command) -> Callable[..., int]:
-    """Return the command of the command line that sends one without content."""
+    """Return the command of the command line that sends one, with the numbers that it cannot come without."""
 
-    def tell(*, service: Service = HERE) -> int:
+    def tell(*values: float, service: Service = HERE) -> int:
         from trirail.client.client import Robot
 
         with Robot(service.robot, service.connect, tls=service.tls) as robot:
-            reply = robot.command(name)
+            reply = robot.command(name, name.content(*values) if values else None)
         confirmed(service, name, reply)
         return 0
 
+    signature = inspect.signature(tell)
+    needed = [field.name for field in msgspec.structs.fields(name.content) if field.required]
+    each = [inspect.Parameter(field, inspect.Parameter.POSITIONAL_ONLY, annotation=float) for field in needed]
+    tell.__signature__ = signature.replace(  # type: ignore[attr-defined]  # where cyclopts looks
+        parameters=[*each, signature.parameters["service"].replace(annotation=Service)]
+    )
     return tell
 
 
