@@ -18,14 +18,21 @@ import msgspec
 import numpy as np
 import pytest
 import zenoh
+from cyclopts import App, CycloptsError
+from msgspec import structs
+from msgspec.structs import fields
+from trirail.cli.commands import app
+from trirail.cli.robot_commands import telling
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.client.outgoing import number, seconds
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import boundary
+from trirail.wire.goals import KINDS as EVERY_KIND
 from trirail.wire.goals import Goal, OwnLimits, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import CommandReply, Event, GoalReply
-from trirail.wire.vocabulary import AcquireLease, Command, ReleaseLease, Stop
+from trirail.wire.stop_door import STOPS
+from trirail.wire.vocabulary import AcquireLease, Command, Override, ReleaseLease, Stop
 from trirail.wire.zenoh_session import open_service
 
 ENDED = Event(seq=1, t=0.0, cycle=0, time=1.0, kind="goal", level="info", message="so it ended", outcome="done")
@@ -183,6 +190,50 @@ def test_every_method_takes_every_kind_of_number(kind: type[Robot | AsyncRobot],
                     assert SERVICE[0].taken()[:1] == plain[:1] != [], (name, made)
 
     asyncio.run(run())
+
+
+GUIDE = (Path(__file__).parents[2] / "service/README.md").read_text(encoding="utf-8")
+EXAMPLES = [
+    line for line in GUIDE.splitlines() if line.startswith("{") and '"kind": ' in line and '"seq": ' not in line
+]
+"""Of goals, one at least of each kind: tests/motion/test_kinds.py."""
+
+
+@pytest.mark.parametrize("kind", [Robot, AsyncRobot])
+def test_a_goal_of_any_kind_and_any_command_with_its_content_are_sent_as_they_are(
+    kind: type[Robot | AsyncRobot], connect: str
+) -> None:
+    goals: list[Goal] = [boundary.decode(line.encode(), Goal, "no goal") for line in EXAMPLES]
+    contents = {name: name.content(*(50.0 for field in fields(name.content) if field.required)) for name in Command}
+
+    async def run() -> None:
+        async with client(kind, connect) as robot:
+            for goal in goals:
+                await done(robot, lambda robot, goal: robot.send(goal), goal)
+                assert SERVICE[0].taken() == [structs.replace(goal, id=None)]
+            for name, content in contents.items():
+                if name not in STOPS:
+                    await done(robot, lambda robot, order: robot.command(*order), (name, content))
+                    assert SERVICE[0].taken() == [content] * (name is not Command.RELEASE)  # which is not kept
+
+    asyncio.run(run())
+    assert {type(goal) for goal in goals} == set(EVERY_KIND)
+
+
+@pytest.mark.parametrize("line", EXAMPLES)
+def test_the_command_line_sends_a_goal_of_any_kind(line: str, connect: str) -> None:
+    assert app(["goal", line, "--connect", connect], exit_on_error=False, result_action="return_value") == 0
+    goal = boundary.decode(line.encode(), Goal, "no goal")
+    assert SERVICE[0].taken() == [structs.replace(goal, id=None)]
+
+
+def test_the_command_line_sends_a_command_with_the_numbers_that_it_cannot_come_without(connect: str) -> None:
+    made = App()
+    made.command(telling(Command.OVERRIDE), name="override")
+    made(["override", "50", "--connect", connect], exit_on_error=False, result_action="return_value")
+    assert SERVICE[0].taken() == [Override(50.0)]
+    with pytest.raises(CycloptsError):
+        made(["override", "--connect", connect], exit_on_error=False, print_error=False)
 
 
 NONE: tuple[Any, ...] = (
