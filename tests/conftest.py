@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 import pytest
 import trirail
+from msgspec.structs import fields
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
 from trirail.control.control import Control, Given
@@ -28,7 +29,7 @@ from trirail.motion.paths import FOR_EVER, Path, constant
 from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
-from trirail.wire.vocabulary import Command, Mode, Override
+from trirail.wire.vocabulary import Command, CommandContent, Mode
 from trirail_drivers.cia402 import frames
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import Feedback, Triple
@@ -78,9 +79,10 @@ FRAMES = 25
 """How deep a stack is looked into for who has allocated."""
 
 
-def carried(name: str, rate: float | None) -> Override | None:
-    """What a command carries: the rate, 1 being full speed, where it is override; else nothing."""
-    return Override(100.0 * (1.0 if rate is None else rate)) if name == Command.OVERRIDE else None
+def carried(name: str, rate: float | None = None) -> CommandContent:
+    """What a command carries at least: 1 for each number that it needs, or for override a rate, 1 being full speed."""
+    content = Command(name).content
+    return content(*(1.0 if rate is None else 100.0 * rate for field in fields(content) if field.required))
 
 
 class Rig:

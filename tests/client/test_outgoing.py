@@ -18,9 +18,9 @@ import msgspec
 import numpy as np
 import pytest
 import zenoh
+from conftest import carried
 from cyclopts import App, CycloptsError
 from msgspec import structs
-from msgspec.structs import fields
 from trirail.cli.commands import app
 from trirail.cli.robot_commands import telling
 from trirail.client.async_client import AsyncRobot
@@ -204,7 +204,7 @@ def test_a_goal_of_any_kind_and_any_command_with_its_content_are_sent_as_they_ar
     kind: type[Robot | AsyncRobot], connect: str
 ) -> None:
     goals: list[Goal] = [boundary.decode(line.encode(), Goal, "no goal") for line in EXAMPLES]
-    contents = {name: name.content(*(50.0 for field in fields(name.content) if field.required)) for name in Command}
+    contents = {name: carried(name) for name in Command}
 
     async def run() -> None:
         async with client(kind, connect) as robot:

@@ -25,11 +25,11 @@ HELD = 1000
 """Cycles of a lease's usual time-out."""
 
 
-def said_with(name: str, lease: str | None, timeout: float, force: bool) -> CommandContent | None:
+def said_with(name: str, lease: str | None, timeout: float, force: bool) -> CommandContent:
     """What a command carries that may be about a lease."""
     if name == Command.ACQUIRE:
         return AcquireLease(lease, timeout, force=force)
-    return ReleaseLease(lease) if name == Command.RELEASE else carried(name, None)
+    return ReleaseLease(lease) if name == Command.RELEASE else carried(name)
 
 
 class Users:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import CONFIG
+from conftest import CONFIG, carried
 from trirail.processes.backlog import MOST_OF_ONE, PATIENCE
 from trirail.processes.gateway import Gateway
 from trirail.processes.guard import Guard
@@ -34,7 +34,7 @@ from trirail.wire.packets import (
     Welcome,
 )
 from trirail.wire.state import Info
-from trirail.wire.vocabulary import AcquireLease, Command, Override, Role
+from trirail.wire.vocabulary import AcquireLease, Command, Role
 from trirail_drivers.interface import MissingProtection
 
 
@@ -96,8 +96,8 @@ def accepted(gateway: Gateway, ticket: int) -> None:
 @pytest.mark.parametrize("name", Command)
 def test_every_command_is_passed_on(rig: Rig, name: Command) -> None:
     gateway, link = rig
-    command(gateway, name, b'{"percent": 50}' if name is Command.OVERRIDE else b"")
-    assert link.sent == [CommandRequest(1, "ann", name, Override(50.0) if name is Command.OVERRIDE else None)]
+    command(gateway, name, msgspec.json.encode(carried(name)))
+    assert link.sent == [CommandRequest(1, "ann", name, carried(name))]
 
 
 @pytest.mark.parametrize("name", Command)

@@ -462,7 +462,8 @@ def telling(name: Command) -> Callable[..., int]:
 
     signature = inspect.signature(tell)
     needed = [field.name for field in msgspec.structs.fields(name.content) if field.required]
-    each = [inspect.Parameter(field, inspect.Parameter.POSITIONAL_ONLY, annotation=float) for field in needed]
+    taken = Annotated[float, Parameter(help=f"Of what it takes: {name.content.words}.")]
+    each = [inspect.Parameter(field, inspect.Parameter.POSITIONAL_ONLY, annotation=taken) for field in needed]
     tell.__signature__ = signature.replace(  # type: ignore[attr-defined]  # where cyclopts looks
         parameters=[*each, signature.parameters["service"].replace(annotation=Service)]
     )
