@@ -136,7 +136,7 @@ class Control:
         if run is None or not run.arrived:
             return False
         goal = self.ledger.goal
-        target = goal is not None and goal.renewed is TrackGoal
+        target = goal is not None and goal.kind.waits_at_end
         return self.state.mode is Mode.MOVING and (self.measured.settling.under_way or target)
 
     def go_on(self, newest: int, time: float, found: int | None) -> None:
