@@ -18,7 +18,6 @@ import io
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,7 @@ from trirail.config import as_built
 from trirail.errors import ConfigError, TrirailError
 from trirail.kinematics import correction_fit
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.calibration import PARAMETERS, Calibration, CalibrationError, identify
+from trirail.kinematics.calibration import Calibration, CalibrationError, identify
 from trirail.kinematics.geometry import LEGS, Geometry, singular_angles
 from trirail.wire.text import number
 from trirail_drivers import files
@@ -80,10 +79,10 @@ def _numbers(names: Sequence[str], fields: Sequence[str], line: int) -> list[flo
 
 def section(geometry: Geometry) -> str:
     """Return the [geometry] section of a configuration, exact to the last digit."""
-    lines = ["[geometry]"]
-    for name, leg in zip(LEGS, geometry.legs, strict=True):
+    lines = ["[geometry]", f'kind = "{geometry.kind}"']
+    for name, leg in zip(LEGS, geometry.each, strict=True):
         lines += ["", f"[[geometry.leg]]  # {name}"]
-        for key, value in asdict(leg).items():
+        for key, value in leg.keys().items():
             lines.append(f"{key} = {np.asarray(value).tolist()}")
     return "\n".join(lines) + "\n"
 
@@ -98,7 +97,7 @@ def describe(found: Calibration, lines: Sequence[int]) -> str:
 
     said += ["", f"{'correction':<36}{'change':>10}{'std. error':>12}"]
     for leg, changes, errors in zip(LEGS, found.corrections, found.standard_errors, strict=True):
-        for name, change, error in zip(PARAMETERS, changes, errors, strict=True):
+        for name, change, error in zip(found.geometry.parameters, changes, errors, strict=True):
             unit = "mrad" if name.endswith("angle") else "mm"
             known = f"{error * 1e3:.4f}" if math.isfinite(error) else "open"
             said.append(f"{f'{leg} {name} [{unit}]':<36}{change * 1e3:>10.4f}{known:>12}")

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from trirail import config
 from trirail.kinematics import calibration
-from trirail.kinematics.calibration import DOUBT, PARAMETERS, CalibrationError, corrected, identify, pose_derivatives
+from trirail.kinematics.calibration import CalibrationError, corrected, identify, pose_derivatives
 from trirail.kinematics.geometry import LEGS, Geometry, Leg
 from trirail.kinematics.robot import forward, inverse
 
@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 START = Geometry.symmetric(0.3)
 SPAN = (0.1, 0.1, 0.6)
 NOISE = np.array([20e-6, 20e-6, 1e-4])
-ANCHOR, RAIL_ANGLE, HOME, EDGE_POINT, EDGE_ANGLE = PARAMETERS
+DOUBT = np.array(Leg.DOUBT)
+ANCHOR, RAIL_ANGLE, HOME, EDGE_POINT, EDGE_ANGLE = Leg.PARAMETERS
 SIM = config.SIM.read_text(encoding="utf-8")
 
 

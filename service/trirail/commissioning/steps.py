@@ -51,7 +51,7 @@ class Steps:
         """Have a slider pushed there and back by hand, without power."""
         bench, index = self.session.bench(), NAMES.index(name)
         read_to = self._see.read_to()
-        angle = np.degrees(geometry(self._config.geometry).legs[index].rail_angle)
+        angle = np.degrees(geometry(self._config.geometry).each[index].rail_angle)
         self._person.tell(
             f"  Put the rule along rail {name}, its numbers rising towards {angle:.0f}° (0° is x, 90° is y)."
         )

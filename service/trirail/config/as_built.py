@@ -69,9 +69,9 @@ prepare(AsBuilt)
 
 def geometry_of(robot: Geometry) -> str:
     """Return eight digits that tell a geometry from others, to a nanometre and a nanoradian."""
-    numbers = [np.round(np.hstack([*leg.anchor, leg.rail_angle, leg.home, *leg.edge_point, leg.edge_angle]), 9) + 0.0
-               for leg in robot.legs]  # fmt: skip
-    return f"{zlib.crc32(np.array(numbers).tobytes()):08x}"
+    numbers = np.round([np.hstack([*leg.keys().values()]) for leg in robot.each], 9) + 0.0
+    kind = b"" if robot.kind == "3-PRP" else robot.kind.encode()  # maps are older than the second kind
+    return f"{zlib.crc32(numbers.tobytes() + kind):08x}"
 
 
 def correction(found: AsBuilt) -> Correction:

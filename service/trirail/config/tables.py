@@ -10,11 +10,13 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
+from trirail_drivers.interface import NAMES
 
 from trirail.config import as_built
 from trirail.config.as_built import AsBuilt
 from trirail.errors import ConfigError
-from trirail.kinematics.geometry import Geometry, Leg, Room
+from trirail.kinematics.geometry import Geometry, Leg, PprLeg, Room
+from trirail.kinematics.leg import AnyLeg
 from trirail.wire.endpoints import endpoint_of, is_local
 from trirail.wire.vocabulary import LeasePolicy, Role
 
@@ -22,6 +24,7 @@ Angle = Annotated[float, Meta(ge=-2.0 * math.pi, le=2.0 * math.pi)]
 """[rad]."""
 Jerk = Annotated[float, Meta(ge=1e-3, le=1e6)]
 """[m/s³] or [rad/s³]."""
+RIGHT = math.pi / 2.0
 BASE, PLATFORM = "base", "platform"
 """Frames that every robot has."""
 FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
@@ -40,7 +43,7 @@ class RobotTable(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LegTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """One leg of a robot as built: [[geometry.leg]], metres and radians, as trirail.kinematics.geometry.Leg."""
+    """One leg of a robot as built: [[geometry.leg]], metres and radians, as the mechanism's own Leg."""
 
     anchor: Point
     """A point of the rail, x and y in the base frame [m]."""
@@ -48,15 +51,22 @@ class LegTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Direction of the rail, in which the slider position rises, from the base's x axis [rad]."""
     home: Coordinate
     """Where on the rail the slider reads zero, from the anchor along the rail [m]."""
-    edge_point: Point
-    """The platform's point that is at the slider's pin when lambda_32 is zero, in the platform's frame [m]."""
-    edge_angle: Angle
-    """Direction of the platform's edge that slides in the pin, in the platform's frame [rad]."""
+    edge_point: Point | None = None
+    """3-PRP: the platform's point that is at the slider's pin when lambda_32 is zero, in the platform's frame [m]."""
+    edge_angle: Angle | None = None
+    """3-PRP: direction of the platform's edge that slides in the pin, in the platform's frame [rad]."""
+    pivot: Point | None = None
+    """3-PPR: where the platform turns on the cross slide, in the platform's frame [m]."""
+    cross_angle: Angle | None = None
+    """3-PPR: direction of the cross slide in the base frame [rad]; at right angles to the rail when absent."""
 
 
 class GeometryTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [geometry]: the paper's symmetric robot by `l0`, or three measured legs."""
 
+    kind: Literal["3-PRP", "3-PPR"] = "3-PRP"
+    """Where the pivot is: on the driven carriage, below a cross slide that turns with the platform (3-PRP, alignment
+    stages of kind 1), or on a cross slide that keeps its direction (3-PPR, kind 2)."""
     l0: Annotated[float, Meta(ge=0.001, le=100.0)] | None = None
     """From the centre to each summit of the fixed triangle [m]; instead of three legs."""
     leg: tuple[LegTable, LegTable, LegTable] | None = None
@@ -85,7 +95,7 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     position: Range
     """Travel of lambda_10 [m]."""
     passive: Range
-    """Travel of lambda_32 along the platform's edges [m]."""
+    """Travel of what slides without a drive [m]: lambda_32 along the platform's edges, or the cross slides of 3-PPR."""
     velocity: Velocity
     """Greatest rate of each slider [m/s]."""
     acceleration: Acceleration
@@ -280,13 +290,42 @@ def geometry(table: GeometryTable) -> Geometry:
     """Build the robot's geometry from its section. Raises ConfigError."""
     if (table.l0 is None) == (table.leg is None):
         raise ConfigError("geometry: give either l0 (the symmetric robot) or three [[geometry.leg]] tables")
+    if table.l0 is not None and table.kind != "3-PRP":
+        raise ConfigError(
+            f"geometry: l0 is the paper's 3-PRP robot: for {table.kind} give three [[geometry.leg]] tables"
+        )
     try:
         if table.leg is None:
             return Geometry.symmetric(table.l0 or 0.0)
-        first, second, third = (Leg(**msgspec.structs.asdict(leg)) for leg in table.leg)
+        first, second, third = (_leg(table.kind, name, leg) for name, leg in zip(NAMES, table.leg, strict=True))
         return Geometry(legs=(first, second, third))
     except ValueError as error:
         raise ConfigError(f"geometry: {error}") from error
+
+
+_OF_KIND = {"3-PRP": ("edge_point", "edge_angle"), "3-PPR": ("pivot", "cross_angle")}
+"""The keys of a leg that are one mechanism's alone."""
+_WORDS = {"3-PRP": "the platform's edge turns with it", "3-PPR": "the cross slide keeps its direction"}
+
+
+def _leg(kind: str, name: str, table: LegTable) -> AnyLeg:
+    """Build a leg, of what its mechanism has. Raises ConfigError."""
+    for other, keys in _OF_KIND.items():
+        for key in keys:
+            if other != kind and getattr(table, key) is not None:
+                raise ConfigError(
+                    f"geometry: leg {name} has {key}, which is of kind {other} ({_WORDS[other]}); "
+                    f"kind is {kind}, with {' and '.join(_OF_KIND[kind])}"
+                )
+    point, angle = (getattr(table, key) for key in _OF_KIND[kind])
+    if point is None or (angle is None and kind == "3-PRP"):
+        missing = _OF_KIND[kind][0 if point is None else 1]
+        raise ConfigError(f"geometry: leg {name} has no {missing}, which kind {kind} needs")
+    if kind == "3-PRP":
+        return Leg(table.anchor, table.rail_angle, table.home, point, angle)
+    return PprLeg(
+        table.anchor, table.rail_angle, table.home, point, table.rail_angle + RIGHT if angle is None else angle
+    )
 
 
 def corrected_geometry(config: Config) -> Geometry:

@@ -3,10 +3,8 @@
 The measured poses are taken to differ from forward(geometry, sliders) by independent normal noise, beside which
 the sliders' encoders are exact. Sought is the geometry for which the weighted squares of the differences are least.
 
-Of the seven numbers of a leg no such data tells more than five combinations: to move the anchor along its rail is
-to change `home`, and to move the edge point along its edge only moves the zero of lambda_32. So there are five
-parameters for each leg, corrections to a starting geometry, whose anchors move across the rails only and whose edge
-points move across the edges only; `across` is to the left, at right angles to where rail and edge pointed at first.
+Of the seven numbers of a leg no such data tells more than five combinations: the PARAMETERS of its mechanism, as
+corrections to a starting geometry.
 
 Poses with too little variety tell even less. The combinations of parameters that they leave open show in the
 singular values of each leg's Jacobian; they stay as in the starting geometry, and are named.
@@ -22,16 +20,12 @@ from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
 from trirail.errors import KinematicsError, TrirailError
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.geometry import LEGS, Geometry, Leg
+from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import forward, inverse, jacobians
 
-__all__ = ["PARAMETERS", "Calibration", "CalibrationError", "Open", "corrected", "identify", "pose_derivatives"]
+__all__ = ["Calibration", "CalibrationError", "Open", "corrected", "identify", "pose_derivatives"]
 
-PARAMETERS = ("anchor across the rail", "rail_angle", "home", "edge_point across the edge", "edge_angle")
-"""Of each leg, in the order of every array of corrections: metres and radians."""
-DOUBT = np.array([0.01, 0.05, 0.01, 0.01, 0.05])
-"""Standard deviation beyond which a combination of parameters counts as open: drawings tell as much [m, rad]."""
-TAKES_PART = 0.1  # share of a parameter, in units of DOUBT, from which on it is named in an open combination
+TAKES_PART = 0.1  # share of a parameter, in units of its doubt, from which on it is named in an open combination
 MINIMUM = 6  # each pose is one equation for a leg: five for its parameters, and one to contradict
 MISFIT = 3.0  # root mean square of residual over noise from which on the data cannot be that of this robot
 TOLERANCE = 1e-12
@@ -55,7 +49,7 @@ class Open(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """A geometry identified from N poses. Corrections have the rows A, B, C and the columns of PARAMETERS."""
+    """A geometry identified from N poses. Corrections have the rows A, B, C and the columns of Geometry.parameters."""
 
     geometry: Geometry
     corrections: Array  # (3, 5), to the starting geometry [m, rad]
@@ -80,7 +74,7 @@ def identify(
             raise CalibrationError(f"the {name} noise is {value}: it must be finite and positive")
     _check(start, poses, sliders)
     noise: Array = np.array([position_noise, position_noise, angle_noise])
-    basis, unknown = _separate(pose_derivatives(start, start, poses) / noise[:, None, None])
+    basis, unknown = _separate(start, pose_derivatives(start, start, poses) / noise[:, None, None])
 
     def geometry(z: Array) -> Geometry:
         return corrected(start, (basis @ z).reshape(3, 5))
@@ -120,7 +114,7 @@ def identify(
     deviations = (basis @ np.linalg.pinv(found.jac)).reshape(3, 5, -1)
     errors = np.sqrt(np.sum(deviations**2, axis=2))
     for leg, names, _ in unknown:
-        errors[LEGS.index(leg), [PARAMETERS.index(name) for name in names]] = math.inf
+        errors[LEGS.index(leg), [start.parameters.index(name) for name in names]] = math.inf
     return Calibration(
         geometry=geometry(found.x),
         corrections=(basis @ found.x).reshape(3, 5),
@@ -132,40 +126,24 @@ def identify(
 
 
 def corrected(start: Geometry, corrections: Array) -> Geometry:
-    """Return the geometry with corrections, (3, 5) in m and rad, to its PARAMETERS. KinematicsError as Geometry."""
-    legs = []
-    for leg, row in zip(start.legs, corrections.tolist(), strict=True):
-        anchor, rail_angle, home, edge_point, edge_angle = row
-        legs.append(
-            Leg(
-                anchor=_across(leg.anchor, leg.rail_angle, anchor),
-                rail_angle=leg.rail_angle + rail_angle,
-                home=leg.home + home,
-                edge_point=_across(leg.edge_point, leg.edge_angle, edge_point),
-                edge_angle=leg.edge_angle + edge_angle,
-            )
-        )
-    return Geometry(legs=(legs[0], legs[1], legs[2]))
+    """Return the geometry with corrections, (3, 5) in m and rad, to its parameters. KinematicsError as Geometry."""
+    first, second, third = (leg.corrected(row) for leg, row in zip(start.each, corrections.tolist(), strict=True))
+    return Geometry(legs=(first, second, third))
 
 
 def pose_derivatives(geometry: Geometry, start: Geometry, poses: Array) -> Array:
     """Return how corrections to `start` move the platform of `geometry`, sliders at rest: (N, 3, 3, 5).
 
-    Axes: pose from which it moves, of `poses` (N, 3); x, y, phi; leg; PARAMETERS. With n the normal of its edge,
-    the loop of a leg demands F = n . (anchor + (home + lambda_10) u(rail_angle) - G - R edge_point) = 0. The
-    derivatives of F are J1 by lambda_10 and -J2 by the pose, (16), so that J2 d pose = dF. KinematicsError as
-    from inverse.
+    Axes: pose from which it moves, of `poses` (N, 3); x, y, phi; leg; parameters. The loop of a leg demands F = 0. The
+    derivatives of F are J1 by the slider and -J2 by the pose, (16), so that J2 d pose = dF. KinematicsError as from
+    inverse.
     """
     _, J2 = jacobians(geometry, poses)
     joints = inverse(geometry, poses)
     dF = np.empty((len(poses), 3, 5))
-    for i, (leg, first) in enumerate(zip(geometry.legs, start.legs, strict=True)):
-        psi = poses[:, 2] + leg.edge_angle
-        dF[:, i, 0] = -np.cos(psi - first.rail_angle)
-        dF[:, i, 1] = -(leg.home + joints.position[:, i]) * np.cos(psi - leg.rail_angle)
-        dF[:, i, 2] = np.sin(psi - leg.rail_angle)
-        dF[:, i, 3] = np.cos(leg.edge_angle - first.edge_angle)
-        dF[:, i, 4] = -joints.passive_position[:, i]
+    for i, (leg, first) in enumerate(zip(geometry.each, start.each, strict=True)):
+        slider, passive = joints.position[:, i], joints.passive_position[:, i]
+        dF[:, i] = leg.parameter_derivatives(first, poses[:, 2], slider, passive)
     return np.linalg.inv(J2)[..., np.newaxis] * dF[:, np.newaxis]
 
 
@@ -188,7 +166,7 @@ def _residuals(geometry: Geometry, poses: Array, sliders: Array) -> Array:
     return difference
 
 
-def _separate(derivatives: Array) -> tuple[Array, tuple[Open, ...]]:
+def _separate(start: Geometry, derivatives: Array) -> tuple[Array, tuple[Open, ...]]:
     """Return a basis (15, K) of the corrections that the data tells, by the whitened derivatives, and the rest.
 
     No correction of one leg can make up for that of another: at each pose their effects are independent. So
@@ -196,21 +174,17 @@ def _separate(derivatives: Array) -> tuple[Array, tuple[Open, ...]]:
     """
     columns: list[Array] = []
     unknown: list[Open] = []
-    for i, leg in enumerate(LEGS):
-        _, values, directions = np.linalg.svd(derivatives[:, :, i].reshape(-1, 5) * DOUBT, full_matrices=False)
+    for i, (leg, built) in enumerate(zip(LEGS, start.each, strict=True)):
+        doubt = np.array(built.DOUBT)
+        _, values, directions = np.linalg.svd(derivatives[:, :, i].reshape(-1, 5) * doubt, full_matrices=False)
         for direction in directions[values > 1.0]:
             column = np.zeros((3, 5))
-            column[i] = DOUBT * direction
+            column[i] = doubt * direction
             columns.append(column.ravel())
         if len(rest := directions[values <= 1.0]):
             shares = np.linalg.norm(rest, axis=0)
-            names = tuple(name for name, share in zip(PARAMETERS, shares, strict=True) if share > TAKES_PART)
+            names = tuple(name for name, share in zip(built.PARAMETERS, shares, strict=True) if share > TAKES_PART)
             unknown.append(Open(leg, names, len(rest)))
     if not columns:
         raise CalibrationError("with so much noise the poses tell nothing that drawings do not")
     return np.stack(columns, axis=1), tuple(unknown)
-
-
-def _across(point: tuple[float, float], angle: float, distance: float) -> tuple[float, float]:
-    """Return the point so far to the left of a line at this angle."""
-    return point[0] - distance * math.sin(angle), point[1] + distance * math.cos(angle)

@@ -24,8 +24,8 @@ ROOMS = ("kinematics", "motion", "control", "processes")
 
 def _sources() -> bytes:
     package = Path(__file__).parents[1]
-    files = [file for room in ROOMS for file in sorted((package / room).glob("*.py"))]
-    sources = [(file.parent.name, file.read_bytes()) for file in files]
+    files = [file for room in ROOMS for file in sorted((package / room).rglob("*.py"))]
+    sources = [(file.relative_to(package).parts[0], file.read_bytes()) for file in files]
     # Constants come from any file of the kinematics; elsewhere from those that have compiled functions themselves.
     return b"".join(source for room, source in sources if room == ROOMS[0] or b"@compiled(" in source)
 

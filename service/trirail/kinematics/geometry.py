@@ -1,17 +1,15 @@
-"""The three legs of a 3-PRP robot, symmetric or as built, and the platform angles at which they are singular.
+"""The three legs of a robot, symmetric or as built, and the platform angles at which they are singular.
 
-Lengths are in metres, angles in radians. With u(a) = (cos a, sin a), the platform's centre G and its rotation
-R(phi), each leg closes the loop (9), (11):
-
-    anchor + (home + lambda_10) u(rail_angle) + lambda_32 u(phi + edge_angle) = G + R(phi) edge_point
+Lengths are in metres, angles in radians. What a leg is, its mechanism says: prp3.leg and ppr3.leg; here the face of
+trirail.kinematics.leg is all that is known.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,52 +17,22 @@ from numpy.typing import ArrayLike, NDArray
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.correction import Correction
-from trirail.kinematics.joints import Joint, serial_leg
+from trirail.kinematics.leg import LEGS, PARALLEL, AnyLeg, wrapped
+from trirail.kinematics.ppr3.leg import PprLeg
+from trirail.kinematics.prp3.leg import Leg
 
-__all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "Room", "det_j2", "gains", "singular_angles", "travels"]
-
-LEGS = ("A", "B", "C")
-PARALLEL = 1e-9  # |sin| of the angle between an edge and its rail up to which the leg counts as singular
-THETA_1 = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # (3)
-
-
-@dataclass(frozen=True, slots=True)
-class Leg:
-    """One leg: a slider on a rail of the base carries a pin, along which an edge of the platform slides.
-
-    `anchor` is a point of the rail, `rail_angle` its direction, and the slider reads zero at `home` from the
-    anchor. `edge_point` is the point of the platform that is at the pin when lambda_32 is zero, `edge_angle`
-    the direction of the edge; both are in the platform's frame.
-    """
-
-    anchor: tuple[float, float]
-    rail_angle: float
-    home: float
-    edge_point: tuple[float, float]
-    edge_angle: float
-
-    def packed(self) -> Array:
-        """Return the leg as joints for trirail.kinematics.recursion: shape (4, 13)."""
-        start = np.array([*self.anchor, 0.0]) + self.home * _theta(self.rail_angle)[0]
-        to_centre = _theta(self.edge_angle) @ [-self.edge_point[0], -self.edge_point[1], 0.0]
-        return serial_leg(
-            [  # (2), with theta_2 for the angle between this leg's rail and edge
-                Joint("prismatic", THETA_1 @ _theta(self.rail_angle), start),
-                Joint("revolute", THETA_1.T),
-                Joint("prismatic", THETA_1 @ _theta(self.edge_angle - self.rail_angle)),
-            ],
-            tip=THETA_1 @ to_centre,
-        )
+__all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "PprLeg", "Room", "det_j2", "gains", "singular_angles", "travels"]
 
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
     """Three legs A, B, C, and what the robot differs from them by, if that is known.
 
-    KinematicsError if a number is not finite or the pose (0, 0, 0) is singular.
+    KinematicsError if a number is not finite, the legs are of two mechanisms, or the pose (0, 0, 0) is singular.
     """
 
-    legs: tuple[Leg, Leg, Leg]
+    legs: tuple[Any, Any, Any]
+    """Of one mechanism, prp3.leg.Leg or ppr3.leg.PprLeg; who knows the face alone reads `each`."""
     correction: Correction | None = None
     _packed: Array = field(init=False, repr=False, compare=False)
 
@@ -106,15 +74,40 @@ class Geometry:
         """
         return self._packed
 
+    @property
+    def each(self) -> tuple[AnyLeg, AnyLeg, AnyLeg]:
+        """The legs, as all mechanisms have them."""
+        return self.legs
+
+    @property
+    def kind(self) -> str:
+        """The mechanism, as [geometry] kind names it: 3-PRP or 3-PPR."""
+        return self.each[0].KIND
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """What calibration can tell of each leg [m, rad]."""
+        return self.each[0].PARAMETERS
+
+    @property
+    def arm(self) -> float:
+        """How far from its centre the platform is held at most [m]: what a turn by one radian moves."""
+        return max(leg.arm for leg in self.each)
+
 
 def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)) -> tuple[float, ...]:
     """Return every phi [rad] in (-pi, pi], ascending, at which J1 or J2 is singular with G at `centre` [m].
 
     The nearest on either side of zero bound the usable range: on the symmetric robot -2 pi/3 and pi/3,
     wherever G is. On a robot as built the angles that J1 excludes, where an edge is parallel to its rail,
-    still depend on nothing else; those that J2 excludes move with G, and can lie degrees inside.
+    still depend on nothing else; those that J2 excludes move with G, and can lie degrees inside. A 3-PPR robot has two,
+    pi apart, at which J2 is singular wherever G is.
     """
     of_j1 = _singular_angles_of_j1(geometry)
+    if not of_j1:  # then det J2 = A sin phi - B cos phi
+        B, A = det_j2(geometry, centre, np.array([math.pi, math.pi / 2.0])).tolist()
+        angle = math.atan2(B, A)
+        return tuple(sorted((wrapped(angle), wrapped(angle + math.pi))))
     found = [*of_j1]
     for low, high in zip(of_j1, [*of_j1[1:], of_j1[0] + 2.0 * math.pi], strict=True):
         # det J2 is smooth between two singular angles of J1. Zeros crowd at the ends, so the samples do too.
@@ -122,7 +115,7 @@ def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)
         negative = det_j2(geometry, centre, phi) < 0.0
         changes = np.flatnonzero(negative[1:] != negative[:-1]).tolist()
         found.extend(_bisect(geometry, centre, float(phi[k]), float(phi[k + 1])) for k in changes)
-    return tuple(sorted(_wrapped(phi) for phi in found))
+    return tuple(sorted(wrapped(phi) for phi in found))
 
 
 class Room(NamedTuple):
@@ -141,72 +134,45 @@ class Room(NamedTuple):
 
 
 def travels(geometry: Geometry, poses: ArrayLike) -> Array:
-    """Return lambda_10 and lambda_32 of the legs at poses (..., 3) of x, y [m], phi [rad]: (2, ..., 3) [m], by (11).
+    """Return where sliders and cross slides are at poses (..., 3) of x, y [m], phi [rad]: (2, ..., 3) [m], by (11).
 
-    For who looks at a few poses and has no use for the compiled trirail.kinematics.robot.inverse. Not finite where an
-    edge is parallel to its rail.
+    For who looks at a few poses and has no use for the compiled trirail.kinematics.robot.inverse. Not finite where a
+    cross slide is parallel to its rail.
     """
     told = np.array(poses, dtype=np.float64)
     if geometry.correction is not None:
         told += geometry.correction.at(told.reshape(-1, 3)).reshape(told.shape)
     x, y, phi = np.moveaxis(told, -1, 0)
-    cos, sin = np.cos(phi), np.sin(phi)
-    found = np.empty((2, *told.shape))
-    for i, leg in enumerate(geometry.legs):
-        (u, v), (anchor_x, anchor_y) = leg.edge_point, leg.anchor
-        way_x, way_y = x + cos * u - sin * v - anchor_x, y + sin * u + cos * v - anchor_y
-        edge_x, edge_y = np.cos(phi + leg.edge_angle), np.sin(phi + leg.edge_angle)
-        rail_x, rail_y = math.cos(leg.rail_angle), math.sin(leg.rail_angle)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pin = (edge_x * way_y - edge_y * way_x) / (edge_x * rail_y - edge_y * rail_x)
-            found[0, ..., i] = pin - leg.home
-            found[1, ..., i] = edge_x * (way_x - pin * rail_x) + edge_y * (way_y - pin * rail_y)
-    return found
+    return np.stack([leg.travels(x, y, phi) for leg in geometry.each], axis=-1)
 
 
 def gains(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
     """Return by how much x, y [m] and phi [rad] change for a metre of each slider: (3, 3), J2^-1 J1 at a pose.
 
-    From (11) without lambda_32: the sine between the edge and the way from the slider's pin to G + R(phi) edge_point
-    stays zero. LinAlgError where J2 is singular.
+    LinAlgError where J2 is singular.
     """
-    x, y, phi = pose
-    j1, j2 = np.zeros((3, 3)), np.zeros((3, 3))
-    for i, leg in enumerate(geometry.legs):
-        edge = _theta(phi + leg.edge_angle)[:2, :2]  # along the edge, and across it
-        rail, turn = _theta(leg.rail_angle)[0, :2], _theta(phi)[:2, :2].T
-        j1[i, i] = edge[1] @ rail
-        way = np.array([x, y]) + turn @ leg.edge_point - leg.anchor
-        pin = (edge[1] @ way) / j1[i, i] * rail
-        across = edge[1] @ turn @ np.array([-leg.edge_point[1], leg.edge_point[0]])
-        j2[i] = *edge[1], across - edge[0] @ (way - pin)
-    changes: Array = np.asarray(np.linalg.solve(j2, j1), dtype=np.float64)
+    rows = [leg.row(pose) for leg in geometry.each]
+    changes: Array = np.linalg.solve(np.array([row for _, row in rows]), np.diag([delta for delta, _ in rows]))
     return changes
 
 
 def _singular_angles_of_j1(geometry: Geometry) -> list[float]:
-    """Return each phi in (-pi, pi] at which the edge of some leg is parallel to its rail, ascending."""
-    parallel = (leg.rail_angle - leg.edge_angle + turn for leg in geometry.legs for turn in (0.0, math.pi))
-    angles = sorted(_wrapped(phi) for phi in parallel)
+    """Return each phi in (-pi, pi] at which the cross slide of some leg is parallel to its rail, ascending."""
+    parallel = [leg.parallel_angle for leg in geometry.each]
+    angles = sorted(wrapped(phi + turn) for phi in parallel if phi is not None for turn in (0.0, math.pi))
     return [phi for k, phi in enumerate(angles) if k == 0 or phi - angles[k - 1] > PARALLEL]
 
 
 def det_j2(geometry: Geometry, centre: tuple[float, float], phi: Array) -> Array:
     """Return det J2 [m] for poses with G at `centre` and any angles `phi`.
 
-    Only the third column of J2 depends on G, and its cofactors w, the sines between the edges, are constant:
-    det J2 = sum w_i beta_3^i. In beta_3^i the slider position is replaced by its solution of (11).
+    The cofactors w of its third column, the sines between the cross slides, are constant: det J2 = sum w_i beta_3^i.
     """
-    a, b, c = (leg.edge_angle for leg in geometry.legs)
+    a, b, c = (leg.cross_angle for leg in geometry.each)
     cofactors = math.sin(c - b), math.sin(a - c), math.sin(b - a)
     det = np.zeros_like(phi)
-    for w, leg in zip(cofactors, geometry.legs, strict=True):
-        rail, edge = leg.rail_angle, leg.edge_angle
-        x, y = leg.anchor[0] - centre[0], leg.anchor[1] - centre[1]
-        to_rail = y * math.cos(rail) - x * math.sin(rail)
-        to_edge = leg.edge_point[0] * math.sin(edge) - leg.edge_point[1] * math.cos(edge)
-        delta = phi + edge - rail
-        det -= w * (to_rail + to_edge * np.cos(delta)) / np.sin(delta)
+    for w, leg in zip(cofactors, geometry.each, strict=True):
+        det += w * leg.lever(centre, phi)
     return det
 
 
@@ -223,35 +189,16 @@ def _bisect(geometry: Geometry, centre: tuple[float, float], low: float, high: f
 
 def _check(geometry: Geometry) -> None:
     """Refuse what is not finite, or singular at the pose (0, 0, 0), by which forward tells branches apart."""
-    for name, leg in zip(LEGS, geometry.legs, strict=True):
-        for key, value in zip(Leg.__slots__, astuple(leg), strict=True):
-            if not np.all(np.isfinite(value)):
-                raise KinematicsError(f"leg {name}: {key} is {value}: it must be finite", leg=name)
-        delta = leg.edge_angle - leg.rail_angle
-        if abs(math.sin(delta)) <= PARALLEL:
-            raise KinematicsError(
-                f"leg {name}: edge_angle is parallel to rail_angle: singular at the pose (0, 0, 0)",
-                leg=name,
-                value=leg.edge_angle,
-                limit=leg.rail_angle,
-            )
+    if len({leg.KIND for leg in geometry.each}) > 1:
+        kinds = ", ".join(leg.KIND for leg in geometry.each)
+        raise KinematicsError(f"the legs are of different mechanisms: {kinds}")
+    for name, leg in zip(LEGS, geometry.each, strict=True):
+        leg.check(name)
     determinant = float(det_j2(geometry, (0.0, 0.0), np.zeros(1))[0])
-    size = max(math.hypot(*leg.anchor) + abs(leg.home) + math.hypot(*leg.edge_point) for leg in geometry.legs)
+    size = max(math.hypot(*leg.anchor) + abs(leg.home) + leg.arm for leg in geometry.each)
     if abs(determinant) <= PARALLEL * size:
         raise KinematicsError(
             f"the legs cannot hold the platform at the pose (0, 0, 0): det J2 is {determinant:.3g} m there",
             value=determinant,
             limit=PARALLEL * size,
         )
-
-
-def _theta(angle: float) -> Array:
-    """Return theta_alpha of (3)."""
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _wrapped(angle: float) -> float:
-    """Return the same angle in (-pi, pi]."""
-    wrapped = math.remainder(angle, 2.0 * math.pi)
-    return wrapped if wrapped > -math.pi else math.pi

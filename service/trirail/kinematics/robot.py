@@ -161,12 +161,14 @@ def _refuse_slider(geometry: Geometry, sliders: Array, pose: Array, leg: int, pl
 
 def _refuse_angle(geometry: Geometry, leg: int, phi: float, place: str) -> NoReturn:
     """Say where the edge of a leg is parallel to its rail."""
-    built = geometry.legs[leg]
-    delta = math.remainder(phi + built.edge_angle - built.rail_angle, math.pi)
-    what = "edge parallel to its rail" if abs(delta) <= 2.0 * PARALLEL else "out of all reach"
-    at, singular = worded(phi, "rad"), worded(phi - delta, "rad")
+    built, at = geometry.each[leg], worded(phi, "rad")
+    parallel = built.parallel_angle
+    if parallel is None:
+        raise KinematicsError(f"{place}leg {LEGS[leg]}: out of all reach at phi = {at}", leg=LEGS[leg], value=phi)
+    delta = math.remainder(phi - parallel, math.pi)
+    what = f"{built.CROSS} parallel to its rail" if abs(delta) <= 2.0 * PARALLEL else "out of all reach"
     raise KinematicsError(
-        f"{place}leg {LEGS[leg]}: {what} at phi = {at} (singular at {singular})",
+        f"{place}leg {LEGS[leg]}: {what} at phi = {at} (singular at {worded(phi - delta, 'rad')})",
         leg=LEGS[leg],
         value=phi,
         limit=phi - delta,

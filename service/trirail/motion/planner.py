@@ -77,8 +77,7 @@ class Planner:
         self.checker = checker
         self._period = period
         self._solver = Solver()
-        # How far the platform's edges are: what a turn by one radian moves at most.
-        self._reach = max(math.hypot(*leg.edge_point) for leg in geometry.legs)
+        self._reach = geometry.arm
 
     def check_pose(self, target: Sequence[float], tool: Sequence[float] = NO_TOOL) -> None:
         """Raise RefusedError, with coordinate, value and limit, if a pose is out of the workspace.

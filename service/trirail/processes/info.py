@@ -17,12 +17,13 @@ def info(config: Config) -> Info:
     """Return what a service of this configuration answers on …/info."""
     live = config.telemetry.live_port
     legs: list[dict[str, Any]] = []
-    for name, leg in zip(NAMES, geometry(config.geometry).legs, strict=True):
-        legs.append({"name": name} | {field: getattr(leg, field) for field in leg.__slots__})
+    for name, leg in zip(NAMES, geometry(config.geometry).each, strict=True):
+        legs.append({"name": name} | leg.keys())
     return Info(
         robot=config.robot.name,
         version=software().trirail,
         geometry=tuple(legs),
+        mechanism=config.geometry.kind,
         limits=msgspec.to_builtins(config.limits),
         frames=msgspec.to_builtins(config.frames),
         rate_hz=config.loop.rate_hz,

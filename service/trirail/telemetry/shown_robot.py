@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 from trirail import config
 from trirail.config import Config, FramesTable, Limits
-from trirail.kinematics.geometry import Geometry, Leg
+from trirail.config.tables import GeometryTable
+from trirail.kinematics.geometry import Geometry
 from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import Info
 
-prepare(Leg)
+prepare(GeometryTable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,10 +37,10 @@ class ShownRobot:
 
     @classmethod
     def told(cls, info: Info) -> ShownRobot:
-        """Take it from a service's answer. msgspec.ValidationError where that is of another version."""
-        first, second, third = (converted(_leg(leg), Leg) for leg in info.geometry)
+        """Take it from a service's answer. msgspec.ValidationError or ConfigError where that is of another version."""
+        legs = converted({"kind": info.mechanism, "leg": [_leg(leg) for leg in info.geometry]}, GeometryTable)
         limits, frames = converted(info.limits, Limits), converted(info.frames, FramesTable)
-        return cls(info.robot, Geometry(legs=(first, second, third)), limits, info.rate_hz, frames)
+        return cls(info.robot, config.geometry(legs), limits, info.rate_hz, frames)
 
 
 def _leg(table: dict[str, object]) -> dict[str, object]:

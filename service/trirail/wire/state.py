@@ -234,6 +234,8 @@ class Info(Struct, frozen=True):
     """What the drives do without; none where they have all."""
     correction: CorrectionTold | None = None
     """Of as-built errors; None where the robot is taken for its geometry."""
+    mechanism: str = "3-PRP"
+    """Key [geometry] kind of the configuration, which says what the keys of its legs are."""
 
 
 class NamedPose(Struct, frozen=True):

@@ -1,0 +1,166 @@
+"""Where the platform of a robot is, whichever its mechanism, from its sliders: forward kinematics; compiled.
+
+Here errors are codes and arrays are written in place. `legs` is Geometry.packed(), poses are (x, y, phi).
+"""
+
+from __future__ import annotations
+
+import math
+
+from trirail.kinematics.algebra import add, cross, dot, scale
+from trirail.kinematics.arrays import Array, Matrix, Vector
+from trirail.kinematics.compiled import compiled
+from trirail.kinematics.corrected import is_corrected, real_motion
+from trirail.kinematics.leg import PARALLEL
+from trirail.kinematics.loops import SlideLine
+from trirail.kinematics.mechanism import beta, close, demand, line, move
+from trirail.kinematics.recursion import ZERO
+
+__all__ = [
+    "J2_SINGULAR",
+    "LEGS_TYPE",
+    "LOOPS_OPEN",
+    "ROUNDING",
+    "forward_batch",
+    "forward_into",
+    "forward_motion",
+    "loop_equation",
+]
+
+ROUNDING = 1e-15  # part of the squares whose difference is (det J2)² that their rounding can make up
+LOOPS_OPEN, J2_SINGULAR = 4, 5  # codes of forward_into; 1 to 3 are the legs'
+LEGS_TYPE = "Array(f8, 3, 'C', readonly=True)"  # numba's name for what Geometry.packed() returns
+
+
+@compiled()
+def _sign_of_det_j2(legs: Array, pose: Vector) -> float:
+    """Return -1, 1, or 0 if the pose is singular or not finite."""
+    a, b, c = close(legs[0], pose), close(legs[1], pose), close(legs[2], pose)
+    rows = beta(a), beta(b), beta(c)
+    det = dot(rows[0], cross(rows[1], rows[2]))
+    size = abs(rows[0][2]) + abs(rows[1][2]) + abs(rows[2][2])
+    parallel = min(abs(a.delta), abs(b.delta), abs(c.delta)) <= PARALLEL
+    return math.copysign(1.0, det) if abs(det) > PARALLEL * size and not parallel else 0.0
+
+
+@compiled()
+def _loop_equation(a: SlideLine, b: SlideLine, c: SlideLine) -> Vector:
+    w = cross(b.u, c.u)[2], cross(c.u, a.u)[2], cross(a.u, b.u)[2]
+    return (
+        dot(w, (a.a, b.a, c.a)),
+        dot(w, (a.b, b.b, c.b)),
+        dot(w, (a.c, b.c, c.c)),
+    )
+
+
+@compiled(f"UniTuple(f8, 3)({LEGS_TYPE}, f8[::1])")
+def loop_equation(legs: Array, sliders: Array) -> Vector:
+    """Return A, B, C [m] of the equation A cos phi + B sin phi = C that the three loops leave for phi.
+
+    Each leg demands n_i . G = a_i cos phi + b_i sin phi - c_i. The normals n_i turn together, or stand, so with the
+    sines w_i between the cross slides sum w_i n_i = 0 at every phi: the sum of the demands with these weights is free
+    of G.
+    """
+    return _loop_equation(line(legs[0], sliders[0]), line(legs[1], sliders[1]), line(legs[2], sliders[2]))
+
+
+@compiled()
+def _forward(legs: Array, sliders: Array | Vector, near: Array, pose: Array) -> int:
+    """Write the pose of the legs as configured, without a correction."""
+    for i in range(3):
+        if not math.isfinite(sliders[i]):
+            return 1 + i
+    lines = line(legs[0], sliders[0]), line(legs[1], sliders[1]), line(legs[2], sliders[2])
+    A, B, C = _loop_equation(lines[0], lines[1], lines[2])
+    square = A * A + B * B
+    if square - C * C < -ROUNDING * square:
+        return LOOPS_OPEN
+    # det J2 = A sin phi - B cos phi: it differs in sign between the two solutions, and keeps it on any path
+    # that does not pass a singularity.
+    sign = _sign_of_det_j2(legs, (near[0], near[1], near[2]))
+    if sign == 0.0 or not square - C * C > ROUNDING * square:
+        return J2_SINGULAR
+    det = sign * math.sqrt(square - C * C)
+    cosine, sine = (A * C - B * det) / square, (B * C + A * det) / square
+    pose[2] = math.atan2(sine, cosine)
+    # The demands on n . G agree at this phi; least squares, to favour none.
+    xx = xy = yy = x = y = 0.0
+    code = 0
+    for i, each in enumerate(lines):
+        n, u, distance = demand(legs[i], each, cosine, sine)
+        xx, xy, yy = xx + n[0] * n[0], xy + n[0] * n[1], yy + n[1] * n[1]
+        x, y = x + n[0] * distance, y + n[1] * distance
+        if not abs(cross(each.rail, u)[2]) > PARALLEL:
+            code = 1 + i
+    pose[0] = (yy * x - xy * y) / (xx * yy - xy * xy)
+    pose[1] = (xx * y - xy * x) / (xx * yy - xy * xy)
+    return code
+
+
+@compiled()
+def _forward_real(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
+    code = _forward(legs, sliders, near, pose)
+    if code == 0 and is_corrected(legs):
+        pose[0], pose[1], pose[2] = real_motion(legs, ((pose[0], pose[1], pose[2]), ZERO, ZERO))[0]
+    return code
+
+
+@compiled(f"i8({LEGS_TYPE}, f8[::1], f8[::1], f8[::1])")
+def forward_into(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
+    """Write the pose at which the sliders stand as given; raises and allocates nothing.
+
+    `sliders`, `near` and `pose` have shape (3,); `near` is a pose on the wanted branch, and may be `pose`
+    itself. Returns 0; 1 + i if slider i is not finite or the cross slide of leg i parallel to its rail; 4 if no
+    pose closes the loops; 5 if J2 is singular, or `near` is. Then `pose` means nothing.
+    """
+    return _forward_real(legs, sliders, near, pose)
+
+
+@compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+def forward_batch(legs: Array, sliders: Array, near: Array, poses: Array) -> int:
+    """Do forward_into for arrays (N, 3); the codes of row k begin after 5 k."""
+    for k in range(len(sliders)):
+        code = _forward_real(legs, sliders[k], near[k], poses[k])
+        if code != 0:
+            return 5 * k + code
+    return 0
+
+
+@compiled()
+def _solve(rows: tuple[Vector, Vector, Vector], right: Vector) -> Vector:
+    """Solve three linear equations by Cramer's rule."""
+    a, b, c = rows
+    by_a, by_b, by_c = cross(b, c), cross(c, a), cross(a, b)
+    det = dot(a, by_a)
+    total = add(add(scale(right[0], by_a), scale(right[1], by_b)), scale(right[2], by_c))
+    return scale(1.0 / det, total)
+
+
+@compiled()
+def forward_motion(legs: Array, sliders: Matrix, near: Array, motion: Array) -> int:
+    """Write the platform's pose, velocity and acceleration (3, 3) for those of the sliders, three rows.
+
+    From (16): J2 times the platform's velocity is J1 times the sliders'. Their accelerations are linear in the
+    platform's, with the same matrices: what they are without it is subtracted. Codes of forward_into.
+    """
+    code = _forward(legs, sliders[0], near, motion[0])
+    if code != 0:
+        return code
+    pose = motion[0, 0], motion[0, 1], motion[0, 2]
+    a, b, c = close(legs[0], pose), close(legs[1], pose), close(legs[2], pose)
+    j2 = beta(a), beta(b), beta(c)
+    rates = a.delta * sliders[1][0], b.delta * sliders[1][1], c.delta * sliders[1][2]
+    velocity = _solve(j2, rates)
+    motion[1, 0], motion[1, 1], motion[1, 2] = velocity
+    for i in range(3):
+        leg = move(legs[i], pose, velocity, ZERO)
+        if not leg.regular:
+            return 1 + i
+        motion[2, i] = leg.closed.delta * (sliders[2][i] - leg.acceleration)
+    acceleration = _solve(j2, (motion[2, 0], motion[2, 1], motion[2, 2]))
+    motion[2, 0], motion[2, 1], motion[2, 2] = acceleration
+    if is_corrected(legs):
+        real = real_motion(legs, (pose, velocity, acceleration))
+        for i in range(3):
+            motion[i, 0], motion[i, 1], motion[i, 2] = real[i]
+    return 0

@@ -1,0 +1,78 @@
+"""Which mechanism a packed leg is, and the calls that go to it: all that compiled code knows of mechanisms.
+
+The tag is in the array: the second joint of a 3-PRP leg turns, that of a 3-PPR leg slides.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from trirail.kinematics.algebra import dot
+from trirail.kinematics.arrays import Array, Vector
+from trirail.kinematics.compiled import compiled, inlined
+from trirail.kinematics.leg import PARALLEL
+from trirail.kinematics.loops import ClosedLeg, SlideLine
+from trirail.kinematics.ppr3 import closure as ppr3
+from trirail.kinematics.prp3 import closure as prp3
+from trirail.kinematics.recursion import joint_motion
+
+__all__ = ["MovingLeg", "beta", "close", "demand", "line", "move"]
+
+_close_prp3, _line_prp3, _demand_prp3 = prp3.close, prp3.line, prp3.demand
+_close_ppr3, _line_ppr3, _demand_ppr3 = ppr3.close, ppr3.line, ppr3.demand
+
+
+class MovingLeg(NamedTuple):
+    """A closed leg whose platform moves."""
+
+    closed: ClosedLeg
+    rate: float  # of the slider
+    acceleration: float
+    passive_rate: float  # of the cross slide
+    passive_acceleration: float
+    regular: bool  # else the leg is singular, or a number is not finite
+
+
+@inlined
+def _turns_second(leg: Array) -> bool:
+    """Whether the pivot rides on the carriage: 3-PRP."""
+    return bool(leg[1, 0] != 0.0)
+
+
+@compiled()
+def close(leg: Array, pose: Vector) -> ClosedLeg:
+    """Return where a leg's joints are with the platform at a pose."""
+    return _close_prp3(leg, pose) if _turns_second(leg) else _close_ppr3(leg, pose)
+
+
+@compiled()
+def line(leg: Array, slider: float) -> SlideLine:
+    """Return the line that a leg leaves to the platform while its slider stands."""
+    return _line_prp3(leg, slider) if _turns_second(leg) else _line_ppr3(leg, slider)
+
+
+@compiled()
+def demand(leg: Array, line: SlideLine, cosine: float, sine: float) -> tuple[Vector, Vector, float]:
+    """Return normal n and direction of a leg's cross slide at phi, and the n . G that the leg demands there."""
+    return _demand_prp3(line, cosine, sine) if _turns_second(leg) else _demand_ppr3(line, cosine, sine)
+
+
+@compiled()
+def move(leg: Array, pose: Vector, velocity: Vector, acceleration: Vector) -> MovingLeg:
+    """Solve a leg for the motion of its platform."""
+    closed = close(leg, pose)
+    prp = _turns_second(leg)
+    second, third = (pose[2], closed.passive) if prp else (closed.passive, pose[2])
+    rates, accelerations = joint_motion(leg, (closed.slider, second, third), velocity, acceleration)
+    rate, change = (rates[2], accelerations[2]) if prp else (rates[1], accelerations[1])
+    sliders = closed.slider + rates[0] + accelerations[0]
+    total = sliders + closed.passive + rate + change
+    regular = abs(closed.delta) > PARALLEL and math.isfinite(total)
+    return MovingLeg(closed, rates[0], accelerations[0], rate, change, regular)
+
+
+@compiled()
+def beta(closed: ClosedLeg) -> Vector:
+    """Return the leg's row of J2, (18)."""
+    return closed.cross[1], -closed.cross[0], dot(closed.cross, closed.to_centre)

@@ -1,0 +1,140 @@
+"""A leg of the 3-PPR mechanism: rail, cross slide on the carriage that keeps its direction, pivot under the platform.
+
+With u(a) = (cos a, sin a), the platform's centre G and its rotation R(phi), the leg closes the loop
+
+    anchor + (home + lambda_10) u(rail_angle) + lambda_21 u(cross_angle) = G + R(phi) pivot
+
+so with n across the cross slide, n . u lambda_10 = n . (G + R(phi) pivot - anchor - home u): linear in G.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from trirail.errors import KinematicsError
+from trirail.kinematics.arrays import Array
+from trirail.kinematics.joints import Joint, serial_leg
+from trirail.kinematics.leg import PARALLEL, THETA_1, Crossing, check_finite, theta
+
+__all__ = ["PprLeg"]
+
+
+@dataclass(frozen=True, slots=True)
+class PprLeg:
+    """One leg: a slider on a rail of the base carries a cross slide, on which a pivot of the platform rides.
+
+    `anchor` is a point of the rail, `rail_angle` its direction, and the slider reads zero at `home` from the anchor.
+    `pivot` is in the platform's frame, `cross_angle` the direction of the cross slide in the base frame.
+    """
+
+    KIND: ClassVar[str] = "3-PPR"
+    # To move the anchor is to change `home`, and the zero of lambda_21: it is not sought. Where the cross slide is at
+    # right angles to its rail, poses do not tell the rail's angle: it is left open.
+    PARAMETERS: ClassVar[tuple[str, ...]] = ("rail_angle", "home", "pivot in x", "pivot in y", "cross_angle")
+    DOUBT: ClassVar[tuple[float, ...]] = (0.05, 0.01, 0.01, 0.01, 0.05)
+    CROSS: ClassVar[str] = "cross slide"
+
+    anchor: tuple[float, float]
+    rail_angle: float
+    home: float
+    pivot: tuple[float, float]
+    cross_angle: float
+
+    @property
+    def parallel_angle(self) -> None:
+        """None: cross slide and rail keep the angle between them."""
+        return None
+
+    @property
+    def arm(self) -> float:
+        """How far from G the pivot is [m]."""
+        return math.hypot(*self.pivot)
+
+    @property
+    def crossing(self) -> Crossing:
+        """How to draw the cross slide: on the carriage, which the pivot leaves along it."""
+        return Crossing(self.pivot, self.cross_angle, False)
+
+    def keys(self) -> dict[str, Any]:
+        """Return its numbers by the keys of [[geometry.leg]] [m, rad]."""
+        return asdict(self)
+
+    def check(self, name: str) -> None:
+        """Refuse what is not finite, or a cross slide along its rail. Raises KinematicsError."""
+        check_finite(self, name)
+        if abs(math.sin(self.cross_angle - self.rail_angle)) <= PARALLEL:
+            raise KinematicsError(
+                f"leg {name}: cross_angle is parallel to rail_angle: the cross slide must lead across the rail",
+                leg=name,
+                value=self.cross_angle,
+                limit=self.rail_angle,
+            )
+
+    def packed(self) -> Array:
+        """Return the leg as joints for trirail.kinematics.recursion: shape (4, 13)."""
+        start = np.array([*self.anchor, 0.0]) + self.home * theta(self.rail_angle)[0]
+        # Each prismatic joint's z axis is its direction; THETA_1 takes x to z, and its transpose back.
+        return serial_leg(
+            [
+                Joint("prismatic", THETA_1 @ theta(self.rail_angle), start),
+                Joint("prismatic", THETA_1 @ theta(self.cross_angle - self.rail_angle) @ THETA_1.T),
+                Joint("revolute", theta(-self.cross_angle) @ THETA_1.T),
+            ],
+            tip=[-self.pivot[0], -self.pivot[1], 0.0],
+        )
+
+    def travels(self, x: Array, y: Array, phi: Array) -> tuple[Array, Array]:
+        """Return lambda_10 and lambda_21 at poses, arrays of one shape [m]."""
+        cos, sin = np.cos(phi), np.sin(phi)
+        way_x = x + cos * self.pivot[0] - sin * self.pivot[1] - self.anchor[0]
+        way_y = y + sin * self.pivot[0] + cos * self.pivot[1] - self.anchor[1]
+        rail_x, rail_y = math.cos(self.rail_angle), math.sin(self.rail_angle)
+        cross_x, cross_y = math.cos(self.cross_angle), math.sin(self.cross_angle)
+        delta = rail_x * cross_y - rail_y * cross_x
+        slider = (way_x * cross_y - way_y * cross_x) / delta - self.home
+        return slider, (rail_x * way_y - rail_y * way_x) / delta
+
+    def row(self, pose: tuple[float, float, float]) -> tuple[float, Array]:
+        """Return the leg's diagonal element of J1 and its row (3,) of J2, (16)."""
+        x, y = math.cos(self.cross_angle), math.sin(self.cross_angle)
+        lever = self.lever((pose[0], pose[1]), np.array([pose[2]]))
+        return math.sin(self.cross_angle - self.rail_angle), np.array([y, -x, lever[0]])
+
+    def lever(self, centre: tuple[float, float], phi: Array) -> Array:  # noqa: ARG002 - as of every leg
+        """Return u(cross_angle) . (-R(phi) pivot), the last element of the leg's row of J2 [m], wherever G is."""
+        angle = phi - self.cross_angle
+        found: Array = -(self.pivot[0] * np.cos(angle) - self.pivot[1] * np.sin(angle))
+        return found
+
+    def corrected(self, corrections: Sequence[float]) -> PprLeg:
+        """Return the leg with corrections to its PARAMETERS."""
+        rail_angle, home, pivot_x, pivot_y, cross_angle = corrections
+        return PprLeg(
+            anchor=self.anchor,
+            rail_angle=self.rail_angle + rail_angle,
+            home=self.home + home,
+            pivot=(self.pivot[0] + pivot_x, self.pivot[1] + pivot_y),
+            cross_angle=self.cross_angle + cross_angle,
+        )
+
+    def parameter_derivatives(self, first: PprLeg, phi: Array, slider: Array, passive: Array) -> Array:  # noqa: ARG002
+        """Return how F changes with corrections: (N, 5).
+
+        With n = (sin, -cos)(cross_angle), F = n . (anchor + (home + lambda_10) u(rail_angle) - G - R pivot) = 0.
+        """
+        delta, angle = self.cross_angle - self.rail_angle, phi - self.cross_angle
+        return np.stack(
+            [
+                -(self.home + slider) * math.cos(delta),
+                np.full(len(phi), math.sin(delta)),
+                np.sin(angle),
+                np.cos(angle),
+                -passive,
+            ],
+            axis=1,
+        )
