@@ -34,8 +34,8 @@ from trirail_drivers import files
 COLUMNS = ("x", "y", "phi", *LEGS)
 COORDINATES = (("x", "µm", 1e6), ("y", "µm", 1e6), ("phi", "mrad", 1e3))
 HELD = """\
-No pose tells where along its rail an anchor lies, which home makes up for, nor where along its edge an edge
-point, which is only the zero of lambda_32: along rail and edge both stay as in the starting geometry."""
+No pose tells where an anchor lies along its rail, which home makes up for, nor where the travel of a cross slide is
+counted from: both stay as in the starting geometry."""
 
 
 def read(path: Path, *, degrees: bool = False) -> tuple[Array, Array, list[int]]:

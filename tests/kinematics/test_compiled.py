@@ -1,6 +1,8 @@
 """Compiled code is kept from one start to the next, and thrown away when any of its sources changes."""
 
 import os
+import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -85,6 +87,26 @@ def test_kept_code_that_names_a_class_which_is_no_more_is_compiled_anew(room: Pa
         (room / "closure.py").write_text(source.format(name))
         assert run(code, tmp_path) == "2.0 1"
         assert run(code, tmp_path) == "2.0 0"
+
+
+PACKAGE = Path(compiled.__file__).parents[1]
+FOLDERS = sorted({file.parent for file in PACKAGE.rglob("*.py") if b"\n@compiled(" in file.read_bytes()})
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: str(folder.relative_to(PACKAGE)))
+def test_every_room_with_compiled_code_belongs_to_the_fingerprint(folder: Path, tmp_path: Path) -> None:
+    for file in PACKAGE.rglob("*.py"):
+        (tmp_path / file.relative_to(PACKAGE)).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, tmp_path / file.relative_to(PACKAGE))
+
+    def fingerprint() -> str:
+        return str(runpy.run_path(str(tmp_path / "kinematics" / "compiled.py"))["FINGERPRINT"])
+
+    assert fingerprint() == compiled.FINGERPRINT
+    edited = next(file for file in sorted(folder.glob("*.py")) if b"\n@compiled(" in file.read_bytes())
+    with (tmp_path / edited.relative_to(PACKAGE)).open("a") as text:
+        text.write("# edited\n")
+    assert fingerprint() != compiled.FINGERPRINT
 
 
 def test_processes_that_start_together_compile_once(room: Path, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from trirail.config import SIM, Limits, load
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import Geometry, Leg, singular_angles
 from trirail.kinematics.robot import inverse, jacobians
-from trirail.workspace.aspect import range_of_j1
+from trirail.workspace.aspect import range_of_phi
 from trirail.workspace.singularity import (
     characteristic_length,
     conditioning,
@@ -163,14 +163,14 @@ def test_the_distance_is_negative_in_another_aspect() -> None:
     low, high = -2 * math.pi / 3, math.pi / 3
     expected = [high, high - 1.0, high - 1.1, -2.0 - low, -2.2 - low]
     assert_allclose(distance_to_singularity(PAPER, poses), expected, atol=1e-12)
-    assert_allclose(range_of_j1(PAPER), [low, high], atol=1e-12)
+    assert_allclose(range_of_phi(PAPER), [low, high], atol=1e-12)
 
 
 def test_beyond_a_singularity_of_j2_alone_the_distance_is_negative_too() -> None:
     robot = next(
         robot
         for robot in (as_built(seed, 0.01) for seed in range(100))
-        if min(angle for angle in singular_angles(robot) if angle > 0.0) < range_of_j1(robot)[1] - 0.1
+        if min(angle for angle in singular_angles(robot) if angle > 0.0) < range_of_phi(robot)[1] - 0.1
     )
     nearest = min(angle for angle in singular_angles(robot) if angle > 0.0)
     for step in (0.02, -0.02):
@@ -197,7 +197,7 @@ def slack(robot: Geometry, limits: Limits, poses: Array) -> Array:
     motion = inverse(robot, poses)
     position, passive = motion.position, motion.passive_position
     (low, high), (inner, outer) = limits.slider.position, limits.slider.passive
-    start, end = range_of_j1(robot)
+    start, end = range_of_phi(robot)
     phi, margin = poses[:, 2], limits.singularity_margin
     left = np.minimum(phi - start, end - phi) - margin
     for turn in np.linspace(-margin, margin, 257):
@@ -289,7 +289,7 @@ def test_the_window_at_zero_by_hand() -> None:
 
 
 def test_outside_of_the_window_and_beyond_the_margin_nothing_is_left() -> None:
-    low, high = range_of_j1(PAPER)
+    low, high = range_of_phi(PAPER)
     everything = limited((-9.0, 9.0), (-9.0, 9.0), margin=0.2)
     for end, inwards in ((low, 0.2), (high, -0.2)):
         assert len(reachable(PAPER, everything, end + inwards * 1.0001)) > 0
@@ -308,7 +308,7 @@ def test_the_margin_cuts_a_slice_of_a_robot_as_built(seed: int) -> None:
     """There det J2 depends on G: at the same angle one part of a slice keeps the margin and another does not."""
     robot = as_built(seed, 0.01)
     nearest = min(angle for angle in singular_angles(robot) if angle > 0.0)
-    assert nearest < range_of_j1(robot)[1] - 0.1
+    assert nearest < range_of_phi(robot)[1] - 0.1
     origin = np.zeros((1, 2))
     wide, narrow = (reachable(robot, limited((-0.5, 0.5), (-0.5, 0.5), m), nearest - 0.1) for m in (0.0999, 0.1001))
     assert contains(wide, origin)

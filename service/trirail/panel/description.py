@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from trirail.client.held_jog import SPEEDS
-from trirail.errors import ServiceError
+from trirail.errors import ConfigError, ServiceError
 from trirail.telemetry import palette
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.state import Info
@@ -19,7 +19,7 @@ def describe(info: Info, user: str) -> dict[str, Any]:
     """Return it, ready to be encoded. Raises ServiceError where the service is of another version."""
     try:
         robot = ShownRobot.told(info)
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, ConfigError) as error:
         raise ServiceError(f"the service is of another version, {info.version}: {error}") from error
     parts = Mechanism.of(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform
@@ -32,8 +32,15 @@ def describe(info: Info, user: str) -> dict[str, Any]:
         "speeds": SPEEDS,
         "homes": info.homes,
         "legs": [
-            {"anchor": leg.anchor, "home": leg.home, "rail_angle": leg.rail_angle, "edge_angle": leg.edge_angle}
-            for leg in robot.geometry.legs
+            {
+                "anchor": leg.anchor,
+                "home": leg.home,
+                "rail_angle": leg.rail_angle,
+                "cross_angle": leg.crossing.angle,
+                "turns": leg.crossing.turns,
+                "pivot": leg.crossing.point,
+            }
+            for leg in robot.geometry.each
         ],
         "parts": {name: _lists(getattr(parts, name)) for name in parts.__slots__},
         "colours": {

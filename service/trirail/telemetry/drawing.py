@@ -68,7 +68,7 @@ def still(parts: Mechanism, frames: FramesTable) -> Iterator[tuple[str, rr.AsCom
         "/robot/goal",
         rr.LineStrips2D.from_fields(colors=[palette.GOAL], radii=rr.Radius.ui_points(1.0), draw_order=24),
     )
-    yield (  # in which the platform's edges slide
+    yield (  # sleeves in which the platform's edges slide, or the carriages' cross slides
         "/robot/passive",
         rr.LineStrips2D.from_fields(
             colors=[palette.dark(c) for c in palette.SLIDERS], radii=rr.Radius.ui_points(5.5), draw_order=25
@@ -82,7 +82,7 @@ def still(parts: Mechanism, frames: FramesTable) -> Iterator[tuple[str, rr.AsCom
         "/robot/platform/centre",
         rr.Points2D([[0.0, 0.0]], radii=rr.Radius.ui_points(4.0), colors=[palette.CENTRE], draw_order=31),
     )
-    yield (  # each slider, and in it the pin that the platform turns on
+    yield (  # each slider, and the pivot that the platform turns on
         "/robot/sliders",
         rr.Points2D.from_fields(
             radii=[-8.5] * 3 + [-3.0] * 3,  # negative: points of the screen, not metres
@@ -95,13 +95,14 @@ def still(parts: Mechanism, frames: FramesTable) -> Iterator[tuple[str, rr.AsCom
 def moving(geometry: Geometry, parts: Mechanism, before: NDArray[np.void], records: NDArray[np.void]) -> list[Column]:
     """Return where the moving parts are in `records`, (N,), and the trace of the centre there from `before`."""
     sliders = mechanism.sliders(geometry, records["position"])
-    sleeves = mechanism.sleeves(geometry, sliders, records["pose"][:, 2], parts.sleeve)
+    crossing = mechanism.cross_slides(geometry, parts, sliders, records["pose"][:, 2])
+    pivots = mechanism.pivots(geometry, sliders, records["pose"])
     steps = np.stack([before["pose"][:, :2], records["pose"][:, :2]], axis=1)[:, None]
     return [
         *_placed("/robot/platform", records["pose"]),
         *_placed("/robot/commanded", records["commanded_pose"]),
-        Column("/robot/sliders", POSITIONS, columns.vectors(np.concatenate([sliders, sliders], axis=1))),
-        Column("/robot/passive", STRIPS, columns.strips(sleeves)),
+        Column("/robot/sliders", POSITIONS, columns.vectors(np.concatenate([sliders, pivots], axis=1))),
+        Column("/robot/passive", STRIPS, columns.strips(crossing)),
         Column("/robot/trace", STRIPS, columns.strips(steps)),
     ]
 

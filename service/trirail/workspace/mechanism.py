@@ -13,13 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trirail.config import SliderLimits
-from trirail.kinematics.geometry import PARALLEL, Geometry, Leg
+from trirail.kinematics.geometry import PARALLEL, Geometry
+from trirail.kinematics.leg import AnyLeg
 
 Points = NDArray[np.float64]
 STOP = 0.022
 """Length of an end stop's mark, as a share of the longest rail."""
 SLEEVE = 0.035
 """Half the length of the sleeve in which an edge of the platform slides, likewise."""
+TABLE = 0.3
+"""By what share of its size a stage's table reaches beyond the points by which it is held."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,15 +37,15 @@ class Mechanism:
     stops: list[Points]
     """Marks across both ends of each travel."""
     outline: list[Points]
-    """The platform's edges: one closed triangle, or three separate edges if two of them are parallel."""
+    """The platform: the triangle of its edges, or a table over those that form none and over pivots."""
     edge_stops: list[Points]
-    """Marks across both ends of the passive joints' travel along the edges."""
+    """Marks across both ends of the passive joints' travel along the platform's edges."""
     arms: list[Points]
-    """From the platform's centre to its corners."""
+    """From the platform's centre to where it is held."""
     names: Points
     """(3, 2): beside the middle of each rail, outside."""
-    sleeve: float
-    """Half the length of a passive joint's sleeve [m]."""
+    cross_slides: Points
+    """(3, 2): where each cross slide's drawn part begins and ends, along it from the carriage [m]."""
     bounds: Points
     """(2, 2): lowest and highest x and y of everything at the pose (0, 0, 0)."""
 
@@ -50,26 +53,30 @@ class Mechanism:
     def of(cls, geometry: Geometry, limits: SliderLimits) -> Mechanism:
         """Lay out a robot's parts."""
         low, high = limits.position
-        legs = geometry.legs
+        legs = geometry.each
         # a rail reaches as far beyond its slider's travel as it begins before it
         rails = [_on_rail(leg, -leg.home, high + (low + leg.home)) for leg in legs]
         longest = max(float(np.linalg.norm(rail[1] - rail[0])) for rail in rails)
         corners = _corners(legs)
-        outline = [_on_edge(leg, *limits.passive) for leg in legs] if corners is None else [corners[[0, 1, 2, 0]]]
-        ends = [edge[0] for edge in outline] if corners is None else list(corners)
+        edges = [_on_edge(leg, *limits.passive) for leg in legs if leg.crossing.turns]
+        outline = [*edges, _table(legs)] if corners is None else [corners[[0, 1, 2, 0]]]
+        ends = [np.array(leg.crossing.point) for leg in legs] if corners is None else list(corners)
         middles = np.array([rail.mean(axis=0) for rail in rails])
         away = [_away(leg, middle - middles.mean(axis=0)) for leg, middle in zip(legs, middles, strict=True)]
         everything = np.concatenate([*rails, *outline])
+        half = SLEEVE * longest
         return cls(
             anchors=np.array([leg.anchor for leg in legs]),
             rails=rails,
             travel=[_on_rail(leg, low, high) for leg in legs],
             stops=[_across(leg, position, STOP * longest) for leg in legs for position in (low, high)],
             outline=outline,
-            edge_stops=[_across_edge(leg, at, STOP * longest) for leg in legs for at in limits.passive],
+            edge_stops=[
+                _across_edge(leg, at, STOP * longest) for leg in legs if leg.crossing.turns for at in limits.passive
+            ],
             arms=[np.array([np.zeros(2), end]) for end in ends],
             names=middles + 0.07 * longest * np.array(away),
-            sleeve=SLEEVE * longest,
+            cross_slides=np.array([(-half, half) if leg.crossing.turns else limits.passive for leg in legs]),
             bounds=np.array([everything.min(axis=0), everything.max(axis=0)]),
         )
 
@@ -77,16 +84,32 @@ class Mechanism:
 def sliders(geometry: Geometry, position: Points) -> Points:
     """Return where the sliders are, (N, 3, 2), for positions lambda_10, (N, 3)."""
     at = np.empty((*position.shape, 2))
-    for k, leg in enumerate(geometry.legs):
+    for k, leg in enumerate(geometry.each):
         at[:, k] = np.array(leg.anchor) + np.outer(leg.home + position[:, k], _u(leg.rail_angle))
     return at
 
 
-def sleeves(geometry: Geometry, centres: Points, phi: Points, half: float) -> Points:
-    """Return the sleeves of the passive joints as lines, (N, 3, 2, 2), around sliders (N, 3, 2) for angles (N,)."""
-    angles = phi[:, None] + [leg.edge_angle for leg in geometry.legs]
-    along = half * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    return np.stack([centres - along, centres + along], axis=2)
+def cross_slides(geometry: Geometry, parts: Mechanism, carriages: Points, phi: Points) -> Points:
+    """Return the cross slides as lines, (N, 3, 2, 2), on carriages (N, 3, 2) for angles (N,).
+
+    The sleeve of an edge turns with the platform; a cross slide that is fixed to its carriage does not.
+    """
+    crossings = [leg.crossing for leg in geometry.each]
+    angles = np.outer(phi, [each.turns for each in crossings]) + [each.angle for each in crossings]
+    along = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    lines: Points = carriages[:, :, None] + parts.cross_slides[:, :, None] * along[:, :, None]
+    return lines
+
+
+def pivots(geometry: Geometry, carriages: Points, poses: Points) -> Points:
+    """Return what the platform turns on, (N, 3, 2): carriages (N, 3, 2), or points of the platform at poses (N, 3)."""
+    at = carriages.copy()
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    for k, leg in enumerate(geometry.each):
+        if not leg.crossing.turns:
+            u, v = leg.crossing.point
+            at[:, k] = poses[:, :2] + np.stack([c * u - s * v, s * u + c * v], axis=1)
+    return at
 
 
 def placed(lines: list[Points], pose: Sequence[float]) -> list[Points]:
@@ -96,43 +119,54 @@ def placed(lines: list[Points], pose: Sequence[float]) -> list[Points]:
     return [line @ np.array([[c, s], [-s, c]]) + [x, y] for line in lines]
 
 
-def _on_rail(leg: Leg, *positions: float) -> Points:
+def _on_rail(leg: AnyLeg, *positions: float) -> Points:
     return np.array([np.array(leg.anchor) + (leg.home + at) * _u(leg.rail_angle) for at in positions])
 
 
-def _on_edge(leg: Leg, *positions: float) -> Points:
-    return np.array([np.array(leg.edge_point) - at * _u(leg.edge_angle) for at in positions])
+def _on_edge(leg: AnyLeg, *positions: float) -> Points:
+    point, angle, _ = leg.crossing
+    return np.array([np.array(point) - at * _u(angle) for at in positions])
 
 
-def _across(leg: Leg, position: float, length: float) -> Points:
+def _across(leg: AnyLeg, position: float, length: float) -> Points:
     across = length / 2.0 * _u(leg.rail_angle + math.pi / 2.0)
     (middle,) = _on_rail(leg, position)
     return np.array([middle - across, middle + across])
 
 
-def _across_edge(leg: Leg, position: float, length: float) -> Points:
-    across = length / 2.0 * _u(leg.edge_angle + math.pi / 2.0)
+def _across_edge(leg: AnyLeg, position: float, length: float) -> Points:
+    across = length / 2.0 * _u(leg.crossing.angle + math.pi / 2.0)
     (middle,) = _on_edge(leg, position)
     return np.array([middle - across, middle + across])
 
 
-def _away(leg: Leg, outward: Points) -> Points:
+def _away(leg: AnyLeg, outward: Points) -> Points:
     """Return the unit vector across the rail on the side of `outward`."""
     across = _u(leg.rail_angle + math.pi / 2.0)
     return across if across @ outward >= 0.0 else -across
 
 
-def _corners(legs: tuple[Leg, Leg, Leg]) -> Points | None:
-    """Return where each edge meets the next, (3, 2), or None where two never do."""
+def _corners(legs: Sequence[AnyLeg]) -> Points | None:
+    """Return where each edge of the platform meets the next, (3, 2), or None where two never do, or it has none."""
     corners = []
-    for leg, other in zip(legs, (*legs[1:], legs[0]), strict=True):
-        sine = math.sin(other.edge_angle - leg.edge_angle)
-        if abs(sine) <= PARALLEL:
+    for one, other in zip(legs, (*legs[1:], legs[0]), strict=True):
+        (point, angle, turns), (beyond, other_angle, _) = one.crossing, other.crossing
+        sine = math.sin(other_angle - angle)
+        if not turns or abs(sine) <= PARALLEL:
             return None
-        between = np.array(other.edge_point) - np.array(leg.edge_point)
-        along = (between[0] * math.sin(other.edge_angle) - between[1] * math.cos(other.edge_angle)) / sine
-        corners.append(np.array(leg.edge_point) + along * _u(leg.edge_angle))
+        between = np.array(beyond) - np.array(point)
+        along = (between[0] * math.sin(other_angle) - between[1] * math.cos(other_angle)) / sine
+        corners.append(np.array(point) + along * _u(angle))
     return np.array(corners)
+
+
+def _table(legs: Sequence[AnyLeg]) -> Points:
+    """Return a closed rectangle over the points by which a stage's table is held, and the centre, (5, 2)."""
+    held = np.array([(0.0, 0.0), *(leg.crossing.point for leg in legs)])
+    low, high = held.min(axis=0), held.max(axis=0)
+    beyond = TABLE * float((high - low).max()) / 2.0
+    (left, bottom), (right, top) = low - beyond, high + beyond
+    return np.array([[left, bottom], [right, bottom], [right, top], [left, top], [left, bottom]])
 
 
 def _u(angle: float) -> Points:

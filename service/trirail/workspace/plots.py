@@ -18,7 +18,7 @@ from matplotlib.patches import Patch, Polygon
 from trirail.config import Limits
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
-from trirail.workspace.aspect import range_of_j1
+from trirail.workspace.aspect import range_of_phi
 from trirail.workspace.mechanism import Mechanism
 from trirail.workspace.singularity import conditioning
 from trirail.workspace.workspace import Extent, area, permitted, reachable
@@ -116,7 +116,7 @@ def _areas(
     strip: Axes, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Extent, service: Extent
 ) -> None:
     """Draw the area of the slices along phi, with the angles near which every pose is singular."""
-    low, high = np.degrees(range_of_j1(geometry))
+    low, high = np.degrees(range_of_phi(geometry))
     margin = math.degrees(limits.singularity_margin)
     for wall, inward in ((low, margin), (high, -margin)):
         strip.axvspan(wall, wall + inward, color=FORBIDDEN, alpha=0.10, linewidth=0)

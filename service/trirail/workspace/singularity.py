@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import jacobians
-from trirail.workspace.aspect import det_j2_rows, parallel_angles
+from trirail.workspace.aspect import det_j2_rows, walls
 
 __all__ = [
     "characteristic_length",
@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 HOME = np.zeros(3)
-SAMPLES = 255  # of det J2 between two angles at which J1 is singular
+SAMPLES = 255  # of det J2 between two walls
 COINCIDENT = 1e-4  # two such angles that are nearer than this leave no room for a pose between them [rad]
 
 
@@ -77,21 +77,21 @@ def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.f
     poses = np.array(pose, dtype=np.float64).reshape(-1, 3)
     turn = 2.0 * math.pi
     poses[:, 2] -= turn * np.round(poses[:, 2] / turn)
-    of_j1 = np.sort(np.concatenate([parallel_angles(geometry) % math.pi + k * math.pi for k in (-2, -1, 0, 1)]))
-    above = np.searchsorted(of_j1, poses[:, 2])
-    distance = np.minimum(poses[:, 2] - of_j1[above - 1], of_j1[above] - poses[:, 2])
-    for k in np.unique(above):  # beyond the neighbours of J1 there is nothing nearer
-        if of_j1[k] - of_j1[k - 1] > COINCIDENT:
+    at_walls = np.sort(np.concatenate([walls(geometry) % math.pi + k * math.pi for k in (-2, -1, 0, 1)]))
+    above = np.searchsorted(at_walls, poses[:, 2])
+    distance = np.minimum(poses[:, 2] - at_walls[above - 1], at_walls[above] - poses[:, 2])
+    for k in np.unique(above):  # beyond the neighbouring walls there is nothing nearer
+        if at_walls[k] - at_walls[k - 1] > COINCIDENT:
             rows = np.flatnonzero(above == k)
-            found, zeros = _zeros_of_det_j2(geometry, poses[rows], of_j1[k - 1], of_j1[k])
+            found, zeros = _zeros_of_det_j2(geometry, poses[rows], at_walls[k - 1], at_walls[k])
             np.minimum.at(distance, rows[found], np.abs(zeros - poses[rows[found], 2]))
     distance = distance.reshape(inside.shape)
     return np.asarray(np.where(inside, distance, -distance), dtype=np.float64)
 
 
 def _zeros_of_det_j2(geometry: Geometry, poses: Array, low: float, high: float) -> tuple[NDArray[np.intp], Array]:
-    """Return every phi between two neighbouring angles of J1 at which J2 is singular, after the row it is for."""
-    # zeros crowd where J1 is singular, so the samples do too
+    """Return every phi between two neighbouring walls at which J2 is singular, after the row it is for."""
+    # zeros crowd there, so the samples do too
     phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, SAMPLES + 2)[1:-1])
     ones = np.ones(len(poses))
     negative = np.column_stack([ones, poses[:, :2]]) @ det_j2_rows(geometry, phi).T < 0.0

@@ -17,14 +17,14 @@ from trirail.config import Limits, Range
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry, travels
-from trirail.workspace.aspect import det_j2_rows, range_of_j1
+from trirail.workspace.aspect import det_j2_rows, range_of_phi
 
 __all__ = ["Extent", "area", "extent", "permitted", "reachable"]
 
 NOTHING = np.empty((0, 2))
 TOUCHING = 1e-13  # a vertex nearer than this to the edge of a half-plane is on it [m]
 TURNS = np.linspace(-1.0, 1.0, 129)  # where between the two ends of the singularity margin det J2 is looked at
-NEAR = 1e-4  # nearer than this to an angle of J1, rounding begins to hide the sign of det J2 [rad]
+NEAR = 1e-4  # nearer than this to a wall, rounding begins to hide the sign of det J2 [rad]
 SMALL = 1e-4  # steps of the centre over which as-built errors count as linear [m]
 SLICES = 721  # for the integral over phi
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
@@ -46,14 +46,14 @@ class Extent(NamedTuple):
 def reachable(geometry: Geometry, limits: Limits, phi: float) -> Array:
     """Return the polygon (V, 2) [m] of all G that the robot itself reaches at this phi.
 
-    Bounds are the travel of the sliders, limits.slider.position, that of the passive joints along the
-    platform's edges, limits.slider.passive, and the singularity margin: as far as that, the platform can turn
+    Bounds are the travel of the sliders, limits.slider.position, that of the cross slides,
+    limits.slider.passive, and the singularity margin: as far as that, the platform can turn
     either way and stay in the aspect of (0, 0, 0). Vertices are exact to rounding, with one exception: where
     det J2 is not monotonic within the margin, as on robots far from symmetric, the true limit is a curve, and
     the polygon circumscribes it, short of the margin by a 64th of it at most.
     """
     phi = math.remainder(phi, 2.0 * math.pi)
-    low, high = range_of_j1(geometry)
+    low, high = range_of_phi(geometry)
     margin = limits.singularity_margin
     if not low + margin <= phi <= high - margin:
         return NOTHING
@@ -97,11 +97,11 @@ def extent(geometry: Geometry, limits: Limits, section: Callable[[Geometry, Limi
     def at(phi: float) -> Array:
         return section(geometry, limits, phi)
 
-    scan = np.linspace(*range_of_j1(geometry), 257)
+    scan = np.linspace(*range_of_phi(geometry), 257)
     filled = np.flatnonzero([len(at(phi)) > 0 for phi in scan])
     if len(filled) == 0:
         raise KinematicsError("no pose is within the limits: widen limits.slider, limits.platform or the margin")
-    first, last = filled[0], filled[-1]  # never the ends of the scan: there J1 is singular
+    first, last = filled[0], filled[-1]  # never the ends of the scan: they are singular
     angles = np.linspace(
         _last_filled(at, scan[first], scan[first - 1]), _last_filled(at, scan[last], scan[last + 1]), SLICES
     )
@@ -129,7 +129,7 @@ def extent(geometry: Geometry, limits: Limits, section: Callable[[Geometry, Limi
 
 
 def _joints(geometry: Geometry, phi: float) -> Array:
-    """Return rows, (6, 3): lambda_10 of legs A, B, C, then lambda_32, each as row @ (1, x, y) [m]."""
+    """Return rows, (6, 3): sliders of legs A, B, C, then their cross slides, each as row @ (1, x, y) [m]."""
     step = 1.0 if geometry.correction is None else SMALL
     at_zero, *beside = travels(geometry, [[0.0, 0.0, phi], [step, 0.0, phi], [0.0, step, phi]]).swapaxes(0, 1)
     slopes = [(there - at_zero) / step for there in beside]
@@ -137,7 +137,7 @@ def _joints(geometry: Geometry, phi: float) -> Array:
 
 
 def _parallelogram(joints: Array, position: Range, passive: Range) -> Array:
-    """Return what one leg alone reaches, from its rows for lambda_10 and lambda_32, (2, 3)."""
+    """Return what one leg alone reaches, from its rows for slider and cross slide, (2, 3)."""
     (low, high), (inner, outer) = position, passive
     ends = np.array([[low, inner], [high, inner], [high, outer], [low, outer]])
     corners = np.asarray(np.linalg.solve(joints[:, 1:], (ends - joints[:, 0]).T).T, dtype=np.float64)

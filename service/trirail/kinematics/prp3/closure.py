@@ -36,7 +36,9 @@ def line(leg: Array, slider: float) -> SlideLine:
     third = link(link(first, leg, 1, 0.0), leg, 2, 0.0)
     u, pin = third.q[2], third.p
     n = u[1], -u[0], 0.0
-    return SlideLine(first.q[2], u, n, pin, dot(n, pin), dot(u, pin), dot(n, subtract(pin, platform_centre(leg, third))))
+    return SlideLine(
+        first.q[2], u, n, pin, dot(n, pin), dot(u, pin), dot(n, subtract(pin, platform_centre(leg, third)))
+    )
 
 
 @compiled()

@@ -6,7 +6,7 @@ export class Drawing {
   constructor(svg, robot) {
     const { parts, legs, colours } = robot;
     this.legs = legs;
-    this.sleeve = parts.sleeve;
+    this.ends = parts.cross_slides;
     const [low, high] = parts.bounds;
     const margin = 0.11 * (high[0] - low[0]);
     svg.replaceChildren();
@@ -34,7 +34,14 @@ export class Drawing {
     lines(parts.edge_stops, "stop", this.platform);
     const centre = add("circle", "centre", this.platform);
     centre.setAttribute("r", 0.012 * (high[0] - low[0]));
-    this.sleeves = legs.map((_, k) => add("line", "sleeve", svg, colours.sliders[k]));
+    this.sleeves = legs.map((leg, k) => add("line", leg.turns ? "sleeve" : "cross", svg, colours.sliders[k]));
+    const dots = (kind, size) => legs.map((_, k) => {
+      const dot = add("circle", kind, svg, colours.sliders[k]);
+      dot.setAttribute("r", size * (high[0] - low[0]));
+      return dot;
+    });
+    this.carriages = dots("carriage", 0.014);
+    this.pivots = dots("pivot", 0.007);
     parts.names.forEach(([x, y], k) => {
       const name = add("text", "");
       name.style.fill = colours.sliders[k];
@@ -53,10 +60,18 @@ export class Drawing {
       const along = leg.home + state.sliders.position[k];
       const x = leg.anchor[0] + along * Math.cos(leg.rail_angle);
       const y = leg.anchor[1] + along * Math.sin(leg.rail_angle);
-      const dx = this.sleeve * Math.cos(state.pose[2] + leg.edge_angle);
-      const dy = this.sleeve * Math.sin(state.pose[2] + leg.edge_angle);
+      const [px, py, phi] = state.pose;
+      const angle = leg.cross_angle + (leg.turns ? phi : 0);
+      const [dx, dy] = [Math.cos(angle), Math.sin(angle)];
+      const [from, to] = this.ends[k];
       const line = this.sleeves[k];
-      for (const [name, value] of [["x1", x - dx], ["y1", dy - y], ["x2", x + dx], ["y2", -y - dy]]) line.setAttribute(name, value);
+      for (const [name, value] of [["x1", x + from * dx], ["y1", -y - from * dy], ["x2", x + to * dx], ["y2", -y - to * dy]]) line.setAttribute(name, value);
+      const [u, v] = leg.pivot;
+      const pivot = leg.turns ? [x, y] : [px + u * Math.cos(phi) - v * Math.sin(phi), py + u * Math.sin(phi) + v * Math.cos(phi)];
+      for (const [dot, at] of [[this.carriages[k], [x, y]], [this.pivots[k], pivot]]) {
+        dot.setAttribute("cx", at[0]);
+        dot.setAttribute("cy", -at[1]);
+      }
     });
   }
 }
