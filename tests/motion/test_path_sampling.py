@@ -24,7 +24,7 @@ Pose = tuple[float, float, float]
 STEP = 0.001
 """The period of a cycle [s]."""
 LEGS = ROBOT.packed()
-ANYWHERE = np.array([[-9.0] * 5, [9.0] * 5])
+ANYWHERE = np.array([[-9.0] * 9, [9.0] * 9])
 """Limits of x, y, phi, lambda_10 and lambda_32 that nothing reaches."""
 COLUMNS = ((0,), (1,), (2,), (3, 4, 5), (6, 7, 8))
 """Which of x, y, phi, the sliders' and the passive positions each limit is of."""
@@ -82,7 +82,7 @@ def surveyed(path: Path, rate: float, box: Array = ANYWHERE, even: int = 16) -> 
     worst, law = np.zeros((6, 3)), constant(rate)
     start = rows_at(path, np.zeros(1))[0, 0]
     until = path.duration / rate
-    leaves_at = survey(LEGS, *path, law.knots, law.pieces, 0.0, until, even, STEP, start, box, worst)
+    leaves_at = survey(LEGS, *path, law.knots, law.pieces, 0.0, until, even, STEP, start, box, np.ones((3, 3)), worst)
     return leaves_at, worst
 
 
@@ -137,11 +137,11 @@ def test_when_a_path_is_first_out_of_reach_is_known_for_every_limit(
     assume(most - outward[0] > 1e-3)
     limit = outward[0] + share * (most - outward[0])
     box = ANYWHERE.copy()
-    box[side, column] = limit if side else -limit
+    box[side, COLUMNS[column]] = limit if side else -limit
     leaves_at, _ = surveyed(path, rate, box)
     first = int(np.argmax(outward > limit))
     assert seen.times[first - 1] - 1e-6 <= leaves_at <= seen.times[first] + 1e-6  # a limit has 1e-9 m of rounding
-    box[side, column] = (most + 1e-6) * (1.0 if side else -1.0)
+    box[side, COLUMNS[column]] = (most + 1e-6) * (1.0 if side else -1.0)
     leaves_at, _ = surveyed(path, rate, box)
     assert math.isnan(leaves_at)
 
@@ -161,7 +161,7 @@ def test_a_turn_beyond_a_limit_between_two_looks_is_seen(
     assume(most > max(outward[0], outward[-1]) + 1e-3)
     for room, inside in ((1e-6, True), (-1e-6, False)):
         box = ANYWHERE.copy()
-        box[side, column] = (most + room) * (1.0 if side else -1.0)
+        box[side, COLUMNS[column]] = (most + room) * (1.0 if side else -1.0)
         leaves_at, _ = surveyed(path, 1.0, box)
         assert math.isnan(leaves_at) is inside
         if not inside:

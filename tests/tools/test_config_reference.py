@@ -35,6 +35,7 @@ def test_every_key_says_what_it_means(headings: tuple[str, ...], key: str, row: 
 def test_every_limit_and_time_out_is_in_the_table_of_where_they_stand(ends: str) -> None:
     told = {place for bound in config_limits.BOUNDS for place in bound.places}
     homing = {f"drives.{drive}.homing." for drive in "BC"}  # as those of A
+    homing |= {f"limits.slider.{slider}." for slider in "BC"}
     for key in config_reference.names():
         own = key.startswith(("can.", "drives.A.simulated", *homing)) or (".homing." in key and ends != "timeout")
         assert own or not key.endswith(ends) or key in told, key

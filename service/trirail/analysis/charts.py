@@ -114,9 +114,11 @@ def _motion(panels: dict[str, Axes], records: NDArray[np.void], t: NDArray[np.fl
     slider, platform = limits.slider, limits.platform
     for x_or_y, values in zip((platform.x, platform.y), records["pose"][:, :2].T, strict=True):
         _bounds(panels["x, y [mm]"], values * 1e3, x_or_y[0] * 1e3, x_or_y[1] * 1e3)
-    _bounds(panels["λ [mm]"], records["position"] * 1e3, slider.position[0] * 1e3, slider.position[1] * 1e3)
-    velocity, allowed = slider.velocity * 1e3, slider.following_error * 1e6
-    _bounds(panels["velocity [mm/s]"], records["commanded_velocity"] * 1e3, -velocity, velocity)
+    for low, high in dict.fromkeys(slider.positions):
+        _bounds(panels["λ [mm]"], records["position"] * 1e3, low * 1e3, high * 1e3)
+    for velocity in dict.fromkeys(slider.velocities):
+        _bounds(panels["velocity [mm/s]"], records["commanded_velocity"] * 1e3, -velocity * 1e3, velocity * 1e3)
+    allowed = slider.following_error * 1e6
     _bounds(panels["error [µm]"], error * 1e6, -allowed, allowed)
 
 

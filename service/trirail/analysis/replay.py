@@ -296,5 +296,5 @@ def _simulated(records: NDArray[np.void], config: Config, clock: _Clock) -> Driv
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)
     can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives
     drives = connect(can, config.drives, clock)
-    drives.configure(config.period, config.limits.slider.velocity)
+    drives.configure(config.period, config.limits.slider.fastest)
     return drives

@@ -50,7 +50,7 @@ def drives(
         protocol = settings.drives.protocol
         raise DriveError(f"drives of protocol {protocol} have no objects to be shown; trirail commission finds them")
     with open_bus(settings.can, settings.drives) as bus:
-        fastest = settings.limits.slider.velocity
+        fastest = settings.limits.slider.fastest
         found = inspect(bus, settings.drives, settings.period, time.monotonic, fastest, apply=apply)
     fit = not any(each["refused"] for each in found)
     if json:

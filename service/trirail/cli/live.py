@@ -119,11 +119,12 @@ def table(state: State, robot: str, limits: Limits | None = None) -> Table:
 def near_limits(state: State, limits: Limits) -> Iterator[str]:
     """Yield a line for each limit that a measured position, commanded rate or following error is near, or beyond."""
     slider, platform = limits.slider, limits.platform
-    for name, at, error in zip(NAMES, state.sliders.position, state.sliders.following_error, strict=True):
-        yield from _position(f"slider {name}", at, slider.position, "mm", 3)
+    measured = zip(NAMES, state.sliders.position, slider.positions, state.sliders.following_error, strict=True)
+    for name, at, travel, error in measured:
+        yield from _position(f"slider {name}", at, travel, "mm", 3)
         yield from _rate(f"following error of {name}", error, slider.following_error, "µm", 1)
-    for name, rate in zip(NAMES, state.commanded.velocity, strict=True):
-        yield from _rate(f"velocity of slider {name}", rate, slider.velocity, "mm/s", 2)
+    for name, rate, most in zip(NAMES, state.commanded.velocity, slider.velocities, strict=True):
+        yield from _rate(f"velocity of slider {name}", rate, most, "mm/s", 2)
     ranges = (platform.x, platform.y, platform.phi)
     for (name, unit, per_second, digits), at, rate, ends, most in zip(
         _ALONG, state.pose, state.commanded.pose_velocity, ranges, platform.velocity, strict=True

@@ -10,6 +10,7 @@ from ruckig import InputParameter, Ruckig, Trajectory
 
 from trirail.config import Config, SliderLimits, geometry
 from trirail.kinematics.arrays import Array
+from trirail.kinematics.geometry import LEGS
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.ruckig_call import solved
 from trirail.quantities import beyond
@@ -40,9 +41,9 @@ def profile(distance: float, limits: SliderLimits, period: float) -> tuple[Array
     """
     request = InputParameter(1)
     request.target_position = [distance]
-    request.max_velocity = [min(VELOCITY, limits.velocity)]
-    request.max_acceleration = [min(ACCELERATION, limits.acceleration)]
-    request.max_jerk = [min(JERK, limits.jerk)]
+    request.max_velocity = [min(VELOCITY, *limits.velocities)]
+    request.max_acceleration = [min(ACCELERATION, *limits.accelerations)]
+    request.max_jerk = [min(JERK, *limits.jerks)]
     trajectory = Trajectory(1)
     if not solved(Ruckig(1), request, trajectory):
         raise ValueError(f"Ruckig finds no motion over {distance} m")
@@ -81,7 +82,10 @@ def square(config: Config, sliders: tuple[float, float, float]) -> tuple[SlowMov
         ("platform x", "m", path[:, 0], platform.x),
         ("platform y", "m", path[:, 1], platform.y),
         ("platform φ", "rad", path[:, 2], platform.phi),
-        ("a slider", "m", motion.position, slider.position),
+        *(
+            (f"slider {name}", "m", motion.position[:, i], ends)
+            for i, (name, ends) in enumerate(zip(LEGS, slider.positions, strict=True))
+        ),
         ("a passive joint", "m", motion.passive_position, slider.passive),
     ):
         for value, limit, outside in (

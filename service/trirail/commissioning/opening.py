@@ -76,7 +76,7 @@ def opened(
         def make_bench() -> Bench:
             nonlocal driver
             driver = PROTOCOLS[config.drives.protocol].driver(bus, config.can.bitrate, config.drives, clock)
-            driver.configure(config.period, config.limits.slider.velocity)
+            driver.configure(config.period, config.limits.slider.fastest)
             ticker = Ticker(round(config.period * 1e9))
             tick = simulated.tick if clock is simulated else lambda: ticker.wait().missed
             return Bench(config, driver, tick, interrupted)

@@ -66,7 +66,7 @@ class Session:
         if inspect is None:
             words = (f"drives of protocol {drives.protocol} have no objects to be shown; the next step finds them",)
             return Judged("ok", words), {}
-        fastest = self._config.limits.slider.velocity
+        fastest = self._config.limits.slider.fastest
         self._told = inspect(self.place.bus, drives, self._config.period, time.monotonic, fastest, apply=False)
         lines = tuple(line for each in self._told for line in drives_told.identity(each))
         refused = tuple(f"drive {each['name']}: {each['refused']}" for each in self._told if each["refused"])

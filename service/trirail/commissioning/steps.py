@@ -235,7 +235,7 @@ class Steps:
     def _way(self, index: int) -> float:
         """Return how far to move a slider [m]: away from the limit of its travel, where it is known where it is."""
         bench = self.session.bench()
-        beyond = bench.position[index] + 2.0 * moves.DISTANCE > self._config.limits.slider.position[1]
+        beyond = bench.position[index] + 2.0 * moves.DISTANCE > self._config.limits.slider.positions[index][1]
         return -moves.DISTANCE if beyond and bench.feedback.homed[index] else moves.DISTANCE
 
     def _step(self, name: str) -> float:

@@ -126,11 +126,11 @@ def told(file: str | None, found: AsBuilt | None, backlash: Triple) -> Correctio
     return CorrectionTold(file or "as_built", found.made, (x, y, phi), backlash)
 
 
-def check(found: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, sliders: Sequence[float]) -> None:
+def check(found: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, sliders: Sequence[Triple]) -> None:
     """Refuse a map that is another robot's, that does not reach all places, or that could break a limit anywhere.
 
     `robot` is without it; `platform` (3, 3) are the limits of velocity, acceleration and jerk of x, y, phi, `sliders`
-    those of the sliders [m, rad, s]. Raises ConfigError.
+    those of the sliders, each for A, B, C [m, rad, s]. Raises ConfigError.
     """
     errors = correction(found)
     if found.geometry != geometry_of(robot):
@@ -156,9 +156,9 @@ def check(found: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, slid
     for order, ((quantity, unit), limit, kept) in enumerate(zip(QUANTITIES, sliders, RESERVE, strict=True)):
         for i, leg in enumerate(LEGS):
             more = adds[order, :, i]
-            if not more.max() <= kept * limit:
+            if not more.max() <= kept * limit[i]:
                 what = f"adds up to {more.max():.3g} {unit} to slider {leg}'s {quantity}"
-                raise ConfigError(_steep(places[more.argmax()], what, f"{kept * limit:.3g} {unit}"))
+                raise ConfigError(_steep(places[more.argmax()], what, f"{kept * limit[i]:.3g} {unit}"))
 
 
 def _adds(errors: Correction, robot: Geometry, room: Room, rates: Array) -> tuple[Array, Array]:

@@ -26,7 +26,7 @@ def check_as_built(found: AsBuilt, robot: Geometry, limits: Limits) -> None:
     """Refuse a map that is not this robot's, or that could break a limit anywhere. Raises ConfigError."""
     platform, slider = limits.platform, limits.slider
     rates = platform.velocity, platform.acceleration, platform.jerk
-    as_built.check(found, robot, room(limits), rates, (slider.velocity, slider.acceleration, slider.jerk))
+    as_built.check(found, robot, room(limits), rates, (slider.velocities, slider.accelerations, slider.jerks))
 
 
 _WINDOWS = (
@@ -80,6 +80,9 @@ def rules(config: Config) -> Iterator[Rule]:
         "limits.slider.position": slider.position,
         "limits.slider.passive": slider.passive,
     }
+    for name, own in zip(NAMES, slider.own, strict=True):
+        if own.position is not None:
+            ranges[f"limits.slider.{name}.position"] = own.position
     for key, both in ranges.items():
         yield Rule(key, (), partial(_check_range, key, *both))
     yield Rule("geometry", (), partial(geometry, config.geometry))
@@ -151,13 +154,16 @@ def _check_rate(config: Config) -> None:
 def _required(config: Config) -> Requirements:
     """Return what the robot asks of its drives; without the windows of a robot that is singular, or none."""
     slider = config.limits.slider
-    places = (*slider.position, *(config.can.simulated.start if config.can.interface == "simulated" else ()))
+    places = (
+        *itertools.chain(*slider.positions),
+        *(config.can.simulated.start if config.can.interface == "simulated" else ()),
+    )
     try:
         _check_singular_angles(config)
         windows = tuple(_windows(config))
     except ConfigError:
         windows = ()
-    return Requirements(config.period, min(places), max(places), slider.velocity, slider.following_error, windows)
+    return Requirements(config.period, min(places), max(places), slider.fastest, slider.following_error, windows)
 
 
 def _windows(config: Config) -> Iterator[Window]:
@@ -193,7 +199,8 @@ def _check_pose(config: Config, name: str) -> None:
     ]
     position, passive = travels(corrected_geometry(config), pose).tolist()
     places += [
-        (f"slider {leg}", at, "position", slider.position, "slider") for leg, at in zip(NAMES, position, strict=True)
+        (f"slider {leg}", at, "position" if own.position is None else f"{leg}.position", ends, "slider")
+        for leg, at, own, ends in zip(NAMES, position, slider.own, slider.positions, strict=True)
     ]
     places += [
         (f"lambda_32 of {leg}", at, "passive", slider.passive, "slider") for leg, at in zip(NAMES, passive, strict=True)

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
-from trirail_drivers.interface import NAMES
+from trirail_drivers.interface import NAMES, Triple
 
 from trirail.config import as_built
 from trirail.config.as_built import AsBuilt
@@ -89,8 +89,24 @@ class PlatformLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """Least and greatest angle of the platform [rad], singularity_margin away from every singular one."""
 
 
+class OneSlider(Struct, frozen=True, forbid_unknown_fields=True):
+    """Section [limits.slider.A], B or C: what is this slider's own; the rest is as of all three."""
+
+    position: Range | None = None
+    """Travel of this slider [m]."""
+    velocity: Velocity | None = None
+    """Greatest rate of this slider [m/s]."""
+    acceleration: Acceleration | None = None
+    """Greatest acceleration of this slider [m/s²]."""
+    jerk: Jerk | None = None
+    """Greatest jerk of this slider [m/s³]."""
+
+
+_NOTHING = OneSlider()
+
+
 class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [limits.slider]: the same for all three."""
+    """Section [limits.slider]: of all three, but for what a slider has of its own."""
 
     position: Range
     """Travel of lambda_10 [m]."""
@@ -104,6 +120,43 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """Greatest jerk of each slider [m/s³]."""
     following_error: Distance
     """Setpoint less measured position beyond which everything stops [m]; less than `[drives] following_error`."""
+    A: OneSlider | None = None
+    B: OneSlider | None = None
+    C: OneSlider | None = None
+
+    @property
+    def own(self) -> tuple[OneSlider, OneSlider, OneSlider]:
+        """What the sliders A, B, C have of their own."""
+        return self.A or _NOTHING, self.B or _NOTHING, self.C or _NOTHING
+
+    @property
+    def positions(self) -> tuple[Range, Range, Range]:
+        """Travel of each slider [m]."""
+        a, b, c = (self.position if one.position is None else one.position for one in self.own)
+        return a, b, c
+
+    @property
+    def velocities(self) -> Triple:
+        """Greatest rate of each slider [m/s]."""
+        a, b, c = (self.velocity if one.velocity is None else one.velocity for one in self.own)
+        return a, b, c
+
+    @property
+    def accelerations(self) -> Triple:
+        """Greatest acceleration of each slider [m/s²]."""
+        a, b, c = (self.acceleration if one.acceleration is None else one.acceleration for one in self.own)
+        return a, b, c
+
+    @property
+    def jerks(self) -> Triple:
+        """Greatest jerk of each slider [m/s³]."""
+        a, b, c = (self.jerk if one.jerk is None else one.jerk for one in self.own)
+        return a, b, c
+
+    @property
+    def fastest(self) -> float:
+        """The greatest rate of any slider [m/s]."""
+        return max(self.velocities)
 
 
 Window = Annotated[float, Meta(ge=1e-9, le=1.0)]
@@ -337,4 +390,4 @@ def corrected_geometry(config: Config) -> Geometry:
 def room(limits: Limits) -> Room:
     """Return where the robot may be."""
     low, high = np.transpose([limits.platform.x, limits.platform.y, limits.platform.phi]).tolist()
-    return Room(low, high, limits.slider.position, limits.slider.passive)
+    return Room(low, high, limits.slider.positions, limits.slider.passive)

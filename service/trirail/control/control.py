@@ -80,7 +80,7 @@ class Control:
         frames, queue = NamedFrames(config.frames), config.motion.queue
         self.lease = LeaseArbiter(config.control.lease, config.period)
         self.goal_queue = GoalQueue(self.ledger, self.lease, self._planner, self.schedule, frames, queue, config.period)
-        legs, step_length = robot.packed(), config.limits.slider.velocity * config.period
+        legs, step_length = robot.packed(), config.limits.slider.fastest * config.period
         self._following_error_limit = config.limits.slider.following_error
         taken = take_up(config.correction.backlash, config.limits.slider)
         self.measured = Measured(

@@ -6,10 +6,12 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
+from trirail_drivers.interface import Triple
 
-from trirail.config import Config, geometry, room
+from trirail.config import Config, SliderLimits, geometry, room
+from trirail.config.tables import OneSlider
 from trirail.diagnosis.check import Check, Judgement, is_simulated, value
-from trirail.kinematics.geometry import gains, travels
+from trirail.kinematics.geometry import LEGS, gains, travels
 
 RAMP = 1e-3, 10.0
 """Between these is what any slider takes to its limit of velocity, or of acceleration [s]."""
@@ -27,12 +29,20 @@ _ORDERS = (("velocity", "acceleration", "", "/s"), ("acceleration", "jerk", "/sÂ
 _AXES = (("x", "m"), ("y", "m"), ("phi", "rad"))
 
 
+def _each(slider: SliderLimits, quantity: str) -> Triple:
+    """Return a limit of each slider by its key for all."""
+    return {"velocity": slider.velocities, "acceleration": slider.accelerations, "jerk": slider.jerks}[quantity]
+
+
 def _ramps(config: Config) -> Iterator[Check]:
     """Nothing reaches its velocity within a millisecond, or takes ten seconds; so for acceleration."""
     slider, platform = config.limits.slider, config.limits.platform
     for rate, by, _, _ in _ORDERS:
         tables: list[tuple[str, float, float]] = [
-            ("limits.slider", getattr(slider, rate), getattr(slider, by)),
+            *dict.fromkeys(
+                (f"limits.slider {leg}" if any(own != OneSlider() for own in slider.own) else "limits.slider", v, a)
+                for leg, v, a in zip(LEGS, _each(slider, rate), _each(slider, by), strict=True)
+            ),
             *(
                 (f"limits.platform {axis}", getattr(platform, rate)[k], getattr(platform, by)[k])
                 for k, (axis, _) in enumerate(_AXES)
@@ -51,6 +61,8 @@ def _ranges(config: Config) -> Iterator[Check]:
     platform, slider = config.limits.platform, config.limits.slider
     ranges = {f"limits.platform.{axis}": getattr(platform, axis) for axis, _ in _AXES}
     ranges |= {"limits.slider.position": slider.position, "limits.slider.passive": slider.passive}
+    own = zip(LEGS, slider.own, strict=True)
+    ranges |= {f"limits.slider.{leg}.position": one.position for leg, one in own if one.position is not None}
     for key, (low, high) in ranges.items():
         small, large = sorted((abs(low), abs(high)))
         said = f"{key} = [{low:g}, {high:g}]"
@@ -85,16 +97,22 @@ def _rates(config: Config) -> Iterator[Check]:
     except np.linalg.LinAlgError:
         return
     for quantity in ("velocity", "acceleration", "jerk"):
-        limit, asked = getattr(slider, quantity), float((per_pose @ np.array(getattr(platform, quantity))).max())
-        if not 1.0 / OUT_OF_STEP < limit / asked < OUT_OF_STEP:
-            found = f"{value(f'limits.slider.{quantity}', limit)}, and limits.platform.{quantity} asks for {asked:.3g}"
-            yield Check("limits", "warning", found, "one of them cannot be used", f"limits.slider.{quantity}")
+        every = (per_pose @ np.array(getattr(platform, quantity))).tolist()
+        limit, asked = _each(slider, quantity)[0], max(every)
+        pairs = [("", limit, asked)]
+        if len(set(_each(slider, quantity))) > 1:
+            pairs = list(zip((f"{leg}." for leg in LEGS), _each(slider, quantity), every, strict=True))
+        for leg, limit, asked in pairs:
+            if not 1.0 / OUT_OF_STEP < limit / asked < OUT_OF_STEP:
+                key = f"limits.slider.{leg}{quantity}"
+                found = f"{value(key, limit)}, and limits.platform.{quantity} asks for {asked:.3g}"
+                yield Check("limits", "warning", found, "one of them cannot be used", key)
 
 
 def _windows(config: Config) -> Iterator[Check]:
     """A robot that is in position, or in error, is so by windows that lie between a cycle's way and the travel."""
     slider, drives, settling = config.limits.slider, config.drives, config.limits.in_position
-    way, travel = slider.velocity * config.period, slider.position[1] - slider.position[0]
+    way, travel = slider.fastest * config.period, min(high - low for low, high in slider.positions)
     for key, window in (
         ("limits.slider.following_error", slider.following_error),
         ("drives.following_error", drives.following_error),
@@ -107,7 +125,7 @@ def _windows(config: Config) -> Iterator[Check]:
             yield Check("limits", "warning", found, "a slider that is stuck would hardly be noticed", key)
     corners = list(itertools.product(*(getattr(config.limits.platform, axis) for axis, _ in _AXES)))
     most = np.abs([gains(geometry(config.geometry), corner) for corner in corners]).max(axis=0).sum(axis=1)
-    ranges = [slider.position] * 3 + [getattr(config.limits.platform, axis) for axis, _ in _AXES]
+    ranges = [*slider.positions] + [getattr(config.limits.platform, axis) for axis, _ in _AXES]
     errors = [slider.following_error] * 3 + (most * slider.following_error).tolist()
     widest = [min(error, COARSE * (high - low)) for error, (low, high) in zip(errors, ranges, strict=True)]
     for i, (window, wide) in enumerate(zip((*settling.sliders, *settling.pose), widest, strict=True)):
@@ -122,14 +140,14 @@ def _simulated(config: Config) -> Iterator[Check]:
     if not is_simulated(config.can):
         return
     slider, servo = config.limits.slider, config.can.simulated
-    lag = slider.velocity * (abs(1.0 - servo.feed_forward_gain) * servo.time_constant + config.period)
+    lag = slider.fastest * (abs(1.0 - servo.feed_forward_gain) * servo.time_constant + config.period)
     if lag > slider.following_error:
         found = f"simulated servos lag {lag * 1e3:.3g} mm behind at limits.slider.velocity, beyond its following_error"
         remedy = "a shorter time_constant, or a feed_forward_gain nearer to 1"
         yield Check("simulated", "warning", found, remedy, "can.simulated.time_constant")
     for key, most, limit in (
-        ("max_velocity", servo.max_velocity, slider.velocity),
-        ("max_acceleration", servo.max_acceleration, slider.acceleration),
+        ("max_velocity", servo.max_velocity, slider.fastest),
+        ("max_acceleration", servo.max_acceleration, max(slider.accelerations)),
     ):
         if most < limit:
             found = f"{value(f'can.simulated.{key}', most)} is less than the sliders' limit, {limit:g}"

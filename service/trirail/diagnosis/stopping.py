@@ -36,19 +36,21 @@ class Stops(Struct, frozen=True):
 
 
 def stops(config: Config) -> Stops:
-    """Return how a slider stops from its limit of velocity.
+    """Return how a slider stops from its limit of velocity: the one that needs most of its travel for that.
 
     A controlled stop is limited in acceleration a and jerk j: it takes v / a + a / j, or 2 sqrt(v / j) where a is not
     reached, and half of that times v is its way. A quick stop takes v / q, and v² / 2q.
     """
     slider, quick = config.limits.slider, config.drives.quick_stop_deceleration
-    v, a, j = slider.velocity, slider.acceleration, slider.jerk
-    time = v / a + a / j if v >= a * a / j else 2.0 * math.sqrt(v / j)
     rail = None
     if config.geometry.l0 is not None:  # the sides of the paper's triangle; a slider reads 0 at a third of one
         third = config.geometry.l0 / math.sqrt(3.0)
         rail = -third, 2.0 * third
-    return Stops(v, v * time / 2.0, time, v * v / (2.0 * quick), v / quick, slider.position, rail)
+    found = []
+    for v, a, j, travel in zip(slider.velocities, slider.accelerations, slider.jerks, slider.positions, strict=True):
+        time = v / a + a / j if v >= a * a / j else 2.0 * math.sqrt(v / j)
+        found.append(Stops(v, v * time / 2.0, time, v * v / (2.0 * quick), v / quick, travel, rail))
+    return max(found, key=lambda each: each.way / (each.travel[1] - each.travel[0]))
 
 
 def _rail(config: Config) -> Iterator[Check]:

@@ -82,14 +82,16 @@ def _sizes(config: Config) -> Iterator[Check]:
 def _homing(config: Config) -> Iterator[Check]:
     """A slider has to reach its switch in the time, and to stop behind it."""
     slider = config.limits.slider
-    travel = slider.position[1] - slider.position[0]
-    for name, drive in zip(NAMES, config.drives.each, strict=True):
+    for name, drive, (low, high), most in zip(
+        NAMES, config.drives.each, slider.positions, slider.velocities, strict=True
+    ):
+        travel = high - low
         homing, key = drive.homing, f"drives.{name}.homing"
         if homing is None:
             continue
         fast = f"{key}.speed_switch = {homing.speed_switch:g} m/s"
-        if homing.speed_switch > slider.velocity:
-            said = f"{fast} is beyond limits.slider.velocity = {slider.velocity:g}"
+        if homing.speed_switch > most:
+            said = f"{fast} is beyond limits.slider.velocity = {most:g}"
             yield Check("homing", "warning", said, "slower", f"{key}.speed_switch")
         if homing.speed_zero > homing.speed_switch:
             said = f"{key}.speed_zero = {homing.speed_zero:g} m/s is faster than speed_switch"

@@ -119,16 +119,18 @@ def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)
 
 
 class Room(NamedTuple):
-    """Where a robot may be: the least and the greatest of x, y [m] and phi [rad], of lambda_10 and of lambda_32 [m]."""
+    """Where a robot may be: the least and the greatest of x, y [m] and phi [rad], of sliders and cross slides [m]."""
 
     low: Sequence[float]
     high: Sequence[float]
-    position: tuple[float, float]
+    position: tuple[float, float] | tuple[tuple[float, float], ...]
+    """Of all sliders, or of each."""
     passive: tuple[float, float]
 
     def holds(self, travelled: Array, spare: float = 0.0) -> NDArray[np.bool]:
         """Whether sliders and passive joints (2, ..., 3) are within their travel, or `spare` beyond it [m]: (...)."""
-        low, high = np.array([self.position, self.passive]).T.reshape(2, 2, *[1] * (travelled.ndim - 1))
+        both = np.stack([np.broadcast_to(ends, (3, 2)) for ends in (self.position, self.passive)])
+        low, high = np.moveaxis(both, -1, 0).reshape(2, 2, *[1] * (travelled.ndim - 2), 3)
         within: NDArray[np.bool] = ((travelled >= low - spare) & (travelled <= high + spare)).all(axis=(0, -1))
         return within
 

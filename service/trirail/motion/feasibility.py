@@ -106,10 +106,15 @@ class Checker:
         self._beat = beat
         platform, slider = limits.platform, limits.slider
         x, y, phi = np.array([platform.velocity, platform.acceleration, platform.jerk]).T
-        each = np.array([[slider.velocity, slider.acceleration, slider.jerk], x, y, phi, x, y])
+        sliders = np.array([slider.velocities, slider.accelerations, slider.jerks])
+        most = sliders.max(axis=1)
+        self._shares = most[:, None] / sliders
+        each = np.array([most, x, y, phi, x, y])
         planned = each * [PLANNED, *[PLATFORM_PLANNED] * 5]
         self.slider_limits = planned[0]
-        """Velocity, acceleration and jerk that plans make use of."""
+        """Velocity, acceleration and jerk that plans make use of, of the slider that may have most."""
+        self.each_slider_limits = self.slider_limits[:, None] / self._shares
+        """Likewise of each slider (3, 3)."""
         self.platform_limits = planned[1:4]
         """Likewise of the platform in x, y and phi (3, 3)."""
         self.centre_limits = planned[4:]
@@ -121,7 +126,7 @@ class Checker:
         self._legs = geometry.packed()
         self._bounds = bounds
         self._period = period
-        self._box = np.array([platform.x, platform.y, platform.phi, slider.position, slider.passive]).T.copy()
+        self._box = np.array([platform.x, platform.y, platform.phi, *slider.positions, *[slider.passive] * 3]).T.copy()
 
     def look(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Look:
         """Look at a path under a law from one time of the law to another [s], from near a pose on.
@@ -135,7 +140,9 @@ class Checker:
             first = -self._period
         even = min(max(FEWEST, int((until - first) / GAP)), MOST)
         worst, start = np.zeros((len(SUBJECTS), 3)), np.array(pose, dtype=np.float64)
-        leaves_at = survey(self._legs, *path, *law[:2], first, until, even, self._period, start, self._box, worst)
+        leaves_at = survey(
+            self._legs, *path, *law[:2], first, until, even, self._period, start, self._box, self._shares, worst
+        )
         worst /= self._planned
         within_limits = math.isnan(leaves_at) and self.bears(worst) and not falls(*law[:2])
         return Look(worst, within_limits, leaves_at)

@@ -27,11 +27,11 @@ a slider or the platform."""
 
 BOUNDS = np.dtype(
     [
-        ("rows", "f8", (4, 3)),  # low, high and slack of lambda_10, v_10, gamma_10, lambda_32
+        ("rows", "f8", (4, 3, 3)),  # of the rows lambda_10, v_10, gamma_10, lambda_32, each slider: low, high, slack
         ("pose", "f8", (3, 2)),  # low and high of x, y, phi
         ("edge", "f8"),  # slack of these
-        ("step", "f8"),  # how far a slider goes in a cycle at most [m]
-        ("slider_jerk", "f8"),
+        ("step", "f8", 3),  # how far each slider goes in a cycle at most [m]
+        ("slider_jerk", "f8", 3),
         ("platform", "f8", (3, 3)),  # velocity, acceleration and jerk of x, y, phi
         ("period", "f8"),
     ]
@@ -111,9 +111,9 @@ def check_setpoint(bounds: NDArray[np.void], rows: Array, found: Array) -> int:
     A value that is not a number is beyond every limit.
     """
     for row in range(min(len(rows), 4)):
-        limits = bounds[0].rows[row]
-        low, high, slack = limits[0], limits[1], limits[2]
         for n in range(3):
+            limits = bounds[0].rows[row, n]
+            low, high, slack = limits[0], limits[1], limits[2]
             value = rows[row, n]
             if not low - slack <= value <= high + slack:
                 return _found(row, n, value, low if value < low else high, found)
@@ -134,13 +134,12 @@ def check_pose(bounds: NDArray[np.void], pose: Array, found: Array) -> int:
 @compiled()
 def _check_step(bounds: NDArray[np.void], rows: Array, before: Array, found: Array) -> int:
     """Check solved sliders against those of the cycle before: how far they go, and with which jerk."""
-    most, jerk_limit = bounds[0].step, bounds[0].slider_jerk
     for n in range(3):
-        step = rows[0, n] - before[0, n]
+        step, most = rows[0, n] - before[0, n], bounds[0].step[n]
         if not abs(step) <= most:
             return _found(_STEP, n, step, most, found)
     for n in range(3):
-        jerk = _jerk(rows, before, n, bounds[0].period)
+        jerk, jerk_limit = _jerk(rows, before, n, bounds[0].period), bounds[0].slider_jerk[n]
         if not jerk <= jerk_limit * (1.0 + EXCESS):
             return _found(_JERK, n, jerk, jerk_limit, found)
     return 0
@@ -188,22 +187,21 @@ class Bounds:
 
     def __init__(self, limits: Limits, period: float, edge: float = ROUNDING) -> None:
         slider, platform = limits.slider, limits.platform
-        velocity, acceleration = slider.velocity, slider.acceleration
         self.packed = np.zeros(1, BOUNDS)
         """As compiled code takes them, (1,) of BOUNDS."""
         self.found = np.zeros(2)
         """The value that was last found to be beyond its limit, and that limit."""
         bounds = self.packed[0]
         bounds["rows"] = (
-            (*slider.position, edge),
-            (-velocity, velocity, velocity * EXCESS),
-            (-acceleration, acceleration, acceleration * EXCESS),
-            (*slider.passive, edge),
+            [(*ends, edge) for ends in slider.positions],
+            [(-velocity, velocity, velocity * EXCESS) for velocity in slider.velocities],
+            [(-acceleration, acceleration, acceleration * EXCESS) for acceleration in slider.accelerations],
+            [(*slider.passive, edge)] * 3,
         )
         bounds["pose"] = platform.x, platform.y, platform.phi
         bounds["edge"] = edge
-        bounds["step"] = velocity * (1.0 + EXCESS) * period
-        bounds["slider_jerk"] = slider.jerk
+        bounds["step"] = [velocity * (1.0 + EXCESS) * period for velocity in slider.velocities]
+        bounds["slider_jerk"] = slider.jerks
         bounds["platform"] = np.transpose((platform.velocity, platform.acceleration, platform.jerk))
         bounds["period"] = period
 

@@ -16,6 +16,7 @@ __all__ = ["survey"]
 
 NEAR = 1e-3
 """How near a limit a position may turn without being looked at [m, rad]."""
+EQUAL = (1.0, 1.0, 1.0)
 WITHIN = 4
 """Parts of every piece of a path at whose ends it is looked at."""
 
@@ -62,7 +63,7 @@ def _moments(
 
 @compiled()
 def _quantity(motion: Array, sliders: Array, i: int) -> tuple[float, float]:
-    """Return one of the nine limited positions, x, y, phi, lambda_10 and lambda_32, and its velocity."""
+    """Return one of the nine limited positions, x, y, phi, of the sliders and of the cross slides, and its velocity."""
     if i < 3:
         return motion[0, i], motion[1, i]
     if i < 6:
@@ -81,6 +82,7 @@ class Way(NamedTuple):
     law_knots: Array
     law_pieces: Array
     box: Array
+    shares: Array
 
 
 @compiled()
@@ -94,9 +96,8 @@ def _look(way: Way, time: float, near: Array, motion: Array, sliders: Array) -> 
     if inverse_motion(way.legs, motion, sliders) != 0:
         return False
     for i in range(9):
-        column = i if i < 3 else 2 + i // 3
         position, _ = _quantity(motion, sliders, i)
-        if not way.box[0, column] - ROUNDING <= position <= way.box[1, column] + ROUNDING:
+        if not way.box[0, i] - ROUNDING <= position <= way.box[1, i] + ROUNDING:
             return False
     return True
 
@@ -108,14 +109,13 @@ def _turns(way: Way, last: float, time: float, near: Array, motion: Array, slide
     `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the looks at `last` and at `time`, and have room for one more.
     """
     for i in range(9):
-        column = i if i < 3 else 2 + i // 3
         before, leaving = _quantity(motion[0], sliders[0], i)
         _, coming = _quantity(motion[1], sliders[1], i)
         if leaving * coming >= 0.0:
             continue
         # It has turned about here, were the acceleration constant.
         turn = before + leaving * leaving / (leaving - coming) * (time - last) / 2.0
-        if way.box[0, column] + NEAR <= turn <= way.box[1, column] - NEAR:
+        if way.box[0, i] + NEAR <= turn <= way.box[1, i] - NEAR:
             continue
         low, high = last, time
         for _ in range(HALVINGS // 3):
@@ -131,21 +131,24 @@ def _turns(way: Way, last: float, time: float, near: Array, motion: Array, slide
 
 
 @compiled()
-def _measure_rates(now: Array, then: Array, i: int, step: float, whole: bool, worst: Array) -> None:
+def _measure_rates(
+    now: Array, then: Array, i: int, step: float, whole: bool, worst: Array, by: tuple[float, float, float] = EQUAL
+) -> None:
     """Raise `worst` (3,) to the velocity, acceleration and jerk of column i of rows (position, velocity, acceleration).
 
-    `then` are the rows a step later. `whole` tells whether the motion goes on for the whole step.
+    `then` are the rows a step later. `whole` tells whether the motion goes on for the whole step. The
+    three count `by` so much.
     """
-    worst[0] = max(worst[0], abs(now[1, i]))
-    worst[1] = max(worst[1], abs(now[2, i]))
+    worst[0] = max(worst[0], by[0] * abs(now[1, i]))
+    worst[1] = max(worst[1], by[1] * abs(now[2, i]))
     # The mean jerk of this step, and what the velocity says of its beginning and its end: a rate may change
     # within a single step, where the accelerations before and after are the same.
     change = then[1, i] - now[1, i]
     early = 2.0 * (change / step - now[2, i]) / step
     late = 2.0 * (then[2, i] - change / step) / step
-    worst[2] = max(worst[2], abs(early + late) / 2.0)
+    worst[2] = max(worst[2], by[2] * (abs(early + late) / 2.0))
     if whole:
-        worst[2] = max(worst[2], abs(early), abs(late))
+        worst[2] = max(worst[2], by[2] * abs(early), by[2] * abs(late))
 
 
 @compiled()
@@ -186,14 +189,15 @@ def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst:
             return time, last
         whole = time >= 0.0 and last <= until  # else it is the step from or to a standstill, in which nothing else is
         for i in range(3):
-            _measure_rates(sliders[1], sliders[0], i, step, whole, worst[0])
+            by = way.shares[0, i], way.shares[1, i], way.shares[2, i]
+            _measure_rates(sliders[1], sliders[0], i, step, whole, worst[0], by)
         _measure_tool(way, time, motion, arms, step, whole, worst)
     return last, math.nan
 
 
 @compiled(
     f"f8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[:, ::1], f8[::1], f8[:, :, ::1], "
-    "f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[:, ::1])"
+    "f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])"
 )
 def survey(
     legs: Array,
@@ -209,18 +213,20 @@ def survey(
     step: float,
     start: Array,
     box: Array,
+    shares: Array,
     worst: Array,
 ) -> float:
     """Look at a path, run by a law, between two times; write the greatest velocities, accelerations and jerks.
 
     It is looked at `even` times, at its knots and between them, and where a position turns near its limit. Jerk is
     what the setpoints before and after a `step` [s] say of it, as the drives see it. `start` is the pose at the first
-    time. `box` (2, 5) holds the limits, low and high, of x, y, phi, lambda_10 and lambda_32. Returns when it is first
-    out of reach, else not a number. `worst` (6, 3) has velocity, acceleration and jerk of the fastest slider, of x, y
-    and phi of the path's tool, and of x and y of the platform's centre where the tool is another point; nothing where
-    the path is out of reach.
+    time. `box` (2, 9) holds the limits, low and high, of x, y, phi, of each slider and of each cross slide, `shares`
+    (3, 3) by what the velocity, acceleration and jerk of each slider count. Returns when it is first out of reach, else
+    not a number. `worst` (6, 3) has velocity, acceleration and jerk of the slider that has most, of x, y and phi of
+    the path's tool, and of x and y of the platform's centre where the tool is another point; nothing where the path is
+    out of reach.
     """
-    way = Way(legs, knots, pieces, in_sliders, tools, law_knots, law_pieces, box)
+    way = Way(legs, knots, pieces, in_sliders, tools, law_knots, law_pieces, box, shares)
     times = _moments(knots, law_knots, law_pieces, first, until, even, step)
     near = start.copy()
     worst[:] = 0.0

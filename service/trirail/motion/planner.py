@@ -70,9 +70,9 @@ class Planner:
         self._most = Kinodynamic(platform.velocity, platform.acceleration, platform.jerk)
         self.platform = Kinodynamic(*checker.platform_limits.T.tolist())
         self._centre = checker.centre_limits
-        self._sliders = Kinodynamic(*([ROOM * limit] * 3 for limit in checker.slider_limits.tolist()))
-        self._checked_sliders = Kinodynamic(*([limit] * 3 for limit in checker.slider_limits.tolist()))
-        self._travel = slider.position
+        self._sliders = Kinodynamic(*(ROOM * checker.each_slider_limits).tolist())
+        self._checked_sliders = Kinodynamic(*checker.each_slider_limits.tolist())
+        self._travel = slider.positions
         self.bounds = bounds
         self.checker = checker
         self._period = period
@@ -94,8 +94,7 @@ class Planner:
 
     def check_sliders(self, target: Sequence[float]) -> None:
         """Raise RefusedError, with slider, value and limit, if slider positions are beyond their travel."""
-        for name, position in zip(LEGS, target, strict=True):
-            low, high = self._travel
+        for name, position, (low, high) in zip(LEGS, target, self._travel, strict=True):
             if not low <= position <= high:
                 limit = low if position < low else high
                 text = beyond(f"slider {name}: position", position, limit, "m")

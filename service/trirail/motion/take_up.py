@@ -13,6 +13,7 @@ from typing import NamedTuple
 import msgspec
 
 from trirail.config import Limits, SliderLimits
+from trirail.config.tables import OneSlider
 
 SHARE = 0.1
 """Of the sliders' limits of velocity, acceleration and jerk, that taking up backlash may make use of."""
@@ -41,7 +42,7 @@ NO_BACKLASH = TakeUp((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0)
 def take_up(widths: Sequence[float], slider: SliderLimits) -> TakeUp:
     """Return how backlash of such widths [m] is taken up as fast as its share of the limits allows."""
     most = max(widths)
-    limits = slider.velocity, slider.acceleration, slider.jerk
+    limits = min(slider.velocities), min(slider.accelerations), min(slider.jerks)
     powers = (1, 2, 3)
     duration = max(
         (peak * most / (SHARE * limit)) ** (1.0 / power)
@@ -58,6 +59,12 @@ def planned_limits(limits: Limits, widths: Sequence[float]) -> Limits:
     if not any(widths):
         return limits
     slider, taken, half = limits.slider, take_up(widths, limits.slider), max(widths) / 2.0
+    a, b, c = (
+        OneSlider((low + half, high - half), v - taken.velocity, acceleration - taken.acceleration, jerk - taken.jerk)
+        for (low, high), v, acceleration, jerk in zip(
+            slider.positions, slider.velocities, slider.accelerations, slider.jerks, strict=True
+        )
+    )
     low, high = slider.position
     less = msgspec.structs.replace(
         slider,
@@ -65,5 +72,8 @@ def planned_limits(limits: Limits, widths: Sequence[float]) -> Limits:
         velocity=slider.velocity - taken.velocity,
         acceleration=slider.acceleration - taken.acceleration,
         jerk=slider.jerk - taken.jerk,
+        A=a,
+        B=b,
+        C=c,
     )
     return msgspec.structs.replace(limits, slider=less)

@@ -261,7 +261,7 @@ def main(
         ports.planner.await_peer(PLANNER_WITHIN)
         capture = Capture() if config.telemetry.capture_can else None
         drives = connect(bus(), config.drives, capture=capture)
-        drives.configure(config.period, config.limits.slider.velocity)
+        drives.configure(config.period, config.limits.slider.fastest)
         lacking = (*realtime.acquire(config.loop), *unrehearsed)
         loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)
 

@@ -78,7 +78,7 @@ class _Rehearsal:
     def run(self) -> None:
         """Run all of it."""
         try:
-            self._drives.configure(self._config.period, self._config.limits.slider.velocity)
+            self._drives.configure(self._config.period, self._config.limits.slider.fastest)
             self._loop.run(Ticker(round(self._config.period * 1e9), lambda: self._now_ns, self._pass))
         finally:
             self._drives.close()

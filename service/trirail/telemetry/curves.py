@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -52,10 +53,10 @@ def plots(robot: ShownRobot) -> dict[str, Lines]:
     error = slider.following_error * 1e6
     margin = float(np.degrees(robot.limits.singularity_margin))
     return {
-        POSITION: _sliders(*(limit * 1e3 for limit in slider.position)),
-        VELOCITY: _sliders(-slider.velocity * 1e3, slider.velocity * 1e3),
-        ACCELERATION: _sliders(-slider.acceleration, slider.acceleration),
-        ERROR: _sliders(-error, error),
+        POSITION: _sliders(np.multiply(slider.positions, 1e3)),
+        VELOCITY: _sliders(_either_way(slider.velocities, 1e3)),
+        ACCELERATION: _sliders(_either_way(slider.accelerations, 1.0)),
+        ERROR: _sliders(np.tile((-error, error), (3, 1))),
         CENTRE: Lines((Curve("x", palette.X), Curve("y", palette.Y)), _window(platform.x, platform.y), NEAR),
         PHI: Lines((Curve("φ", palette.PHI),)),
         SINGULARITY: Lines((Curve("distance", palette.SINGULARITY),), (Limit("margin", margin),)),
@@ -116,6 +117,18 @@ def _window(x: Range, y: Range) -> tuple[Limit, ...]:
     return tuple(Limit(name, end * 1e3) for name, end in ends)
 
 
-def _sliders(low: float, high: float) -> Lines:
+def _either_way(limits: Sequence[float], scale: float) -> NDArray[np.float64]:
+    return np.multiply.outer(limits, (-scale, scale))
+
+
+def _sliders(ends: NDArray[np.float64]) -> Lines:
+    """Return the lines of the sliders with their limits, (3, 2), once where all have the same."""
     lines = tuple(Curve(leg, colour) for leg, colour in zip(LEGS, palette.SLIDERS, strict=True))
-    return Lines(lines, (Limit("min", low), Limit("max", high)), NEAR)
+    alike = bool((ends == ends[0]).all())
+    named = [("", ends[0])] if alike else [(f"{leg} ", own) for leg, own in zip(LEGS, ends, strict=True)]
+    limits = tuple(
+        Limit(f"{name}{end}", float(value))
+        for name, own in named
+        for end, value in zip(("min", "max"), own, strict=True)
+    )
+    return Lines(lines, limits, NEAR)

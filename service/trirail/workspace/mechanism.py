@@ -52,10 +52,11 @@ class Mechanism:
     @classmethod
     def of(cls, geometry: Geometry, limits: SliderLimits) -> Mechanism:
         """Lay out a robot's parts."""
-        low, high = limits.position
-        legs = geometry.each
+        legs, ends_of = geometry.each, limits.positions
         # a rail reaches as far beyond its slider's travel as it begins before it
-        rails = [_on_rail(leg, -leg.home, high + (low + leg.home)) for leg in legs]
+        rails = [
+            _on_rail(leg, -leg.home, high + (low + leg.home)) for leg, (low, high) in zip(legs, ends_of, strict=True)
+        ]
         longest = max(float(np.linalg.norm(rail[1] - rail[0])) for rail in rails)
         corners = _corners(legs)
         edges = [_on_edge(leg, *limits.passive) for leg in legs if leg.crossing.turns]
@@ -68,8 +69,12 @@ class Mechanism:
         return cls(
             anchors=np.array([leg.anchor for leg in legs]),
             rails=rails,
-            travel=[_on_rail(leg, low, high) for leg in legs],
-            stops=[_across(leg, position, STOP * longest) for leg in legs for position in (low, high)],
+            travel=[_on_rail(leg, *own) for leg, own in zip(legs, ends_of, strict=True)],
+            stops=[
+                _across(leg, position, STOP * longest)
+                for leg, own in zip(legs, ends_of, strict=True)
+                for position in own
+            ],
             outline=outline,
             edge_stops=[
                 _across_edge(leg, at, STOP * longest) for leg in legs if leg.crossing.turns for at in limits.passive

@@ -21,11 +21,11 @@ def violations(geometry: Geometry, limits: Limits, pose: ArrayLike) -> list[Viol
     """
     motion = inverse(geometry, pose)
     found = []
-    for quantity, values, (low, high) in (
-        ("position", motion.position, limits.slider.position),
-        ("passive position", motion.passive_position, limits.slider.passive),
+    for quantity, values, ends in (
+        ("position", motion.position, limits.slider.positions),
+        ("passive position", motion.passive_position, [limits.slider.passive] * 3),
     ):
-        for leg, value in zip(LEGS, values.tolist(), strict=True):
+        for leg, value, (low, high) in zip(LEGS, values.tolist(), ends, strict=True):
             if not low <= value <= high:
                 found.append(Violation(leg, quantity, value, low if value < low else high, "m"))
     distance = float(distance_to_singularity(geometry, pose))

@@ -58,8 +58,9 @@ def reachable(geometry: Geometry, limits: Limits, phi: float) -> Array:
     if not low + margin <= phi <= high - margin:
         return NOTHING
     joints = _joints(geometry, phi)
-    least, most = np.repeat([limits.slider.position, limits.slider.passive], 3, axis=0).T
-    polygon = _parallelogram(joints[[0, 3]], limits.slider.position, limits.slider.passive)
+    positions, passive = limits.slider.positions, limits.slider.passive
+    least, most = np.array([*positions, passive, passive, passive]).T
+    polygon = _parallelogram(joints[[0, 3]], positions[0], passive)
     unit = np.array([1.0, 0.0, 0.0])
     polygon = _clip(polygon, joints - np.outer(least, unit))
     polygon = _clip(polygon, np.outer(most, unit) - joints)
