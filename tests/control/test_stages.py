@@ -11,7 +11,7 @@ from trirail.config import SIM, Config, geometry, load, parse
 from trirail.config.tables import OneSlider
 from trirail.errors import ConfigError
 from trirail.kinematics.robot import inverse
-from trirail.wire.goals import PoseGoal, SlidersGoal
+from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
 from trirail.wire.packets import Accepted, Refused
 
 STAGES = ("uvw", "xxy", "uvw-ppr")
@@ -41,7 +41,11 @@ def test_each_slider_keeps_its_own_limits(slider: int) -> None:
     rig.enable()
     limits, robot = rig.config.limits.slider, geometry(rig.config.geometry)
     target = tuple(inverse(robot, (-0.002, -0.002, 0.01)).position.tolist())
-    goals = PoseGoal(x=0.0025, y=0.002, phi=0.01), SlidersGoal(target), PoseGoal(x=0.0, y=0.0, phi=0.0)
+    goals: tuple[Goal, ...] = (
+        PoseGoal(x=0.0025, y=0.002, phi=0.01),
+        SlidersGoal(target),
+        PoseGoal(x=0.0, y=0.0, phi=0.0),
+    )
     for number, goal in enumerate(goals):
         assert isinstance(rig.send(f"g{number}", goal), Accepted)
         rig.until(rig.holds)

@@ -256,6 +256,10 @@ def test_stops_are_those_of_the_motion_itself(v: float, a: float, j: float, q: f
 def test_the_rail_is_drawn(path: Path) -> None:
     found = stops(load(path))
     lines = rail_drawing.drawn(found)
-    assert [line.split("  ")[0] for line in lines[:4]] == ["rail", "travel", "stop", "quick stop"]
     assert max(map(len, lines)) < 100
+    rows = [line.split("  ")[0] for line in lines[:-1]]
+    if load(path).geometry.l0 is None:  # measured legs do not tell where rails end
+        assert (rows, found.rail) == (["travel", "stop", "quick stop"], None)
+        return
+    assert rows == ["rail", "travel", "stop", "quick stop"]
     assert found.rail == pytest.approx((-0.1732, 0.3464), abs=1e-4)

@@ -69,6 +69,7 @@ def test_every_key_of_a_file_that_is_shipped_is_in_the_reference() -> None:
         for key in leaves(msgspec.to_builtins(load(path))):
             tables = {
                 "geometry.leg",
+                *(f"limits.slider.{name}" for name in "ABC"),
                 "drives.A.homing",
                 "drives.B.homing",
                 "drives.C.homing",

@@ -96,11 +96,13 @@ def run(
 
 
 @app.command
-def demo(*, stay: Annotated[bool, Flag] = False, record: Path | None = None) -> int:
+def demo(name: str = "sim", /, *, stay: Annotated[bool, Flag] = False, record: Path | None = None) -> int:
     """Start the service on simulated drives, enable it, send it a tour of goals, and report.
 
     Parameters
     ----------
+    name
+        A shipped configuration, as `trirail config` lists it: sim, or a stage as uvw, xxy, uvw-ppr.
     stay
         Keep the service and its live view up afterwards, until Ctrl-C.
     record
@@ -108,7 +110,7 @@ def demo(*, stay: Annotated[bool, Flag] = False, record: Path | None = None) -> 
     """
     from trirail.cli import demo as shown
 
-    return shown.run(stay=stay, record=record)
+    return shown.run(name, stay=stay, record=record)
 
 
 @app.command

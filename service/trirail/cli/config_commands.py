@@ -62,7 +62,7 @@ def copy(name: str, dest: Path | None = None, /, *, json: Annotated[bool, Flag] 
     json
         Print one JSON object instead of words.
     """
-    source = _find(name)
+    source = shipped_file(name)
     target = dest or Path()
     if target.is_dir():
         target /= source.name
@@ -154,7 +154,8 @@ def _purpose(path: Path) -> str:
         return file.readline().lstrip("# ").rstrip(":\n")
 
 
-def _find(name: str) -> Path:
+def shipped_file(name: str) -> Path:
+    """Return the shipped file of a name; ".toml" may be left out. Raises ConfigError."""
     for path in _shipped():
         if name in (_name(path), _name(path).removesuffix(".toml")):
             return path

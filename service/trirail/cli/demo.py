@@ -5,17 +5,18 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from trirail.cli.config_commands import shipped_file
 from trirail.cli.terminal import out, percentiles, plain
 from trirail.client import own_service
 from trirail.client.client import Result, Robot
-from trirail.config import SIM, load
-from trirail.errors import RefusedError
+from trirail.config import Config, load
+from trirail.errors import ConfigError, RefusedError
 from trirail.processes.signals import Signals
 from trirail.wire.state import State
 
@@ -33,6 +34,19 @@ class Stage(NamedTuple):
 
 
 CENTRE = (0.0, 0.0, 0.0)
+ALIGNMENT = (
+    Stage("1 mm along x", 0.001, 0.0, 0.0),
+    Stage("1 mm along y", 0.001, 0.001, 0.0),
+    Stage("1° to the left", 0.001, 0.001, math.radians(1.0)),
+    Stage("a part that lies askew", -0.0012, 0.0008, math.radians(-0.35)),
+    Stage("30 µm and 15 arcsec further", -0.00117, 0.00083, math.radians(-0.35 + 15.0 / 3600.0)),
+    Stage("4 mm and 3°", 0.004, -0.003, math.radians(3.0)),
+    Stage("the other way", -0.003, 0.004, math.radians(-2.5)),
+    Stage("back to the centre", *CENTRE),
+)
+"""For stages of millimetres."""
+SMALL = 0.02
+"""The greatest |x| of a stage's table up to which it is one of millimetres [m]."""
 TOUR = (
     Stage("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.18),
     Stage("back to the centre", *CENTRE),
@@ -55,22 +69,30 @@ class _Row(NamedTuple):
     seconds: float
 
 
-def run(*, stay: bool, record: Path | None) -> int:
-    """Run the demo; return 0 if every goal ended `done` and the service ended well."""
-    config = load(SIM)
+def tour(config: Config) -> tuple[Stage, ...]:
+    """Return the goals for a robot: the paper's and a round, or those of alignment."""
+    return ALIGNMENT if max(map(abs, config.limits.platform.x)) <= SMALL else TOUR
+
+
+def run(name: str = "sim", *, stay: bool, record: Path | None) -> int:
+    """Run the demo on a shipped configuration; return 0 if every goal ended `done` and the service ended well."""
+    file = shipped_file(name)
+    config = load(file)
+    if config.can.interface != "simulated":
+        raise ConfigError(f"{file.name} has drives on {config.can.interface}: a demo moves simulated ones alone")
     stamp = time.strftime("%Y%m%d-%H%M%S")
     recording = record or Path(config.telemetry.directory) / f"demo-{stamp}.rrd"
     locator = config.zenoh.listen[0]
     out.print(
-        f"[bold]trirail demo[/]: starting the service on {SIM.name}, simulated drives at {config.loop.rate_hz} Hz"
+        f"[bold]trirail demo[/]: starting the service on {file.name}, simulated drives at {config.loop.rate_hz} Hz"
     )
     with contextlib.ExitStack() as stack:
         with out.status("starting the service") as status:
             said = lambda words: status.update(f"starting the service: {plain(words)}")  # noqa: E731
-            service = stack.enter_context(own_service.service(SIM, recording, said))
+            service = stack.enter_context(own_service.service(file, recording, said))
         with Robot(config.robot.name, locator, user="demo") as robot:
             robot.enable()
-            rows = list(_tour(robot))
+            rows = list(_tour(robot, tour(config)))
             state = robot.state()
             if stay and all(row.result.outcome == "done" for row in rows):
                 _report(rows, state, recording)
@@ -84,7 +106,7 @@ def run(*, stay: bool, record: Path | None) -> int:
     return 0 if code == 0 and all(row.result.outcome == "done" for row in rows) else 1
 
 
-def _tour(robot: Robot) -> Iterator[_Row]:
+def _tour(robot: Robot, stages: Sequence[Stage]) -> Iterator[_Row]:
     columns = (
         TextColumn("{task.description:28}"),
         BarColumn(),
@@ -92,8 +114,8 @@ def _tour(robot: Robot) -> Iterator[_Row]:
         TextColumn("{task.fields[note]}"),
     )
     with Progress(*columns, console=out) as progress:
-        task = progress.add_task("the tour", total=len(TOUR), note="")
-        for number, stage in enumerate(TOUR, 1):
+        task = progress.add_task("the tour", total=len(stages), note="")
+        for number, stage in enumerate(stages, 1):
             began = time.monotonic()
             try:
                 goal = robot.move_to(x=stage.x, y=stage.y, phi=stage.phi, speed=stage.speed, id=f"tour-{number}")
@@ -102,7 +124,7 @@ def _tour(robot: Robot) -> Iterator[_Row]:
             else:
                 for state in robot.states(2.0):
                     x, y, phi = state.pose
-                    pose = f"x {x * 1e3:6.1f} mm  y {y * 1e3:6.1f} mm  φ {math.degrees(phi):6.1f}°"
+                    pose = f"x {x * 1e3:9.4f} mm  y {y * 1e3:9.4f} mm  φ {math.degrees(phi):9.4f}°"
                     progress.update(task, description=stage.name, note=pose)
                     if goal.result or time.monotonic() - began > GOAL_WITHIN:
                         break

@@ -8,10 +8,10 @@ from pathlib import Path
 from trirail_drivers.errors import shortened
 
 from trirail.config import Config, Mistake, overlap
-from trirail.diagnosis import drives, limits, stopping, times
+from trirail.diagnosis import bench, drives, limits, stopping, times
 from trirail.diagnosis.check import Check
 
-JUDGEMENTS = (*stopping.JUDGEMENTS, *limits.JUDGEMENTS, *times.JUDGEMENTS, *drives.JUDGEMENTS)
+JUDGEMENTS = (*bench.JUDGEMENTS, *stopping.JUDGEMENTS, *limits.JUDGEMENTS, *times.JUDGEMENTS, *drives.JUDGEMENTS)
 
 
 def diagnose(config: Config, impossible: Sequence[str] = ()) -> list[Check]:

@@ -21,7 +21,19 @@ from trirail.kinematics.leg import LEGS, PARALLEL, AnyLeg, wrapped
 from trirail.kinematics.ppr3.leg import PprLeg
 from trirail.kinematics.prp3.leg import Leg
 
-__all__ = ["LEGS", "PARALLEL", "Geometry", "Leg", "PprLeg", "Room", "det_j2", "gains", "singular_angles", "travels"]
+__all__ = [
+    "LEGS",
+    "PARALLEL",
+    "Geometry",
+    "Leg",
+    "PprLeg",
+    "Room",
+    "det_j2",
+    "gains",
+    "other_kind",
+    "singular_angles",
+    "travels",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +158,22 @@ def travels(geometry: Geometry, poses: ArrayLike) -> Array:
         told += geometry.correction.at(told.reshape(-1, 3)).reshape(told.shape)
     x, y, phi = np.moveaxis(told, -1, 0)
     return np.stack([leg.travels(x, y, phi) for leg in geometry.each], axis=-1)
+
+
+def other_kind(geometry: Geometry) -> Geometry:
+    """Return the robot of the other mechanism with rails and cross slides in the same places at the pose (0, 0, 0).
+
+    What an owner has who mistakes one for the other. KinematicsError where that is singular there.
+    """
+    sliders = travels(geometry, (0.0, 0.0, 0.0))[0].tolist()
+    legs = []
+    for leg, slider in zip(geometry.each, sliders, strict=True):
+        x, y = leg.anchor
+        along = leg.home + slider
+        carriage = x + along * math.cos(leg.rail_angle), y + along * math.sin(leg.rail_angle)
+        kind = PprLeg if isinstance(leg, Leg) else Leg
+        legs.append(kind(leg.anchor, leg.rail_angle, leg.home, carriage, leg.cross_angle))
+    return Geometry(legs=(legs[0], legs[1], legs[2]))
 
 
 def gains(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
