@@ -41,6 +41,7 @@ trirail config show robot.toml              # every key as it will be used, and 
 trirail doctor robot.toml                   # this machine, its rights, the CAN interface and the bus load for it
 ```
 
+Alignment stages, UVW and XXY: [which one have I got?](stages.md)
 How to bring a real robot up with one: [drivers/README.md](../drivers/README.md).
 A key is added in `service/trirail/config/tables.py` or, for bus and drives, in `drivers/trirail_drivers/config.py`,
 with a docstring that gives meaning and unit. What follows is made from there by `tools/config_reference.py`; a test

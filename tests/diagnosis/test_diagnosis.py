@@ -33,8 +33,8 @@ HARMLESS = {
     ("telemetry.keep_mb", 1000),
     ("drives.A.direction", -1),
 }
-WITHIN = {("vcan.toml", "can.simulated.feed_forward_gain", 0.001)}
-"""Its window takes the whole lag."""
+WITHIN = {(f"{name}.toml", "can.simulated.feed_forward_gain", 0.001) for name in ("vcan", "uvw", "xxy", "uvw-ppr")}
+"""Their windows take the whole lag."""
 
 
 def key_of(place: Place) -> str:

@@ -21,7 +21,11 @@ from trirail.wire.goals import Goal
 
 ROOT = Path(__file__).parents[2]
 GUIDES = sorted(
-    {*ROOT.glob("*.md"), *(ROOT / name / "README.md" for name in ("service", "drivers", "configs", "tools"))}
+    {
+        *ROOT.glob("*.md"),
+        *(ROOT / name / "README.md" for name in ("service", "drivers", "configs", "tools")),
+        ROOT / "configs/stages.md",
+    }
 )
 PACKAGES = {"service": "service/trirail", "drivers": "drivers/trirail_drivers", "CONTRIBUTING.md": "service/trirail"}
 """Below which folder a guide's paths are, where they are not below its own or the checkout's."""
