@@ -30,7 +30,7 @@ from trirail.wire.links import Port
 from trirail.wire.packets import CommandRequest, GoalRequest, Happened, Kind, Request, decode_answer, message
 from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.bus.can_frame import CAN_FRAME
 from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.bus.unixbus import UnixBus
@@ -334,6 +334,29 @@ def test_a_bus_that_dies_is_a_fault_in_the_same_cycle(unread: bool, moving: bool
             session.close()
         assert session.loop.control.fault is not None
         told.append(session.heard)
+    _compare(*told)
+
+
+@pytest.mark.parametrize("cycles", [50.0, 50.3, 50.999])
+def test_a_jog_that_nobody_renews_ends_also_where_its_time_is_over_within_a_cycle(
+    cycles: float, tmp_path: Path
+) -> None:
+    jog = VelocityGoal(0.02, 0.0, 0.0, timeout=cycles * CONFIG.period)
+    happens = {
+        30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
+        100: [Happening(lambda session: session.ask(GoalRequest(2, "ann", "jog", jog, session.now_ns)))],
+    }
+    told = []
+    for quiet in (True, False):
+        folder = tmp_path / str(quiet)
+        folder.mkdir()
+        session = Session(CONFIG, folder, quiet=quiet)
+        try:
+            session.run(happens, 400)
+        finally:
+            session.close()
+        told.append(session.heard)
+        assert session.loop.control.state.mode is Mode.HOLDING
     _compare(*told)
 
 
