@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import CONFIG, Rig, carried
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.config import Config
@@ -27,7 +27,7 @@ def answer_to(rig: Rig, ticket: int) -> Answer | None:
 def confirmed_after(rig: Rig, name: str, within: int) -> int:
     """Send a command beside what waits; return after how many cycles it is confirmed."""
     ticket = 10**6 + len(rig.rows)
-    rig.cycle(CommandRequest(ticket, "bob", Command(name)))
+    rig.cycle(CommandRequest(ticket, "bob", Command(name), carried(name)))
     for number in range(within):
         answer = answer_to(rig, ticket)
         if answer is not None:

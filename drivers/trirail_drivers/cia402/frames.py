@@ -138,6 +138,7 @@ def _background(heartbeat: float) -> float:
 TRAFFIC: Final = Traffic(
     cycle_bits=frame_bits(0) + 3 * frame_bits(SETPOINT.size) + 3 * frame_bits(POSITION.size),
     background=_background,
-    most_sent=8,
+    most_sent=11,
 )
-"""One cycle: SYNC, three setpoints, three positions; sent are at most SYNC, heartbeat, setpoints, controlwords."""
+"""One cycle: SYNC, three setpoints, three positions; sent are at most SYNC, heartbeat, setpoints, controlwords
+before they leave, and other ones that are decided behind them."""

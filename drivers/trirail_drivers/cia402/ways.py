@@ -168,5 +168,5 @@ def traffic(ways: Iterable[Exchange]) -> Traffic:
     return Traffic(
         cycle_bits=cycle,
         background=lambda heartbeat: status + polls + lives / heartbeat,
-        most_sent=8 + sum(way.guarded + way.polled for way in ways),
+        most_sent=11 + sum(way.guarded + way.polled for way in ways),
     )

@@ -22,7 +22,7 @@ import zenoh
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import GoalHandle, Jog, Result
 from trirail.client.lease import Lease
-from trirail.client.outgoing import content_message, goal_message, id_of, number, seconds
+from trirail.client.outgoing import content_message, goal_message, id_of, made_content, number, seconds
 from trirail.client.track import Taker, Track
 from trirail.client.trajectory import Points, check_arrived, first_pose, points_of
 from trirail.errors import RefusalCode, RefusedError, ServiceError
@@ -324,7 +324,7 @@ class Robot:
 
     def override(self, percent: float) -> None:
         """Let this motion and those to come run at a share of full speed, 0 or 1 to 200 %, within the limits."""
-        self.command(Command.OVERRIDE, Override(number(percent, "override")))
+        self.command(Command.OVERRIDE, made_content(Command.OVERRIDE, lambda: Override(number(percent, "override"))))
 
     def lease(self, *, force: bool = False, timeout: float = 1.0) -> Lease:
         """Have the robot for oneself while the context lasts: only this user's goals and commands move it.

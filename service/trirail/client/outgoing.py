@@ -49,7 +49,12 @@ def content_message(name: str, content: CommandContent | bytes | None) -> bytes 
     """Return what a command carries, as JSON; None for nothing. Raises RefusedError for what it cannot."""
     if content is None or isinstance(content, bytes):
         return content
-    return message(lambda: content, Command(name).accepts, f"not for {name}")
+    return made_content(Command(name), lambda: content)
+
+
+def made_content(command: Command, make: Callable[[], CommandContent]) -> bytes:
+    """Return what a command carries, as JSON, once it can be made. Raises RefusedError for what it cannot."""
+    return message(make, command.accepts, f"not for {command}")
 
 
 def number(value: object, what: str) -> float:

@@ -88,7 +88,8 @@ def _table(path: str, table: dict[str, object]) -> Iterator[str]:
 
 def _value(value: object) -> str:
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{name} = {_value(inner)}" for name, inner in value.items()) + " }"
+        inner = (f"{name} = {_value(inner)}" for name, inner in value.items() if inner is not None)
+        return "{ " + ", ".join(inner) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_value, value)) + "]"
     # Strings, numbers and truth values are written in TOML as in JSON; repr of a number is exact in both.
