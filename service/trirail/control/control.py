@@ -240,7 +240,10 @@ class Control:
     # ------------------------------------------------------------------ between two cycles
 
     def conclude(self) -> None:
-        """End goals, or the motion, by what the compiled call has found in the cycle before, and what was measured."""
+        """End goals, or the motion, by what the compiled call has found in this cycle and what was measured in it.
+
+        Commands that are carried out are answered.
+        """
         try:
             schedule, found = self.schedule, self._found
             if found and schedule.runs:
@@ -251,6 +254,7 @@ class Control:
             moves = self.state.mode in (Mode.MOVING, Mode.STOPPING)
             if found and moves and schedule.runs and schedule.runs[0].stands:
                 self._stand(schedule.runs[0])
+            self._commands.settle()
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
         self.modes.cycle += 1
@@ -258,11 +262,9 @@ class Control:
     def decide(self, given: Iterable[Given]) -> None:
         """Decide what the next cycle executes.
 
-        Answer what is carried out, `handle` what is given, end a lease or a jog that nobody renews, and begin what is
-        planned and due.
+        `handle` what is given, end a lease or a jog that nobody renews, and begin what is planned and due.
         """
         try:
-            self._commands.settle()
             for what, now_ns in given:
                 self.handle(what, now_ns)
             self._commands.end_silent_lease()

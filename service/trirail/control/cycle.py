@@ -51,6 +51,8 @@ OLDEST = 3
 """The greatest age of a position that is looked at, in SYNCs: at the next one the drive is silent."""
 PASSED, STANDS = 1, 2
 """What command finds beside what is refused: the goal under way has ended on the path, the motion stands."""
+FAR = 1000
+"""Steps of a slider that its setpoint may be away from it where no wrong position has been followed."""
 BACKWARDS = -1
 """What command refuses where the time along the path would fall."""
 OLDEST_RECORDED = 255
@@ -265,7 +267,8 @@ def follow(
     """Command the pose that is measured, at rest, and lead each slider to where it is, by a `step` [m] at most.
 
     A position that jumps is not followed, nor one that an enabled drive holds where `held`, nor any where all drives
-    were `stopped_now`. A drive that moves by itself gets its own position at once.
+    were `stopped_now`. A drive that moves by itself gets its own position at once, and so does one without power whose
+    setpoint is FAR from it: that came of a position that was none.
     """
     let_go(kept)
     now, told = feedback[0], record[0]
@@ -278,6 +281,7 @@ def follow(
         if not now.follows[i]:
             sliders[0, 0, i] = position
         elif not (stopped_now or jumps[i] or (held and now.drive_state[i] == _ENABLED)):
-            sliders[0, 0, i] = last + max(-step, min(position - last, step))
+            lost = now.drive_state[i] != _ENABLED and abs(position - last) > FAR * step
+            sliders[0, 0, i] = position if lost else last + max(-step, min(position - last, step))
         sliders[0, 1, i] = sliders[0, 2, i] = 0.0
     _tell(motion, sliders, 0.0, 0.0, record)
