@@ -35,6 +35,7 @@ from trirail.wire.records import DTYPE
 
 __all__ = [
     "BACKWARDS",
+    "FAR",
     "FEEDBACK",
     "OLDEST",
     "PASSED",
