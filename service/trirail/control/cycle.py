@@ -242,7 +242,6 @@ def hold(
     return 4 * refused
 
 
-@compiled()
 def refusal(code: int) -> int:
     """Return what is refused, from what `command` and `hold` return.
 

@@ -321,7 +321,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             code = 0
             cycle.follow(legs, feedback, jumps, s.held != 0, False, s.step, motion, sliders, backlash, record)
         late = _now_ns(state, moment) / 1e9 - s.synced > s.period
-        if cycle.refusal(code) or late or not set_frames(setpoints, axes, sliders[0]):
+        if code >> 2 != 0 or late or not set_frames(setpoints, axes, sliders[0]):
             _copy(kept, 0, 1)
             return Reached.SYNCED
         _mark(state, moment, Part.KINEMATICS)
