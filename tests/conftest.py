@@ -161,7 +161,7 @@ class Rig:
         ticket = next(self._tickets)
         self.cycle(CommandRequest(ticket, "ann", Command(name), carried(name, value)))
         self.until(lambda: self._answered(ticket))
-        return self.answers[-1]
+        return self._answer(ticket)
 
     def goal(self, id: str, x: float, y: float, phi: float, speed: float = 1.0) -> Answer:  # noqa: A002
         """Send a pose goal; return its answer."""
@@ -172,7 +172,7 @@ class Rig:
         ticket = next(self._tickets)
         self.cycle(GoalRequest(ticket, "ann", id, goal, round(self.now * 1e9)))
         self.until(lambda: self._answered(ticket), 50)
-        return self.answers[-1]
+        return self._answer(ticket)
 
     def post(self, id: str, goal: Goal) -> None:  # noqa: A002
         """Send a goal in this cycle and do not wait for its answer."""
@@ -194,7 +194,10 @@ class Rig:
         self.cycle(CommandRequest(next(self._tickets), "ann", Command(name), carried(name, value)))
 
     def _answered(self, ticket: int) -> bool:
-        return bool(self.answers) and getattr(self.answers[-1], "ticket", None) == ticket
+        return any(getattr(answer, "ticket", None) == ticket for answer in self.answers)
+
+    def _answer(self, ticket: int) -> Answer:
+        return next(answer for answer in reversed(self.answers) if getattr(answer, "ticket", None) == ticket)
 
     def enable(self) -> None:
         self.command("enable")

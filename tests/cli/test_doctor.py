@@ -126,7 +126,7 @@ def test_each_fault_of_a_machine_is_named_with_its_remedy(
 
 @pytest.mark.parametrize(("protocol", "verdict"), [("cia402", "ok"), ("odrive", "warning")])
 def test_the_queue_takes_two_cycles_of_the_protocol(protocol: str, verdict: str) -> None:
-    machine = msgspec.structs.replace(GOOD, link=link(txqlen=20))
+    machine = msgspec.structs.replace(GOOD, link=link(txqlen=22))
     checks = doctor.examine(changed(REAL, "drives", protocol=protocol), machine)
     assert [check.verdict for check in checks if check.name == "can0 queue"] == [verdict]
 

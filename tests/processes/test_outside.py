@@ -377,8 +377,10 @@ def events(service: Service, *arguments: str) -> Iterator[Callable[[], str]]:
     command = [sys.executable, "-m", "trirail", *arguments, "--connect", service.locator]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as shown:
         assert shown.stdout is not None
-        yield lambda: shown.stdout.readline().rstrip("\n") if shown.stdout else ""
-        shown.send_signal(signal.SIGINT)
+        try:
+            yield lambda: shown.stdout.readline().rstrip("\n") if shown.stdout else ""
+        finally:
+            shown.send_signal(signal.SIGINT)
 
 
 # ---------------------------------------------------------------------- careless programs

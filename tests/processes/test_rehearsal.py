@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 from trirail.config import SIM, load
@@ -20,14 +19,14 @@ CONFIGS = sorted(file for file in (SIM, *(SIM.parent / "drives").glob("*.toml"))
 def modes(monkeypatch: pytest.MonkeyPatch) -> list[Mode]:
     """The modes that a control goes through, in their order."""
     seen: list[Mode] = []
-    cycle = Control.cycle
+    conclude = Control.conclude
 
-    def watched(control: Control, *arguments: Any, **options: Any) -> None:
-        cycle(control, *arguments, **options)
+    def watched(control: Control) -> None:
+        conclude(control)
         if not seen or seen[-1] is not control.state.mode:
             seen.append(control.state.mode)
 
-    monkeypatch.setattr(Control, "cycle", watched)
+    monkeypatch.setattr(Control, "conclude", watched)
     return seen
 
 

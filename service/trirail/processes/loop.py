@@ -149,6 +149,7 @@ class Loop:
         self._mark(Part.MODE)
         self.control.execute(feedback, self._mark)
         self._reports.record(tick, self._overruns, self._parts_ns)
+        self._reports.pass_on()
         self.control.conclude()
         self._decide(tick.deadline_ns + self._period_ns)
         self._flush_full()

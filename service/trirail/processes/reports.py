@@ -102,7 +102,10 @@ class Reports:
         return np.frombuffer(self._batch, np.uint8)[1:].reshape(-1, SIZE)
 
     def pass_on(self) -> None:
-        """Pass on what was given to the control, what has happened and what is answered, if anything."""
+        """Pass on what was given to the control, what has happened and what is answered, if anything.
+
+        An event belongs to the first cycle that it shows in: that under way or, behind its end, the next.
+        """
         if self._control.ledger.answers or self._control.ledger.notices or self._given:
             self._publish()
         if self._answers:
@@ -171,8 +174,8 @@ class Reports:
         self._given.clear()
         for notice in ledger.notices:
             self._events += 1
-            t = control.cycles * self._period
-            event = Event(self._events, t, control.cycles, time.time(), **notice._asdict())
+            cycle = control.modes.cycle
+            event = Event(self._events, cycle * self._period, cycle, time.time(), **notice._asdict())
             packet = told(event)
             self._kept.append(packet)
             self._recorder.send(packet)
