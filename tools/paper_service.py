@@ -80,7 +80,7 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     """Cut the motion to a goal out of a recording, in time with equation (5). Raises ServiceError.
 
     Nothing is fitted. The log names the goal and the cycle that set the robot in motion for it. In that cycle the
-    motion advanced by one period for the first time (trirail.control.control.Control.advance), so its setpoints
+    motion advanced by one period for the first time (trirail.control.control.Control.solve), so its setpoints
     are those of t = 1 period, those of the k-th cycle of motion t = k periods, and t = 0 is the standstill before. It
     ends with its path, since it does not wait for the robot to settle.
     That time ran like this throughout is checked by the progress in each record.
@@ -91,7 +91,7 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     if len(began) != 1:
         raise ServiceError(f"the recording's log says {len(began)} times, not once, that goal {goal} began")
     first = int(np.searchsorted(recording.t, began[0] - period / 2.0))
-    moving = records["mode"][first:] == MODES.index(Mode.MOVING)
+    moving = (records["mode"][first:] == MODES.index(Mode.MOVING)) & (records["progress"][first:] < 1.0)
     n = int(np.argmin(np.append(moving, False)))
     span = records[first : first + n + REACHED]
     t = np.arange(1.0, n + 1.0) * period
