@@ -91,11 +91,12 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     if len(began) != 1:
         raise ServiceError(f"the recording's log says {len(began)} times, not once, that goal {goal} began")
     first = int(np.searchsorted(recording.t, began[0] - period / 2.0))
-    moving = (records["mode"][first:] == MODES.index(Mode.MOVING)) & (records["progress"][first:] < 1.0)
+    moving = records["mode"][first:] == MODES.index(Mode.MOVING)
     n = int(np.argmin(np.append(moving, False)))
+    wanted = round(DURATION / period)
+    n -= n > wanted and records["progress"][first + n - 1] >= 1.0  # the cycle behind its end, which finds it ended
     span = records[first : first + n + REACHED]
     t = np.arange(1.0, n + 1.0) * period
-    wanted = round(DURATION / period)
     if n != wanted or not np.array_equal(np.diff(span["cycle"]), np.ones(n + REACHED - 1)):
         raise ServiceError(f"goal {goal}: {n} cycles of motion are recorded; wanted are {wanted} without a gap")
     if np.max(np.abs(span["progress"][:n] * DURATION - t)) > 1e-3 * period:
