@@ -287,26 +287,34 @@ def script(seed: int, protocol: str = "cia402") -> dict[int, list[Happening]]:  
     return happens
 
 
+def both_ways(
+    config: Config, folder: Path, script: Callable[[], dict[int, list[Happening]]], cycles: int
+) -> list[Session]:
+    """Run a session with quiet cycles, and once more with every cycle run by Python."""
+    sessions = []
+    for quiet in (True, False):
+        place = folder / str(quiet)
+        place.mkdir()
+        session = Session(config, place, quiet=quiet)
+        try:
+            session.run(script(), cycles)
+        finally:
+            session.close()
+        sessions.append(session)
+    return sessions
+
+
 @pytest.mark.parametrize(
     ("protocol", "seed"), [("cia402", seed) for seed in range(12)] + [("odrive", seed) for seed in range(6)]
 )
 def test_quiet_cycles_are_those_of_python_to_the_last_bit(protocol: str, seed: int, tmp_path: Path) -> None:
     """Frames on the bus, records and events; and most cycles were quiet, so there was something to compare."""
-    told = []
-    for quiet in (True, False):
-        folder = tmp_path / str(quiet)
-        folder.mkdir()
-        session = Session(CONFIGS[protocol], folder, quiet=quiet)
-        try:
-            session.run(script(seed, protocol))
-        finally:
-            session.close()
-        told.append((session.sent, session.heard))
-        assert (session.loop.quiet_cycles > 100) is quiet
-    (frames, heard), (frames_of_python, heard_of_python) = told
-    assert len(heard) > CYCLES
-    _compare(heard, heard_of_python)
-    assert frames == frames_of_python
+    one, other = both_ways(CONFIGS[protocol], tmp_path, lambda: script(seed, protocol), CYCLES)
+    assert one.loop.quiet_cycles > 100
+    assert other.loop.quiet_cycles == 0
+    assert len(one.heard) > CYCLES
+    _compare(one.heard, other.heard)
+    assert one.sent == other.sent
 
 
 @pytest.mark.parametrize("unread", [False, True])
@@ -323,18 +331,9 @@ def test_a_bus_that_dies_is_a_fault_in_the_same_cycle(unread: bool, moving: bool
 
     happens = {number: list(what) for number, what in script(1).items() if number < (400 if moving else 31)}
     happens[412] = [Happening(die)]
-    told = []
-    for quiet in (True, False):
-        folder = tmp_path / str(quiet)
-        folder.mkdir()
-        session = Session(CONFIG, folder, quiet=quiet)
-        try:
-            session.run(happens, 500)
-        finally:
-            session.close()
-        assert session.loop.control.fault is not None
-        told.append(session.heard)
-    _compare(*told)
+    one, other = both_ways(CONFIG, tmp_path, lambda: happens, 500)
+    assert one.loop.control.fault is not None
+    _compare(one.heard, other.heard)
 
 
 @pytest.mark.parametrize("cycles", [50.0, 50.3, 50.999])
@@ -346,18 +345,9 @@ def test_a_jog_that_nobody_renews_ends_also_where_its_time_is_over_within_a_cycl
         30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
         100: [Happening(lambda session: session.ask(GoalRequest(2, "ann", "jog", jog, session.now_ns)))],
     }
-    told = []
-    for quiet in (True, False):
-        folder = tmp_path / str(quiet)
-        folder.mkdir()
-        session = Session(CONFIG, folder, quiet=quiet)
-        try:
-            session.run(happens, 400)
-        finally:
-            session.close()
-        told.append(session.heard)
-        assert session.loop.control.state.mode is Mode.HOLDING
-    _compare(*told)
+    one, other = both_ways(CONFIG, tmp_path, lambda: happens, 400)
+    assert one.loop.control.state.mode is Mode.HOLDING
+    _compare(one.heard, other.heard)
 
 
 def _compare(heard: list[object], heard_of_python: list[object]) -> None:

@@ -138,19 +138,21 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def velocities(self) -> Triple:
         """Greatest rate of each slider [m/s]."""
-        a, b, c = (self.velocity if one.velocity is None else one.velocity for one in self.own)
-        return a, b, c
+        return self._each("velocity")
 
     @property
     def accelerations(self) -> Triple:
         """Greatest acceleration of each slider [m/s²]."""
-        a, b, c = (self.acceleration if one.acceleration is None else one.acceleration for one in self.own)
-        return a, b, c
+        return self._each("acceleration")
 
     @property
     def jerks(self) -> Triple:
         """Greatest jerk of each slider [m/s³]."""
-        a, b, c = (self.jerk if one.jerk is None else one.jerk for one in self.own)
+        return self._each("jerk")
+
+    def _each(self, name: str) -> Triple:
+        common = getattr(self, name)
+        a, b, c = (common if (own := getattr(one, name)) is None else own for one in self.own)
         return a, b, c
 
     @property

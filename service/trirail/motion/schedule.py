@@ -44,11 +44,6 @@ class Schedule:
         return sum(run.ends - run.time for run in self.runs)
 
     @property
-    def single(self) -> bool:
-        """Whether it is one motion to one goal at most: then its run alone tells how far it has come."""
-        return len(self.runs) <= 1 and not (self.runs and self.runs[0].seams)
-
-    @property
     def ended(self) -> bool:
         """Whether the end of the last path has been reached: nothing can follow it on the way."""
         return len(self.runs) == 1 and self.runs[0].arrived
