@@ -60,7 +60,7 @@ class Calm(NamedTuple):
     stands: bool
     """As of trirail.control.cycle.observe."""
     found: int
-    """What trirail.control.cycle.command goes on to find."""
+    """What trirail.control.cycle.command has found in the newest cycle."""
     until: float
     """The last cycle before something is due."""
     settles_by: int | None
