@@ -336,6 +336,22 @@ def test_a_bus_that_dies_is_a_fault_in_the_same_cycle(unread: bool, moving: bool
     _compare(one.heard, other.heard)
 
 
+@pytest.mark.parametrize("number", [250, 251, 257])
+def test_an_odrive_that_stands_still_in_motion_is_found_in_the_same_cycle(number: int, tmp_path: Path) -> None:
+    """Its driver watches the following error by setpoints of earlier cycles, which compiled code keeps for it."""
+    drives = structs.replace(CONFIGS["odrive"].drives, following_error=0.001)
+    happens = {
+        30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
+        100: [
+            Happening(lambda session: session.ask(GoalRequest(2, "ann", "g", PoseGoal(0.1, 0.05, 0.1), session.now_ns)))
+        ],
+        number: [Happening(lambda session: session.drives.faults.add("A stuck for 1"))],
+    }
+    one, other = both_ways(structs.replace(CONFIGS["odrive"], drives=drives), tmp_path, lambda: happens, 400)
+    assert "is beyond its window 1 mm" in (one.loop.control.fault or "")
+    _compare(one.heard, other.heard)
+
+
 @pytest.mark.parametrize("cycles", [50.0, 50.3, 50.999])
 def test_a_jog_that_nobody_renews_ends_also_where_its_time_is_over_within_a_cycle(
     cycles: float, tmp_path: Path
