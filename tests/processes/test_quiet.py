@@ -352,6 +352,25 @@ def test_an_odrive_that_stands_still_in_motion_is_found_in_the_same_cycle(number
     _compare(one.heard, other.heard)
 
 
+@pytest.mark.parametrize("protocol", CONFIGS)
+def test_what_the_last_gate_refuses_is_a_fault_in_the_same_cycle(protocol: str, tmp_path: Path) -> None:
+    """No goal comes to that: the time that a motion has reached is put ahead, as if it ran backwards from there."""
+
+    def put_ahead(session: Session) -> None:
+        session.loop.control.schedule.runs[0].furthest += 1.0
+
+    goal = PoseGoal(0.1, 0.05, 0.1)
+    happens = {
+        30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))],
+        100: [Happening(lambda session: session.ask(GoalRequest(2, "ann", "g", goal, session.now_ns)))],
+        250: [Happening(put_ahead)],
+    }
+    one, other = both_ways(CONFIGS[protocol], tmp_path, lambda: happens, 400)
+    assert "time along the path would run backwards" in (one.loop.control.fault or "")
+    _compare(one.heard, other.heard)
+    assert one.sent == other.sent
+
+
 @pytest.mark.parametrize("cycles", [50.0, 50.3, 50.999])
 def test_a_jog_that_nobody_renews_ends_also_where_its_time_is_over_within_a_cycle(
     cycles: float, tmp_path: Path
