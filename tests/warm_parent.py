@@ -1,16 +1,13 @@
 """The warm process: forks `trirail` with arguments, for tests: python warm_parent.py CONTROL, as warm.py starts it.
 
 On CONTROL, a SEQPACKET socket, it takes requests, each with the descriptor of a socket where it says the process id and
-how that ended, and the one of what the program prints to. The fork server of a service is forked as well, from its
-supervisor before that has a thread.
+how that ended, and the one of what the program prints to.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import gc
-import io
 import json
 import os
 import select
@@ -18,15 +15,12 @@ import signal
 import socket
 import sys
 import traceback
-from typing import Final, NamedTuple, NoReturn
-from unittest.mock import patch
+from typing import Final, NoReturn
 
 from setproctitle import setproctitle
 
 LARGEST: Final = 1 << 17
 """Bytes of a request."""
-SOCKETS: Final = 16
-"""So many descriptors may go with one."""
 
 
 class Warm:
@@ -113,11 +107,9 @@ def _program(request: dict[str, object], output: int) -> NoReturn:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
         sys.argv = ["trirail", *arguments]
-        helper = _fork_helper()
         from trirail.__main__ import main
 
-        with patch("trirail.processes.warm_parent.subprocess.Popen", functools.partial(ForkServer, helper)):
-            main()
+        main()
         code = 0
     except SystemExit as ended:
         code = ended.code
@@ -130,74 +122,6 @@ def _leave(code: object) -> NoReturn:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code if isinstance(code, int) else 0 if code is None else 1)
-
-
-# ---------------------------------------------------------------------- a service's fork server
-
-
-class Helper(NamedTuple):
-    """A process that becomes the fork server when it is asked."""
-
-    pid: int
-    control: socket.socket
-
-
-def _fork_helper() -> Helper:
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    pid = os.fork()
-    if pid:
-        theirs.close()
-        return Helper(pid, ours)
-    ours.close()
-    code: object = 1
-    try:
-        code = _fork_server(theirs)
-    except BaseException:  # noqa: BLE001 - as above
-        traceback.print_exc()
-    _leave(code)
-
-
-def _fork_server(control: socket.socket) -> int:
-    for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the service may have been asked to end before it asks
-    packet, descriptors, _, _ = socket.recv_fds(control, LARGEST, SOCKETS)
-    control.close()
-    if not packet:
-        return 0  # a program that is no service
-    order, *passed = descriptors
-    from trirail.processes import fork_server
-
-    sys.stdin = io.TextIOWrapper(os.fdopen(order, "rb"))
-    sys.argv = ["", json.loads(packet)["runtime"], *map(str, passed)]
-    os.environ.update(json.loads(packet)["environment"])
-    return fork_server.main()
-
-
-class ForkServer:
-    """In the place of Popen: the process that was forked before the supervisor had a thread."""
-
-    def __init__(
-        self, helper: Helper, command: list[str], *, stdin: int, pass_fds: list[int], env: dict[str, str]
-    ) -> None:
-        reading, writing = os.pipe()
-        runtime = command[command.index("-m") + 2]
-        request = json.dumps({"runtime": runtime, "environment": env}).encode()
-        socket.send_fds(helper.control, [request], [reading, *pass_fds])
-        os.close(reading)
-        self.stdin = os.fdopen(writing, "wb")
-        self._pid = helper.pid
-        self._code: int | None = None
-
-    def wait(self) -> int:
-        """Return its exit code."""
-        if self._code is None:
-            self._code = os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
-        return self._code
-
-    def kill(self) -> None:
-        """Kill it, if it has not ended."""
-        if self._code is None:
-            os.kill(self._pid, signal.SIGKILL)
 
 
 def main() -> None:

@@ -23,6 +23,7 @@ from processes.test_service import (
     until,
 )
 from trirail.errors import ServiceError
+from trirail.processes.supervisor import CHILDREN_WITH_DRIVES
 from trirail.telemetry.reading import Recording, read
 from trirail.wire.messages import Event
 from trirail.wire.vocabulary import MODES, Mode
@@ -202,3 +203,17 @@ def test_nothing_is_imported_from_the_folder_it_is_started_in(tmp_path: Path, mo
         service.wait_up()
         assert service.end() == 0
         assert not (folder / "run").exists()
+
+
+def test_the_fork_server_has_of_the_supervisors_descriptors_those_it_hands_on_alone(service: Service) -> None:
+    """An end that another process holds as well is not seen to end; and a listener stays."""
+    folder = f"/proc/{service.child('fork-server')}/fd"
+    has = [os.readlink(f"{folder}/{number}") for number in sorted(map(int, os.listdir(folder)))]
+    assert has[0] == os.devnull
+    kinds = [target.partition(":")[0] if ":[" in target else target for target in has[3:]]
+    ports_and_control = 4
+    assert sorted(kinds) == sorted(
+        ["socket"] * ports_and_control
+        + ["/memfd:trirail-heartbeats (deleted)"]
+        + ["anon_inode"] * len(CHILDREN_WITH_DRIVES)
+    )

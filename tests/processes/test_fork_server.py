@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import select
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import servers
 from trirail.config import SIM, load
 from trirail.processes import warm_parent
 from trirail.processes.child_process import ChildProcess
@@ -60,7 +60,6 @@ def work(child):
             exec((folder / child.name).read_text())
 
 compiling.load, compiling.compile_all = load, compile_all
-sys.exit(fork_server.main(work))
 """
 WITHIN = 30.0
 
@@ -74,7 +73,7 @@ class Parent:
         self.heartbeats = Heartbeats.create()
         sockets = [listening.fileno() for listening in self.listening]
         self.children: list[ChildProcess] = []
-        self.warm = WarmParent(Order(load(SIM), None), folder, self.heartbeats.descriptor, sockets)
+        self.warm = WarmParent(Order(load(SIM), None), folder, self.heartbeats, sockets)
 
     def child(self, name: str, record: str | None = None) -> ChildProcess:
         self.children.append(ChildProcess(self.warm, name, record))
@@ -101,10 +100,8 @@ class Parent:
 
 @pytest.fixture
 def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Parent]:
-    script = tmp_path / "server.py"
-    script.write_text(SERVER.format(folder=str(tmp_path)))
     (tmp_path / "kept").touch()
-    monkeypatch.setattr(warm_parent, "python", lambda *arguments: [sys.executable, str(script), *arguments[2:]])
+    monkeypatch.setattr(warm_parent, "ServerProcess", servers.doing(SERVER.format(folder=str(tmp_path)), tmp_path))
     made = Parent(tmp_path)
     try:
         yield made

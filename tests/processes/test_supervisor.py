@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 import pytest
+import servers
 from msgspec import structs
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
@@ -51,8 +51,6 @@ def work(child):
 
     exec((folder / f"{{name}}-{{number}}").read_text(), globals() | locals())
     return 0
-
-sys.exit(fork_server.main(work))
 """
 CONFIG = load(SIM)
 TURNING = "ready(); beat_until(never)"
@@ -63,9 +61,7 @@ SERVING = "ready(); beat_until(lambda: heartbeats.of('loop').count); beat_until(
 @pytest.fixture
 def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What the supervisor says. Its children do what is written in files of their name and number."""
-    script = tmp_path / "server.py"
-    script.write_text(SERVER.format(folder=str(tmp_path)))
-    monkeypatch.setattr(warm_parent, "python", lambda *arguments: [sys.executable, str(script), *arguments[2:]])
+    monkeypatch.setattr(warm_parent, "ServerProcess", servers.doing(SERVER.format(folder=str(tmp_path)), tmp_path))
     monkeypatch.setattr(supervisor, "END_WITHIN", 0.5)
     return []
 

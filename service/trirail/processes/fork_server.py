@@ -1,9 +1,10 @@
 """The warm parent: imports what the service's processes need, once, and forks them from itself.
 
-`python -m trirail.processes.fork_server RUNTIME CONTROL BEATS SOCKETS…`, its order on standard input. On CONTROL, a
-SEQPACKET socket, it takes requests to fork (`Fork`, with the descriptor on which the child speaks) and says what it has
-forked (`Forked`, with a pidfd) and how that ended (`Ended`). It has no thread, so that a fork is a whole process: Zenoh
-and Rerun, which have, are imported by the child that needs them. It compiles nothing: what is not kept, a child does.
+It is forked itself, from the supervisor before that has a thread, so that what both need is in memory once. On its
+control, a SEQPACKET socket, it takes requests to fork (`Fork`, with the descriptor on which the child speaks) and says
+what it has forked (`Forked`, with a pidfd) and how that ended (`Ended`). It has no thread, so that a fork is a whole
+process: Zenoh and Rerun, which have, are imported by the child that needs them. It compiles nothing: what is not kept,
+a child does.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import socket
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple, NoReturn
 
@@ -35,6 +37,8 @@ WITH_PARENT: Final = {"loop": signal.SIGTERM, "drives": signal.SIGTERM, "planner
 gone, so that what it says of its end is published and on disk; so do drives that it has, for it stops them first."""
 OF_TERMINAL: Final = (signal.SIGINT, signal.SIGHUP)
 """What a terminal sends to all of its processes: Ctrl-C, and its own end."""
+AS_NEEDED: Final = {"MIMALLOC_ARENA_EAGER_COMMIT": "0"}
+"""The environment in which Rerun's allocator takes memory as it is needed, and not in advance."""
 LARGEST = 4096
 """Bytes of a packet on CONTROL."""
 
@@ -195,25 +199,61 @@ def _compile(child: Child) -> int:
     return 0
 
 
-def main(work: Callable[[Child], int] = run) -> int:
-    """Run the fork server; return its exit code."""
-    runtime, control, beats, *sockets = sys.argv[1:]
+class Inheritance(NamedTuple):
+    """What the fork server has from the supervisor."""
+
+    control: socket.socket
+    order: Order
+    runtime: Path
+    heartbeats: Heartbeats
+    sockets: list[int]
+    """Those that the loop listens on."""
+
+
+def serve(inheritance: Inheritance, work: Callable[[Child], int] = run) -> None:
+    """Be the fork server until the supervisor has gone."""
     name_process("fork-server")
     die_with_parent(signal.SIGKILL)
     # The supervisor alone acts on what a terminal sends; SIGTERM waits for the child that unblocks it.
     for number in OF_TERMINAL:
         signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, [signal.SIGTERM])
+    os.environ.update(AS_NEEDED)
     gc.disable()
-    order = decoded(sys.stdin.buffer.read(), Order)
-    with socket.socket(fileno=int(control)) as connected:
-        server = ForkServer(
-            connected, order, Path(runtime), Heartbeats(int(beats)), [int(number) for number in sockets]
-        )
-        server.serve(work)
-    return 0
+    ForkServer(*inheritance).serve(work)
 
 
-if __name__ == "__main__":
-    code = main()
-    os._exit(code)
+def fork(inheritance: Inheritance) -> int:
+    """Return the process id of a new fork server. This process may have no other thread."""
+    supervisor = os.getpid()
+    gc.collect()
+    gc.freeze()  # either's collector would touch, and so copy, what they share
+    sys.stdout.flush()
+    sys.stderr.flush()
+    pid = os.fork()
+    if pid:
+        return pid
+    code = 1
+    try:
+        signal.set_wakeup_fd(-1)
+        _keep(inheritance.control.fileno(), inheritance.heartbeats.descriptor, *inheritance.sockets)
+        if not sys.flags.safe_path:
+            del sys.path[0]  # what lies in the current folder is nothing to import, whoever has put it there
+        if os.getppid() == supervisor:
+            serve(inheritance)
+        code = 0
+    except BaseException:  # noqa: BLE001 - nothing of this process may return into the supervisor
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+def _keep(*descriptors: int) -> None:
+    """Close all but these and the standard ones, of which the input is empty."""
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    for entry in os.listdir("/proc/self/fd"):
+        if int(entry) not in (0, 1, 2, *descriptors):
+            with suppress(OSError):  # that of the listing itself
+                os.close(int(entry))

@@ -23,8 +23,6 @@ ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "M
 are small."""
 TITLE = "trirail: "
 """What `ps` and its like show of one of the service's processes, before its name."""
-FORK_SERVER = "trirail.processes.fork_server"
-"""The module that the parent of the service's other processes runs."""
 
 
 def processes(service: int) -> dict[str, int]:

@@ -20,7 +20,6 @@ from trirail.errors import TrirailError
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.ports import Ports
 from trirail.wire import links
-from trirail.wire.decoding import prepare
 from trirail.wire.messages import Event
 from trirail.wire.planning import MAX_PLANNING
 
@@ -32,8 +31,6 @@ class Order(msgspec.Struct, frozen=True):
     record: str | None
     """Recording file to write, None for one named by the time."""
 
-
-prepare(Order)
 
 COMPILING = "compiling"
 """The key of what is said of a function that is being compiled."""

@@ -110,23 +110,28 @@ class Supervisor:
         """
         raise_limit()
         runtime = _runtime_folder()
-        with runtime as folder, Signals() as signals, self._monitor:
-            self._runtime = Path(folder)
-            self._listening = [links.listen(self._runtime / name) for name in PORTS]
+        with runtime as folder, Signals() as signals:
+            self._listening = [links.listen(Path(folder, name)) for name in PORTS]
             self._selector.register(signals.reader, selectors.EVENT_READ, None)
             sockets = [listening.fileno() for listening in self._listening]
-            self._parent = WarmParent(self._order, self._runtime, self._heartbeats.descriptor, sockets)
+            self._parent = WarmParent(self._order, Path(folder), self._heartbeats, sockets)
             self._selector.register(self._parent, selectors.EVENT_READ)
             try:
-                for name in self._names:
-                    self._start(name)
-                self._watch(up, signals)
+                with self._monitor:  # it may have a thread
+                    self._run_children(up, signals)
             finally:
-                self._end()
                 self._parent.close()
                 for listening in self._listening:
                     listening.close()
         return 1 if self._failed else 0
+
+    def _run_children(self, up: Callable[[dict[str, dict[str, Any]]], None], signals: Signals) -> None:
+        try:
+            for name in self._names:
+                self._start(name)
+            self._watch(up, signals)
+        finally:
+            self._end()
 
     def _start(self, name: str) -> None:
         if name in PROCESSES:

@@ -6,20 +6,17 @@ import os
 import select
 import signal
 import socket
-import subprocess
 import time
 from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 
-from trirail.processes.fork_server import LARGEST, MATHEMATICS, OF_TERMINAL, Ended, Fork, Forked
-from trirail.processes.interpreter import FORK_SERVER, ONE_THREAD, python
+from trirail.processes.fork_server import LARGEST, MATHEMATICS, OF_TERMINAL, Ended, Fork, Forked, Inheritance, fork
+from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.process import Order
 from trirail.wire.decoding import decoded, prepare
 
-AS_NEEDED = {"MIMALLOC_ARENA_EAGER_COMMIT": "0"}
-"""The environment in which Rerun's allocator takes memory as it is needed, and not in advance."""
 TELLS_WITHIN = 1.0
 """So long after the end of a child the fork server may take to say how it ended [s]."""
 IMPORTS_WITHIN = 6.0
@@ -30,28 +27,36 @@ UNTOLD = os.EX_UNAVAILABLE
 prepare(Forked | Ended)
 
 
-class WarmParent:
-    """Starts the fork server, asks it for children, and hears how they end."""
+class ServerProcess:
+    """The fork server's process: what Popen is for one's own child."""
 
-    def __init__(self, order: Order, runtime: Path, beats: int, sockets: list[int]) -> None:
+    def __init__(self, inheritance: Inheritance) -> None:
+        self._pid = fork(inheritance)
+        self._code: int | None = None
+
+    def wait(self) -> int:
+        """Wait for its end, and return its exit code, or the negative number of the signal that killed it."""
+        if self._code is None:
+            self._code = os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
+        return self._code
+
+    def kill(self) -> None:
+        """Kill it, if nobody has waited for its end."""
+        if self._code is None:
+            os.kill(self._pid, signal.SIGKILL)
+
+
+class WarmParent:
+    """Starts the fork server, asks it for children, and hears how they end. Its process may have no other thread."""
+
+    def __init__(self, order: Order, runtime: Path, heartbeats: Heartbeats, sockets: list[int]) -> None:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setblocking(False)
-        arguments = [str(runtime), str(theirs.fileno()), str(beats), *map(str, sockets)]
         # The supervisor alone acts on what a terminal sends to all: also while the server is still importing.
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, OF_TERMINAL)
-        try:
-            self._process = subprocess.Popen(
-                python("-m", FORK_SERVER, *arguments),
-                stdin=subprocess.PIPE,
-                pass_fds=[theirs.fileno(), beats, *sockets],
-                env=os.environ | ONE_THREAD | AS_NEEDED,
-            )
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-            theirs.close()
-        if self._process.stdin is not None:
-            self._process.stdin.write(msgspec.json.encode(order))
-            self._process.stdin.close()
+        with theirs:
+            self._process = ServerProcess(Inheritance(theirs, order, runtime, heartbeats, sockets))
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         self._asked: dict[int, ForkedProcess] = {}
         self._numbers = 0
         self._hung_for = 0.0
