@@ -7,14 +7,22 @@ from pathlib import Path
 import made
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pyarrow import csv, parquet
 from trirail.analysis import export
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
-from trirail.telemetry.reading import Recording, read
+from trirail.telemetry import tables
+from trirail.telemetry.reading import Line, Recording, read
 from trirail.telemetry.recorder import Recorder
-from trirail.wire.records import DTYPE
+from trirail.wire.goals import MoveGoal
+from trirail.wire.messages import Event
+from trirail.wire.packets import ControlInput, GoalRequest
+from trirail.wire.records import DTYPE, PARTS
 from trirail.wire.vocabulary import MODES
+
+ENDINGS = {"", *(f"_{end}" for end in ("x", "y", "phi", "a", "b", "c", *PARTS))}
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +63,62 @@ def test_a_file_is_never_written_over_and_its_name_says_its_format(recording: Re
     assert path.read_text() == "mine"
     with pytest.raises(ServiceError, match=r"must end in \.csv or \.parquet"):
         export.write(recording, tmp_path / "table.xls")
+
+
+@given(
+    begin=st.none() | st.floats(0.0, 1.2),
+    end=st.none() | st.floats(0.0, 1.2),
+    every=st.none() | st.sampled_from([1e-3, 2e-3, 0.01, 0.0375, 0.3, 5.0]),
+)
+def test_a_part_has_the_cycles_between_and_the_first_of_every_so_long(
+    begin: float | None, end: float | None, every: float | None, recording: Recording
+) -> None:
+    first, last = begin if begin is not None else -1.0, end if end is not None else 2.0
+    wanted = [t for t in recording.t.tolist() if first <= t <= last]
+    if every is not None and wanted:
+        starts = [int((t - wanted[0]) / every + 1e-6) for t in wanted]
+        wanted = [t for number, t in enumerate(wanted) if not number or starts[number] > starts[number - 1]]
+    if not wanted:
+        with pytest.raises(ServiceError):
+            recording.part(begin, end, every=every)
+        return
+    part = recording.part(begin, end, every=every)
+    assert part.t.tolist() == wanted
+    np.testing.assert_array_equal(part.records, recording.records[np.isin(recording.t, wanted)])
+    assert all(wanted[0] <= line.t <= wanted[-1] for line in part.events)
+
+
+def test_columns_are_names_of_fields_or_words_of_these(recording: Recording) -> None:
+    every = set(tables.table(recording).column_names)
+    for name in DTYPE.names or ():
+        found = set(tables.table(recording, [name]).column_names)
+        assert found - {"t"} == {column for column in every if column.removeprefix(name) in ENDINGS}
+    for word in {word for name in DTYPE.names or () for word in name.split("_")} - set(DTYPE.names or ()):
+        found = set(tables.table(recording, [word]).column_names) - {"t"}
+        assert found == {column for column in every if word in column.split("_")}
+    assert tables.table(recording, ["error", "following_error"]).num_columns == 4
+    with pytest.raises(ServiceError, match="no column poze"):
+        tables.table(recording, ["poze"])
+
+
+def test_a_dataframe_is_the_table_by_time(recording: Recording) -> None:
+    frame = recording.table("10ms", columns=["pose", "mode"])
+    assert list(frame.columns) == ["pose_x", "pose_y", "pose_phi", "mode"]
+    np.testing.assert_array_equal(frame["pose_x"], recording.records["pose"][::10, 0])
+    assert frame.index.tolist() == recording.t[::10].tolist()
+    assert len(recording.table(0.01)) == len(frame)
+    for nonsense in ("10 parsec", "", "-5ms", "0s"):
+        with pytest.raises(ServiceError):
+            recording.table(nonsense)
+
+
+def test_a_goal_lasts_from_where_it_was_given_until_it_ended(recording: Recording) -> None:
+    goal = GoalRequest(1, "ann", "g-17", MoveGoal(0.0, 0.0, 0.1), 0)
+    ended = Event(1, 0.5, 500, 0.0, "goal", "info", "goal g-17 done", id="g-17", outcome="done")
+    line = Line(0.5, recording.wall[0], "INFO", "", ended)
+    told = recording._replace(requests=(ControlInput(1, 200, 0, goal),), events=[line])
+    part = told.part(goal="g-17")
+    assert (part.records["cycle"][0], part.records["cycle"][-1], part.t[-1]) == (200, 500, 0.5)
+    assert told._replace(events=[]).part(goal="g-17").t[-1] == recording.t[-1]
+    with pytest.raises(ServiceError, match="no goal g-18 in it; the newest: g-17"):
+        told.part(goal="g-18")

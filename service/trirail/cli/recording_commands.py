@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.text import Text
 
-from trirail.cli import terminal
+from trirail.cli import terminal, units
 from trirail.cli.options import Flag
 from trirail.errors import ServiceError, TrirailError
 from trirail.telemetry import palette
@@ -99,7 +99,16 @@ def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Fl
     return 0
 
 
-def export(*file: Recordings, out: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
+def export(
+    *file: Recordings,
+    out: Path | None = None,
+    begin: Annotated[units.Time | None, Parameter(name="--from")] = None,
+    end: Annotated[units.Time | None, Parameter(name="--to")] = None,
+    every: units.Time | None = None,
+    columns: str = "",
+    goal: str | None = None,
+    json: Annotated[bool, Flag] = False,
+) -> int:
     """Write a recorded session as a table, a row a cycle, in SI units: CSV or Parquet.
 
     Parameters
@@ -109,17 +118,28 @@ def export(*file: Recordings, out: Path | None = None, json: Annotated[bool, Fla
     out
         File to write, never over one that exists; its suffix is its format: .csv, .parquet. Beside the recording, as
         CSV, if absent.
+    begin
+        First time, since the start of the service's loop, as report shows times: 12.5s.
+    end
+        Last time.
+    every
+        A row every so often, the first of each such time: 10ms.
+    columns
+        Names of columns, or words of names, with commas between: pose,error. All if absent.
+    goal
+        From when a goal of this id was given until it ended.
     json
         Print one JSON object instead of words.
     """
     from trirail.analysis.export import write
 
     path = out or file[0].with_suffix(".csv")
-    rows = write(_read(file), path)
+    wanted = [column.strip() for column in columns.split(",") if column.strip()]
+    rows = write(_read(file).part(begin, end, goal=goal, every=every), path, wanted)
     if json:
         terminal.json({"file": str(path), "rows": rows})
     else:
-        terminal.say(f"{rows} cycles written to {path}")
+        terminal.say(f"{rows} rows written to {path}")
     return 0
 
 

@@ -13,6 +13,7 @@ import re
 import threading
 import uuid
 from collections.abc import Callable, Iterator
+from html import escape
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
@@ -25,7 +26,7 @@ from trirail.client.lease import Lease
 from trirail.client.outgoing import content_message, goal_message, id_of, made_content, number, seconds
 from trirail.client.track import Taker, Track
 from trirail.client.trajectory import Points, check_arrived, first_pose, points_of
-from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.credentials import Credentials, credentials_for
 from trirail.wire.endpoints import DEFAULT_LOCATOR, ReachableBy, reach
 from trirail.wire.goals import (
@@ -47,6 +48,8 @@ from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Overr
 
 __all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot", "Track"]
 
+SEEN_WITHIN = 1.0
+"""How long a state is waited for by who looks where the robot is [s]."""
 HOME_WITHIN = 600.0
 """How long homing may take [s]: three drives of the greatest time-out there is."""
 
@@ -85,6 +88,24 @@ class Robot:
         self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+    def __repr__(self) -> str:
+        """Say where the robot is, and what it does."""
+        from trirail.client import picture
+
+        try:
+            return picture.line(self.name, self.state(SEEN_WITHIN))
+        except (TrirailError, zenoh.ZError) as error:
+            return f"<Robot {self.name}: {error}>"
+
+    def _repr_html_(self) -> str:
+        """The same with a drawing, for notebooks."""
+        from trirail.client import picture
+
+        try:
+            return picture.html(self.info(), self.state(SEEN_WITHIN))
+        except (TrirailError, zenoh.ZError) as error:
+            return escape(f"<Robot {self.name}: {error}>")
 
     def close(self) -> None:
         """End the connection; goals under way go on."""

@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -36,6 +36,9 @@ from trirail.wire.decoding import decoded, prepare
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # What an RRD file is made of: Rerun's crate re_log_encoding, src/rrd/frames.rs.
 _MAGIC = b"RRF2"
@@ -91,6 +94,33 @@ class Recording(NamedTuple):
     """Text documents that hold for the whole session, by entity path: /configuration, /software."""
     requests: tuple[ControlInput, ...] = ()
     """What the control was given, in order: goals and commands, each with the cycle that took it, and mishaps."""
+
+    def part(
+        self,
+        begin: float | None = None,
+        end: float | None = None,
+        *,
+        goal: str | None = None,
+        every: float | None = None,
+    ) -> Recording:
+        """Return a stretch of it: from and to some time `t` [s], while a `goal` of this id lasts, a row `every` [s].
+
+        Of the rows of such a time the first is taken, none is a mean. Requests are kept, for who looks up a goal.
+        Raises ServiceError where nothing is left, or there is no such goal.
+        """
+        from trirail.telemetry import tables
+
+        return tables.part(self, begin, end, goal=goal, every=every)
+
+    def table(self, every: float | str | None = None, columns: Sequence[str] = ()) -> pd.DataFrame:
+        """Return the records as a DataFrame of pandas, by `t` [s], a row `every` so many seconds, or as "10ms".
+
+        SI units and radians; `columns` are names of fields, or words of names, as pose or error: all if absent. A
+        pose's numbers end in _x, _y, _phi, those of sliders in _a, _b, _c. Raises ServiceError where a column is none.
+        """
+        from trirail.telemetry import tables
+
+        return tables.frame(self, every, columns)
 
 
 def read(path: Path) -> Recording:

@@ -1,0 +1,97 @@
+"""A robot where it stands, as a line of text and as HTML with a drawing, for notebooks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trirail.quantities import worded
+from trirail.telemetry import palette
+from trirail.telemetry.palette import Colour
+from trirail.telemetry.shown_robot import ShownRobot
+from trirail.wire.state import Info, State
+from trirail.workspace import mechanism
+from trirail.workspace.mechanism import Mechanism
+
+WIDTH = 360
+"""Of the drawing [px]."""
+MARGIN = 0.08
+"""Around it, as a share of the robot's size."""
+LINE, THICK = 0.005, 0.02
+"""How wide lines are drawn, likewise."""
+
+
+def line(name: str, state: State) -> str:
+    """Say where a robot is and what it does, in one line."""
+    goal = f" to {state.goal.id}" if state.goal is not None else ""
+    fault = f": {state.faults[0]}" if state.faults else ""
+    return f"<Robot {name}: {state.mode}{goal}{fault}, {_pose(state.pose)}>"
+
+
+def html(info: Info, state: State) -> str:
+    """Return the same with a drawing of rails, sliders and platform: that commanded is pale."""
+    robot = ShownRobot.told(info)
+    mode = palette.code(next(colour for mode, colour in palette.MODES.items() if str(mode) == state.mode))
+    goal = f" to <b>{escape(state.goal.id)}</b>" if state.goal is not None else ""
+    faults = "".join(f"<br/><b>{escape(fault)}</b>" for fault in state.faults)
+    return (
+        f'<div style="display:inline-block;font-family:sans-serif"><div><b>{escape(info.robot)}</b> '
+        f'<span style="background:{mode};color:#fff;border-radius:3px;padding:0 6px">{escape(state.mode)}</span>'
+        f"{goal}<br/>{escape(_pose(state.pose))}{faults}</div>{drawing(robot, state)}</div>"
+    )
+
+
+def drawing(robot: ShownRobot, state: State) -> str:
+    """Return the robot at a state as an SVG picture, x to the right and y upwards."""
+    parts = Mechanism.of(robot.geometry, robot.limits.slider)
+    placed = mechanism.placed(parts.outline, state.pose)
+    everything = np.concatenate([parts.bounds, *placed])
+    (left, bottom), (right, top) = everything.min(axis=0), everything.max(axis=0)
+    size = max(right - left, top - bottom)
+    edge, thin = MARGIN * size, LINE * size
+    width, height = right - left + 2.0 * edge, top - bottom + 2.0 * edge
+    pose = np.array([state.pose])
+    carriages = mechanism.sliders(robot.geometry, np.array([state.sliders.position]))
+    slides = mechanism.cross_slides(robot.geometry, parts, carriages, pose[:, 2])[0]
+    held = mechanism.pivots(robot.geometry, carriages, pose)[0]
+    colours = palette.SLIDERS
+    shapes = [
+        *_lines(parts.rails, [palette.FRAME] * 3, 2.0 * thin),
+        *_lines(parts.travel, colours, thin),
+        *_lines(parts.stops, [palette.LIMIT] * 6, thin),
+        *_lines(mechanism.placed(parts.outline, state.commanded.pose), [palette.COMMANDED] * len(placed), 4.0 * thin),
+        *_lines(list(slides), colours, THICK * size),
+        *_lines(placed, [palette.ARMS] * len(placed), 2.0 * thin),
+        *_lines(mechanism.placed(parts.arms, state.pose), [palette.ARMS] * 3, thin),
+        *(_disc(at, THICK * size, colour) for at, colour in zip(carriages[0], colours, strict=True)),
+        *(_disc(at, 1.5 * thin, palette.PIN) for at in held),
+        _disc(state.pose[:2], 2.5 * thin, palette.CENTRE),
+    ]
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" width="{WIDTH}" height="{WIDTH * height / width:.0f}" '
+        f'viewBox="{left - edge:.6g} {-top - edge:.6g} {width:.6g} {height:.6g}">'
+        f"<title>{escape(_pose(state.pose))}</title>"
+        f'<g transform="scale(1 -1)" fill="none" stroke-linecap="round">{"".join(shapes)}</g></svg>'
+    )
+
+
+def _pose(pose: Sequence[float]) -> str:
+    x, y, phi = pose
+    return f"x {worded(x, 'm')}, y {worded(y, 'm')}, φ {worded(phi, 'rad')}"
+
+
+def _lines(lines: Iterable[NDArray[np.float64]], colours: Sequence[Colour], width: float) -> list[str]:
+    found = []
+    for points, colour in zip(lines, colours, strict=True):
+        at = " ".join(f"{x:.6g},{y:.6g}" for x, y in points)
+        pale = f' stroke-opacity="{colour[3] / 255.0:.2g}"' if len(colour) == 4 else ""
+        found.append(f'<polyline points="{at}" stroke="{palette.code(colour)}" stroke-width="{width:.3g}"{pale}/>')
+    return found
+
+
+def _disc(at: Sequence[float] | NDArray[np.float64], radius: float, colour: Colour) -> str:
+    x, y = at
+    return f'<circle cx="{x:.6g}" cy="{y:.6g}" r="{radius:.3g}" fill="{palette.code(colour)}"/>'
