@@ -19,7 +19,9 @@ from typing import Any
 import msgspec
 import pytest
 from cyclopts import App
-from trirail.cli import commands, help_pages, live, terminal, units, view
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.cli import commands, help_pages, live, terminal, typed, units, view
 from trirail.client import client, connection
 from trirail.client.goal import Result
 from trirail.config import SIM, load
@@ -57,7 +59,7 @@ def pages(app: App = commands.app, *path: str) -> Iterator[tuple[str, App]]:
 
 def test_every_command_is_in_a_group_with_examples_that_can_be_typed() -> None:
     listed = [name for group in help_pages.GROUPS.values() for name in group]
-    assert sorted(listed) == sorted(name for name, _ in pages() if " " not in name)
+    assert sorted(listed) == sorted(name for name, _ in pages() if " " not in name and name != "help")
     for group in help_pages.GROUPS.values():
         for name, examples in group.items():
             assert examples
@@ -77,9 +79,37 @@ def test_every_argument_is_described(name: str, page: App, run: Run) -> None:
 def test_help_shows_groups_and_examples(run: Run) -> None:
     code, out, _ = run("--help")
     assert code == 0
-    titles = [out.index(f"─ {name} ─") for name in help_pages.GROUPS]
+    titles = [out.index(f"─ {name} ─") for name in help_pages.GROUPS if name != "Mathematics"]
     assert titles == sorted(titles)
     assert "trirail goto 30mm 20mm 10deg --wait" in run("goto", "--help")[1]
+
+
+def test_what_is_seldom_needed_is_on_the_page_of_all_alone(run: Run) -> None:
+    names = {name for group in help_pages.GROUPS.values() for name in group}
+    assert set(help_pages.SELDOM) < names
+    for line, shown in (("--help", names - {*help_pages.SELDOM}), ("help all", names), ("help", None)):
+        code, out, _ = run(*line.split())
+        found = {line.split()[1] for line in out.splitlines() if line.startswith("│ ") and line[2].isalpha()}
+        assert code == 0
+        assert found & names == (shown if shown is not None else names - {*help_pages.SELDOM})
+    assert run("help", "keys", "add")[1] == run("keys", "add", "--help")[1]
+    assert "Unknown command" in run("help", "nonsense")[2]
+
+
+@given(
+    st.lists(st.sampled_from(["10mm", "-20", "5deg", "0.5", "-.1e-3", "1in"]), min_size=3, max_size=3),
+    st.sampled_from([" ", ",", ", ", ";", "; "]),
+    st.sampled_from(typed.OF_THREE),
+)
+def test_three_numbers_may_have_commas_between(numbers: list[str], between: str, command: str) -> None:
+    assert typed.spread([command, *between.join(numbers).split()]) == [command, *numbers]
+
+
+@pytest.mark.parametrize(
+    "line", ["goto 10,5 20 3", "goto pick", "goto a,b,c", "goto 1 2 3 --tool 20,0", "export x --columns 1,2,3", ""]
+)
+def test_nothing_else_is_read_otherwise_for_its_commas(line: str) -> None:
+    assert typed.spread(line.split()) == line.split()
 
 
 @pytest.mark.long

@@ -30,6 +30,7 @@ from trirail.cli import (
     sessions_command,
     stop_commands,
     terminal,
+    typed,
     units,
     workspace_command,
 )
@@ -226,7 +227,25 @@ def completion(shell: Shell | None = None, /, *, install: Annotated[bool, Flag] 
     install
         Write it where the shell finds it, and load it from the shell's start file where that is needed.
     """
-    return script(app, shell, install=install)
+    with help_pages.everything(app):
+        return script(app, shell, install=install)
+
+
+@app.command(name="help")
+def help_(*command: str) -> int:
+    """Show this page, with the seldom needed commands too, or the page of one command.
+
+    Parameters
+    ----------
+    command
+        A command, or all.
+    """
+    if command == ("all",):
+        with help_pages.everything(app):
+            app("--help")
+    else:
+        app([*command, "--help"])
+    return 0
 
 
 help_pages.arrange(app)
@@ -248,7 +267,9 @@ def main() -> None:
         for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is signal.SIG_DFL:  # not where it is ignored, as under nohup
                 signal.signal(number, _terminated)
-        code = app(units.numbers(words), exit_on_error=False, print_error=False, result_action="return_value")
+        code = app(
+            units.numbers(typed.spread(words)), exit_on_error=False, print_error=False, result_action="return_value"
+        )
     except CycloptsError as error:
         terminal.complain(_wrong_usage(error, words))
         code = 2

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Final
 
 from cyclopts import App, Group
@@ -93,7 +94,11 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
             "trirail sessions /var/lib/trirail --user ann --outcome faulted --json",
         ),
         "report": ("trirail report session.rrd", "trirail report session.rrd --plot session.png"),
-        "export": ("trirail export session.rrd", "trirail export session.rrd --out session.parquet"),
+        "export": (
+            "trirail export session.rrd --out session.parquet",
+            "trirail export session.rrd --from 2s --to 5s --every 10ms --columns pose,error",
+            "trirail export session.rrd --goal g-17",
+        ),
         "replay": (
             "trirail replay session.rrd",
             "trirail replay session.rrd --config other.toml",
@@ -107,6 +112,12 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
     },
 }
 """The commands by group, with lines that can be typed."""
+SELDOM: Final = (
+    *("keys", "router", "completion", "acquire", "release", "goal", "fleet", "replay"),
+    *GROUPS["Mathematics"],
+)
+"""Those that a new user does not need: `trirail help all` shows them too."""
+MORE: Final = "`trirail help all` shows the seldom needed commands too, `trirail help COMMAND` what one takes."
 
 
 def arrange(app: App) -> None:
@@ -115,5 +126,21 @@ def arrange(app: App) -> None:
         group = Group.create_ordered(name)
         for position, (command, examples) in enumerate(commands.items()):
             page = app[command]
-            page.group, page.sort_key = (group,), position
+            page.group, page.sort_key, page.show = (group,), position, command not in SELDOM
             page.help_epilogue = "```\n" + "\n".join(examples) + "\n```"
+    app["help"].show = False
+    app.help_epilogue = MORE
+
+
+@contextmanager
+def everything(app: App) -> Iterator[None]:
+    """Have the page of all commands show every one, while the context lasts."""
+    for command in SELDOM:
+        app[command].show = True
+    app.help_epilogue = None
+    try:
+        yield
+    finally:
+        for command in SELDOM:
+            app[command].show = False
+        app.help_epilogue = MORE
