@@ -158,20 +158,54 @@ def test_a_recording_is_read_while_it_is_written(service: Service) -> None:
     assert lines[1].count("µm") == 3
 
 
+def cells(name: str) -> list[str]:
+    """Return what the cells of a notebook run, one after the other, as Jupyter runs them."""
+    notebook = nbformat.read(EXAMPLES / name, as_version=4)  # type: ignore[no-untyped-call]
+    nbformat.validate(notebook)
+    runs = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(not cell.outputs and cell.execution_count is None for cell in runs), "clear its outputs"
+    return [cell.source for cell in runs]
+
+
+@pytest.mark.slow
+def test_a_scan_in_a_notebook(service: Service) -> None:
+    """Every reading is drawn, every goal reached, and the recording shows the poses that were sent."""
+    jupyter = """
+class Shown:
+    updates = 0
+    def update(self, figure):
+        figure.canvas.draw()
+        Shown.updates += 1
+def display(figure, display_id):
+    return Shown()
+"""
+    checks = """
+print(len(goals), Shown.updates, np.isfinite(found).all(), (found < 100.0).all())
+at = scan.records["pose"][:, :2]
+print(all(np.min(np.hypot(*(at - pose).T)) < 1e-4 for pose in poses))
+print([len(line.get_ydata()) > 10 for line in axes.lines], "disabled" in str(Robot()))
+"""
+    recording = str(service.recording)
+    environment = {"MPLBACKEND": "Agg", "TRIRAIL_CONNECT": service.locator, "RECORDINGS": f"{recording}:{recording}"}
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join([jupyter, *cells("scan.ipynb"), checks])],
+        env=os.environ | environment,
+        capture_output=True, text=True, timeout=WITHIN, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["15 15 True True", "True", "[True, True] True"]
+
+
 @pytest.mark.slow
 def test_the_notebook_plots_a_recording(service: Service) -> None:
-    """Its cells one after the other, as Jupyter runs them; every axis has something finite drawn in it."""
-    notebook = nbformat.read(EXAMPLES / "plot_recording.ipynb", as_version=4)  # type: ignore[no-untyped-call]
-    nbformat.validate(notebook)
-    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert all(not cell.outputs and cell.execution_count is None for cell in cells), "clear its outputs"
+    """Every axis has something finite drawn in it."""
     drawn = """
 for axes in (axes for number in plt.get_fignums() for axes in plt.figure(number).axes):
     curves = [line.get_ydata() for line in axes.lines] or [[patch.get_height() for patch in axes.patches]]
     print("drawn", axes.get_ylabel(), all(np.all(np.isfinite(curve)) and len(curve) > 10 for curve in curves))
 """
     done = subprocess.run(
-        [sys.executable, "-c", "\n".join([*(cell.source for cell in cells), drawn])],
+        [sys.executable, "-c", "\n".join([*cells("plot_recording.ipynb"), drawn])],
         env=os.environ | {"MPLBACKEND": "Agg", "RECORDING": str(service.recording)},
         capture_output=True, text=True, timeout=WITHIN, check=False,
     )  # fmt: skip
