@@ -101,6 +101,10 @@ class Page:
         self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
         self._call("Emulation.setTouchEmulationEnabled", enabled=phone)
 
+    def colours(self, scheme: str) -> None:
+        """Show the page as to somebody who likes it light, or dark."""
+        self._call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+
     # ------------------------------------------------------------------ using
 
     def middle(self, selector: str) -> dict[str, float]:
@@ -120,6 +124,21 @@ class Page:
     def click(self, selector: str) -> None:
         self.press(selector)
         self.let_go(selector)
+
+    def drag(self, selector: str, right: float, up: float) -> None:
+        """Drag from the middle of an element by so many pixels."""
+        at = self.middle(selector)
+        self._mouse("mousePressed", at)
+        for part in (0.5, 1.0):
+            self._mouse("mouseMoved", {"x": at["x"] + part * right, "y": at["y"] - part * up})
+        self._mouse("mouseReleased", {"x": at["x"] + right, "y": at["y"] - up})
+
+    def write(self, selector: str, words: str) -> None:
+        """Write into a field, in place of what stands there."""
+        self.evaluate(
+            f"(() => {{ const field = document.querySelector({selector!r}); field.focus(); field.value = {words!r};"
+            " field.dispatchEvent(new Event('input', {bubbles: true})); })()"
+        )
 
     def touch(self, selector: str) -> None:
         self._call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[self.middle(selector)])

@@ -109,6 +109,27 @@ class FakeRobot:
             self._hanging["goal"].wait()
         return GoalHandle(name, self.robot().command)
 
+    def move_to(self, x: float, y: float, phi: float) -> GoalHandle:
+        with self._lock:
+            if self.refusal is not None:
+                raise self.refusal
+            self.pose = (x, y, phi)
+        return GoalHandle("there", self.robot().command)
+
+    def move(self, x: float, y: float, phi: float) -> GoalHandle:
+        return self.move_to(*(a + b for a, b in zip(self.pose, (x, y, phi), strict=True)))
+
+    def teach(self, name: str) -> NamedPose:
+        self.named[name] = self.pose
+        self.say(f"pose {name} taught by ann", kind="pose")
+        return NamedPose(name, *self.pose, taught=True)
+
+    def forget(self, name: str) -> NamedPose:
+        if name not in self.named:
+            raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {name!r}")
+        self.say(f"pose {name} removed by ann", kind="pose")
+        return NamedPose(name, *self.named.pop(name), taught=True)
+
     def lease(self) -> Lease:
         return Lease(self.command, force=False, timeout=0.2)
 

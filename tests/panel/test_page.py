@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -293,16 +294,108 @@ def test_named_poses_are_buttons_that_come_and_go_with_them(enabled: Page, robot
     enabled.click("#poses button:last-child")
     enabled.until("document.querySelector('#answer').textContent === 'go to pick: on its way'")
     assert robot.gone_to == ["pick"]
+    assert set(robot.named) == {"park", "pick"}
     robot.named.clear()  # and nobody is told
     enabled.click("#poses button:first-child")
     enabled.until("document.querySelector('#answer').textContent === \"go to park: no pose 'park'\"")
     robot.say("pose park removed by bob", kind="pose")
-    enabled.until("document.querySelector('#poses-part').hidden")
+    enabled.until("document.querySelector('#poses').childElementCount === 0")
     robot.named["<b>"] = (0.0, 0.0, 0.0)  # whatever a service says, it is a name and no page
     robot.say("pose <b> taught by bob", kind="pose")
     enabled.until(f"{names} === '[\"<b>\"]'")
     robot.command("disable")
     enabled.until("document.querySelector('#poses button').disabled")
+
+
+# ---------------------------------------------------------------------- poses that are typed, dragged and kept
+
+
+def typed(page: Page, *words: str) -> None:
+    for field, word in zip(("x", "y", "phi"), words, strict=True):
+        page.write(f"#to-{field}", word)
+
+
+@pytest.mark.parametrize(
+    ("words", "pose"),
+    [
+        (("20", "-10", "10"), (0.02, -0.01, math.radians(10.0))),
+        (("2,5", "500 um", "-30arcsec"), (0.0025, 0.0005, -math.radians(30.0 / 3600.0))),
+        (("0.01 m", "1in", "5mrad"), (0.01, 0.0254, 0.005)),
+    ],
+)
+def test_a_pose_that_is_typed_is_checked_and_gone_to_when_told(
+    words: tuple[str, str, str], pose: tuple[float, float, float], enabled: Page, robot: FakeRobot
+) -> None:
+    before = robot.pose
+    typed(enabled, *words)
+    enabled.until("document.querySelector('#going').dataset.may === 'yes'")
+    assert enabled.text("#going-says") == "nothing is in the way"
+    assert robot.pose == before
+    enabled.click("#go")
+    enabled.until("document.querySelector('#answer').textContent === 'go there: on its way'")
+    assert robot.pose == pytest.approx(pose, abs=1e-12)
+
+
+def test_what_is_in_the_way_is_said_before_anything_moves(enabled: Page) -> None:
+    typed(enabled, "500", "0", "0")
+    enabled.until("document.querySelector('#going').dataset.may === 'no'")
+    assert "slider" in enabled.text("#going-says")
+    assert enabled.evaluate("document.querySelector('.wanted').parentElement.getAttribute('class')") == "barred"
+
+
+@pytest.mark.parametrize("word", ["ten", "10 furlongs", "1.2.3", "1e3", "--5", "5 mm mm"])
+def test_what_is_no_number_is_said_and_goes_nowhere(word: str, enabled: Page, robot: FakeRobot) -> None:
+    before = robot.pose
+    typed(enabled, "1", word, "0")
+    assert "a number was expected" in enabled.text("#going-says")
+    assert enabled.evaluate("document.querySelector('#to-y').getAttribute('aria-invalid')") == "true"
+    enabled.click("#go")
+    assert enabled.evaluate("document.activeElement.id") == "to-y"
+    assert robot.pose == before
+
+
+def test_a_pose_is_dragged_on_the_drawing_and_moves_nothing_before_it_is_told(enabled: Page, robot: FakeRobot) -> None:
+    before = robot.pose
+    scale = enabled.evaluate("document.querySelector('#mechanism').getScreenCTM().a")  # pixels a metre
+    enabled.drag("#mechanism", right=0.02 * scale, up=0.01 * scale)
+    enabled.until("document.querySelector('#going').dataset.may === 'yes'")
+    assert robot.pose == before
+    enabled.click("#go")
+    until(lambda: robot.pose != before, "it goes there")
+    assert robot.pose == pytest.approx((before[0] + 0.02, before[1] + 0.01, before[2]), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("button", "by"),
+    [("[data-axis=x][data-sign='1']", (1e-4, 0, 0)), ("[data-axis=phi][data-sign='-1']", (0, 0, -math.radians(0.1)))],
+)
+def test_a_step_is_one_move_for_one_press(
+    button: str, by: tuple[float, float, float], enabled: Page, robot: FakeRobot
+) -> None:
+    before = robot.pose
+    enabled.click("[data-step='2']")
+    enabled.press(button)
+    until(lambda: robot.pose != before, "it steps")
+    time.sleep(2 * TIMEOUT)  # held for longer: no more steps, and no jog
+    enabled.let_go(button)
+    assert robot.pose == pytest.approx(tuple(a + b for a, b in zip(before, by, strict=True)), abs=1e-12)
+    assert not robot.sent
+    enabled.click("[data-step='0']")
+    enabled.press(button)
+    until(lambda: bool(robot.sent), "it jogs")
+    enabled.let_go(button)
+
+
+def test_a_place_is_kept_and_forgotten_by_its_name(enabled: Page, robot: FakeRobot) -> None:
+    enabled.write("#pose-name", "pick")
+    enabled.click("#teach")
+    enabled.until("document.querySelector('#poses').innerText.includes('pick')")
+    assert robot.named["pick"] == robot.pose
+    enabled.until("!document.querySelector('#forget').disabled")
+    enabled.click("#forget")
+    enabled.until("!document.querySelector('#poses').innerText.includes('pick')")
+    enabled.write("#pose-name", "park")  # of the configuration
+    assert enabled.evaluate("document.querySelector('#forget').disabled")
 
 
 def test_only_a_robot_that_homes_has_the_button(page: Page, browser: Page) -> None:
@@ -370,9 +463,17 @@ def test_nothing_is_loaded_from_elsewhere_and_nothing_fails(page: Page, panel: P
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("faulty", [False, True])
-def test_text_has_the_contrast_of_wcag_aa(enabled: Page, robot: FakeRobot, size: str, faulty: bool) -> None:
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_has_the_contrast_of_wcag_aa(
+    enabled: Page, robot: FakeRobot, size: str, faulty: bool, scheme: str
+) -> None:
     width, height, phone = SIZES[size]
     enabled.resize(width, height, phone=phone)
+    enabled.colours(scheme)
+    enabled.write("#to-x", "900")
+    enabled.write("#to-y", "0")
+    enabled.write("#to-phi", "0")
+    enabled.until("document.querySelector('#going').dataset.may === 'no'")
     robot.say("a warning", "warning")
     robot.say("an error", "error")
     enabled.until("document.querySelector('#events li').innerText.includes('an error')")
@@ -453,8 +554,9 @@ def test_every_control_is_reached_by_tab_named_and_seen_to_have_the_focus(enable
     for _ in range(40):
         enabled.type_key("Tab")
         found = enabled.evaluate(
-            "(({id, dataset, tagName, innerText, labels}, style) => [id || JSON.stringify(dataset), tagName,"
-            " innerText || labels?.[0]?.innerText || '', style.outlineStyle, parseFloat(style.outlineWidth)])"
+            "(({id, dataset, tagName, innerText, labels, ariaLabel}, style) => [id || JSON.stringify(dataset), tagName,"
+            " innerText || labels?.[0]?.innerText || ariaLabel || '',"
+            " style.outlineStyle, parseFloat(style.outlineWidth)])"
             "(document.activeElement, getComputedStyle(document.activeElement))"
         )
         if found[1] in ("BUTTON", "INPUT"):

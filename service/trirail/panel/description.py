@@ -15,12 +15,16 @@ from trirail.wire.state import Info
 from trirail.workspace.mechanism import Mechanism
 
 
-def describe(info: Info, user: str) -> dict[str, Any]:
-    """Return it, ready to be encoded. Raises ServiceError where the service is of another version."""
+def shown(info: Info) -> ShownRobot:
+    """Return the robot that a service tells of. Raises ServiceError where the service is of another version."""
     try:
-        robot = ShownRobot.told(info)
+        return ShownRobot.told(info)
     except (msgspec.ValidationError, ConfigError) as error:
         raise ServiceError(f"the service is of another version, {info.version}: {error}") from error
+
+
+def describe(info: Info, robot: ShownRobot, user: str) -> dict[str, Any]:
+    """Return what a tab must know, ready to be encoded."""
     parts = Mechanism.of(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform
     return {

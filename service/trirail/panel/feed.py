@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
 import time
 from collections import deque
 
 import msgspec
+from trirail_drivers.interface import Triple
 
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
-from trirail.panel.description import describe
+from trirail.panel import path_check
+from trirail.panel.description import describe, shown
+from trirail.wire.state import Info
 
 SILENT = 1.0
 """After so long without a state the service is taken for gone [s]."""
@@ -28,8 +32,8 @@ class Feed:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self.changed = threading.Condition()
-        self.robot = msgspec.json.encode(describe(robot.info(), robot.user))
-        """What a tab must know of the robot before it can draw it, as JSON."""
+        self._pose: Triple | None = None
+        self._take(robot.info())
         self.poses = self._ask_poses()
         """The names of its poses, as JSON."""
         self.state: bytes | None = None
@@ -62,7 +66,7 @@ class Feed:
                 stamp = now()
                 content = msgspec.json.encode({"tell": "state", "stamp": stamp, "state": state})
                 with self.changed:
-                    self.state, self.stamp = content, stamp
+                    self.state, self.stamp, self._pose = content, stamp, state.pose
                     self.changed.notify_all()
             with self.changed:
                 self.state = None
@@ -70,20 +74,30 @@ class Feed:
 
     def _describe(self) -> None:
         """Ask again what robot it is: a service that was silent may have been started anew."""
-        try:
-            content = msgspec.json.encode(describe(self._robot.info(), self._robot.user))
-        except TrirailError:
-            return  # the old description stands until it answers
         poses = self._ask_poses()
-        with self.changed:
-            self.robot, self.poses = content, poses
+        with contextlib.suppress(TrirailError):  # the old description stands until it answers
+            told = self._robot.info()
+            with self.changed:
+                self._take(told)
+                self.poses = poses
+
+    def _take(self, told: Info) -> None:
+        """Take in what robot it is. Raises ServiceError where the service is of another version."""
+        self._shown = shown(told)
+        self.robot = msgspec.json.encode(describe(told, self._shown, self._robot.user))
+        """What a tab must know of the robot before it can draw it, as JSON."""
+
+    def problem(self, pose: Triple) -> str:
+        """Return what keeps the robot from going from where it is measured to a pose, as problem of path_check."""
+        return path_check.problem(self._shown, self._pose if self._pose is not None else pose, pose)
 
     def _ask_poses(self) -> bytes:
         try:
-            names = list(self._robot.poses())
+            poses = self._robot.poses()
         except TrirailError:
-            names = []  # a service that knows none
-        return msgspec.json.encode({"tell": "poses", "names": names})
+            poses = {}  # a service that knows none
+        taught = [name for name, pose in poses.items() if pose.taught]
+        return msgspec.json.encode({"tell": "poses", "names": list(poses), "taught": taught})
 
     def _hear_events(self) -> None:
         for number, event in zip(itertools.count(1), self._robot.events(history=True), strict=False):

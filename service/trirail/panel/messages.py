@@ -49,4 +49,43 @@ class GoTo(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag=
     """The pose's."""
 
 
-FromPage = Seen | Hold | Release | Tell | SetOverride | GoTo
+class GoToPose(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="pose"):
+    """A pose that was typed, or dragged on the drawing, is to be gone to."""
+
+    pose: Coordinates
+    """x, y [m] and phi [rad] in the base frame."""
+
+
+class Check(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="check"):
+    """Whether such a pose can be gone to is to be said, without moving."""
+
+    pose: Coordinates
+    """Likewise."""
+    number: int
+    """By which the page knows the answer."""
+
+
+class Step(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="step"):
+    """A jog button has been pressed where it is for steps."""
+
+    by: Coordinates
+    """Along x, y [m] and about phi [rad], in the base frame."""
+    seen: int
+    """As of Hold."""
+
+
+class Teach(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="teach"):
+    """Where the robot stands is to be kept as a pose."""
+
+    name: str
+    """The pose's."""
+
+
+class Forget(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="forget"):
+    """A taught pose is to be removed."""
+
+    name: str
+    """The pose's."""
+
+
+FromPage = Seen | Hold | Release | Tell | SetOverride | GoTo | GoToPose | Check | Step | Teach | Forget

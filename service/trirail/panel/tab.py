@@ -16,7 +16,21 @@ from trirail.client.held_jog import HeldJog
 from trirail.client.lease import Lease
 from trirail.errors import TrirailError
 from trirail.panel.feed import Feed, now
-from trirail.panel.messages import FromPage, GoTo, Hold, Release, Seen, SetOverride, Tell
+from trirail.panel.messages import (
+    Check,
+    Forget,
+    FromPage,
+    GoTo,
+    GoToPose,
+    Hold,
+    Release,
+    Seen,
+    SetOverride,
+    Step,
+    Teach,
+    Tell,
+)
+from trirail.panel.path_check import PathCheck
 from trirail.wire.decoding import decoded, prepare
 from trirail.wire.vocabulary import Command
 
@@ -49,6 +63,7 @@ class Tab:
         self._unseen: deque[int] = deque()
         self._under_way: set[Command] = set()
         self._stops, self._others = (threading.BoundedSemaphore(UNDER_WAY) for _ in range(2))
+        self._checks = PathCheck(feed.problem, lambda number, why: self._say("checked", number=number, why=why))
         self._lease: Lease | None = None
         self._open = True
 
@@ -62,6 +77,7 @@ class Tab:
                     self._take(text)
         finally:
             self._jog.close()
+            self._checks.close()
             with self._feed.changed:
                 self._open = False
                 self._feed.changed.notify_all()
@@ -86,12 +102,30 @@ class Tab:
                 self._jog.release()
             case Tell(name):
                 self._tell(name)
-            case SetOverride(percent):
-                self._begin(lambda: self._robot.override(percent), Command.OVERRIDE)
-            case GoTo(name):
-                self._begin(lambda: self._robot.move_to_named(name), f"go to {name}", "accepted")
+            case Check(pose, number):
+                self._checks.ask(pose, number)
+            case _:
+                self._ask(said)
 
     # ------------------------------------------------------------------ doing
+
+    def _ask(self, said: SetOverride | GoTo | GoToPose | Step | Teach | Forget) -> None:
+        """Ask the service for what is answered there, and is under way beside all else."""
+        robot = self._robot
+        match said:
+            case SetOverride(percent):
+                self._begin(lambda: robot.override(percent), Command.OVERRIDE)
+            case GoTo(name):
+                self._begin(lambda: robot.move_to_named(name), f"go to {name}", "accepted")
+            case GoToPose(pose):
+                self._begin(lambda: robot.move_to(*pose), "go there", "accepted")
+            case Step(by, seen):
+                if now() - seen <= FRESH:
+                    self._begin(lambda: robot.move(*by), "step", "accepted")
+            case Teach(name):
+                self._begin(lambda: robot.teach(name), f"teach {name}")
+            case Forget(name):
+                self._begin(lambda: robot.forget(name), f"forget {name}")
 
     def _tell(self, name: Command) -> None:
         """Send a command, unless it is under way already; what stops the robot waits for no other."""
@@ -151,7 +185,7 @@ class Tab:
 
     # ------------------------------------------------------------------ showing
 
-    def _say(self, tell: str, **content: str) -> None:
+    def _say(self, tell: str, **content: str | int) -> None:
         with self._feed.changed:
             self._outbox.append(msgspec.json.encode({"tell": tell, **content}))
             self._feed.changed.notify_all()

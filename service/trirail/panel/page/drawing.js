@@ -28,6 +28,11 @@ export class Drawing {
     lines(parts.stops, "stop");
     this.goal = add("g", "");
     lines(parts.outline, "goal", this.goal);
+    this.svg = svg;
+    this.chosen = add("g", "");
+    lines(parts.outline, "wanted", this.chosen);
+    lines(parts.arms, "wanted", this.chosen);
+    this.wanted(null, null);
     this.platform = add("g", "");
     lines(parts.outline, "platform", this.platform);
     lines(parts.arms, "arm", this.platform);
@@ -49,6 +54,19 @@ export class Drawing {
       name.setAttribute("y", -y);
       name.textContent = "ABC"[k];
     });
+  }
+
+  // Show a pose that is chosen; whether it can be gone to, or null where nobody has said.
+  wanted(pose, may) {
+    this.chosen.style.display = pose ? "" : "none";
+    this.chosen.setAttribute("class", may === null ? "" : may ? "free" : "barred");
+    if (pose) place(this.chosen, pose);
+  }
+
+  // Where a pointer is, in metres.
+  place(event) {
+    const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
+    return [at.x, -at.y];
   }
 
   show(state) {

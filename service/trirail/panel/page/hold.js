@@ -11,10 +11,12 @@ const KEYS = {
 };
 
 export class Hold {
-  // `sign(direction)` is told {x, y, phi}, each -1, 0 or 1, while something is held; `release()` when nothing is any more.
-  constructor(buttons, sign, release) {
+  // `sign(direction)` is told {x, y, phi}, each -1, 0 or 1, while something is held; `release()` when nothing is any more;
+  // `press({axis, sign})` when a button is pressed, once.
+  constructor(buttons, sign, release, press) {
     this.sign = sign;
     this.release = release;
+    this.press = press;
     this.held = new Map(); // which finger or key holds which button
     this.timer = null;
     this.last = 0;
@@ -64,6 +66,7 @@ export class Hold {
     if (button.disabled) return;
     this.held.set(by, button);
     button.classList.add("held");
+    this.press(button.dataset);
     this.#say();
     clearInterval(this.timer);
     this.last = performance.now();
