@@ -192,7 +192,7 @@ def test_every_method_takes_every_kind_of_number(kind: type[Robot | AsyncRobot],
     asyncio.run(run())
 
 
-GUIDE = (Path(__file__).parents[2] / "service/README.md").read_text(encoding="utf-8")
+GUIDE = (Path(__file__).parents[2] / "service/talking.md").read_text(encoding="utf-8")
 EXAMPLES = [
     line for line in GUIDE.splitlines() if line.startswith("{") and '"kind": ' in line and '"seq": ' not in line
 ]

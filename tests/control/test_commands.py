@@ -24,7 +24,7 @@ from trirail.wire.packets import Confirmed, Refused
 from trirail.wire.vocabulary import Command, CommandContent, Mode, NoContent, Override
 from trirail_drivers.interface import Feedback, PowerState
 
-GUIDE = Path(__file__).parents[2] / "service/README.md"
+GUIDE = Path(__file__).parents[2] / "service/talking.md"
 every_command = pytest.mark.parametrize("name", Command)
 
 

@@ -18,7 +18,7 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.messages import ErrorReply
 
 SOURCE = Path(trirail.__file__).parent
-GUIDE = Path(__file__).parents[2] / "service/README.md"
+GUIDE = Path(__file__).parents[2] / "service/codes.md"
 
 
 def test_every_code_has_a_meaning_and_a_remedy_of_one_line() -> None:

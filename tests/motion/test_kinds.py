@@ -13,7 +13,7 @@ from trirail.motion.goals import MOTIONS
 from trirail.wire.goal_kind import GoalKind
 from trirail.wire.goals import KINDS
 
-GUIDE = Path(__file__).parents[2] / "service/README.md"
+GUIDE = Path(__file__).parents[2] / "service/talking.md"
 every_kind = pytest.mark.parametrize("kind", KINDS)
 
 

@@ -23,7 +23,8 @@ ROOT = Path(__file__).parents[2]
 GUIDES = sorted(
     {
         *ROOT.glob("*.md"),
-        *(ROOT / name / "README.md" for name in ("service", "drivers", "configs", "tools")),
+        *(ROOT / "service").glob("*.md"),
+        *(ROOT / name / "README.md" for name in ("drivers", "configs", "tools")),
         ROOT / "configs/stages.md",
     }
 )
@@ -128,10 +129,11 @@ def test_the_readme_stays_one_for_a_newcomer() -> None:
         assert (guide.name == "README.md" and guide.parent == ROOT) or f"]({named(guide)}" in text
 
 
-def test_every_room_has_its_paragraph() -> None:
-    text = (ROOT / "service/README.md").read_text(encoding="utf-8")
+def test_every_room_has_its_line() -> None:
+    text = (ROOT / "service/changing.md").read_text(encoding="utf-8")
+    section = text.partition("\n## The rooms\n")[2].partition("\n## ")[0]
     rooms = {path.parent.name for path in Path(trirail.__file__).parent.glob("*/__init__.py")}
-    assert rooms == set(re.findall(r"^\*\*(\w+)\*\*:", text, re.MULTILINE))
+    assert rooms == set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE))
 
 
 def test_every_tool_has_its_line() -> None:
@@ -148,7 +150,7 @@ def test_every_section_of_the_configuration_that_is_named_exists() -> None:
 
 
 def test_the_tree_of_errors_is_drawn_as_it_is() -> None:
-    (drawing,) = (block for block in blocks(ROOT / "service/README.md", "") if block.startswith("TrirailError"))
+    (drawing,) = (block for block in blocks(ROOT / "service/codes.md", "") if block.startswith("TrirailError"))
     drawn = re.findall(r"^([│├└─ ]*)(\w+(?:Error|Timeout|Refused))\b", drawing, re.M)
     for package in (trirail, trirail_drivers):  # so that all of them are there
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
