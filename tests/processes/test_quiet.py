@@ -1,22 +1,21 @@
 """The compiled call runs cycles as Python runs them: the same frames, records and events, whatever happens in between.
 
-Whole sessions are generated, and run twice over a socket by a clock of the test's: once with every cycle run by Python.
+Whole sessions are generated, and run twice over a bus by a clock of the test's: once with every cycle run by Python.
 """
 
 from __future__ import annotations
 
 import random
-import socket
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
-import can
 import numpy as np
 import pytest
 from conftest import CONFIG, carried
+from lockstep import CARRIERS, STEP_NS, Lockstep
 from msgspec import structs
 from trirail.config import Config
 from trirail.motion.planning import MotionPlanner
@@ -31,17 +30,14 @@ from trirail.wire.packets import CommandRequest, GoalRequest, Happened, Kind, Re
 from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED
 from trirail_drivers.bus.frames import packed, unpacked
-from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus
 
 CYCLES = 1500
-STEP_NS = 200_000
-"""How time passes for who waits."""
 NEVER_MIND = ("parts_ns",)
 """What a record has of the time that the program itself took."""
 
@@ -57,24 +53,10 @@ class Happening(NamedTuple):
     does: Callable[[Session], None]
 
 
-class Pumped(UnixBus):
-    """The service's end of a bus, whose other end lives while it waits."""
-
-    def __init__(self, channel: str, session: Session) -> None:
-        self._session = session
-        super().__init__(channel)
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        end = self._session.now_ns + round((timeout or 0.0) * 1e9)
-        while (found := super().recv(0)) is None and self._session.now_ns < end:
-            self._session.pass_time(STEP_NS)
-        return found
-
-
 class Session:
     """A loop, what is around it, and everything that it has said; one turn of it is a cycle."""
 
-    def __init__(self, config: Config, folder: Path, *, quiet: bool) -> None:
+    def __init__(self, config: Config, folder: Path, carrier: str, *, quiet: bool) -> None:
         self.now_ns = 100_000_000_000
         self.config = config
         self.late_ns = 0
@@ -86,26 +68,22 @@ class Session:
         self.holds = False
         """Whether what the drives say is kept for the next cycle."""
         self._stack = ExitStack()
-        listening = self._stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
-        listening.bind(str(folder / "can"))
-        listening.listen()
         self.drives: SimulatedBus = simulated_bus(config.can, config.drives, self.clock)
-        bus = Pumped.__new__(Pumped)
-        self.end: socket.socket | None = None
-        bus.__init__(str(folder / "can"), self)  # type: ignore[misc]
-        self.end, _ = listening.accept()
-        self.end.setblocking(False)
-        self.bus = bus
-        driver = PROTOCOLS[config.drives.protocol].driver(bus, config.can.bitrate, config.drives, self.clock_of_driver)
+        self.lives = True
+        """Whether the bus does."""
+        self.ends = Lockstep(carrier, folder, self)
+        self._stack.callback(self.ends.close)
+        driver = PROTOCOLS[config.drives.protocol].driver(
+            self.ends.bus, config.can.bitrate, config.drives, self.clock_of_driver
+        )
         self.setting_up = True
         driver.configure(config.period, config.limits.slider.velocity)
         self.setting_up = False
         names = ("gateway", "recorder", "planner")
         ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))
         self.gateway, self.recorder, self.planner = (links.connect(folder / name, MAX_PLANNING) for name in names)
-        for closes in (*ports, self.gateway, self.recorder, self.planner, self.end):
+        for closes in (*ports, self.gateway, self.recorder, self.planner):
             self._stack.callback(closes.close)
-        self._stack.callback(bus.shutdown)
         self.hearts = Heartbeats.create()
         self.motion = MotionPlanner(config)
         self.loop = Loop(config, driver, ports, self.hearts, quiet=quiet)
@@ -142,13 +120,9 @@ class Session:
 
     def pump(self) -> None:
         """Bring to the drives what has been sent, and back what they say."""
-        if self.end is None:
+        if not self.lives:
             return
-        while True:
-            try:
-                packet = self.end.recv(CAN_FRAME.size)
-            except BlockingIOError:
-                break
+        while (packet := self.ends.take()) is not None:
             self.sent.append(packet)
             self.drives.send(unpacked(packet))
         said, self.held = self.held, []
@@ -156,12 +130,15 @@ class Session:
             (self.held if self.holds else said).append(packed(frame))
         self.holds = False
         for packet in said:
-            self.end.send(packet)
+            self.ends.say(packet)
 
     def inject(self, packet: bytes) -> None:
         """Somebody else sends a frame."""
-        assert self.end is not None
-        self.end.send(packet)
+        self.ends.say(packet)
+
+    def captured(self) -> list[bytes]:
+        """The frames that were noted down."""
+        return [frame for chunk in self.ends.capture.take() for _, frame in CAPTURED.iter_unpack(chunk)]
 
     def ask(self, request: Request) -> None:
         """Send a request; a stop with haste, as the gateway does."""
@@ -288,14 +265,14 @@ def script(seed: int, protocol: str = "cia402") -> dict[int, list[Happening]]:  
 
 
 def both_ways(
-    config: Config, folder: Path, script: Callable[[], dict[int, list[Happening]]], cycles: int
+    config: Config, folder: Path, script: Callable[[], dict[int, list[Happening]]], cycles: int, carrier: str = "unix"
 ) -> list[Session]:
     """Run a session with quiet cycles, and once more with every cycle run by Python."""
     sessions = []
     for quiet in (True, False):
         place = folder / str(quiet)
         place.mkdir()
-        session = Session(config, place, quiet=quiet)
+        session = Session(config, place, carrier, quiet=quiet)
         try:
             session.run(script(), cycles)
         finally:
@@ -305,34 +282,42 @@ def both_ways(
 
 
 @pytest.mark.parametrize(
-    ("protocol", "seed"), [("cia402", seed) for seed in range(12)] + [("odrive", seed) for seed in range(6)]
+    ("carrier", "protocol", "seed"),
+    [
+        *(("unix", "cia402", seed) for seed in range(12)),
+        *(("unix", "odrive", seed) for seed in range(6)),
+        *((carrier, protocol, seed) for carrier in CARRIERS[1:] for protocol in CONFIGS for seed in (3, 4)),
+    ],
 )
-def test_quiet_cycles_are_those_of_python_to_the_last_bit(protocol: str, seed: int, tmp_path: Path) -> None:
+def test_quiet_cycles_are_those_of_python_to_the_last_bit(
+    carrier: str, protocol: str, seed: int, tmp_path: Path
+) -> None:
     """Frames on the bus, records and events; and most cycles were quiet, so there was something to compare."""
-    one, other = both_ways(CONFIGS[protocol], tmp_path, lambda: script(seed, protocol), CYCLES)
+    one, other = both_ways(CONFIGS[protocol], tmp_path, lambda: script(seed, protocol), CYCLES, carrier)
     assert one.loop.quiet_cycles > 100
     assert other.loop.quiet_cycles == 0
     assert len(one.heard) > CYCLES
     _compare(one.heard, other.heard)
     assert one.sent == other.sent
+    assert one.captured() == other.captured()
 
 
+@pytest.mark.parametrize("carrier", CARRIERS)
 @pytest.mark.parametrize("unread", [False, True])
 @pytest.mark.parametrize("moving", [False, True])
-def test_a_bus_that_dies_is_a_fault_in_the_same_cycle(unread: bool, moving: bool, tmp_path: Path) -> None:
+def test_a_bus_that_dies_is_a_fault_in_the_same_cycle(moving: bool, unread: bool, carrier: str, tmp_path: Path) -> None:
     """The kernel tells of a broken socket once: who hears of it hands it on."""
 
     def die(session: Session) -> None:
-        assert session.end is not None
         if not unread:
             session.pump()
-        session.end.close()
-        session.end = None
+        session.lives = False
+        session.ends.die()
 
     happens = {number: list(what) for number, what in script(1).items() if number < (400 if moving else 31)}
     happens[412] = [Happening(die)]
-    one, other = both_ways(CONFIG, tmp_path, lambda: happens, 500)
-    assert one.loop.control.fault is not None
+    one, other = both_ways(CONFIG, tmp_path, lambda: happens, 500, carrier)
+    assert "CAN bus: cannot" in (one.loop.control.fault or "")
     _compare(one.heard, other.heard)
 
 

@@ -12,7 +12,7 @@ import select
 import socket
 import time
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from struct import Struct
 from typing import Final, Protocol
 
@@ -23,6 +23,7 @@ from can.interfaces.udp_multicast import UdpMulticastBus
 from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, HEAD, REMOTE, STANDARD_BITS
 from trirail_drivers.bus.capture import Capture, CapturedBus
 from trirail_drivers.bus.frames import Frame, can_id
+from trirail_drivers.bus.packets import BusAccess, Packets
 from trirail_drivers.bus.unixbus import UnixBus
 
 MOST_NOTHINGS = 64
@@ -49,16 +50,6 @@ class FrameIO(Protocol):
 
     def hear(self, identifiers: Collection[int]) -> None:
         """Only data frames of these 11-bit identifiers are needed, and what the controller reports."""
-
-    @property
-    def descriptor(self) -> int | None:
-        """The socket, where frames may pass it beside this object; else None."""
-
-    def hand_in(self, received: Iterable[Received], error: int = 0) -> None:
-        """Frames that somebody else took from the descriptor, and the number of an error that he met after them.
-
-        They come before all that is there.
-        """
 
 
 def frame_io(bus: can.BusABC) -> FrameIO:
@@ -128,13 +119,18 @@ class SocketFrames:
             )
 
     @property
-    def descriptor(self) -> int | None:
-        """The socket, unless every frame is to be noted with its time."""
-        return self._socket.fileno() if self._capture is None else None
+    def captured(self) -> bool:
+        """Whether every frame is to be noted with its time."""
+        return self._capture is not None
 
-    def hand_in(self, received: Iterable[Received], error: int = 0) -> None:
-        """Frames that somebody else took from the descriptor, and the error that he met after them."""
-        self._handed_in.extend(received)
+    @property
+    def access(self) -> BusAccess:
+        """The socket."""
+        return BusAccess(self._socket.fileno())
+
+    def hand_in(self, arrived: Packets, number: int, error: int) -> None:
+        """So many frames that somebody else took from the socket, and the error that he met after them (errno.h)."""
+        self._handed_in.extend(arrived.unpacked(number))
         self._error = error
 
     def _receive_timed(self, capture: Capture) -> int:
@@ -206,14 +202,6 @@ class PythonCanFrames:
 
     def hear(self, identifiers: Collection[int]) -> None:
         """Do nothing: filters are each interface's own affair."""
-
-    @property
-    def descriptor(self) -> int | None:
-        """None: only python-can knows how its frames lie there."""
-        return None
-
-    def hand_in(self, received: Iterable[Received], error: int = 0) -> None:
-        """Do nothing: nobody else takes frames."""
 
     def _may_have_more(self) -> bool:
         if self._poll is not None:

@@ -7,7 +7,16 @@ from typing import Final
 
 import can
 
-from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
+from trirail_drivers.bus.can_frame import (
+    CAN_FRAME,
+    DATA_AT,
+    ERROR,
+    EXTENDED,
+    EXTENDED_BITS,
+    HEAD,
+    REMOTE,
+    STANDARD_BITS,
+)
 
 
 def frame_bits(n: int) -> int:
@@ -42,8 +51,9 @@ class Frame:
     @classmethod
     def of(cls, packed: bytes) -> Frame:
         """Return a `struct can_frame` as a frame."""
-        identifier, length, data = CAN_FRAME.unpack(packed)
-        return cls(identifier & STANDARD_BITS, data[:length], remote=bool(identifier & REMOTE))
+        frame = cls.__new__(cls)
+        frame.bits, frame.packed = BITS[HEAD.unpack_from(packed)[1]], bytearray(packed)
+        return frame
 
     def fill(self, layout: Struct, *values: int) -> None:
         """Give it other data, of the same length; struct.error where the layout cannot hold a value."""

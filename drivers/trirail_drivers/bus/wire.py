@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Protocol
 
 import can
 
 from trirail_drivers.bus import canerrors
 from trirail_drivers.bus.can_frame import ERROR, EXTENDED_BITS
-from trirail_drivers.bus.frame_io import Received, frame_io
+from trirail_drivers.bus.frame_calls import lendable
+from trirail_drivers.bus.frame_io import frame_io
 from trirail_drivers.bus.frames import BITS, Frame
+from trirail_drivers.bus.packets import BusAccess, Packets
 from trirail_drivers.interface import Clock, DriveFault
 
 MOST_FRAMES = 1000
@@ -41,7 +43,7 @@ class Wire:
         """For what is no part of the cycle: setting drives up, leaving."""
         self.traffic = 0
         """Bits of all frames sent and received so far, each with worst-case stuffing."""
-        self._frames = frame_io(bus)
+        self._frames = lendable(frame_io(bus))
         self.fault: DriveFault | None = None
         self._stop = stop
         self._handlers: dict[int, tuple[Listener, Handler]] = {}
@@ -67,18 +69,18 @@ class Wire:
             self._stop()
 
     @property
-    def descriptor(self) -> int | None:
-        """The bus' socket, where frames may pass it beside this object; else None."""
-        return self._frames.descriptor
+    def access(self) -> BusAccess:
+        """How somebody else may move frames, beside this object."""
+        return self._frames.access
 
     @property
     def calm(self) -> bool:
         """Whether nothing is wrong, nothing is to be told, and the bus takes what it is given."""
         return self.fault is None and not self._warnings and not self._unsent and self._unsent_cycles == 0
 
-    def hand_in(self, received: Iterable[Received], error: int = 0) -> None:
-        """Frames that somebody else took from the socket, and the error that he met after them (errno.h)."""
-        self._frames.hand_in(received, error)
+    def hand_in(self, arrived: Packets, number: int, error: int) -> None:
+        """So many frames that somebody else took and has not looked at, and the error that he met after them."""
+        self._frames.hand_in(arrived, number, error)
 
     def warn(self, text: str) -> None:
         """Tell something once, until faults are reset."""

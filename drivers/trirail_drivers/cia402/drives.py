@@ -14,13 +14,14 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.packets import packets
 from trirail_drivers.cia402 import frames, setup, ways
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.cia402.objects import means
 from trirail_drivers.cia402.one_drive import HAS_POWER
 from trirail_drivers.cia402.strangers import Strangers
-from trirail_drivers.driver.cyclic import Cyclic, packets
+from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
@@ -172,13 +173,15 @@ class Cia402(Driver[Cia402Axis]):
 
     def lend(self) -> Cyclic | None:
         """The tables of a cycle, where every drive rests in what it was asked for and nothing else is to be done."""
-        due, descriptor = self._heartbeat_due, self._wire.descriptor
-        if due is None or descriptor is None or not (self._wire.calm and self._homing.idle) or self._period == 0.0:
+        due = self._heartbeat_due
+        if due is None or not (self._wire.calm and self._homing.idle) or self._period == 0.0:
             return None
         if self._stopped_in_this_cycle or not all(axis.rests(_asked_of(axis, self._wanted)) for axis in self._axes):
             return None
         if self._lent is None:
-            self._lent = Cyclic(descriptor, packets([self._sync]), packets(self._beats), packets(self._setpoints))
+            self._lent = Cyclic(
+                self._wire.access, packets([self._sync]), packets(self._beats), packets(self._setpoints)
+            )
         lent, beats = self._lent, len(self._beats)
         lent.times[0] = self._off_by, due, self._drives.heartbeat, beats, 0, 0, 0, self._wire.traffic, 0
         lent.write([axis.lend() for axis in self._axes])
@@ -200,7 +203,7 @@ class Cia402(Driver[Cia402Axis]):
         self._wire.traffic, self._heartbeat_due = int(times["traffic"]), float(times["beat_due"])
         for axis, row in zip(self._axes, lent.rows(), strict=True):
             axis.take_back(row, int(times["cycles"]))
-        self._wire.hand_in(lent.arrived.unpacked(arrived), error)
+        self._wire.hand_in(lent.arrived, arrived, error)
         if synced is not None:
             self._wire.begin()
             self._synced = synced

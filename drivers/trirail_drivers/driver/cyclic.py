@@ -6,14 +6,13 @@ it keeps of each drive is in them as long as they are lent, and goes back to it 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, HEAD
-from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.packets import BusAccess, Packets
 from trirail_drivers.interface import Feedback
 
 MOST_FRAMES: Final = 32
@@ -116,54 +115,13 @@ def expected(
     return identifier, len(data), axis, *padded, position_at, status_at, lives
 
 
-class Packets:
-    """Frames as libc's sendmmsg and recvmmsg take them: `struct mmsghdr` of sys/socket.h, one `iovec` each."""
-
-    def __init__(self, number: int) -> None:
-        self.frames = np.zeros((number, CAN_FRAME.size), np.uint8)
-        """`struct can_frame`, one a row."""
-        self._vectors = np.zeros((number, 2), np.uint64)
-        self.headers = np.zeros((number, 8), np.uint64)
-        """`struct mmsghdr`: what was received of each is in the last number."""
-        for frame, vector, header in zip(self.frames, self._vectors, self.headers, strict=True):
-            vector[:] = frame.ctypes.data, CAN_FRAME.size
-            header[2:4] = vector.ctypes.data, 1
-
-    def part(self, first: int, end: int) -> Packets:
-        """Return some of them, which stay the same."""
-        part = Packets.__new__(Packets)
-        part.frames, part._vectors, part.headers = self.frames[first:end], self._vectors, self.headers[first:end]
-        return part
-
-    def fill(self, frames: Iterable[Frame]) -> None:
-        """Have these frames."""
-        for row, frame in zip(self.frames, frames, strict=True):
-            row[:] = np.frombuffer(frame.packed, np.uint8)
-
-    def unpacked(self, number: int) -> list[tuple[int, bytearray]]:
-        """The first so many, as identifier with flags and data."""
-        found = []
-        for row in self.frames[:number]:
-            packed = row.tobytes()
-            identifier, length = HEAD.unpack_from(packed)
-            found.append((identifier, bytearray(packed[DATA_AT : DATA_AT + length])))
-        return found
-
-
-def packets(frames: Sequence[Frame]) -> Packets:
-    """Return frames as packets."""
-    made = Packets(len(frames))
-    made.fill(frames)
-    return made
-
-
 class Cyclic:
     """The tables of three drives, made once, and filled in each time that they are lent."""
 
-    def __init__(self, descriptor: int, begin: Packets, beats: Packets, setpoints: Packets, history: int = 0) -> None:
+    def __init__(self, bus: BusAccess, begin: Packets, beats: Packets, setpoints: Packets, history: int = 0) -> None:
         """`history`: so many setpoints are kept of those that were sent."""
-        self.descriptor = descriptor
-        """The bus: a socket of `struct can_frame`, one a packet."""
+        self.bus = np.array(bus, np.int64)
+        """A BusAccess, (3,)."""
         self.axes: NDArray[np.void] = np.zeros(3, AXIS)
         self.times: NDArray[np.void] = np.zeros(1, TIMES)
         self.expected: NDArray[np.void] = np.zeros(0, EXPECTED)
@@ -199,7 +157,7 @@ class Lender(Protocol):
     def lend(self) -> Cyclic | None:
         """Between two cycles: the tables of a cycle, where all that drives need is to have it run by these.
 
-        None where there is more to do, or the bus has no socket. As long as they are lent, nothing else is called.
+        None where there is more to do. As long as they are lent, nothing else is called.
         """
 
     def take_back(self, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:

@@ -142,15 +142,15 @@ class Odrive(Driver[OdriveAxis]):
 
     def lend(self) -> Cyclic | None:
         """The tables of a cycle, where every drive rests in what it was asked for and nothing else is to be done."""
-        descriptor, due, sender = self._wire.descriptor, self._errors_due, self._setpoints
-        if descriptor is None or due is None or not self._wire.calm or sender.stopping:
+        due, sender = self._errors_due, self._setpoints
+        if due is None or not self._wire.calm or sender.stopping:
             return None
         if self._enabled and (sender.sent is None or sender.written is None):
             return None
         if not all(axis.rests(self._wanted(axis)) for axis in self._axes):
             return None
         if self._tables is None:
-            self._tables = Tables(descriptor, self._axes, self._error_requests, self._requests, len(self._due))
+            self._tables = Tables(self._wire.access, self._axes, self._error_requests, self._requests, len(self._due))
         lent = self._lent = self._tables.cyclic
         traffic, asks = self._wire.traffic, (1, self._next_request)
         lent.times[0] = self._off_by, due, frames.ERROR_PERIOD, *asks, 0, 0, traffic, 0
@@ -167,7 +167,7 @@ class Odrive(Driver[OdriveAxis]):
         self._wire.traffic, self._errors_due = int(times["traffic"]), float(times["beat_due"])
         self._next_request = int(times["next_beat"])
         self._tables.empty(self._setpoints, self._due)
-        self._wire.hand_in(lent.arrived.unpacked(arrived), error)
+        self._wire.hand_in(lent.arrived, arrived, error)
         if synced is not None:
             self._wire.begin()
             self._synced = synced

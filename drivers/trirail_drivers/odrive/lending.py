@@ -13,8 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.packets import BusAccess, packets
 from trirail_drivers.bus.wire import Wire
-from trirail_drivers.driver.cyclic import Cyclic, Row, packets
+from trirail_drivers.driver.cyclic import Cyclic, Row
 from trirail_drivers.interface import Triple
 from trirail_drivers.odrive import frames
 from trirail_drivers.odrive.axis import OdriveAxis
@@ -27,7 +28,7 @@ class Tables:
     """The tables of three drives, and what goes from their driver into them and back."""
 
     def __init__(
-        self, descriptor: int, axes: Sequence[OdriveAxis], errors: Sequence[Frame], requests: Sequence[Frame], due: int
+        self, bus: BusAccess, axes: Sequence[OdriveAxis], errors: Sequence[Frame], requests: Sequence[Frame], due: int
     ) -> None:
         """`errors` and `requests` are what asks each drive for its errors and position; `due` setpoints are kept."""
         self._axes = axes
@@ -35,7 +36,7 @@ class Tables:
         setpoints = [frames.command(axis.node, frames.SET_INPUT_POS, setpoint) for axis in axes]
         self._all = packets([*setpoints, *requests])
         self._asking = self._all.part(len(setpoints), len(setpoints) + len(requests))
-        self.cyclic = Cyclic(descriptor, self._all, packets(errors), self._all.part(0, len(setpoints)), due)
+        self.cyclic = Cyclic(bus, self._all, packets(errors), self._all.part(0, len(setpoints)), due)
         self.cyclic.end = self.cyclic.end[:0]
 
     def fill(self, sender: SetpointSender, due: Sequence[Triple | None], *, follow: bool, within: float) -> None:

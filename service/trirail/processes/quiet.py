@@ -36,30 +36,21 @@ from trirail.processes.exchange import (
     take_frames,
 )
 from trirail.processes.heartbeats import HASTE
+from trirail.processes.packet_calls import memcpy, receive_frames, send_frames
 from trirail.wire.records import LONGEST, Part
 
 __all__ = ["COMMAND", "FOLLOW", "HOLD", "STATE", "Reached", "run"]
 
-# Of libc, by name: sys/socket.h, time.h, poll.h, string.h.
-_sendmmsg: Any = types.ExternalFunction("sendmmsg", i4(i4, types.intp, types.uint32, i4))
-_recvmmsg: Any = types.ExternalFunction("recvmmsg", i4(i4, types.intp, types.uint32, i4, types.intp))
+# Of libc, by name: time.h, poll.h.
 _clock_nanosleep: Any = types.ExternalFunction("clock_nanosleep", i4(i4, i4, types.intp, types.intp))
 _clock_gettime: Any = types.ExternalFunction("clock_gettime", i4(i4, types.intp))
 _poll: Any = types.ExternalFunction("poll", i4(types.intp, u8, i4))
-_errno: Any = types.ExternalFunction("__errno_location", types.intp())
-_memcpy: Any = types.ExternalFunction("memcpy", types.intp(types.intp, types.intp, u8))
 
 _MONOTONIC: Final = 1
 _ABSOLUTE: Final = 1
 """Of clock_nanosleep: to a deadline."""
 _INTERRUPTED: Final = 4
-_NOTHING_THERE: Final = 11
-"""EINTR and EAGAIN of errno.h."""
-_ENDED: Final = -1
-"""The other end has gone: whoever receives next finds that again."""
-_FLAGS: Final = 0x40 | 0x4000
-"""MSG_DONTWAIT, MSG_NOSIGNAL."""
-_FRAME: Final = 16
+"""EINTR of errno.h."""
 _GONE: Final = (0x008 | 0x010) << 16
 """POLLERR and POLLHUP of poll.h, where poll leaves them."""
 _SECOND: Final = 1_000_000_000
@@ -158,28 +149,23 @@ def _mark(state: NDArray[np.void], moment: NDArray[np.int64], part: int) -> None
 def _copy(kept: NDArray[np.int64], to: int, source: int) -> None:
     """Copy all that is kept: rows of two addresses and a number of bytes; `to` and `source` say which is which."""
     for i in range(len(kept)):
-        _memcpy(kept[i, to], kept[i, source], np.uint64(kept[i, 2]))
+        memcpy(kept[i, to], kept[i, source], np.uint64(kept[i, 2]))
 
 
 @compiled()
-def _receive(state: NDArray[np.void], moment: NDArray[np.int64], bus: int, headers: NDArray[np.uint64]) -> int:
-    """Take what has arrived; return how many frames that are. Where it has failed after them, the error is set."""
-    number = _recvmmsg(bus, headers.ctypes.data, np.uint32(MOST_FRAMES), _FLAGS, 0)
-    if number < 0:
-        moment[0] = 0
-        _memcpy(moment.ctypes.data, _errno(), np.uint64(4))
-        if moment[0] != _NOTHING_THERE:
-            state[0].error = moment[0]  # the kernel tells of it once
+def _send(
+    bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], times: NDArray[np.void]
+) -> int:
+    """Send frames, count what they take of the bus, and return how many it has taken."""
+    number = send_frames(bus, headers, frames)
     for i in range(number):
-        if headers[i, 7] & np.uint64(0xFFFFFFFF) != np.uint64(_FRAME):
-            state[0].error = _ENDED
-            return i
-    return int(max(number, 0))
+        times[0].traffic += BITS[frames[i, LENGTH_AT]]
+    return number
 
 
 @compiled(
     i8(
-        *(_STATE, i8[:, ::1], i8[::1], i8, FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
+        *(_STATE, i8[:, ::1], i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], _DOORS, u8[::1], FRAMES),
         *(cycle.LEGS, cycle.BOUND, cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
@@ -192,7 +178,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     state: NDArray[np.void],
     kept: NDArray[np.int64],
     moment: NDArray[np.int64],
-    bus: int,
+    bus: NDArray[np.int64],
     arrived: NDArray[np.uint8],
     arrivals: NDArray[np.uint64],
     starts: NDArray[np.uint8],
@@ -231,9 +217,9 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     """Run cycles; return how far the newest has come: Reached.
 
     `kept` (n, 3) are addresses and sizes of all that a cycle changes, and of copies of it; `moment` (2,) room for a
-    struct timespec, `doors` (n, 2) as poll takes them, the gateway's first, `hearts` the counters of
-    trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made` (SIZE,) the bytes of `record`. All else as
-    in control.cycle and exchange.
+    struct timespec, `bus` (3,) a trirail_drivers.bus.packets.BusAccess, `doors` (n, 2) as poll takes them, the
+    gateway's first, `hearts` the counters of trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made`
+    (SIZE,) the bytes of `record`. All else as in control.cycle and exchange.
     """
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):
@@ -246,7 +232,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             return Reached.WAITED
         _copy(kept, 1, 0)
         t = now / 1e9
-        number = s.arrived = _receive(state, moment, bus, arrivals)
+        number, s.error = receive_frames(bus, arrivals, arrived, moment)
+        s.arrived = number
         if (
             s.error != 0
             or number >= MOST_FRAMES
@@ -255,14 +242,12 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         ):
             _copy(kept, 0, 1)
             return Reached.WAITED
-        begun = _sendmmsg(bus, begin.ctypes.data, np.uint32(len(begin)), _FLAGS)
+        begun = _send(bus, begin, starts, times)
         if begun < 1:
             _copy(kept, 0, 1)
             return Reached.WAITED
         begin_cycle(axes, history, begun)
         times[0].begun = begun
-        for i in range(begun):
-            times[0].traffic += BITS[starts[i, LENGTH_AT]]
         s.synced, s.arrived = t, 0
         if begun < len(begin):
             return Reached.SYNCED
@@ -270,17 +255,16 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             times[0].beat_due = t + times[0].beat_period
             first, number = times[0].next_beat, times[0].beats
             times[0].next_beat = (first + number) % len(beats)
-            gone = max(_sendmmsg(bus, beats[first:].ctypes.data, np.uint32(number), _FLAGS), 0)
+            gone = _send(bus, beats[first : first + number], signs[first : first + number], times)
             times[0].unsent = number - gone
-            for i in range(gone):
-                times[0].traffic += BITS[signs[first + i, LENGTH_AT]]
             if gone < number:
                 return Reached.SYNCED
         _mark(state, moment, Part.SYNC)
 
         _copy(kept, 1, 0)
         t = _now_ns(state, moment) / 1e9
-        number = s.arrived = _receive(state, moment, bus, arrivals)
+        number, s.error = receive_frames(bus, arrivals, arrived, moment)
+        s.arrived = number
         if s.error != 0 or number >= MOST_FRAMES or take_frames(arrived, number, expected, axes, times, t) < number:
             _copy(kept, 0, 1)
             return Reached.SYNCED
@@ -328,9 +312,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
 
         s.called, s.found = in_position or called or code != s.found or s.cycle + 1 >= s.due, code
         s.arrived, s.time, s.gateway_seen, s.gateway_turns = 0, time, count, turns
-        s.sent = max(_sendmmsg(bus, departures.ctypes.data, np.uint32(len(departures)), _FLAGS), 0)
-        for i in range(s.sent):
-            times[0].traffic += BITS[setpoints[i, LENGTH_AT]]
+        s.sent = _send(bus, departures, setpoints, times)
         _mark(state, moment, Part.WRITE)
 
         s.cycle += 1

@@ -167,7 +167,7 @@ class QuietCycles:
             self._kept, self._rooms = quiet.copies(kept)
         self._kept[-1, 0] = furthest.ctypes.data
         given: tuple[Any, ...] = (
-            *(self._state, self._kept, self._moment, lent.descriptor),
+            *(self._state, self._kept, self._moment, lent.bus),
             *(lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
             *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
             *(lent.expected, lent.axes, lent.times, lent.history),

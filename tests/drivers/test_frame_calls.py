@@ -1,0 +1,102 @@
+"""Frames that compiled code moves by calling Python: the same as if Python had moved them itself."""
+
+from __future__ import annotations
+
+import ctypes
+from collections import deque
+from collections.abc import Collection
+
+import can
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.frame_calls import FrameCalls
+from trirail_drivers.bus.frame_io import Received
+from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.packets import Packets, packets
+
+ROOM = 8
+NUMBER = ctypes.c_int64
+ERRORS = (can.CanOperationError("gone"), OSError(100, "down"), RuntimeError("a maker's own"), KeyboardInterrupt())
+
+
+class Fake:
+    """A bus that gives and refuses as it is told to."""
+
+    def __init__(self, arriving: Collection[Received | BaseException] = (), refused: int = -1) -> None:
+        self.arriving = deque(arriving)
+        self.sent: list[bytes] = []
+        self.refused = refused
+        self.error: BaseException = ERRORS[0]
+
+    def send(self, frame: Frame) -> None:
+        if len(self.sent) == self.refused:
+            self.refused = -1
+            raise self.error
+        self.sent.append(bytes(frame.packed))
+
+    def receive(self, timeout: float = 0.0) -> Received | None:
+        found = self.arriving.popleft() if self.arriving else None
+        if isinstance(found, BaseException):
+            raise found
+        return found
+
+    def hear(self, identifiers: Collection[int]) -> None:
+        """Hear all."""
+
+
+def called(address: int, frames: Packets, number: int) -> int:
+    """Call as compiled code does."""
+    function = ctypes.CFUNCTYPE(NUMBER, NUMBER, NUMBER)(address)
+    return int(function(frames.frames.ctypes.data, number))
+
+
+frames_of_any_length = st.tuples(st.integers(0, 0x7FF), st.binary(max_size=64).map(bytearray))
+
+
+@given(arriving=st.lists(frames_of_any_length, max_size=2 * ROOM), looked_at=st.integers(0, ROOM))
+def test_what_is_not_looked_at_is_received_once_more_in_its_order(arriving: list[Received], looked_at: int) -> None:
+    """Frames of CAN FD too, which are longer than there is room for."""
+    frames, room = FrameCalls(Fake(arriving)), Packets(ROOM)
+    number = called(frames.access.receive, room, ROOM)
+    assert number == min(len(arriving), ROOM)
+    for row, (identifier, data) in zip(room.frames[:number], arriving, strict=False):
+        assert row.tobytes() == CAN_FRAME.pack(identifier, len(data), data)
+    if looked_at < number:
+        frames.hand_in(room, number, 0)
+        assert [frames.receive() for _ in range(len(arriving) + 1)] == [*arriving, None]
+    else:
+        assert [frames.receive() for _ in range(len(arriving) - number + 1)] == [*arriving[number:], None]
+
+
+@pytest.mark.parametrize("error", ERRORS)
+@pytest.mark.parametrize("before", range(ROOM))
+def test_an_error_is_raised_behind_the_frames_before_it_and_once(before: int, error: BaseException) -> None:
+    first: list[Received] = [(0x181 + i, bytearray([i])) for i in range(before)]
+    last: Received = 0x7FF, bytearray(b"last")
+    frames, room = FrameCalls(Fake([*first, error, last])), Packets(ROOM)
+    assert called(frames.access.receive, room, ROOM) == ~before
+    frames.hand_in(room, before, 0)
+    assert [frames.receive() for _ in range(before)] == first
+    with pytest.raises(type(error)):
+        frames.receive()
+    assert [frames.receive(), frames.receive()] == [last, None]
+
+
+@pytest.mark.parametrize("error", ERRORS)
+@pytest.mark.parametrize("refused", range(5))
+def test_a_refused_frame_is_refused_again_and_not_tried_twice(refused: int, error: BaseException) -> None:
+    bus = Fake(refused=refused)
+    bus.error = error
+    frames, sent = FrameCalls(bus), packets([Frame(0x200 + i, bytes([i])) for i in range(4)])
+    taken = called(frames.access.send, sent, 4)
+    assert taken == min(refused, 4)
+    for number in range(taken, 4):
+        frame = Frame.of(sent.frames[number].tobytes())
+        if number == refused:
+            with pytest.raises(type(error)):
+                frames.send(frame)
+        else:
+            frames.send(frame)
+    assert bus.sent == [row.tobytes() for number, row in enumerate(sent.frames) if number != refused]
