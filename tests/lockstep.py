@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import socket
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from typing import Final, Protocol
 
 import can
 from can.interfaces.virtual import VirtualBus
-from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.can_frame import CAN_FRAME, STANDARD_BITS
 from trirail_drivers.bus.capture import Capture, CapturedBus
 from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.bus.unixbus import UnixBus
@@ -23,6 +24,8 @@ from trirail_drivers.bus.unixbus import UnixBus
 CARRIERS: Final = ("unix", "captured", "virtual")
 STEP_NS: Final = 200_000
 """How time passes for who waits."""
+FILLER: Final = CAN_FRAME.pack(STANDARD_BITS, 0, b"")
+"""What a full bus is full of: nobody hears it."""
 _channels = itertools.count()
 
 
@@ -57,6 +60,11 @@ class WaitingVirtual(Waiting, VirtualBus):
     broken = False
     """Whether the adapter has gone."""
 
+    def __init__(self, channel: str) -> None:
+        self.refused: dict[int, Exception] = {}
+        """By identifier: the next frame that is refused, and how."""
+        super().__init__(channel)
+
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         found = super()._recv_internal(timeout)
         if self.broken and found[0] is None:
@@ -66,6 +74,8 @@ class WaitingVirtual(Waiting, VirtualBus):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if self.broken:
             raise can.CanOperationError("the adapter is gone", 19)
+        if (refusal := self.refused.pop(msg.arbitration_id, None)) is not None:
+            raise refusal
         super().send(msg, timeout)
 
 
@@ -84,6 +94,10 @@ class Lockstep:
         """Sends the service a frame."""
         self.die: Callable[[], None]
         """Ends the bus for the service, for good."""
+        self.leave_room: Callable[[int], None]
+        """Has the bus take so many frames more, until some are taken from it."""
+        self.refuse: Callable[[int, Exception], None]
+        """Has the bus refuse the next frame of an identifier."""
         self._virtual(time) if carrier == "virtual" else self._socket(carrier, folder, time)
         self._stack.callback(self.bus.shutdown)
 
@@ -100,6 +114,7 @@ class Lockstep:
         self.take = lambda: packed(found) if (found := end.recv(0)) is not None else None
         self.say = lambda packet: end.send(unpacked(packet))
         self.die = lambda: setattr(bus, "broken", True)
+        self.refuse = bus.refused.__setitem__
 
     def _socket(self, carrier: str, folder: Path, time: Time) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listening:
@@ -113,12 +128,21 @@ class Lockstep:
         self.bus = CapturedBus(bus, self.capture) if carrier == "captured" else bus
 
         def take() -> bytes | None:
-            try:
-                return end.recv(CAN_FRAME.size)
-            except BlockingIOError:
-                return None
+            with contextlib.suppress(BlockingIOError):
+                while (packet := end.recv(CAN_FRAME.size)) == FILLER:
+                    pass
+                return packet
+            return None
+
+        def leave_room(frames: int) -> None:
+            assert bus.carrier is not None
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    bus.carrier.send(FILLER, socket.MSG_DONTWAIT)
+            for _ in range(frames):
+                assert end.recv(CAN_FRAME.size) == FILLER
 
         def say(packet: bytes) -> None:
             end.send(packet)
 
-        self.take, self.say, self.die = take, say, end.close
+        self.take, self.say, self.die, self.leave_room = take, say, end.close, leave_room

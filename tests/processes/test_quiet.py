@@ -5,13 +5,15 @@ Whole sessions are generated, and run twice over a bus by a clock of the test's:
 
 from __future__ import annotations
 
+import errno
 import random
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
+import can
 import numpy as np
 import pytest
 from conftest import CONFIG, carried
@@ -61,6 +63,8 @@ class Session:
         self.config = config
         self.late_ns = 0
         """By how much the next tick comes late."""
+        self.room: int | None = None
+        """So many frames the bus takes in the next cycle; None for all."""
         self.beats = True
         self.sent: list[bytes] = []
         self.held: list[bytes] = []
@@ -113,6 +117,9 @@ class Session:
         self.now_ns = deadline_ns + self.late_ns
         self.late_ns = 0
         self.pump()
+        if self.room is not None:
+            self.ends.leave_room(self.room)
+            self.room = None
 
     def pass_time(self, ns: int) -> None:
         self.now_ns += ns
@@ -319,6 +326,79 @@ def test_a_bus_that_dies_is_a_fault_in_the_same_cycle(moving: bool, unread: bool
     one, other = both_ways(CONFIG, tmp_path, lambda: happens, 500, carrier)
     assert "CAN bus: cannot" in (one.loop.control.fault or "")
     _compare(one.heard, other.heard)
+
+
+BEAT: Final = 0x700 + CONFIG.drives.master_node
+SENT: Final = {
+    "cia402": (0x080, BEAT, 0x301, 0x302, 0x303),
+    "odrive": (0x02C, 0x04C, 0x06C, 0x029, 0x049, 0x069, 0x023, 0x043, 0x063),
+}
+"""Identifiers of the frames that are sent in quiet cycles."""
+FULL: Final = can.CanOperationError("Transmit buffer full")
+DOWN: Final = OSError(errno.ENETDOWN, "Network is down")
+
+
+def moves() -> dict[int, list[Happening]]:
+    """A session without faults of its own, without power, at rest and in motion."""
+    happens: dict[int, list[Happening]] = {}
+    requests: list[CommandRequest | GoalRequest] = [
+        *(CommandRequest(at, "ann", Command(name)) for at, name in ((30, "enable"), (450, "reset"), (480, "enable"))),
+        *(
+            GoalRequest(at, "ann", f"g{at}", PoseGoal(x, 0.01, 0.1, speed=0.3), 0)
+            for at, x in ((330, 0.02), (780, 0.1))
+        ),
+    ]
+    for request in requests:
+        happens[request.ticket] = [Happening(lambda session, request=request: session.ask(request))]  # type: ignore[misc]
+    return happens
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("protocol", CONFIGS)
+def test_frames_that_a_full_bus_refuses_are_lost_alone(protocol: str, seed: int, tmp_path: Path) -> None:
+    """Whichever they are, the others go on, and it is told of."""
+    chance, happens = random.Random(seed), moves()
+    for number in range(60, 900, 7):
+        for identifier in chance.sample(SENT[protocol], chance.choice((1, 1, 2, len(SENT[protocol])))):
+            if identifier != BEAT or number == 305:  # drives that miss it stop
+                refuse = Happening(lambda session, identifier=identifier: session.ends.refuse(identifier, FULL))  # type: ignore[misc]
+                happens.setdefault(number, []).append(refuse)
+    one, other = both_ways(CONFIGS[protocol], tmp_path, lambda: happens, 900, "virtual")
+    assert any("Transmit buffer full" in repr(each) for each in one.heard if isinstance(each, tuple))
+    assert one.loop.quiet_cycles > 100
+    assert one.loop.control.fault is None
+    _compare(one.heard, other.heard)
+    assert one.sent == other.sent
+
+
+@pytest.mark.parametrize("room", range(8))
+@pytest.mark.parametrize("protocol", CONFIGS)
+def test_a_socket_that_is_full_within_a_cycle_loses_its_last_frames(protocol: str, room: int, tmp_path: Path) -> None:
+    happens = moves()
+    for number in range(101, 450, 9):
+        happens.setdefault(number, []).append(Happening(lambda session: setattr(session, "room", room)))
+    one, other = both_ways(CONFIGS[protocol], tmp_path, lambda: happens, 450)
+    assert one.loop.quiet_cycles > 50
+    assert one.loop.control.fault is None
+    _compare(one.heard, other.heard)
+    assert one.sent == other.sent
+
+
+@pytest.mark.parametrize(
+    ("protocol", "identifier"), [(protocol, identifier) for protocol in CONFIGS for identifier in SENT[protocol]]
+)
+def test_a_frame_that_is_refused_for_good_stops_the_drives_in_the_same_cycle(
+    protocol: str, identifier: int, tmp_path: Path
+) -> None:
+    """At rest and in motion; the frames behind it are those of a stop."""
+    happens = moves()
+    for number in (303, 810):
+        happens[number] = [Happening(lambda session: session.ends.refuse(identifier, DOWN))]
+    one, other = both_ways(CONFIGS[protocol], tmp_path, lambda: happens, 950, "virtual")
+    assert sum("Network is down" in repr(each) for each in one.heard if isinstance(each, tuple)) > 1
+    assert one.loop.quiet_cycles > 100
+    _compare(one.heard, other.heard)
+    assert one.sent == other.sent
 
 
 @pytest.mark.parametrize("number", [250, 251, 257])

@@ -21,7 +21,7 @@ from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.cia402.objects import means
 from trirail_drivers.cia402.one_drive import HAS_POWER
 from trirail_drivers.cia402.strangers import Strangers
-from trirail_drivers.driver.cyclic import Cyclic
+from trirail_drivers.driver.cyclic import NOWHERE, Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
@@ -91,17 +91,22 @@ class Cia402(Driver[Cia402Axis]):
         self._wire.begin()
         now = self._synced = self._clock()
         self._wire.receive(now)
-        self._wire.send(self._sync)
         if self._heartbeat_due is None:
             # The drives' watchdogs and ours begin with the first cycle, however long ago the set-up was.
             self._heartbeat_due = now
             for axis in self._axes:
                 axis.status_heard = now
                 axis.heard = now if axis.way.heard else math.inf
-        if now >= self._heartbeat_due:
+        self._begin(now, self._heartbeat_due)
+
+    def _begin(self, now: float, heartbeat_due: float, sent: int = 0) -> None:
+        """Send SYNC and, where they are due, the signs of life; somebody else has sent so many of these frames."""
+        frames_due = [self._sync]
+        if now >= heartbeat_due:
             self._heartbeat_due = now + self._drives.heartbeat
-            for frame in self._beats:
-                self._wire.send(frame)
+            frames_due += self._beats
+        for frame in frames_due[sent:]:
+            self._wire.send(frame)
         for axis in self._axes:
             axis.answers.sync_sent()
             axis.command_age += 1
@@ -183,7 +188,7 @@ class Cia402(Driver[Cia402Axis]):
                 self._wire.access, packets([self._sync]), packets(self._beats), packets(self._setpoints)
             )
         lent, beats = self._lent, len(self._beats)
-        lent.times[0] = self._off_by, due, self._drives.heartbeat, beats, 0, 0, 0, self._wire.traffic, 0
+        lent.times[0] = self._off_by, due, self._drives.heartbeat, beats, 0, NOWHERE, self._wire.traffic, 0
         lent.write([axis.lend() for axis in self._axes])
         self._away = True
         words = [(axis.controlword, axis.statusword) for axis in self._axes]
@@ -204,12 +209,13 @@ class Cia402(Driver[Cia402Axis]):
         for axis, row in zip(self._axes, lent.rows(), strict=True):
             axis.take_back(row, int(times["cycles"]))
         self._wire.hand_in(lent.arrived, arrived, error)
+        feedback = self._feedback()
         if synced is not None:
             self._wire.begin()
             self._synced = synced
-        for frame in self._beats[len(self._beats) - int(times["unsent"]) :]:
-            self._wire.send(frame)
-        return self._feedback()
+            if times["begun"] != NOWHERE:
+                self._begin(synced, self._heartbeat_due, int(times["begun"]))
+        return feedback
 
     def send_on(self, first: int) -> None:
         """Send the setpoints in the tables that the bus has not taken, one at a time."""

@@ -89,8 +89,7 @@ TIMES = np.dtype(
         ("beat_period", "<f8"),
         ("beats", "<i8"),  # so many of them go at once, and which is the next
         ("next_beat", "<i8"),
-        ("unsent", "<i8"),  # so many of them, the last ones, the bus has not taken
-        ("begun", "<i8"),  # frames that begin the newest cycle, and that the bus has taken
+        ("begun", "<i8"),  # frames of the newest cycle's beginning, before the first that was refused; NOWHERE for none
         ("traffic", "<i8"),  # bits that have passed the bus
         ("cycles", "<i8"),  # whole cycles
     ],

@@ -18,7 +18,7 @@ from collections import deque
 import can
 
 from trirail_drivers import config
-from trirail_drivers.driver.cyclic import Cyclic
+from trirail_drivers.driver.cyclic import NOWHERE, Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import frames, setup
@@ -87,14 +87,19 @@ class Odrive(Driver[OdriveAxis]):
                 axis.heard = now
                 axis.answers.forgive()
         self._wire.receive(now)
-        sent = self._setpoints.sent
-        self._due.append(sent[0] if sent is not None else None)
-        self._setpoints.step(self._enabled)
+        self._begin(now, self._errors_due)
+
+    def _begin(self, now: float, errors_due: float, sent: int = 0) -> None:
+        """Send what begins a cycle; somebody else has sent so many frames of it."""
+        setpoints = self._setpoints.sent
+        self._due.append(setpoints[0] if setpoints is not None else None)
+        sent -= self._setpoints.step(self._enabled, sent)
         self._command()
-        for axis, request in zip(self._axes, self._requests, strict=True):
-            self._wire.send(request)
+        for number, (axis, request) in enumerate(zip(self._axes, self._requests, strict=True)):
+            if number >= sent:
+                self._wire.send(request)
             axis.answers.sync_sent()
-        if now >= self._errors_due:
+        if now >= errors_due:
             self._errors_due = now + frames.ERROR_PERIOD
             self._wire.send(self._error_requests[self._next_request])
             self._next_request = (self._next_request + 1) % len(self._error_requests)
@@ -153,7 +158,7 @@ class Odrive(Driver[OdriveAxis]):
             self._tables = Tables(self._wire.access, self._axes, self._error_requests, self._requests, len(self._due))
         lent = self._lent = self._tables.cyclic
         traffic, asks = self._wire.traffic, (1, self._next_request)
-        lent.times[0] = self._off_by, due, frames.ERROR_PERIOD, *asks, 0, 0, traffic, 0
+        lent.times[0] = self._off_by, due, frames.ERROR_PERIOD, *asks, NOWHERE, traffic, 0
         self._tables.fill(sender, self._due, follow=self._enabled, within=self._drives.following_error)
         self._away = True
         return lent
@@ -168,11 +173,13 @@ class Odrive(Driver[OdriveAxis]):
         self._next_request = int(times["next_beat"])
         self._tables.empty(self._setpoints, self._due)
         self._wire.hand_in(lent.arrived, arrived, error)
+        feedback = self._feedback()
         if synced is not None:
             self._wire.begin()
             self._synced = synced
-            self._tables.send_on(self._wire, self._setpoints)
-        return self._feedback()
+            if times["begun"] != NOWHERE:
+                self._begin(synced, self._errors_due, int(times["begun"]))
+        return feedback
 
     def send_on(self, first: int) -> None:
         """Do nothing: setpoints go with the next SYNC."""

@@ -14,7 +14,6 @@ import numpy as np
 
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packets import BusAccess, packets
-from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.cyclic import Cyclic, Row
 from trirail_drivers.interface import Triple
 from trirail_drivers.odrive import frames
@@ -70,20 +69,6 @@ class Tables:
         if sender.in_force:
             sender.in_force = [row["in_force"] for row in rows]
         due.extend((a, b, c) if math.isfinite(a) else None for a, b, c in self.cyclic.history.tolist())
-
-    def send_on(self, wire: Wire, sender: SetpointSender) -> None:
-        """Send what the bus has not taken of what begins the newest cycle, and of the requests for errors."""
-        begun, unsent = int(self.cyclic.times[0]["begun"]), int(self.cyclic.times[0]["unsent"])
-        asked = len(self.cyclic.begin.frames) - len(self._asking.frames)
-        for number, packed in enumerate(self.cyclic.begin.frames[begun:], begun):
-            taken = wire.send(Frame.of(packed.tobytes()))
-            if number < asked and taken and sender.written is not None:
-                sender.in_force[number] = sender.written[0][number]
-            elif number < asked:
-                self._axes[number].setpoints_lost += 1
-        if unsent:
-            last = int(self.cyclic.times[0]["next_beat"]) - 1
-            wire.send(Frame.of(self.cyclic.beats.frames[last].tobytes()))
 
 
 def _setpoints(rows: Sequence[Row], name: str) -> tuple[Triple, Triple] | None:

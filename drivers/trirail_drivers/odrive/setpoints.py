@@ -54,13 +54,15 @@ class SetpointSender:
         self.written = position, velocity
         return None
 
-    def step(self, enabled: bool) -> None:
-        """Send what is due at a SYNC."""
+    def step(self, enabled: bool, sent: int = 0) -> int:
+        """Send what is due at a SYNC, where somebody else has sent so many frames; return how many frames are due."""
         if self._braking is not None:
             self._brake()
         # Without power none is sent: a drive that has missed losing it is to stay where the ramp has ended.
         if self.written is not None and (enabled or self.stopping):
-            self._send(*self.written)
+            self._send(*self.written, sent)
+            return len(self._axes)
+        return 0
 
     def stop(self) -> None:
         """Begin to lead the drives down the ramp, now; they must have been sent setpoints."""
@@ -77,13 +79,13 @@ class SetpointSender:
         """Lead the drives down the ramp no longer."""
         self._braking = None
 
-    def _send(self, position: Triple, velocity: Triple) -> None:
-        """Send setpoints; each is in force when it arrives."""
+    def _send(self, position: Triple, velocity: Triple, taken: int = 0) -> None:
+        """Send setpoints, but for so many that the bus has taken; each is in force when it arrives."""
         self.sent = sent = position, velocity
         self.in_force = self.in_force or list(position)
         for number, (axis, metres, rate) in enumerate(zip(self._axes, position, velocity, strict=True)):
             data = axis.input_pos(metres, rate)
-            if self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
+            if number < taken or self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
                 self.in_force[number] = metres
             else:
                 axis.setpoints_lost += 1

@@ -134,8 +134,8 @@ def take_frames(
 
 
 @compiled()
-def begin_cycle(axes: NDArray[np.void], history: Array, taken: int) -> None:
-    """Note that the SYNC has been sent, with so many setpoints where these wait for one."""
+def begin_cycle(axes: NDArray[np.void], history: Array) -> None:
+    """Note that the SYNC has been sent, with the setpoints where these wait for one."""
     if len(history):
         history[:-1] = history[1:]
     for i in range(3):
@@ -147,8 +147,7 @@ def begin_cycle(axes: NDArray[np.void], history: Array, taken: int) -> None:
             history[-1, i] = axis.sent[0]
         if axis.waits:
             axis.sent[0], axis.sent[1] = axis.wanted[0], axis.wanted[1]
-            if i < taken:
-                axis.in_force = axis.wanted[0]
+            axis.in_force = axis.wanted[0]
 
 
 @compiled(i8(AXES, TIMINGS, f8[:, ::1], f8))

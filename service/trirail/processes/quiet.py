@@ -62,7 +62,7 @@ class Reached(IntEnum):
     WAITED = 0
     """Its tick is there; frames may have been taken from the bus."""
     SYNCED = 1
-    """Its SYNC has been sent, and frames have been taken from the bus."""
+    """Its SYNC has been sent, as far as the bus takes it, and frames may have been taken from the bus."""
     WRITTEN = 2
     """All is done, but for setpoints that the bus has not taken."""
     DONE = 3
@@ -242,23 +242,17 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         ):
             _copy(kept, 0, 1)
             return Reached.WAITED
-        begun = _send(bus, begin, starts, times)
-        if begun < 1:
-            _copy(kept, 0, 1)
-            return Reached.WAITED
-        begin_cycle(axes, history, begun)
-        times[0].begun = begun
         s.synced, s.arrived = t, 0
-        if begun < len(begin):
+        begun, due = _send(bus, begin, starts, times), t >= times[0].beat_due
+        first, number = times[0].next_beat, times[0].beats
+        if begun == len(begin) and due:
+            begun += _send(bus, beats[first : first + number], signs[first : first + number], times)
+        if begun < len(begin) + number * due:
+            times[0].begun = begun
             return Reached.SYNCED
-        if t >= times[0].beat_due:
-            times[0].beat_due = t + times[0].beat_period
-            first, number = times[0].next_beat, times[0].beats
-            times[0].next_beat = (first + number) % len(beats)
-            gone = _send(bus, beats[first : first + number], signs[first : first + number], times)
-            times[0].unsent = number - gone
-            if gone < number:
-                return Reached.SYNCED
+        if due:
+            times[0].beat_due, times[0].next_beat = t + times[0].beat_period, (first + number) % len(beats)
+        begin_cycle(axes, history)
         _mark(state, moment, Part.SYNC)
 
         _copy(kept, 1, 0)
