@@ -221,8 +221,8 @@ def test_as_many_positions_may_be_missed_as_the_configuration_says(most: int) ->
     axis.on_status(ENABLED, T)
     for cycle in range(most + 1):
         assert axis.fault(T, WANTED) is None, cycle
-        axis.answers.sync_sent()
+        axis.sync_sent()
         if cycle == 0:
             axis.on_position(frames.POSITION.pack(1000), T)
-        axis.answers.read_over()
+        axis.read_over()
     assert axis.fault(T, WANTED) == ("B", "silent", 0, f"drive B: no position for {most} cycles in a row")

@@ -12,7 +12,7 @@ from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
-from trirail_drivers.driver.cyclic import Row, expected
+from trirail_drivers.driver.cyclic import expected
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
@@ -41,59 +41,18 @@ _CAN_MOVE_OR_SOON = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, Powe
 class Cia402Axis(Axis):
     """One drive's newest feedback; the `on_` methods take a frame's data or raise struct.error."""
 
-    __slots__ = (
-        "_answers_after",
-        "_answers_per_sync",
-        "_followed",
-        "_operational",
-        "_register_until",
-        "_restarted",
-        "_stands_at",
-        "_stands_since",
-        "_unfollowed_since",
-        "actual",
-        "command_age",
-        "controlword",
-        "cyclic",
-        "error_code",
-        "follows",
-        "has_followed",
-        "held",
-        "homed",
-        "left_operational",
-        "mode",
-        "mode_bits",
-        "mute",
-        "poll_due",
-        "register_wanted",
-        "reset_until",
-        "sdo_answer",
-        "sdo_asked",
-        "seen_clear",
-        "setpoint",
-        "state",
-        "status_heard",
-        "statusword",
-        "stopped",
-        "units",
-        "way",
-    )
-
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
-        self.actual = 0
-        """Actual position [counts]."""
-        self.way = ways.usual(node)
-        self.units = Units(scale, scale.counts_per_metre, abs(scale.counts_per_metre))
-        self.setpoint: tuple[int, int] | None = None
-        """Position and velocity that were sent last, in its units."""
-        self.statusword = self.seen_clear = 0
-        """The newest one, and its bits that have been 0 since somebody began to watch."""
+        self.set_up(ways.usual(node), Units(scale, scale.counts_per_metre, abs(scale.counts_per_metre)))
+        self.velocity_step, self.velocity_bytes = 1.0, 4
+        self.still = max(1.0, abs(scale.counts_per_metre) * STILL)
+        self.status_heard = self.stands_since = math.inf
+        self.status_within = MISSED_STATUSES * frames.STATUS_PERIOD
+        self.has_setpoint = False
+        """It was sent one."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.controlword = frames.DISABLE_VOLTAGE
         """The last one sent."""
-        self.command_age = 0
-        """SYNCs since it was sent."""
         self.mode_bits = 0
         """Controlword bits that go with "enable operation"."""
         self.held: int | None = None
@@ -111,8 +70,6 @@ class Cia402Axis(Axis):
         """The newest answer about an object."""
         self.error_code = 0
         """What the drive last gave as the reason of its fault; 0 once it said that is over."""
-        self.status_heard = math.inf
-        """Time of the last statusword [s]."""
         self.reset_until = -math.inf
         """Until when a fault reset is under way [s]."""
         self.mute = False
@@ -127,18 +84,32 @@ class Cia402Axis(Axis):
         """Its error register 1001h is to be asked for."""
         self._operational = self._restarted = self._followed = self.stopped = False
         self._unfollowed_since: float | None = None
-        self._answers_per_sync, self._answers_after = AnswersPerSync(scale.counts_per_metre), AnswersAfter()
-        self._stands_at, self._stands_since = 0, math.inf
+        self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfter()
+
+    def set_up(self, way: ways.Exchange, units: Units) -> None:
+        """Note what goes by which frames, and in which units."""
+        self.way, self.units = way, units
+        self.velocity_per_metre = units.velocity_per_metre
+        self.position_at, self.velocity_at = way.setpoints.place(0), way.setpoints.place(1)
+
+    def aim(self, target: int, offset: int) -> None:
+        """Note position and velocity that it is sent, in its units."""
+        self.target, self.offset, self.has_setpoint = target, offset, True
+
+    @property
+    def setpoint(self) -> tuple[int, int]:
+        """What it was sent last, in its units; where that is nothing yet, the place where it is."""
+        return (self.target, self.offset) if self.has_setpoint else (self.actual, 0)
 
     def on_position(self, data: bytes | bytearray, now: float) -> None:
         """TPDO2: the position sampled at a SYNC, and the statusword where the drive's way has it here."""
         counts, statusword = self.way.feedback.unpack(data)
-        if abs(counts - self._stands_at) > max(1.0, abs(self.scale.counts_per_metre) * STILL):
-            self._stands_at, self._stands_since = counts, now
-        self._stands_since = min(self._stands_since, now)
+        if abs(counts - self.stands_at) > self.still:
+            self.stands_at, self.stands_since = counts, now
+        self.stands_since = min(self.stands_since, now)
         self._answers_per_sync.come(counts)
         self.take_position(counts)
-        self.answers.come()
+        self.answer()
         if statusword is not None:
             self.status_heard = now
             self.take_status(statusword)
@@ -154,50 +125,11 @@ class Cia402Axis(Axis):
         quiet = self._answers_after.idle and self._answers_per_sync.calm and self._unfollowed_since is None
         return (
             (settled and told and lives and quiet and not asked)
-            and (self.cyclic and self.follows and self.holds is None and self.setpoint is not None)
-            and self.answers.missed == 0
+            and (self.cyclic and self.follows and self.holds is None and self.has_setpoint)
+            and self.missed == 0
             and self._followed == follows
             and self.controlword == self.word(-math.inf, wanted)
         )
-
-    def lend(self) -> Row:
-        """Return what is kept of it, where it rests."""
-        row: Row = {
-            "position": self.position,
-            "actual": self.actual,
-            "heard": self.heard,
-            "status_heard": self.status_heard,
-            "statusword": self.statusword,
-            "seen_clear": self.seen_clear,
-            "stands_at": self._stands_at,
-            "stands_since": self._stands_since,
-            "command_age": self.command_age,
-            "counts_per_metre": self.scale.counts_per_metre,
-            "zero": self.scale.offset,
-            "velocity_per_metre": self.units.velocity_per_metre,
-            "velocity_step": 1.0,
-            "velocity_bytes": 4,
-            "wanted": (0.0, 0.0),
-            "sent": (0.0, 0.0),
-            "still": max(1.0, abs(self.scale.counts_per_metre) * STILL),
-            "heard_within": self._heartbeat_timeout,
-            "status_within": MISSED_STATUSES * frames.STATUS_PERIOD,
-            "position_at": self.way.setpoints.place(0),
-            "velocity_at": self.way.setpoints.place(1),
-        }
-        row["target"], row["offset"] = self.setpoint or (0, 0)
-        self.answers.lend(row)
-        self._answers_per_sync.lend(row)
-        return row
-
-    def take_back(self, row: Row, cycles: int) -> None:
-        """Go on from there, so many whole cycles later."""
-        self.position, self.actual, self.heard = row["position"], row["actual"], row["heard"]
-        self.statusword, self.seen_clear, self.status_heard = row["statusword"], row["seen_clear"], row["status_heard"]
-        self._stands_at, self._stands_since = row["stands_at"], row["stands_since"]
-        self.command_age, self.setpoint = row["command_age"], (row["target"], row["offset"])
-        self.answers.take_back(row)
-        self._answers_per_sync.take_back(row, cycles)
 
     def expected(self, number: int) -> list[tuple[Any, ...]]:
         """The frames that say nothing new of it, as rows of trirail_drivers.driver.cyclic.EXPECTED; it has a number."""
@@ -285,7 +217,7 @@ class Cia402Axis(Axis):
 
         Returns what this drive was said to have done, and another node of its id has: `event` says so from now on.
         """
-        mistaken = self._answers_after.of_another(came=self._answers_per_sync.came)
+        mistaken = self._answers_after.of_another(came=self.came)
         if self._answers_per_sync.from_two_nodes():
             self.tell("frame", 0, told(self.node, "each SYNC has two positions"))
         if mistaken is not None:
@@ -340,7 +272,7 @@ class Cia402Axis(Axis):
     @property
     def may_be_deaf(self) -> bool:
         """It may hear no PDO: what it is to do it has to be told by SDO too."""
-        return self.left_operational or self.answers.missed > 0
+        return self.left_operational or self.missed > 0
 
     def forgive(self, now: float) -> None:
         """Forget what happened, but not what lasts, and allow time for a fault reset."""
@@ -351,7 +283,7 @@ class Cia402Axis(Axis):
             self.reset_until = now + RESET_TIME
         if self.left_operational:
             self.left_operational = False
-            self.answers.forgive()
+            self.forgive_unanswered()
             self.status_heard = now
         if self.error_code and self.state not in _IN_FAULT:
             # An EMCY that was never followed by "error reset": the register tells whether it is over.
@@ -384,7 +316,7 @@ class Cia402Axis(Axis):
 
     def _stands(self, now: float) -> bool:
         """Whether its slider stands: only positions that still come can tell."""
-        return now - self._stands_since >= STILL_FOR and self.answers.missed == 0
+        return now - self.stands_since >= STILL_FOR and self.missed == 0
 
     def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
         """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not.
@@ -411,7 +343,7 @@ class Cia402Axis(Axis):
             return self.made("emcy", self.error_code, f"emergency {words(self.error_code, ' is still in force')}")
         elif silent := self.silence(now):
             return silent
-        elif now - self.status_heard > MISSED_STATUSES * frames.STATUS_PERIOD:
+        elif now - self.status_heard > self.status_within:
             return self.made("silent", 0, f"no statusword for {now - self.status_heard:.3g} s")
         elif (
             self.powered_up

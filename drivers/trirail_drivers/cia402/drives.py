@@ -21,7 +21,8 @@ from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.cia402.objects import means
 from trirail_drivers.cia402.one_drive import HAS_POWER
 from trirail_drivers.cia402.strangers import Strangers
-from trirail_drivers.driver.cyclic import NOWHERE, Cyclic
+from trirail_drivers.driver.axis_row import NOWHERE
+from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
@@ -44,8 +45,6 @@ class Cia402(Driver[Cia402Axis]):
         self._heartbeat_due: float | None = None
         self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
-        self._away = False
-        """What is kept of the drives is lent."""
         self._lent_with: list[tuple[int, int]] = []
         """The controlwords and statuswords that the tables are made for."""
 
@@ -61,7 +60,7 @@ class Cia402(Driver[Cia402Axis]):
         done = setup.configure(self._wire.bus, self._drives, scales, period, self._clock, fastest)
         self._set_period(period, ways.traffic(made.way for made, _ in done))
         for axis, (made, start) in zip(self._axes, done, strict=True):
-            axis.way, axis.units = made.way, made.units
+            axis.set_up(made.way, made.units)
             axis.mode.shown = made.way.mode_shown
             self._listen(axis)
             axis.take_position(start.counts)
@@ -108,7 +107,7 @@ class Cia402(Driver[Cia402Axis]):
         for frame in frames_due[sent:]:
             self._wire.send(frame)
         for axis in self._axes:
-            axis.answers.sync_sent()
+            axis.sync_sent()
             axis.command_age += 1
 
     def read(self) -> Feedback:
@@ -116,8 +115,8 @@ class Cia402(Driver[Cia402Axis]):
         now = self._clock()
         self._wire.receive(now)
         for axis in self._axes:
-            axis.answers.read_over()
             mistaken = axis.cycle_over()
+            axis.read_over()
             if mistaken is not None and self._wire.fault is mistaken:
                 self._wire.fault = axis.event
             fault = axis.fault(now, _asked_of(axis, self._wanted)) if self._wire.fault is None else None
@@ -140,7 +139,7 @@ class Cia402(Driver[Cia402Axis]):
             self._wire.fault,
             (a.counts, b.counts, c.counts),
             self._wire.warnings(),
-            (a.answers.age, b.answers.age, c.answers.age),
+            (a.age, b.age, c.age),
             self._homing.under_way,
             (a.follows, b.follows, c.follows),
             (a.homed, b.homed, c.homed),
@@ -168,7 +167,7 @@ class Cia402(Driver[Cia402Axis]):
             except (ValueError, OverflowError, struct.error):
                 self._refuse_setpoint(axis, metres, rate)
                 return
-            axis.setpoint = setpoint
+            axis.aim(*setpoint)
         for axis, frame in zip(self._axes, self._setpoints, strict=True):
             if not self._wire.send(frame):
                 axis.setpoints_lost += 1
@@ -183,32 +182,25 @@ class Cia402(Driver[Cia402Axis]):
             return None
         if self._stopped_in_this_cycle or not all(axis.rests(_asked_of(axis, self._wanted)) for axis in self._axes):
             return None
-        if self._lent is None:
-            self._lent = Cyclic(
-                self._wire.access, packets([self._sync]), packets(self._beats), packets(self._setpoints)
-            )
-        lent, beats = self._lent, len(self._beats)
-        lent.times[0] = self._off_by, due, self._drives.heartbeat, beats, 0, NOWHERE, self._wire.traffic, 0
-        lent.write([axis.lend() for axis in self._axes])
-        self._away = True
+        lent, beats = self._tables, len(self._beats)
+        if not len(lent.end):
+            lent.begin, lent.beats, lent.setpoints = map(packets, ([self._sync], self._beats, self._setpoints))
+            lent.end = lent.setpoints.headers
+        lent.times[0] = self._off_by, due, self._drives.heartbeat, beats, 0, NOWHERE, lent.times[0]["traffic"]
         words = [(axis.controlword, axis.statusword) for axis in self._axes]
         if words != self._lent_with:
             self._lent_with = words
             for axis, frame in zip(self._axes, self._setpoints, strict=True):
-                axis.way.setpoints.fill(frame, *(axis.setpoint or (0, 0)), axis.controlword)
+                axis.way.setpoints.fill(frame, *axis.setpoint, axis.controlword)
             lent.setpoints.fill(self._setpoints)
             lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected(number)])
         return lent
 
     def take_back(self, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
         """Go on from what the tables hold: see trirail_drivers.driver.cyclic.Lender."""
-        assert self._lent is not None
-        self._away = False
-        lent, times = self._lent, self._lent.times[0]
-        self._wire.traffic, self._heartbeat_due = int(times["traffic"]), float(times["beat_due"])
-        for axis, row in zip(self._axes, lent.rows(), strict=True):
-            axis.take_back(row, int(times["cycles"]))
-        self._wire.hand_in(lent.arrived, arrived, error)
+        times = self._tables.times[0]
+        self._heartbeat_due = float(times["beat_due"])
+        self._wire.hand_in(self._tables.arrived, arrived, error)
         feedback = self._feedback()
         if synced is not None:
             self._wire.begin()
@@ -219,8 +211,7 @@ class Cia402(Driver[Cia402Axis]):
 
     def send_on(self, first: int) -> None:
         """Send the setpoints in the tables that the bus has not taken, one at a time."""
-        assert self._lent is not None
-        for axis, packed in zip(self._axes[first:], self._lent.setpoints.frames[first:], strict=True):
+        for axis, packed in zip(self._axes[first:], self._tables.setpoints.frames[first:], strict=True):
             axis.setpoints_lost += not self._wire.send(Frame.of(packed.tobytes()))
 
     def enable(self, alone: str | None = None) -> None:
@@ -319,7 +310,7 @@ class Cia402(Driver[Cia402Axis]):
         if axis.way.controlword is not None:
             return self._wire.send(Frame(axis.way.controlword, frames.CONTROLWORD.pack(word)))
         frame = axis.way.setpoints.frame()
-        axis.way.setpoints.fill(frame, *(axis.setpoint or (axis.actual, 0)), word)
+        axis.way.setpoints.fill(frame, *axis.setpoint, word)
         return self._wire.send(frame)
 
     def _send_word_by_sdo(self, axis: Cia402Axis, word: int) -> None:

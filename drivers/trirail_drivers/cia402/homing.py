@@ -155,24 +155,24 @@ class HomingSequence:
 
     def _halt(self, axis: Cia402Axis) -> Steps:
         axis.mode_bits = frames.HALT
-        answered = axis.answers.sampled + FRESH
+        answered = axis.sampled + FRESH
         yield from self._until(
-            lambda: axis.answers.sampled >= answered and bool(axis.statusword & _REACHED),
+            lambda: axis.sampled >= answered and bool(axis.statusword & _REACHED),
             self._stop_timeout,
             "the slider did not stand still",
         )
 
     def _follow_setpoints(self, axis: Cia402Axis) -> Steps:
         """Back to the mode of setpoints, when the drive's setpoint is where it stands."""
-        answered = axis.answers.sampled + FRESH
-        yield from self._until(lambda: axis.answers.sampled >= answered, self._sdo_timeout, "there was no new position")
+        answered = axis.sampled + FRESH
+        yield from self._until(lambda: axis.sampled >= answered, self._sdo_timeout, "there was no new position")
         standing = axis.actual
         yield
         # Whoever gives setpoints has seen that position, and from now on holds it, as is done here meanwhile.
         axis.held = standing
         axis.follows = True
-        taken_up = axis.answers.syncs + TAKEN_UP
-        yield from self._until(lambda: axis.answers.syncs >= taken_up, self._sdo_timeout, "there was no SYNC")
+        taken_up = axis.syncs + TAKEN_UP
+        yield from self._until(lambda: axis.syncs >= taken_up, self._sdo_timeout, "there was no SYNC")
         yield from self._change_mode(axis, axis.way.mode)
         axis.cyclic = True
         axis.held = None

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from trirail_drivers.driver.cyclic import Row
+from trirail_drivers.driver.axis_row import AxisRow
 from trirail_drivers.interface import DriveFault
 
 FAR: Final = 0.005
@@ -70,50 +70,39 @@ class AnswersPerSync:
     positions go to and fro, but for motion that is faster than they are apart.
     """
 
-    __slots__ = ("_came", "_counts_far", "_cycles", "_far", "_far_in_a_row", "_newest", "_step", "_two", "_with_two")
+    __slots__ = ("_counted_from", "_counts_far", "_far", "_far_in_a_row", "_row", "_two", "_with_two")
 
-    def __init__(self, counts_per_metre: float) -> None:
-        self._counts_far = abs(counts_per_metre) * FAR
-        self._newest = self._step = 0
-        self._came = self._two = self._far = False
-        self._far_in_a_row = self._cycles = self._with_two = 0
-
-    @property
-    def came(self) -> bool:
-        """Whether a position has come in this cycle."""
-        return self._came
+    def __init__(self, row: AxisRow) -> None:
+        """`row` is where the positions that come are noted."""
+        self._row = row
+        self._counts_far = abs(row.counts_per_metre) * FAR
+        self._two = self._far = False
+        self._far_in_a_row = self._with_two = 0
+        self._counted_from = 0
+        """The number of a SYNC."""
 
     def come(self, counts: int) -> None:
-        """A position has come."""
-        step = counts - self._newest
-        if self._came:
-            self._two = self._two or step * self._step < 0
+        """A position comes."""
+        row = self._row
+        step, before = counts - row.newest, row.step
+        if row.came:
+            self._two = self._two or step * before < 0
             self._far = self._far or abs(step) > self._counts_far
-        self._newest, self._step, self._came = counts, step or self._step, True
+        row.newest, row.step = counts, step or before
 
     @property
     def calm(self) -> bool:
         """Whether no SYNC has had two positions lately."""
         return not (self._far_in_a_row or self._with_two or self._two or self._far)
 
-    def lend(self, row: Row) -> None:
-        """Write what is kept of a calm one into a row of trirail_drivers.driver.cyclic.AXIS."""
-        row["came"], row["newest"], row["step"] = self._came, self._newest, self._step
-
-    def take_back(self, row: Row, cycles: int) -> None:
-        """Go on from there, so many cycles later: no SYNC has had two positions since."""
-        self._cycles = (self._cycles + cycles) % COUNTED
-        self._came, self._newest, self._step = bool(row["came"]), row["newest"], row["step"]
-
     def from_two_nodes(self) -> bool:
         """Whether the positions of the cycle that is over, with those before it, are two nodes'."""
         self._far_in_a_row = self._far_in_a_row + 1 if self._far else 0
         self._with_two += self._two
-        self._cycles += 1
         found = self._far_in_a_row >= FAR_IN_A_ROW or self._with_two > MOST
         if found:
             self._far_in_a_row = 0
-        if found or self._cycles == COUNTED:
-            self._cycles = self._with_two = 0
-        self._came = self._two = self._far = False
+        if found or (self._row.syncs - self._counted_from) % COUNTED == 0:
+            self._counted_from, self._with_two = self._row.syncs, 0
+        self._two = self._far = False
         return found

@@ -16,7 +16,7 @@ from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.refusals import SetUpDrive, told
-from trirail_drivers.driver.scaling import Scale, scale_of
+from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection
 
 AnyAxis = TypeVar("AnyAxis", bound=Axis)
@@ -35,17 +35,20 @@ class Driver(ABC, Generic[AnyAxis]):
         bitrate: int,
         drives: config.Drives,
         clock: Clock,
-        axis: Callable[[str, int, Scale, config.Drives], AnyAxis],
+        axis: type[AnyAxis],
+        history: int = 0,
     ) -> None:
+        """`history`: so many setpoints are kept of those that were sent."""
         self.bus_load = 0.0
         self.missing_protections: tuple[MissingProtection, ...] = ()
         self._wire = Wire(bus, self._stop)
         self._bitrate = bitrate
         self._drives = drives
         self._clock = clock
+        self._tables = Cyclic(self._wire.access, history)
         self._axes = tuple(
-            axis(name, drive.node, scale_of(name, drive), drives)
-            for name, drive in zip(NAMES, drives.each, strict=True)
+            axis.placed(self._tables.axes, number, name, drive.node, scale_of(name, drive), drives)
+            for number, (name, drive) in enumerate(zip(NAMES, drives.each, strict=True))
         )
         self._period = 0.0
         self._synced = 0.0
@@ -54,9 +57,6 @@ class Driver(ABC, Generic[AnyAxis]):
         """When the drives must have lost their power [s]; inf where that was not asked for, or has been told of."""
         self._asked = ""
         """By what that was asked for."""
-        self._lent: Cyclic | None = None
-        self._away = False
-        """Whether somebody else runs the cycles, by those tables."""
         self._closed = False
 
     def _tell(self, made: Sequence[SetUpDrive], means: Callable[[str], str]) -> None:
@@ -70,7 +70,7 @@ class Driver(ABC, Generic[AnyAxis]):
     @property
     def traffic(self) -> int:
         """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
-        return int(self._lent.times[0]["traffic"]) if self._away and self._lent is not None else self._wire.traffic
+        return self._wire.traffic + int(self._tables.times[0]["traffic"])
 
     @property
     def told(self) -> tuple[DriveFault | None, ...]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
-from trirail_drivers.driver.cyclic import Row, expected
+from trirail_drivers.driver.cyclic import expected
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.odrive import frames
@@ -24,22 +24,16 @@ STALE_HEARTBEATS = 1
 class OdriveAxis(Axis):
     """One drive's newest feedback; the `on_` methods take a message's data or raise struct.error."""
 
-    __slots__ = (
-        "_beats",
-        "_initialised",
-        "_restarted",
-        "_result",
-        "errors",
-        "requested",
-        "reset_until",
-        "sdo",
-        "state",
-        "told",
-        "version",
-    )
-
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
+        self.wanted = self.sent = self.in_force = math.nan
+        self.floats, self.still = True, math.inf
+        self.velocity_per_metre, self.velocity_step, self.velocity_bytes = (
+            scale.counts_per_metre,
+            frames.VELOCITY_STEP,
+            2,
+        )
+        self.position_at, self.velocity_at = 0, 4
         self.state: int = AxisState.UNDEFINED
         """Axis state of the newest heartbeat."""
         self.errors = 0
@@ -64,34 +58,12 @@ class OdriveAxis(Axis):
         in_state = wanted is not None and self.requested is wanted and self.state == wanted and self.obeys
         well = self.told and not self.errors and self.event is None and self.reset_until == -math.inf
         follows = self.powered_up or wanted is AxisState.IDLE
-        return in_state and well and follows and self.answers.missed == 0 and math.isfinite(self.position)
+        return in_state and well and follows and self.missed == 0 and math.isfinite(self.position)
 
-    def lend(self) -> Row:
-        """Return what is kept of it, where it rests."""
-        row: Row = {
-            "position": self.position,
-            "heard": self.heard,
-            "status_heard": 0.0,
-            "stands_since": 0.0,
-            "floats": True,
-            "counts_per_metre": self.scale.counts_per_metre,
-            "zero": self.scale.offset,
-            "velocity_per_metre": self.scale.counts_per_metre,
-            "velocity_step": frames.VELOCITY_STEP,
-            "velocity_bytes": 2,
-            "still": math.inf,
-            "heard_within": self._heartbeat_timeout,
-            "status_within": math.inf,
-            "position_at": 0,
-            "velocity_at": 4,
-        }
-        self.answers.lend(row)
-        return row
-
-    def take_back(self, row: Row) -> None:
-        """Go on from there."""
-        self.position, self.heard = row["position"], row["heard"]
-        self.answers.take_back(row)
+    @property
+    def said(self) -> tuple[int, int]:
+        """What of its newest heartbeat decides something: state, and how the last procedure ended."""
+        return self.state, self._result
 
     def expected(self, number: int) -> list[tuple[Any, ...]]:
         """The frames that say nothing new of it, as rows of trirail_drivers.driver.cyclic.EXPECTED; it has a number."""
@@ -99,7 +71,7 @@ class OdriveAxis(Axis):
         def of(command: int) -> int:
             return frames.identifier(self.node, command)
 
-        beat, decides = frames.BEAT.pack(0, self.state, self._result, 0), frames.BEAT.pack(0xFFFFFFFF, 0xFF, 0xFF, 0)
+        beat, decides = frames.BEAT.pack(0, *self.said, 0), frames.BEAT.pack(0xFFFFFFFF, 0xFF, 0xFF, 0)
         nothing, any_of_it = bytes(frames.ESTIMATES.size), b"\xff" * frames.ERRORS.size
         return [
             expected(of(frames.GET_ENCODER_ESTIMATES), number, nothing, nothing, position_at=0),
@@ -124,7 +96,7 @@ class OdriveAxis(Axis):
     def on_estimates(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """Get_Encoder_Estimates: the position when the request came."""
         turns, _ = frames.ESTIMATES.unpack(data)
-        self.answers.come()
+        self.answer()
         if math.isfinite(turns):
             self.position = self.scale.metres(turns)
         else:

@@ -13,18 +13,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 
 import can
 
 from trirail_drivers import config
-from trirail_drivers.driver.cyclic import NOWHERE, Cyclic
+from trirail_drivers.driver.axis_row import NOWHERE
+from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import frames, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.frames import AxisState
-from trirail_drivers.odrive.lending import Tables
+from trirail_drivers.odrive.lending import Lending
 from trirail_drivers.odrive.protections import means
 from trirail_drivers.odrive.setpoints import SetpointSender
 
@@ -42,7 +42,7 @@ class Odrive(Driver[OdriveAxis]):
 
     def __init__(self, bus: can.BusABC, bitrate: int, drives: config.Drives, clock: Clock = time.monotonic) -> None:
         setup.check_nodes(drives)
-        super().__init__(bus, bitrate, drives, clock, OdriveAxis)
+        super().__init__(bus, bitrate, drives, clock, OdriveAxis, history=drives.missed_positions)
         for axis in self._axes:
             for number, handler in (
                 (frames.GET_VERSION, axis.on_version),
@@ -58,9 +58,7 @@ class Odrive(Driver[OdriveAxis]):
         self._errors_due: float | None = None
         self._enabled = False
         self._setpoints = SetpointSender(self._axes, self._wire, drives.quick_stop_deceleration)
-        self._tables: Tables | None = None
-        self._due: deque[Triple | None] = deque([None] * drives.missed_positions, maxlen=drives.missed_positions)
-        """Setpoints that the drives should have reached when positions were asked for, the newest at the right [m]."""
+        self._lending = Lending(self._tables, self._axes, self._error_requests, self._requests)
 
     def configure(self, period: float, fastest: float | None = None) -> None:  # noqa: ARG002  their unit says any
         """Find the drives and leave them without power, for a cycle of `period` seconds.
@@ -85,20 +83,20 @@ class Odrive(Driver[OdriveAxis]):
             self._errors_due = now
             for axis in self._axes:
                 axis.heard = now
-                axis.answers.forgive()
+                axis.forgive_unanswered()
         self._wire.receive(now)
         self._begin(now, self._errors_due)
 
     def _begin(self, now: float, errors_due: float, sent: int = 0) -> None:
         """Send what begins a cycle; somebody else has sent so many frames of it."""
-        setpoints = self._setpoints.sent
-        self._due.append(setpoints[0] if setpoints is not None else None)
+        history = self._tables.history
+        history[(self._axes[0].syncs + 1) % len(history)] = [axis.sent for axis in self._axes]
         sent -= self._setpoints.step(self._enabled, sent)
         self._command()
         for number, (axis, request) in enumerate(zip(self._axes, self._requests, strict=True)):
             if number >= sent:
                 self._wire.send(request)
-            axis.answers.sync_sent()
+            axis.sync_sent()
         if now >= errors_due:
             self._errors_due = now + frames.ERROR_PERIOD
             self._wire.send(self._error_requests[self._next_request])
@@ -109,7 +107,7 @@ class Odrive(Driver[OdriveAxis]):
         now = self._clock()
         self._wire.receive(now)
         for axis in self._axes:
-            axis.answers.read_over()
+            axis.read_over()
         if self._wire.fault is None:
             fault = self._found(now)
             if fault is not None:
@@ -126,7 +124,7 @@ class Odrive(Driver[OdriveAxis]):
             self._wire.fault,
             (a.counts, b.counts, c.counts),
             self._wire.warnings(),
-            (a.answers.age, b.answers.age, c.answers.age),
+            (a.age, b.age, c.age),
         )
 
     def write(self, position: Triple, velocity: Triple) -> None:
@@ -150,29 +148,20 @@ class Odrive(Driver[OdriveAxis]):
         due, sender = self._errors_due, self._setpoints
         if due is None or not self._wire.calm or sender.stopping:
             return None
-        if self._enabled and (sender.sent is None or sender.written is None):
+        if self._enabled and not (sender.sent and sender.written):
             return None
         if not all(axis.rests(self._wanted(axis)) for axis in self._axes):
             return None
-        if self._tables is None:
-            self._tables = Tables(self._wire.access, self._axes, self._error_requests, self._requests, len(self._due))
-        lent = self._lent = self._tables.cyclic
-        traffic, asks = self._wire.traffic, (1, self._next_request)
-        lent.times[0] = self._off_by, due, frames.ERROR_PERIOD, *asks, NOWHERE, traffic, 0
-        self._tables.fill(sender, self._due, follow=self._enabled, within=self._drives.following_error)
-        self._away = True
-        return lent
+        times, asks = self._tables.times, (1, self._next_request)
+        times[0] = self._off_by, due, frames.ERROR_PERIOD, *asks, NOWHERE, times[0]["traffic"]
+        self._lending.fill(follow=self._enabled, within=self._drives.following_error)
+        return self._tables
 
     def take_back(self, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
         """Go on from what the tables hold: see trirail_drivers.driver.cyclic.Lender."""
-        assert self._tables is not None
-        self._away = False
-        lent = self._tables.cyclic
-        times = lent.times[0]
-        self._wire.traffic, self._errors_due = int(times["traffic"]), float(times["beat_due"])
-        self._next_request = int(times["next_beat"])
-        self._tables.empty(self._setpoints, self._due)
-        self._wire.hand_in(lent.arrived, arrived, error)
+        times = self._tables.times[0]
+        self._errors_due, self._next_request = float(times["beat_due"]), int(times["next_beat"])
+        self._wire.hand_in(self._tables.arrived, arrived, error)
         feedback = self._feedback()
         if synced is not None:
             self._wire.begin()
@@ -223,7 +212,7 @@ class Odrive(Driver[OdriveAxis]):
         self._give_time_to_stop("quick stop")
         powering = self._enabled or self._powered()
         self._enabled = False
-        if self._setpoints.sent is None or not powering:
+        if not self._setpoints.sent or not powering:
             self._command()
         else:
             self._setpoints.stop()
@@ -259,10 +248,11 @@ class Odrive(Driver[OdriveAxis]):
             fault = axis.fault(now, self._enabled and not axis.left_out)
             if fault is not None:
                 return fault
-            due = self._due[-1 - min(axis.answers.age, len(self._due) - 1)]
-            if due is None or not (self._enabled and axis.powered_up):
+            history = self._tables.history
+            due = float(history[(axis.syncs - min(axis.age, len(history) - 1)) % len(history), number])
+            if math.isnan(due) or not (self._enabled and axis.powered_up):
                 continue
-            error = due[number] - axis.position
+            error = due - axis.position
             if not abs(error) <= self._drives.following_error:
                 return axis.made(
                     "fault",
@@ -291,7 +281,7 @@ class Odrive(Driver[OdriveAxis]):
             return AxisState.IDLE
         if not self._enabled:
             return None if self._setpoints.stopping else AxisState.IDLE
-        return AxisState.CLOSED_LOOP_CONTROL if self._setpoints.sent is not None else None
+        return AxisState.CLOSED_LOOP_CONTROL if self._setpoints.sent else None
 
     def _wait_for_standstill(self, deadline: float) -> None:
         while self._powered() and (now := self._clock()) < deadline:  # the cycle goes on, for it leads the ramp

@@ -18,21 +18,15 @@ SETTLING: Final = 0.05
 
 
 class SetpointSender:
-    """The setpoints [m], [m/s] that were written, those sent last, and the positions in force."""
+    """Sends the setpoints that were written; these, those sent last and the positions in force are in the axes."""
 
     def __init__(self, axes: Sequence[OdriveAxis], wire: Wire, deceleration: float) -> None:
         """`deceleration` is that of the quick-stop ramp [m/s²]."""
         self.period = 0.0
         """Of the cycle [s]."""
-        self.sent: tuple[Triple, Triple] | None = None
-        """Setpoints sent last; None where no drive has been sent any since enabling."""
         self._axes = axes
         self._wire = wire
         self._deceleration = deceleration
-        self.written: tuple[Triple, Triple] | None = None
-        """Setpoints to be sent at the next SYNC."""
-        self.in_force: list[float] = []
-        """Positions that the bus has taken last [m]."""
         self._braking: float | None = None
         """Time since a quick stop has brought the setpoints to a standstill [s]; None where none is under way."""
 
@@ -41,17 +35,29 @@ class SetpointSender:
         """Whether a quick stop is under way."""
         return self._braking is not None
 
+    @property
+    def written(self) -> bool:
+        """Whether setpoints are to be sent at the next SYNC."""
+        return not math.isnan(self._axes[0].wanted)
+
+    @property
+    def sent(self) -> bool:
+        """Whether drives have been sent setpoints since enabling."""
+        return not math.isnan(self._axes[0].sent)
+
     def begin(self) -> None:
         """Forget what was sent before the drives are to get power."""
-        self._braking = self.sent = None
-        self.in_force = []
+        self._braking = None
+        for axis in self._axes:
+            axis.sent = axis.sent_rate = axis.in_force = math.nan
 
     def take(self, position: Triple, velocity: Triple) -> OdriveAxis | None:
         """Take what is to be sent at the next SYNC; the axis whose message cannot hold it, if there is one."""
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             if not _is_sendable(axis, metres, rate):
                 return axis
-        self.written = position, velocity
+        for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
+            axis.wanted, axis.wanted_rate = metres, rate
         return None
 
     def step(self, enabled: bool, sent: int = 0) -> int:
@@ -59,37 +65,39 @@ class SetpointSender:
         if self._braking is not None:
             self._brake()
         # Without power none is sent: a drive that has missed losing it is to stay where the ramp has ended.
-        if self.written is not None and (enabled or self.stopping):
-            self._send(*self.written, sent)
+        if self.written and (enabled or self.stopping):
+            self._send([(axis.wanted, axis.wanted_rate) for axis in self._axes], sent)
             return len(self._axes)
         return 0
 
     def stop(self) -> None:
         """Begin to lead the drives down the ramp, now; they must have been sent setpoints."""
-        if self.sent is None:
+        if not self.sent:
             return
         self._braking = 0.0
         # The position in force stays; what the drives are to run on with is less from now on.
-        a, b, c = self.in_force
-        _, slower = self._braked(self.sent[1])
-        self._send((a, b, c), slower)
-        self.written = None
+        self._send([(axis.in_force, self._braked(axis)[1]) for axis in self._axes])
+        for axis in self._axes:
+            axis.wanted = math.nan
 
     def abandon(self) -> None:
         """Lead the drives down the ramp no longer."""
         self._braking = None
 
-    def _send(self, position: Triple, velocity: Triple, taken: int = 0) -> None:
+    def _send(self, setpoints: Sequence[tuple[float, float]], taken: int = 0) -> None:
         """Send setpoints, but for so many that the bus has taken; each is in force when it arrives."""
-        self.sent = sent = position, velocity
-        self.in_force = self.in_force or list(position)
-        for number, (axis, metres, rate) in enumerate(zip(self._axes, position, velocity, strict=True)):
+        for axis, (metres, rate) in zip(self._axes, setpoints, strict=True):
+            axis.sent, axis.sent_rate = metres, rate
+            if math.isnan(axis.in_force):
+                axis.in_force = metres
+        stopping = self.stopping
+        for number, (axis, (metres, rate)) in enumerate(zip(self._axes, setpoints, strict=True)):
             data = axis.input_pos(metres, rate)
             if number < taken or self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
-                self.in_force[number] = metres
+                axis.in_force = metres
             else:
                 axis.setpoints_lost += 1
-            if self.sent is not sent:
+            if self.stopping != stopping:
                 return  # what could not be sent has begun a quick stop, whose setpoints are newer
 
     def _brake(self) -> None:
@@ -98,23 +106,20 @@ class SetpointSender:
         Where the bus takes no setpoint the time goes on, but the place does not: a drive that hears nothing stands
         soon, and is not to catch up with the ramp when the bus is back.
         """
-        if self.sent is None or self._braking is None:
+        if not self.sent or self._braking is None:
             return
-        _, velocity = self.sent
-        self.written = self._braked(velocity)
-        if any(velocity):
+        moving = any(axis.sent_rate for axis in self._axes)
+        for axis in self._axes:
+            axis.wanted, axis.wanted_rate = self._braked(axis)
+        if moving:
             return
         self._braking += self.period
         if self._braking > SETTLING:
             self._braking = None
 
-    def _braked(self, velocity: Triple) -> tuple[Triple, Triple]:
-        """Setpoints one period further down the ramp from those in force, of this velocity."""
-        (a, da), (b, db), (c, dc) = (
-            braked(place, rate, self._deceleration, self.period)
-            for place, rate in zip(self.in_force, velocity, strict=True)
-        )
-        return (a, b, c), (da, db, dc)
+    def _braked(self, axis: OdriveAxis) -> tuple[float, float]:
+        """The setpoint one period further down the ramp from that in force, of the velocity sent last."""
+        return braked(axis.in_force, axis.sent_rate, self._deceleration, self.period)
 
 
 def _is_sendable(axis: OdriveAxis, metres: float, rate: float) -> bool:

@@ -63,7 +63,7 @@ def configure(
     for axis in axes:
         send(wire, frames.command(axis.node, frames.SET_AXIS_STATE, frames.AXIS_STATE.pack(AxisState.IDLE)))
         axis.ask(AxisState.IDLE)
-        axis.answers.sync_sent()
+        axis.sync_sent()
         for number in (frames.GET_VERSION, frames.GET_ERROR, frames.GET_ENCODER_ESTIMATES):
             send(wire, frames.request(axis.node, number))
     for axis in late(wire, axes, clock, drives.sdo_timeout, _missing):
@@ -105,7 +105,7 @@ def _missing(axis: OdriveAxis) -> str:
         return "Get_Version"
     if not axis.told:
         return "Get_Error"
-    return "Get_Encoder_Estimates" if axis.answers.age else ""
+    return "Get_Encoder_Estimates" if axis.age else ""
 
 
 def _not_idle(axis: OdriveAxis) -> bool:

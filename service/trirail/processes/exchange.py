@@ -14,7 +14,8 @@ from numba import f8, from_dtype, i8, u1
 from numpy.typing import NDArray
 from trirail_drivers.bus.can_frame import DATA_AT
 from trirail_drivers.bus.frames import BITS
-from trirail_drivers.driver.cyclic import AXIS, EXPECTED, NOWHERE, TIMES
+from trirail_drivers.driver.axis_row import AXIS, NOWHERE
+from trirail_drivers.driver.cyclic import EXPECTED, TIMES
 from trirail_drivers.driver.scaling import INT32_MAX
 
 from trirail.kinematics.arrays import Array
@@ -55,7 +56,7 @@ def _signed(number: int) -> int:
 
 @compiled()
 def _come(axis: Any) -> bool:
-    """Take in that a position has come, as trirail_drivers.driver.answers.Answers.come; False where that is late."""
+    """Take in that a position has come, as trirail_drivers.driver.answers.Answers.answer; False where that is late."""
     to_the_one_before = not axis.between and not axis.prompt and axis.sampled < axis.syncs - 1
     sampled = axis.syncs - to_the_one_before
     if sampled - axis.sampled > 1 or (axis.prompt and axis.between and sampled > axis.sampled):
@@ -136,18 +137,16 @@ def take_frames(
 @compiled()
 def begin_cycle(axes: NDArray[np.void], history: Array) -> None:
     """Note that the SYNC has been sent, with the setpoints where these wait for one."""
-    if len(history):
-        history[:-1] = history[1:]
     for i in range(3):
         axis = axes[i]
         axis.syncs += 1
         axis.between = False
         axis.command_age += 1
         if len(history):
-            history[-1, i] = axis.sent[0]
+            history[axis.syncs % len(history), i] = axis.sent
         if axis.waits:
-            axis.sent[0], axis.sent[1] = axis.wanted[0], axis.wanted[1]
-            axis.in_force = axis.wanted[0]
+            axis.sent, axis.sent_rate = axis.wanted, axis.wanted_rate
+            axis.in_force = axis.wanted
 
 
 @compiled(i8(AXES, TIMINGS, f8[:, ::1], f8))
@@ -162,7 +161,7 @@ def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, no
         if now - axis.status_heard > axis.status_within:
             return False
         if len(history) and math.isfinite(axis.follows_within):
-            due = history[len(history) - 1 - min(age, len(history) - 1), i]
+            due = history[(axis.syncs - min(age, len(history) - 1)) % len(history), i]
             if not abs(due - axis.position) <= axis.follows_within:
                 return False
     in_time: bool = now < times[0].due
@@ -199,5 +198,5 @@ def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -
                 return False
             axis.offset = np.int64(offset)
             _put(frames[i], axis.velocity_at, axis.offset, axis.velocity_bytes)
-        axis.wanted[0], axis.wanted[1] = sent[0, i], sent[1, i]
+        axis.wanted, axis.wanted_rate = sent[0, i], sent[1, i]
     return True

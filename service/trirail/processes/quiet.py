@@ -310,7 +310,6 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         _mark(state, moment, Part.WRITE)
 
         s.cycle += 1
-        times[0].cycles += 1
         row.cycle, row.deadline_ns, row.lateness_ns, row.overruns = s.cycle, s.deadline_ns, s.lateness_ns, s.overruns
         row.parts_ns[:] = s.parts_ns
         row.mode = s.mode
