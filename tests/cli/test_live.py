@@ -16,6 +16,7 @@ from trirail.cli.units import ANGLE, LENGTH, VELOCITY, quantity
 from trirail.config import SIM, load
 from trirail.processes.info import info
 from trirail.wire.state import Commanded, CorrectionTold, FrameCounts, GoalState, LoopState, Percentiles, Sliders, State
+from trirail_drivers.interface import NAMES
 
 LIMITS = load(SIM).limits
 NONE = Percentiles(0.0, 0.0, 0.0, 0.0)
@@ -46,7 +47,7 @@ def printed(state: State) -> dict[str, str]:
     """Return the lines by name."""
     console = Console(width=160, color_system=None, no_color=True)
     with console.capture() as captured:
-        console.print(live.table(state, "demo", LIMITS))
+        console.print(live.table(state, "demo", NAMES, LIMITS))
     rows = (re.fullmatch(r" *(\S+(?: \S+)?)  +(.*?) *", line) for line in captured.get().splitlines())
     return {row[1]: row[2] for row in rows if row}
 
@@ -91,15 +92,19 @@ def test_a_paused_goal_and_a_robot_that_has_settled_are_named() -> None:
     assert printed(a_state(faults=("drive B: over-current",)))["fault"] == "drive B: over-current"
 
 
+def near(state: State) -> list[str]:
+    return list(live.near_limits(state, LIMITS, NAMES))
+
+
 def test_limits_are_shown_only_where_they_are_near() -> None:
-    assert list(live.near_limits(a_state(), LIMITS)) == []
+    assert near(a_state()) == []
     high = LIMITS.platform.x[1]
-    assert list(live.near_limits(a_state(pose=(high - 0.001, 0.0, 0.0)), LIMITS)) == [
+    assert near(a_state(pose=(high - 0.001, 0.0, 0.0))) == [
         f"x {(high - 0.001) * 1e3:.3f} mm, limit {high * 1e3:.3f} mm"
     ]
     error = LIMITS.slider.following_error
     sliders = Sliders(REST, REST, (0.0, -0.96 * error, 0.0), REST, ("ready",) * 3, (COUNTS,) * 3)
-    (said,) = live.near_limits(a_state(sliders=sliders), LIMITS)
+    (said,) = near(a_state(sliders=sliders))
     assert said == f"following error of B {-0.96e6 * error:.1f} µm, limit {-1e6 * error:.1f} µm"
 
 
@@ -107,9 +112,9 @@ def test_limits_are_shown_only_where_they_are_near() -> None:
 def test_a_position_beyond_its_limit_is_always_said(at: float) -> None:
     low, high = LIMITS.slider.position
     sliders = Sliders((at, 0.0, 0.0), REST, REST, REST, ("ready",) * 3, (COUNTS,) * 3)
-    said = [words for words in live.near_limits(a_state(sliders=sliders), LIMITS) if words.startswith("slider A")]
-    near = min(abs(at - low), abs(high - at)) <= 0.05 * (high - low)
-    assert bool(said) == (near or not low <= at <= high)
+    said = [words for words in near(a_state(sliders=sliders)) if words.startswith("slider A")]
+    close = min(abs(at - low), abs(high - at)) <= 0.05 * (high - low)
+    assert bool(said) == (close or not low <= at <= high)
 
 
 def test_a_correction_that_is_on_is_said(capsys: pytest.CaptureFixture[str]) -> None:

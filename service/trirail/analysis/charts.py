@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from trirail.analysis.summary import ENABLED_MODES, GoalSummary, Incident, Summary
 from trirail.config import Limits
 from trirail.errors import ConfigError
-from trirail.kinematics.geometry import LEGS
+from trirail.naming import Labels, label
 from trirail.telemetry import palette, provenance
 from trirail.telemetry.reading import Recording
 from trirail.wire.vocabulary import MODES, Mode
@@ -65,9 +65,12 @@ def draw(file: Path, recording: Recording, summed: Summary) -> None:
     records, t = recording.records, recording.t
     axes[-1].set_xlim(t[0], max(t[-1], t[0] + 1e-3))
     _modes(panels["goals"], records, t, summed)
-    _motion(panels, records, t, _limits(recording))
+    _motion(panels, records, t, _limits(recording), summed.labels)
     _timing(panels["loop [µs]"], records, t, 1e6 / summed.rate_hz)
-    worst = [f"{each.slider}  max {each.max * 1e6:.0f}, rms {each.rms * 1e6:.1f} µm" for each in summed.tracking]
+    worst = [
+        f"{label(each.slider, summed.labels)}  max {each.max * 1e6:.0f}, rms {each.rms * 1e6:.1f} µm"
+        for each in summed.tracking
+    ]
     _names(panels["error [µm]"], worst, SLIDERS)
     for panel in axes:
         _quiet(panel)
@@ -98,7 +101,13 @@ def _limits(recording: Recording) -> Limits | None:
     return config.limits if config else None
 
 
-def _motion(panels: dict[str, Axes], records: NDArray[np.void], t: NDArray[np.float64], limits: Limits | None) -> None:
+def _motion(
+    panels: dict[str, Axes],
+    records: NDArray[np.void],
+    t: NDArray[np.float64],
+    limits: Limits | None,
+    labels: Labels,
+) -> None:
     """Draw the platform and the sliders, in millimetres and degrees, each with the limits that it comes near."""
     enabled = np.isin(records["mode"], ENABLED_MODES)[:, np.newaxis]
     error = np.where(enabled, records["following_error"], np.nan)
@@ -108,7 +117,7 @@ def _motion(panels: dict[str, Axes], records: NDArray[np.void], t: NDArray[np.fl
     _curves(panels["velocity [mm/s]"], t, records["commanded_velocity"] * 1e3, SLIDERS)
     _curves(panels["error [µm]"], t, error * 1e6, SLIDERS)
     _names(panels["x, y [mm]"], "xy", CENTRE)
-    _names(panels["λ [mm]"], LEGS, SLIDERS)
+    _names(panels["λ [mm]"], labels, SLIDERS)
     if limits is None:
         return
     slider, platform = limits.slider, limits.platform

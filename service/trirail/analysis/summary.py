@@ -7,7 +7,9 @@ from collections.abc import Iterator
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from trirail_drivers.interface import NAMES
 
+from trirail.naming import Labels
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import Line, Recording
 from trirail.wire.messages import Event
@@ -69,6 +71,8 @@ class Summary(msgspec.Struct, frozen=True):
     """Ticks that the loop missed."""
     rate_hz: int
     software: str
+    labels: Labels
+    """What people call the sliders A, B, C."""
     modes: dict[str, float]
     """Time in each mode that occurred [s]."""
     distance: tuple[float, float, float]
@@ -99,6 +103,7 @@ def summary(recording: Recording) -> Summary:
         missed=int(records["overruns"][-1] - records["overruns"][0]),
         rate_hz=round(1.0 / period),
         software=str(software) if software else UNKNOWN,
+        labels=provenance.labels(recording.texts),
         modes={str(MODES[mode]): float(count * period) for mode, count in zip(modes, counts, strict=True)},
         distance=tuple(np.abs(np.diff(records["position"], axis=0)).sum(axis=0).tolist()),
         tracking=list(_tracking(records)),
@@ -124,7 +129,7 @@ def _tracking(records: NDArray[np.void]) -> Iterator[Tracking]:
     enabled = np.isin(records["mode"], ENABLED_MODES)
     error = np.abs(records["following_error"])
     moving = enabled & (records["commanded_velocity"] != 0.0).any(axis=1)
-    for number, slider in enumerate("ABC"):
+    for number, slider in enumerate(NAMES):
         of_all, of_motion = error[enabled, number], error[moving, number]
         yield Tracking(slider, float(of_all.max(initial=0.0)), _rms(of_all), _rms(of_motion))
 

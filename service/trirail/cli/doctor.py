@@ -126,4 +126,4 @@ def corrected(config: Config) -> list[Check]:
     """What as-built errors are corrected by: nobody should have to guess that it is on."""
     section = config.correction
     words = as_built.told(section.map, section.as_built, section.backlash)
-    return [] if words is None else [Check("correction", "ok", units.correction(words))]
+    return [] if words is None else [Check("correction", "ok", units.correction(words, config.geometry.labels))]

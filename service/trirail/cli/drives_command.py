@@ -57,7 +57,10 @@ def drives(
         terminal.json({"ok": fit, "applied": apply, "drives": found})
     else:
         for each in found:
-            for line in (*drives_told.identity(each), *drives_told.differences(each, applied=apply)):
+            for line in (
+                *drives_told.identity(each, settings.geometry.labels),
+                *drives_told.differences(each, applied=apply),
+            ):
                 terminal.say(line)
         if not is_simulated(settings.can):
             terminal.say(UNTRIED)

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING
 import msgspec
 from rich.live import Live
 from rich.table import Table
-from trirail_drivers.interface import NAMES, MissingProtection
+from trirail_drivers.interface import MissingProtection
 
+from trirail import naming
 from trirail.cli import units
 from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain, say
 from trirail.errors import ServiceError
+from trirail.naming import Labels
 from trirail.wire.decoding import converted
 from trirail.wire.state import GoalState, Info, State
 from trirail.wire.vocabulary import Mode
@@ -31,16 +33,17 @@ _ALONG = (("x", "mm", "mm/s", 3), ("y", "mm", "mm/s", 3), ("φ", "°", "°/s", 4
 
 def show(state: State, info: Info) -> None:
     """Print a state, with what as-built errors are corrected by, and what drives do without."""
-    grid = table(state, info.robot, limits_of(info))
+    grid = table(state, info.robot, info.labels, limits_of(info))
     if info.correction is not None:
-        grid.add_row("corrected", plain(units.correction(info.correction)))
+        grid.add_row("corrected", plain(units.correction(info.correction, info.labels)))
     out.print(grid)
-    _missing(info.missing_protections)
+    _missing(info.missing_protections, info.labels)
 
 
 def watch(robot: Robot, *, json_lines: bool) -> None:
     """Show the state live, or as lines of JSON, until Ctrl-C; raises ServiceError where nobody answers any more."""
-    limits = limits_of(robot.info())  # so that a missing service is said, not waited for
+    info = robot.info()  # so that a missing service is said, not waited for
+    limits = limits_of(info)
     with contextlib.suppress(KeyboardInterrupt):
         if json_lines:
             for state in robot.states(SILENT):
@@ -50,7 +53,7 @@ def watch(robot: Robot, *, json_lines: bool) -> None:
         else:
             with Live(console=out, refresh_per_second=10, transient=False) as live:
                 for state in robot.states(SILENT):
-                    live.update(table(state, robot.name, limits))
+                    live.update(table(state, robot.name, info.labels, limits))
         raise ServiceError("the service has gone silent")
 
 
@@ -67,11 +70,12 @@ def _say_once_a_second(robot: Robot) -> None:
 
 def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
     """Show where a jog leads, until it ends or its time is over."""
+    labels = robot.info().labels
     ends = math.inf if seconds is None else time.monotonic() + seconds
     with Live(console=out, refresh_per_second=10, transient=True) as live:
         for state in robot.states(SILENT):
             if show:
-                live.update(table(state, robot.name))
+                live.update(table(state, robot.name, labels))
             if time.monotonic() >= ends or jog.error is not None or jog.result is not None:
                 return
     raise ServiceError("the service has gone silent")
@@ -87,7 +91,7 @@ def limits_of(info: Info) -> Limits:
         raise ServiceError(f"the service is of another version: its limits cannot be read: {error}") from error
 
 
-def table(state: State, robot: str, limits: Limits | None = None) -> Table:
+def table(state: State, robot: str, labels: Labels, limits: Limits | None = None) -> Table:
     """Return a state as a table: what is wrong, what is under way, measured and commanded, near limits, the loop."""
     grid = Table.grid(padding=(0, 2))
     grid.add_row("robot", f"[bold]{plain(robot)}[/]  {_mode(state)}  t {state.t:.2f} s")
@@ -101,8 +105,8 @@ def table(state: State, robot: str, limits: Limits | None = None) -> Table:
         _add_goal(grid, state, state.goal)
     grid.add_row("measured", units.pose(state.pose, 9))
     grid.add_row("commanded", units.pose(state.commanded.pose, 9))
-    _add_sliders(grid, state)
-    for words in near_limits(state, limits) if limits else ():
+    _add_sliders(grid, state, labels)
+    for words in near_limits(state, limits, labels) if limits else ():
         grid.add_row("[yellow]near[/]", plain(words))
     loop = state.loop
     words = f"{loop.rate_hz} Hz, {loop.cycles} cycles, {loop.overruns} missed"
@@ -116,14 +120,14 @@ def table(state: State, robot: str, limits: Limits | None = None) -> Table:
     return grid
 
 
-def near_limits(state: State, limits: Limits) -> Iterator[str]:
+def near_limits(state: State, limits: Limits, labels: Labels) -> Iterator[str]:
     """Yield a line for each limit that a measured position, commanded rate or following error is near, or beyond."""
     slider, platform = limits.slider, limits.platform
-    measured = zip(NAMES, state.sliders.position, slider.positions, state.sliders.following_error, strict=True)
+    measured = zip(labels, state.sliders.position, slider.positions, state.sliders.following_error, strict=True)
     for name, at, travel, error in measured:
         yield from _position(f"slider {name}", at, travel, "mm", 3)
         yield from _rate(f"following error of {name}", error, slider.following_error, "µm", 1)
-    for name, rate, most in zip(NAMES, state.commanded.velocity, slider.velocities, strict=True):
+    for name, rate, most in zip(labels, state.commanded.velocity, slider.velocities, strict=True):
         yield from _rate(f"velocity of slider {name}", rate, most, "mm/s", 2)
     ranges = (platform.x, platform.y, platform.phi)
     for (name, unit, per_second, digits), at, rate, ends, most in zip(
@@ -163,9 +167,9 @@ def _add_goal(grid: Table, state: State, goal: GoalState) -> None:
         grid.add_row("  to go", units.pose([end - at for end, at in zip(goal.target, state.pose, strict=True)], 9))
 
 
-def _add_sliders(grid: Table, state: State) -> None:
+def _add_sliders(grid: Table, state: State, labels: Labels) -> None:
     sliders = state.sliders
-    for index, name in enumerate(NAMES):
+    for index, name in enumerate(labels):
         written = (
             units.written(sliders.position[index], "mm", 3, 9),
             f"commanded {units.written(state.commanded.position[index], 'mm', 3, 9)}",
@@ -179,11 +183,11 @@ def _add_sliders(grid: Table, state: State) -> None:
             grid.add_row("", f"[yellow]{', '.join(said)}[/]")
 
 
-def _missing(protections: Sequence[MissingProtection]) -> None:
+def _missing(protections: Sequence[MissingProtection], labels: Labels) -> None:
     """Print what drives do without, a line for what is so of several."""
     drives: dict[str, list[str]] = {}
     for each in protections:
         drives.setdefault(f"{each.object}, {each.means}", []).append(each.drive)
     for what, names in drives.items():
-        whose = f"drive{'s' * (len(names) > 1)} {', '.join(names)}"
+        whose = ", ".join(naming.drive(name, labels) for name in names)
         out.print(f"[yellow]lacking[/]   {whose}: {plain(what)}", soft_wrap=True)

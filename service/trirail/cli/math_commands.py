@@ -62,7 +62,7 @@ def ik(
     solved = {name: values.tolist() for name, values in motion._asdict().items()}
     sensitivities = sensitivity(robot, pose)
     isotropy, distance = float(conditioning(robot, pose)), float(distance_to_singularity(robot, pose))
-    bounds = Bounds(config.limits, config.period)
+    bounds = Bounds(config.limits, config.period, labels=robot.labels)
     refused = bounds.pose(pose.tolist()), bounds.setpoint(list(solved.values()))
     warnings = [str(violation) for violation in refused if violation]
     if offline.json:
@@ -70,7 +70,7 @@ def ik(
         terminal.json({"pose": pose.tolist()} | solved | {"sensitivity": sensitivities.tolist()} | derived)
         return 0
     _print_pose(pose)
-    _print_joints(solved, sensitivities)
+    _print_joints(robot, solved, sensitivities)
     terminal.say(f"conditioning {isotropy:.3f} (1 is isotropic), singular {units.written(distance, '°', 2)} away in φ")
     for warning in warnings:
         terminal.complain(f"warning: the service would refuse this: {warning}")
@@ -96,7 +96,7 @@ def fk(a: units.Length, b: units.Length, c: units.Length, /, *, offline: Offline
 
     config, robot = robot_of(offline)
     sliders = a, b, c
-    beyond = Bounds(config.limits, config.period).setpoint([sliders])
+    beyond = Bounds(config.limits, config.period, labels=robot.labels).setpoint([sliders])
     if beyond:
         raise _out_of_reach([beyond])
     pose = forward(robot, sliders)
@@ -136,13 +136,13 @@ def _print_pose(pose: Array) -> None:
     terminal.say(f"{units.pose(values)} = {units.written(values[2], 'rad', 6)}")
 
 
-def _print_joints(solved: dict[str, list[float]], sensitivities: Array) -> None:
-    table = terminal.table("", "A", "B", "C", "")
+def _print_joints(robot: Geometry, solved: dict[str, list[float]], sensitivities: Array) -> None:
+    table = terminal.table("", *robot.labels, "")
     for title, name, scale, unit in (
         ("slider", "position", 1e3, "mm"),
         ("  velocity", "velocity", 1e3, "mm/s"),
         ("  acceleration", "acceleration", 1.0, "m/s²"),
-        ("platform edge", "passive_position", 1e3, "mm"),
+        ("cross slide", "passive_position", 1e3, "mm"),
         ("  velocity", "passive_velocity", 1e3, "mm/s"),
         ("  acceleration", "passive_acceleration", 1.0, "m/s²"),
     ):

@@ -12,6 +12,7 @@ from rich.text import Text
 from trirail.cli import terminal, units
 from trirail.cli.options import Flag
 from trirail.errors import ServiceError, TrirailError
+from trirail.naming import Labels, label
 from trirail.telemetry import palette
 
 if TYPE_CHECKING:
@@ -148,6 +149,7 @@ def _resend(recording: Recording, name: str, locator: str, json: bool) -> int:
     from trirail.client.client import Robot
 
     with Robot(name, locator) as robot:
+        labels = robot.info().labels
         motions = resend(recording, robot, (lambda _: None) if json else terminal.say)
     if json:
         terminal.json([motion._asdict() for motion in motions])
@@ -156,7 +158,7 @@ def _resend(recording: Recording, name: str, locator: str, json: bool) -> int:
     for motion in motions:
         longer = f", one is {motion.lacking} cycles longer" if motion.lacking else ""
         lines.add(terminal.plain(motion.id), f"{motion.outcome}, {motion.cycles} cycles compared{longer}")
-        lines.add("  differ at most", _each(motion.position, 1e6, "µm"))
+        lines.add("  differ at most", _each(labels, motion.position, 1e6, "µm"))
     lines.show()
     return 0
 
@@ -181,6 +183,9 @@ def _draw(file: Path, recording: Recording, summed: Summary) -> None:
 def _print_comparison(
     recording: Recording, compared: Comparison, by: Software | None, here: Software, config: Path | None
 ) -> None:
+    from trirail.telemetry import provenance
+
+    labels = provenance.labels(recording.texts)
     drives = f"simulated drives, {config}" if config else "the drives' recorded answers"
     lines = _Lines()
     lines.add("session", terminal.plain(recording.name))
@@ -202,8 +207,8 @@ def _print_comparison(
         share = compared.differing / compared.cycles
         lines.add("setpoints", f"[bold red]differ[/] in {compared.differing} cycles ({share:.1%})")
         lines.add("  first", f"in cycle {compared.first}")
-        lines.add("  at most", _each(compared.position, 1e6, "µm"))
-        lines.add("", _each(compared.velocity, 1e3, "mm/s"))
+        lines.add("  at most", _each(labels, compared.position, 1e6, "µm"))
+        lines.add("", _each(labels, compared.velocity, 1e3, "mm/s"))
     lines.show()
 
 
@@ -213,7 +218,7 @@ def _print_summary(summed: Summary) -> None:
     lines.add("recorded by", terminal.plain(summed.software))
     modes = ", ".join(f"{name} {_seconds(time)}" for name, time in summed.modes.items())
     lines.add("duration", f"{_seconds(summed.duration)}: {modes}")
-    lines.add("moved", _each(summed.distance, 1.0, "m", 3))
+    lines.add("moved", _each(summed.labels, summed.distance, 1.0, "m", 3))
     missed = f"[yellow]{summed.missed} missed[/]" if summed.missed else "none missed"
     lacking = f"[yellow]{summed.lacking} lack[/] in the recording" if summed.lacking else "all recorded"
     lines.add("cycles", f"{summed.cycles} at {summed.rate_hz} Hz, {missed}, {lacking}")
@@ -221,7 +226,7 @@ def _print_summary(summed: Summary) -> None:
     lines.add("cycle time", terminal.percentiles(summed.cycle_us))
     for tracking in summed.tracking:
         rms = f"rms {tracking.rms * 1e6:7.1f} µm, in motion {tracking.moving_rms * 1e6:7.1f} µm"
-        lines.add(f"error of {tracking.slider}", f"max {tracking.max * 1e6:7.1f} µm, {rms}")
+        lines.add(f"error of {label(tracking.slider, summed.labels)}", f"max {tracking.max * 1e6:7.1f} µm, {rms}")
     commands = ", ".join(f"{name} {count}×" if count > 1 else name for name, count in summed.commands.items())
     lines.add("commands", commands or "none")
     outcomes = [goal.outcome for goal in summed.goals]
@@ -266,8 +271,8 @@ class _Lines:
             terminal.out.print(f"{name}{padding}{words}", soft_wrap=True)
 
 
-def _each(values: tuple[float, float, float], scale: float, unit: str, digits: int = 4) -> str:
-    return "   ".join(f"{name} {value * scale:.{digits}g} {unit}" for name, value in zip("ABC", values, strict=True))
+def _each(labels: Labels, values: tuple[float, float, float], scale: float, unit: str, digits: int = 4) -> str:
+    return "   ".join(f"{name} {value * scale:.{digits}g} {unit}" for name, value in zip(labels, values, strict=True))
 
 
 def _seconds(time: float) -> str:

@@ -17,6 +17,7 @@ from cyclopts import CycloptsError, Parameter, validators
 from trirail.cli import live, terminal, units
 from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
 from trirail.cli.options import poses as poses_of_robot
+from trirail.naming import Labels
 from trirail.wire import boundary
 from trirail.wire.goals import Goal
 from trirail.wire.messages import CommandReply
@@ -185,8 +186,9 @@ def sliders(
     from trirail.client.client import Robot
 
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
+        title = _sliders(robot.info().labels, a, b, c)
         goal = robot.move_sliders(a, b, c, speed=speed)
-        return _follow(service, robot, goal, wait, _sliders(a, b, c))
+        return _follow(service, robot, goal, wait, title)
 
 
 def jog(
@@ -479,8 +481,8 @@ def confirmed(service: Service, name: Command, reply: CommandReply) -> None:
     )
 
 
-def _sliders(*positions: float) -> str:
-    return "   ".join(f"{name} {units.written(at, 'mm', 3)}" for name, at in zip("ABC", positions, strict=True))
+def _sliders(labels: Labels, *positions: float) -> str:
+    return "   ".join(f"{name} {units.written(at, 'mm', 3)}" for name, at in zip(labels, positions, strict=True))
 
 
 def _follow(service: Service, robot: Robot, goal: GoalHandle, wait: bool, title: str) -> int:

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Final, NamedTuple
 import msgspec
 from cyclopts import Parameter, Token
 
+from trirail.naming import Labels
 from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import CorrectionTold
 from trirail.wire.text import NAME_RULE, NUMBER, comma_hint, is_name, quoted
@@ -132,7 +133,7 @@ def pose(values: Sequence[float], width: int = 0) -> str:
     return f"x {written(x, 'mm', 3, width)}   y {written(y, 'mm', 3, width)}   φ {written(phi, '°', 4, width)}"
 
 
-def correction(told: CorrectionTold) -> str:
+def correction(told: CorrectionTold, labels: Labels) -> str:
     """Write what as-built errors are corrected by on a line."""
     words = []
     if told.file:
@@ -140,8 +141,8 @@ def correction(told: CorrectionTold) -> str:
         most = f"{written(x, 'µm', 1)} in x, {written(y, 'µm', 1)} in y, {written(phi, 'mrad', 3)}"
         words.append(f"{told.file}, measured {told.made}: up to {most}")
     if any(told.backlash):
-        a, b, c = (written(width, "µm", 1) for width in told.backlash)
-        words.append(f"backlash of A {a}, B {b}, C {c}")
+        each = [f"{name} {written(width, 'µm', 1)}" for name, width in zip(labels, told.backlash, strict=True)]
+        words.append(f"backlash of {', '.join(each)}")
     return "; ".join(words)
 
 

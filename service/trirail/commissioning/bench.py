@@ -82,6 +82,7 @@ class Bench:
         """
         self.config = config
         self.period = config.period
+        self._labels = config.geometry.labels
         self.missed = 0
         """Cycles missed while a drive had power."""
         self.worst = [0.0, 0.0, 0.0]
@@ -134,7 +135,7 @@ class Bench:
         """Give all drives power, or one `alone`, and take it off at the end. Raises Stopped where they get none."""
         self.clear()
         before = self.feedback.position
-        for name, was, now in zip(NAMES, before, self.wait(REST).position, strict=True):
+        for name, was, now in zip(self._labels, before, self.wait(REST).position, strict=True):
             if abs(now - was) > FOLLOWING / 3.0:
                 raise Stopped(
                     f"slider {name} is not at rest: it went {(now - was) * 1e3:.3f} mm by itself, or by a hand"
@@ -250,7 +251,8 @@ class Bench:
                 error = self._written[-DELAY - min(feedback.age[index], 7)][index] - feedback.position[index]
                 self.worst[index] = max(self.worst[index], abs(error))
                 if not abs(error) <= FOLLOWING:
-                    return f"slider {name}: following error {error * 1e3:.3f} mm, beyond {FOLLOWING * 1e3:g} mm"
+                    slider = f"slider {self._labels[index]}"
+                    return f"{slider}: following error {error * 1e3:.3f} mm, beyond {FOLLOWING * 1e3:g} mm"
         return ""
 
     def _halt(self, reason: str) -> None:

@@ -9,6 +9,7 @@ from trirail_drivers.config import Drive, Drives
 from trirail_drivers.interface import NAMES
 
 from trirail.commissioning.judgement import Changes, Judged, in_mm
+from trirail.naming import Labels, label
 
 SCALE: Final = 0.02
 """Share of a way by which drive and rule may differ where the rule could be read better than that."""
@@ -50,6 +51,8 @@ class MoveSeen(NamedTuple):
     """How finely the rule can be read [m]."""
     step: float
     """How fine the encoder's counts are [m]."""
+    labels: Labels = NAMES
+    """What people call the sliders."""
 
 
 class _Stroke(NamedTuple):
@@ -76,6 +79,7 @@ class PushSeen(NamedTuple):
     ways_back: tuple[float, float, float]
     read_to: float
     step: float
+    labels: Labels = NAMES
 
 
 def judge_move(seen: MoveSeen, drives: Drives) -> Judged:
@@ -97,7 +101,7 @@ def judge_move(seen: MoveSeen, drives: Drives) -> Judged:
             (*words, seen.stopped or "the drive did nothing", "the motor does not turn, or cannot"),
             f"look at drive {name}: motor phases, brake (is it released?), current limit, jammed slider",
         )
-    by_rule = f"slider {slider} moved {in_mm(seen.rule_out)} by the rule"
+    by_rule = f"slider {label(slider, seen.labels)} moved {in_mm(seen.rule_out)} by the rule"
     if seen.out / seen.asked < -AGAINST:
         return Judged(
             "wrong",
@@ -124,10 +128,10 @@ def judge_move(seen: MoveSeen, drives: Drives) -> Judged:
         return Judged(
             "wrong",
             (by_encoder, by_rule, f"it went {in_mm(lost[0])} less than counted there and {in_mm(lost[1])} back: play"),
-            f"look for play in the coupling, screw or belt of slider {name}; where there is none, it is a wrong scale, "
-            "which the step by hand finds over 10 mm",
+            f"look for play in the coupling, screw or belt of slider {label(name, seen.labels)}; where there is none, "
+            "it is a wrong scale, which the step by hand finds over 10 mm",
         )
-    return _coupled(name, slider, out, back, seen.read_to, seen.step, drives, (by_encoder, by_rule), PLAY)
+    return _coupled(name, slider, out, back, seen, drives, (by_encoder, by_rule), PLAY)
 
 
 def judge_push(seen: PushSeen, drives: Drives) -> Judged:
@@ -136,7 +140,8 @@ def judge_push(seen: PushSeen, drives: Drives) -> Judged:
     sizes = [max(abs(way), abs(back)) for way, back in zip(seen.ways, seen.ways_back, strict=True)]
     most = sizes.index(max(sizes))
     counted = ", ".join(f"{name} {in_mm(way)}" for name, way in zip(NAMES, seen.ways, strict=True))
-    words = (f"slider {seen.slider} was pushed {in_mm(seen.rule)} by the rule; the drives counted {counted}",)
+    slider = label(seen.slider, seen.labels)
+    words = (f"slider {slider} was pushed {in_mm(seen.rule)} by the rule; the drives counted {counted}",)
     if min(abs(seen.rule), abs(seen.rule_back)) < 5.0 * seen.read_to:
         return Judged(
             "failed",
@@ -152,7 +157,7 @@ def judge_push(seen: PushSeen, drives: Drives) -> Judged:
     drive = seen.slider if sizes[at] >= FOLLOWS * sizes[most] else NAMES[most]
     index = NAMES.index(drive)
     out, back = _Stroke(seen.ways[index], seen.rule), _Stroke(seen.ways_back[index], seen.rule_back)
-    return _coupled(drive, seen.slider, out, back, seen.read_to, seen.step, drives, words, SCALE)
+    return _coupled(drive, seen.slider, out, back, seen, drives, words, SCALE)
 
 
 def _coupled(
@@ -160,8 +165,7 @@ def _coupled(
     slider: str,
     out: _Stroke,
     back: _Stroke,
-    read_to: float,
-    step: float,
+    seen: MoveSeen | PushSeen,
     drives: Drives,
     words: tuple[str, ...],
     tolerance: float,
@@ -171,10 +175,11 @@ def _coupled(
     A wrong scale is the same factor both ways, a slip or play is not: strokes are to differ by less than `tolerance`,
     or by what the rule leaves open.
     """
-    drive, configured = _of(drives, name), _of(drives, slider)
+    drive, configured, read_to, step = _of(drives, name), _of(drives, slider), seen.read_to, seen.step
+    named = f"slider {label(slider, seen.labels)}"
     found = [*words]
     if slider != name:
-        found.append(f"swapped nodes: drive {name}, node {drive.node}, has slider {slider}")
+        found.append(f"swapped nodes: drive {name}, node {drive.node}, has {named}")
     if min(abs(out.rule), abs(back.rule)) <= 2.0 * read_to:
         found.append(f"the rule, read to {read_to * 1e3:g} mm, shows neither direction nor scale")
         if slider == name:
@@ -192,7 +197,7 @@ def _coupled(
     direction, counts = drive.direction, drive.counts_per_metre
     if out.counted * out.rule < 0.0:
         direction = -drive.direction
-        found.append(f"wrong direction: by the counts of drive {name} slider {slider} goes the other way")
+        found.append(f"wrong direction: by the counts of drive {name} {named} goes the other way")
     open_share = max(unread)
     if open_share > COARSE:
         found.append(

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from trirail import naming
+from trirail.naming import Labels
 
-def identity(drive: dict[str, Any]) -> list[str]:
+
+def identity(drive: dict[str, Any], labels: Labels) -> list[str]:
     """Return who a drive says it is, its modes and units; `drive` is one of what a protocol's `inspect` returns."""
-    lines = [f"drive {drive['name']}, node {drive['node']}"]
+    lines = [f"{naming.drive(drive['name'], labels)}, node {drive['node']}"]
     if "device_type" in drive:
         who = ", ".join(f"{key} {drive[key]}" for key in ("vendor", "product", "revision", "serial"))
         lines += [

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from trirail_drivers.interface import NAMES
 
+from trirail import naming
 from trirail.commissioning import configuration
 from trirail.commissioning.bench import INTERRUPTED
 from trirail.commissioning.exchange import merged
@@ -37,6 +38,10 @@ class GuideStep(NamedTuple):
 
 def plan(steps: Steps, config: Config) -> list[GuideStep]:
     """Return the steps in their order."""
+
+    def named(name: str) -> str:
+        return naming.drive(name, config.geometry.labels)
+
     made = [
         GuideStep(
             "bus",
@@ -58,8 +63,8 @@ def plan(steps: Steps, config: Config) -> list[GuideStep]:
         GuideStep(
             "push",
             name,
-            f"Slider {name} by hand",
-            f"You push slider {name}, nothing has power. Refuse it (s) where the slider cannot be pushed.",
+            f"Slider {steps.labelled(name)} by hand",
+            f"You push slider {steps.labelled(name)}, nothing has power. Refuse it (s) where it cannot be pushed.",
             partial(steps.push, name),
             (("setup", ""),),
         )
@@ -69,7 +74,7 @@ def plan(steps: Steps, config: Config) -> list[GuideStep]:
         GuideStep(
             "power",
             name,
-            f"Power on drive {name} alone",
+            f"Power on {named(name)} alone",
             f"POWER on drive {name}, which holds for a second. Hand on the emergency stop; Ctrl-C stops as well.",
             partial(steps.power, name),
             (("setup", ""),),
@@ -81,7 +86,7 @@ def plan(steps: Steps, config: Config) -> list[GuideStep]:
         GuideStep(
             "move",
             name,
-            f"Drive {name} moves 1 mm",
+            f"D{named(name)[1:]} moves 1 mm",
             f"MOTION: drive {name} alone goes 1 mm and back, 5 mm/s at most. Free way on both sides; Ctrl-C stops.",
             partial(steps.move, name),
             (("power", name),),
@@ -93,8 +98,9 @@ def plan(steps: Steps, config: Config) -> list[GuideStep]:
         GuideStep(
             "switches",
             name,
-            f"Switches of slider {name}",
-            f"You press each limit switch and the home switch of slider {name} by hand; nothing has power.",
+            f"Switches of slider {steps.labelled(name)}",
+            f"You press each limit switch and the home switch of slider {steps.labelled(name)} by hand; "
+            "nothing has power.",
             partial(steps.switches, name),
             (("setup", ""),),
         )
@@ -105,7 +111,7 @@ def plan(steps: Steps, config: Config) -> list[GuideStep]:
         GuideStep(
             "home",
             name,
-            f"Home of slider {name}",
+            f"Home of slider {steps.labelled(name)}",
             f"MOTION: drive {name} alone searches its home switch, as [drives.{name}.homing] says. Ctrl-C stops.",
             partial(steps.home, name),
             (("move", name),),
@@ -118,7 +124,7 @@ def plan(steps: Steps, config: Config) -> list[GuideStep]:
         GuideStep(
             "watchdog",
             name,
-            f"Watchdog of drive {name}",
+            f"Watchdog of {named(name)}",
             f"POWER on drive {name}, then SYNC and heartbeat end: it must let go of the slider by itself.",
             partial(steps.watchdog, name),
             (("power", name),),

@@ -8,6 +8,8 @@ from typing import Final, Literal, NamedTuple
 
 from trirail_drivers.interface import NAMES
 
+from trirail.naming import Labels, label
+
 Verdict = Literal["ok", "wrong", "failed", "skipped"]
 """As it should be; a defect was found; the step could not be carried out; it was left out."""
 Changes = Mapping[str, int | float]
@@ -43,7 +45,7 @@ def judge_power(drive: str, drift: float, seconds: float, stopped: str) -> Judge
     )
 
 
-def judge_switches(name: str, rest: int, changed: int, seen: bool) -> Judged:
+def judge_switches(name: str, rest: int, changed: int, seen: bool, labels: Labels = NAMES) -> Judged:
     """Judge a slider's switches: bits of 60FDh at rest and those that changed; whether these are all that there are."""
     told = [f"{switch} {'changed' if changed & bit else 'never changed'}" for bit, switch in SWITCHES.items()]
     words = (f"drive {name} told: {', '.join(told)}",)
@@ -52,27 +54,28 @@ def judge_switches(name: str, rest: int, changed: int, seen: bool) -> Judged:
         return Judged(
             "wrong",
             (*words, f"at rest it takes its {' and its '.join(pressed)} for pressed"),
-            f"if slider {name} does not stand on it: turn the input's polarity in the drive (a normally closed "
-            "contact?), or look for a broken wire",
+            f"if slider {label(name, labels)} does not stand on it: turn the input's polarity in the drive (a normally "
+            "closed contact?), or look for a broken wire",
         )
     if not seen:
         return Judged(
             "wrong",
-            (*words, f"slider {name} has other switches than these"),
+            (*words, f"slider {label(name, labels)} has other switches than these"),
             f"look at their wiring, and at which input drive {name} takes for which (its maker's tool)",
         )
     return Judged("ok", words)
 
 
-def judge_homing(drive: str, way: float, position: float, seen: bool, stopped: str) -> Judged:
+def judge_homing(drive: str, way: float, position: float, seen: bool, stopped: str, labels: Labels = NAMES) -> Judged:
     """Judge a drive that has found home: how far it went [m], where it says that it is [m], whether that was seen."""
+    slider = f"slider {label(drive, labels)}"
     if stopped:
         return Judged(
             "failed",
             (stopped,),
-            f"look at slider {drive}'s home switch, its wiring, and drives.{drive}.homing: method, speeds, timeout",
+            f"look at {slider}'s home switch, its wiring, and drives.{drive}.homing: method, speeds, timeout",
         )
-    words = (f"drive {drive} says that it is home; slider {drive} went {in_mm(way)} and is at {in_mm(position)} now",)
+    words = (f"drive {drive} says that it is home; {slider} went {in_mm(way)} and is at {in_mm(position)} now",)
     if seen:
         return Judged("ok", words)
     return Judged(
@@ -99,18 +102,21 @@ def judge_watchdog(drive: str, seconds: float | None, by: str, said: str, code: 
     )
 
 
-def judge_square(deviation: float, following: Sequence[float], seen: bool, stopped: str) -> Judged:
+def judge_square(
+    deviation: float, following: Sequence[float], seen: bool, stopped: str, labels: Labels = NAMES
+) -> Judged:
     """Judge a square of the platform: how far the measured pose was from the commanded one [m], and what was seen."""
     if stopped:
         return Judged("failed", (stopped,), "repeat the step of the slider that is named")
-    errors = ", ".join(f"{name} {error * 1e3:.3f}" for name, error in zip(NAMES, following, strict=True))
+    errors = ", ".join(f"{name} {error * 1e3:.3f}" for name, error in zip(labels, following, strict=True))
     words = (f"the platform stayed within {deviation * 1e3:.3f} mm of its square; following errors {errors} mm",)
     if seen:
         return Judged("ok", words)
     return Judged(
         "wrong",
         (*words, "the sliders did as they were told, and the platform did not go along x, along y, and back"),
-        "compare [geometry] with the robot: which rail is A, B, C, which way its slider counts, l0 or the three legs",
+        "compare [geometry] with the robot: "
+        f"which rail is {', '.join(labels)}, which way its slider counts, l0 or the three legs",
     )
 
 

@@ -10,7 +10,6 @@ from ruckig import InputParameter, Ruckig, Trajectory
 
 from trirail.config import Config, SliderLimits, geometry
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.geometry import LEGS
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.ruckig_call import solved
 from trirail.quantities import beyond
@@ -84,7 +83,7 @@ def square(config: Config, sliders: tuple[float, float, float]) -> tuple[SlowMov
         ("platform φ", "rad", path[:, 2], platform.phi),
         *(
             (f"slider {name}", "m", motion.position[:, i], ends)
-            for i, (name, ends) in enumerate(zip(LEGS, slider.positions, strict=True))
+            for i, (name, ends) in enumerate(zip(robot.labels, slider.positions, strict=True))
         ),
         ("a passive joint", "m", motion.passive_position, slider.passive),
     ):

@@ -12,6 +12,7 @@ from trirail.commissioning.bench import FOLLOWING
 from trirail.commissioning.moves import DISTANCE
 from trirail.commissioning.person import Person, Question, choose, number
 from trirail.kinematics.arrays import Array
+from trirail.naming import Labels
 
 SEEN = 0.00005
 """How far a simulated slider must have gone for somebody to see it [m]."""
@@ -33,11 +34,14 @@ def apart(one: Reading, other: Reading) -> Reading:
 class Observer:
     """Asks a person for what no encoder tells."""
 
-    def __init__(self, person: Person, simulated: Carriages | None, idle: Callable[[], object]) -> None:
+    def __init__(
+        self, person: Person, simulated: Carriages | None, idle: Callable[[], object], labels: Labels = NAMES
+    ) -> None:
         """`idle` is called while the person thinks."""
         self._person = person
         self._simulated = simulated
         self._idle = idle
+        self._labels = labels
         self._read_to: float | None = None
 
     def rules(self) -> Rules | None:
@@ -55,7 +59,7 @@ class Observer:
     def reading(self, index: int) -> float:
         """Return what the rule beside a slider reads [m]."""
         rules = self.rules()
-        text = f"What does the rule at slider {NAMES[index]} read now, in mm?"
+        text = f"What does the rule at slider {self._labels[index]} read now, in mm?"
         return self.number(text, None if rules is None else rules[index])
 
     def number(self, text: str, simulated: float | None) -> float:
@@ -68,19 +72,21 @@ class Observer:
         index = NAMES.index(slider)
         if slider == name:
             return self.reading(index) - before
-        text = f"How far did slider {slider} {verb}, in mm, above 0 in its positive direction?"
+        text = (
+            f"How far did slider {self._labels[NAMES.index(slider)]} {verb}, in mm, above 0 in its positive direction?"
+        )
         return self.number(text, now[index] - was[index] if now and was else None)
 
     def which(self, before: Rules | None, now: Rules | None) -> str | None:
         """Ask which slider has moved, from what rules read before to what they read now."""
-        default, text = None, "Which slider moved: A, B, C, or n for none?"
+        default, text = None, f"Which slider moved: {', '.join(self._labels)}, or n for none?"
         if before is not None and now is not None:
             ways = [abs(here - was) for here, was in zip(now, before, strict=True)]
             most = ways.index(max(ways))
-            default = NAMES[most] if ways[most] > SEEN else "n"
-        choices = {each: f"slider {each}" for each in NAMES} | {"n": "none of them"}
+            default = self._labels[most] if ways[most] > SEEN else "n"
+        choices = {each: f"slider {each}" for each in self._labels} | {"n": "none of them"}
         answer = choose(self._person, self._idle, Question(text, default), choices)
-        return None if answer == "n" else answer
+        return None if answer == "n" else NAMES[self._labels.index(answer)]
 
     def yes(self, text: str) -> bool:
         """Ask what can be answered by yes or no."""

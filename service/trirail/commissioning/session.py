@@ -68,7 +68,7 @@ class Session:
             return Judged("ok", words), {}
         fastest = self._config.limits.slider.fastest
         self._told = inspect(self.place.bus, drives, self._config.period, time.monotonic, fastest, apply=False)
-        lines = tuple(line for each in self._told for line in drives_told.identity(each))
+        lines = tuple(line for each in self._told for line in drives_told.identity(each, self._config.geometry.labels))
         refused = tuple(f"drive {each['name']}: {each['refused']}" for each in self._told if each["refused"])
         measured: dict[str, Number] = {}
         for each in self._told:

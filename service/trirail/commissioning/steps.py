@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from trirail_drivers.interface import NAMES
 
+from trirail import naming
 from trirail.commissioning import moves
 from trirail.commissioning.bench import Stopped
 from trirail.commissioning.coupling import MoveSeen, PushSeen, judge_move, judge_push
@@ -43,7 +44,12 @@ class Steps:
         self._config = session.place.config
         self._place = session.place
         self._person = session.place.person
-        self._see = Observer(session.place.person, session.place.rules, session.idle)
+        self._labels = session.place.config.geometry.labels
+        self._see = Observer(session.place.person, session.place.rules, session.idle, self._labels)
+
+    def labelled(self, name: str) -> str:
+        """Return what people call the slider A, B or C."""
+        return naming.label(name, self._labels)
 
     # Without power.
 
@@ -51,15 +57,16 @@ class Steps:
         """Have a slider pushed there and back by hand, without power."""
         bench, index = self.session.bench(), NAMES.index(name)
         read_to = self._see.read_to()
+        label = self.labelled(name)
         angle = np.degrees(geometry(self._config.geometry).each[index].rail_angle)
         self._person.tell(
-            f"  Put the rule along rail {name}, its numbers rising towards {angle:.0f}° (0° is x, 90° is y)."
+            f"  Put the rule along rail {label}, its numbers rising towards {angle:.0f}° (0° is x, 90° is y)."
         )
         before = self._see.reading(index), bench.position
-        there = self._pushed(index, PUSH, f"Push slider {name} by {PUSH * 1e3:g} mm or more, that way, and let it go.")
-        back = self._pushed(index, -PUSH, f"Push slider {name} back to about where it was, and let it go.")
+        there = self._pushed(index, PUSH, f"Push slider {label} by {PUSH * 1e3:g} mm or more, that way, and let it go.")
+        back = self._pushed(index, -PUSH, f"Push slider {label} back to about where it was, and let it go.")
         (rule, ways), (rule_back, ways_back) = apart(before, there), apart(there, back)
-        seen = PushSeen(name, rule, ways, rule_back, ways_back, read_to, self._step(name))
+        seen = PushSeen(name, rule, ways, rule_back, ways_back, read_to, self._step(name), self._labels)
         measured: dict[str, Number] = {"rule": rule, "rule_back": rule_back, "read_to": read_to}
         measured |= dict(zip(NAMES, ways, strict=True))
         measured |= {f"{each}_back": way for each, way in zip(NAMES, ways_back, strict=True)}
@@ -73,7 +80,7 @@ class Steps:
         else:
             self._place.rules.push(index, by)
             bench.wait(HOLD / 10.0)
-            self._person.tell(f"  A simulated hand has pushed slider {NAMES[index]} {by * 1e3:+g} mm that way.")
+            self._person.tell(f"  A simulated hand has pushed slider {self._labels[index]} {by * 1e3:+g} mm that way.")
         return self._see.reading(index), bench.position
 
     def switches(self, name: str) -> Done:
@@ -83,7 +90,7 @@ class Steps:
         if read is None or rest is None:
             told = f"drive {name} does not tell its digital inputs (60FDh): look at them with its maker's tool"
             return Judged("skipped", (told,)), {}
-        changed, turned = 0, 0
+        changed, turned, slider = 0, 0, f"slider {self.labelled(name)}"
 
         def look() -> None:
             nonlocal changed, turned
@@ -93,17 +100,17 @@ class Steps:
                 changed |= (read(name) or 0) ^ rest
 
         if (press := self._place.press) is None:
-            text = f"Press each limit switch and the home switch of slider {name} for a second; Enter when that is done"
+            text = f"Press each limit switch and the home switch of {slider} for a second; Enter when that is done"
             choose(self._person, look, Question(text, "done"), {"done": "all were pressed"})
         else:
-            self._person.tell(f"  A simulated hand presses the switches of slider {name}.")
+            self._person.tell(f"  A simulated hand presses the switches of {slider}.")
             for bits in (*SWITCHES, 0):
                 press(NAMES.index(name), bits)
                 for _ in range(round(2.0 * LOOK / bench.period)):
                     look()
         found = [switch for bit, switch in SWITCHES.items() if changed & bit]
-        seen = self._see.yes(f"Seen were: {', '.join(found) or 'none'}. Are those all that slider {name} has?")
-        return judge_switches(name, rest, changed, seen), {"at_rest": rest & 7, "changed": changed & 7}
+        seen = self._see.yes(f"Seen were: {', '.join(found) or 'none'}. Are those all that {slider} has?")
+        return judge_switches(name, rest, changed, seen, self._labels), {"at_rest": rest & 7, "changed": changed & 7}
 
     # With power, one drive alone.
 
@@ -153,6 +160,7 @@ class Steps:
             rule_back,
             read_to,
             self._step(name),
+            self._labels,
         )
         measured |= {"back": back_way, "following": there.following, "stopped": there.stopped}
         measured |= {"rule_out": rule_out, "rule_back": rule_back, "read_to": read_to}
@@ -174,8 +182,8 @@ class Steps:
         position = bench.position[index]
         now = self._see.rules()
         way = position - began if rules is None or now is None else now[index] - rules[index]
-        seen = stopped or self._see.yes(f"Did slider {name} stop at its home switch?")
-        judged = judge_homing(name, way, position, bool(seen), stopped)
+        seen = stopped or self._see.yes(f"Did slider {self.labelled(name)} stop at its home switch?")
+        judged = judge_homing(name, way, position, bool(seen), stopped, self._labels)
         return judged, {"way": way, "position": position, "stopped": stopped}
 
     def watchdog(self, name: str) -> Done:
@@ -217,7 +225,7 @@ class Steps:
             stopped = str(why)
         seen = bool(stopped) or self._see.square(way.position[half - 1], rules, corner)
         following = dict(zip(NAMES, bench.worst, strict=True))
-        judged = judge_square(deviation, bench.worst, seen, stopped)
+        judged = judge_square(deviation, bench.worst, seen, stopped, self._labels)
         return judged, {"deviation": deviation, "missed_cycles": bench.missed, **following}
 
     def _moved(self, index: int, way: float) -> _Moved:

@@ -24,7 +24,7 @@ from trirail_drivers.interface import Triple
 from trirail.errors import ConfigError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.correction import STEEPEST, Correction
-from trirail.kinematics.geometry import LEGS, Geometry, Room, travels
+from trirail.kinematics.geometry import Geometry, Room, travels
 from trirail.quantities import worded
 from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import CorrectionTold
@@ -154,7 +154,7 @@ def check(found: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, slid
             raise ConfigError(_steep(place, what, f"{STEEPEST:.0%}"))
     places, adds = _adds(errors, robot, room, rates)
     for order, ((quantity, unit), limit, kept) in enumerate(zip(QUANTITIES, sliders, RESERVE, strict=True)):
-        for i, leg in enumerate(LEGS):
+        for i, leg in enumerate(robot.labels):
             more = adds[order, :, i]
             if not more.max() <= kept * limit[i]:
                 what = f"adds up to {more.max():.3g} {unit} to slider {leg}'s {quantity}"

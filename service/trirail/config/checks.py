@@ -197,13 +197,15 @@ def _check_pose(config: Config, name: str) -> None:
     places = [
         (key, at, key, getattr(platform, key), "platform") for key, at in zip(("x", "y", "phi"), pose, strict=True)
     ]
-    position, passive = travels(corrected_geometry(config), pose).tolist()
+    robot = corrected_geometry(config)
+    position, passive = travels(robot, pose).tolist()
     places += [
-        (f"slider {leg}", at, "position" if own.position is None else f"{leg}.position", ends, "slider")
-        for leg, at, own, ends in zip(NAMES, position, slider.own, slider.positions, strict=True)
+        (f"slider {label}", at, "position" if own.position is None else f"{leg}.position", ends, "slider")
+        for leg, label, at, own, ends in zip(NAMES, robot.labels, position, slider.own, slider.positions, strict=True)
     ]
     places += [
-        (f"lambda_32 of {leg}", at, "passive", slider.passive, "slider") for leg, at in zip(NAMES, passive, strict=True)
+        (f"cross slide {label}", at, "passive", slider.passive, "slider")
+        for label, at in zip(robot.labels, passive, strict=True)
     ]
     for what, at, key, (low, high), section in places:
         if not low <= at <= high:

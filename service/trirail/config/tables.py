@@ -17,6 +17,7 @@ from trirail.config.as_built import AsBuilt
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry, Leg, PprLeg, Room
 from trirail.kinematics.leg import AnyLeg
+from trirail.naming import Labels
 from trirail.wire.endpoints import endpoint_of, is_local
 from trirail.wire.vocabulary import LeasePolicy, Role
 
@@ -31,6 +32,8 @@ FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 UserName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 """The <user> of Zenoh keys."""
 PoseName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+Label = Annotated[str, Meta(pattern=r"^[^\W\d_][^\W_]{0,3}\Z")]
+"""One to four letters and digits of any script, a letter first."""
 Point = tuple[Coordinate, Coordinate]
 Range = tuple[Coordinate, Coordinate]
 
@@ -70,6 +73,8 @@ class GeometryTable(Struct, frozen=True, forbid_unknown_fields=True):
     l0: Annotated[float, Meta(ge=0.001, le=100.0)] | None = None
     """From the centre to each summit of the fixed triangle [m]; instead of three legs."""
     leg: tuple[LegTable, LegTable, LegTable] | None = None
+    labels: tuple[Label, Label, Label] = NAMES
+    """What people call the sliders A, B, C, as U, V, W: in all that they read. One to four letters and digits."""
 
 
 class PlatformLimits(Struct, frozen=True, forbid_unknown_fields=True):
@@ -349,13 +354,27 @@ def geometry(table: GeometryTable) -> Geometry:
         raise ConfigError(
             f"geometry: l0 is the paper's 3-PRP robot: for {table.kind} give three [[geometry.leg]] tables"
         )
+    labels = _labels(table)
     try:
         if table.leg is None:
-            return Geometry.symmetric(table.l0 or 0.0)
+            return dataclasses.replace(Geometry.symmetric(table.l0 or 0.0), labels=labels)
         first, second, third = (_leg(table.kind, name, leg) for name, leg in zip(NAMES, table.leg, strict=True))
-        return Geometry(legs=(first, second, third))
+        return Geometry(legs=(first, second, third), labels=labels)
     except ValueError as error:
         raise ConfigError(f"geometry: {error}") from error
+
+
+def _labels(table: GeometryTable) -> Labels:
+    """Return what people call the sliders. Raises ConfigError where one could be taken for another, or an answer."""
+    given = dict(zip(NAMES, table.labels, strict=True))
+    for name, label in given.items():
+        others = [word for other in NAMES if other != name for word in (other, given[other])]
+        if label.casefold() in (word.casefold() for word in (*others, "n", "q")):
+            raise ConfigError(
+                f"geometry.labels: {label} for slider {name}: wanted is what is neither label nor letter of another, "
+                "nor n or q, which are answers to trirail commission"
+            )
+    return table.labels
 
 
 _OF_KIND = {"3-PRP": ("edge_point", "edge_angle"), "3-PPR": ("pivot", "cross_angle")}

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 from trirail_drivers.interface import NAMES, DriveGroup, Feedback, PowerState, Triple
 
+from trirail import naming
 from trirail.config import Config, corrected_geometry
 from trirail.control import cycle
 from trirail.control.commands import Commands
@@ -72,6 +73,7 @@ class Control:
 
     def __init__(self, config: Config, drives: DriveGroup, planner: PlannerPort) -> None:
         robot = corrected_geometry(config)
+        self._labels = robot.labels
         self._drives = drives
         self._period = self.period = config.period
         self.schedule = Schedule(rest(STILL), config.period)
@@ -86,7 +88,8 @@ class Control:
         self.measured = Measured(
             legs, config.period, step_length, self._following_error_limit, config.limits.in_position, taken
         )
-        self.setpoints = Setpoints(legs, Bounds(config.limits, config.period, EDGE), self.measured, step_length)
+        bounds = Bounds(config.limits, config.period, EDGE, robot.labels)
+        self.setpoints = Setpoints(legs, bounds, self.measured, step_length)
         self.modes = Transitions(
             drives, self.schedule, self._planner, self.ledger, self.goal_queue, self.measured, self.setpoints
         )
@@ -204,7 +207,7 @@ class Control:
             if behind:
                 error = self.measured.following_error[behind - 1]
                 self.modes.trip(
-                    f"slider {NAMES[behind - 1]}: following error {error * 1e3:.3f} mm is beyond its limit "
+                    f"slider {self._labels[behind - 1]}: following error {error * 1e3:.3f} mm is beyond its limit "
                     f"{self._following_error_limit * 1e3:g} mm",
                     FaultCause.FOLLOWING_ERROR,
                     NAMES[behind - 1],
@@ -387,7 +390,7 @@ class Control:
         if settled is None:
             return
         outcome: Outcome = "done" if settled.settle is not None else "unsettled"
-        self.ledger.end(outcome, settling.said(settled), settled=settled)
+        self.ledger.end(outcome, settling.said(settled, self._labels), settled=settled)
         self.modes.go(ModeEvent.ARRIVED, "standstill")
 
     def _power_up(self) -> None:
@@ -401,7 +404,7 @@ class Control:
                 self.modes.go(ModeEvent.POWERED, "all drives are enabled")
         elif self.modes.cycle - self.modes.entered > self._enable_cycles:
             waiting = [
-                f"drive {name} is {state}"
+                f"{naming.drive(name, self._labels)} is {state}"
                 for name, state in zip(NAMES, self.measured.feedback.state, strict=True)
                 if state is not PowerState.OPERATION_ENABLED
             ]

@@ -15,6 +15,7 @@ from trirail_drivers.interface import NAMES, Triple
 
 from trirail.config import InPosition
 from trirail.kinematics.compiled import compiled
+from trirail.naming import Labels
 from trirail.wire.messages import Residual
 
 __all__ = ["MONITOR", "Settled", "Settling", "monitor"]
@@ -96,7 +97,7 @@ class Settling:
         )
         return Settled(settle, Residual(sliders, pose), overshoot)
 
-    def said(self, settled: Settled) -> str:
+    def said(self, settled: Settled, labels: Labels = NAMES) -> str:
         """Say in words how it has settled, or where the robot is instead."""
         if settled.settle is not None:
             x, y, phi = map(abs, settled.residual.pose)
@@ -105,7 +106,7 @@ class Settling:
             )
             return f"arrived, settled in {settled.settle * 1e3:g} ms; left to go: {left}, {phi * 1e6:.2f} µrad"
         x, y, phi = settled.residual.pose
-        errors = zip(NAMES, settled.residual.sliders, strict=True)
+        errors = zip(labels, settled.residual.sliders, strict=True)
         said = [f"slider {name} {error * 1e3:.3f} mm" for name, error in errors]
         said += [f"x {x * 1e3:.3f} mm", f"y {y * 1e3:.3f} mm", f"phi {phi * 1e3:.3f} mrad"]
         return (

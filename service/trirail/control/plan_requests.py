@@ -75,7 +75,7 @@ class PlanRequests:
         """The rate at which motions are to run."""
         robot, self._period = corrected_geometry(config), config.period
         limits = planned_limits(config.limits, config.correction.backlash)
-        checker = Checker(robot, limits, Bounds(limits, self._period), self._period)
+        checker = Checker(robot, limits, Bounds(limits, self._period, labels=robot.labels), self._period)
         self._scaling = TimeScaling(robot, checker, self._period)
         self._legs = robot.packed()
         self._revision = revision(config)

@@ -81,7 +81,8 @@ class Setpoints:
             now, furthest = self._bounds.found.tolist()
             return f"no setpoint: time along the path would run backwards, from {furthest:.6g} to {now:.6g} s"
         if refused <= len(NAMES):
-            return f"slider {NAMES[refused - 1]}: no setpoint, the commanded pose is singular or not a number"
+            slider = f"slider {self._bounds.labels[refused - 1]}"
+            return f"{slider}: no setpoint, the commanded pose is singular or not a number"
         return f"setpoint refused: {self._bounds.violation(refused - len(NAMES))}"
 
     def follow(self, schedule: Schedule, *, held: bool, stopped_now: bool) -> None:
@@ -104,7 +105,8 @@ class Setpoints:
 
     def check_rest(self) -> None:
         """Refuse to enable while a setpoint is on its way to where its slider is."""
-        for name, setpoint, position in zip(NAMES, self.rows[0], self._measured.feedback.position, strict=True):
+        places = self._measured.feedback.position
+        for name, setpoint, position in zip(self._bounds.labels, self.rows[0], places, strict=True):
             if not abs(setpoint - position) <= self.step:
                 raise RefusedError(
                     RefusalCode.NOT_AT_REST,

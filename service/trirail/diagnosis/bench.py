@@ -10,7 +10,7 @@ import numpy as np
 from trirail.config import Config, geometry
 from trirail.diagnosis.check import Check, Judgement
 from trirail.errors import KinematicsError
-from trirail.kinematics.geometry import LEGS, Geometry, other_kind, travels
+from trirail.kinematics.geometry import Geometry, other_kind, travels
 
 MOTIONS = (
     ("1 mm in x", (0.001, 0.0, 0.0)),
@@ -29,14 +29,14 @@ def _moved(robot: Geometry, pose: tuple[float, float, float]) -> list[float]:
     return moved
 
 
-def _words(moved: list[float]) -> str:
-    return ", ".join(f"{leg} {way * 1e3:+.4f} mm" for leg, way in zip(LEGS, moved, strict=True))
+def _words(robot: Geometry, moved: list[float]) -> str:
+    return ", ".join(f"{leg} {way * 1e3:+.4f} mm" for leg, way in zip(robot.labels, moved, strict=True))
 
 
 def _kind(config: Config) -> Iterator[Check]:
     """What the configured mechanism does, and what the other kind would do with carriages in the same places."""
     robot = geometry(config.geometry)
-    said = [f"{name} moves {_words(_moved(robot, pose))}" for name, pose in MOTIONS]
+    said = [f"{name} moves {_words(robot, _moved(robot, pose))}" for name, pose in MOTIONS]
     turned = MOTIONS[-1][1]
     try:
         other = other_kind(robot)
@@ -46,7 +46,7 @@ def _kind(config: Config) -> Iterator[Check]:
     if other is not None:
         moved = _moved(other, turned)
         if np.abs(np.subtract(moved, _moved(robot, turned))).max() > APART:
-            remedy = f"of kind {other.kind}, {_KINDS[other.kind]}, {MOTIONS[-1][0]} would move {_words(moved)}"
+            remedy = f"of kind {other.kind}, {_KINDS[other.kind]}, {MOTIONS[-1][0]} would move {_words(robot, moved)}"
     yield Check("kind", "ok", f"{robot.kind}, {_KINDS[robot.kind]}: {'; '.join(said)}", remedy, "geometry.kind")
 
 
@@ -55,8 +55,9 @@ def _zero(config: Config) -> Iterator[Check]:
     platform = config.limits.platform
     if not all(low <= 0.0 <= high for low, high in (platform.x, platform.y, platform.phi)):
         return
-    at_zero = travels(geometry(config.geometry), (0.0, 0.0, 0.0))[0].tolist()
-    for leg, at, (low, high) in zip(LEGS, at_zero, config.limits.slider.positions, strict=True):
+    robot = geometry(config.geometry)
+    at_zero = travels(robot, (0.0, 0.0, 0.0))[0].tolist()
+    for leg, at, (low, high) in zip(robot.labels, at_zero, config.limits.slider.positions, strict=True):
         if not low <= at <= high:
             found = f"at x = y = φ = 0 slider {leg} would be at {at:.4g} m, beyond its travel, [{low:g}, {high:g}]"
             yield Check(

@@ -20,6 +20,7 @@ from trirail.kinematics.correction import Correction
 from trirail.kinematics.leg import LEGS, PARALLEL, AnyLeg, wrapped
 from trirail.kinematics.ppr3.leg import PprLeg
 from trirail.kinematics.prp3.leg import Leg
+from trirail.naming import Labels
 
 __all__ = [
     "LEGS",
@@ -46,6 +47,8 @@ class Geometry:
     legs: tuple[Any, Any, Any]
     """Of one mechanism, prp3.leg.Leg or ppr3.leg.PprLeg; who knows the face alone reads `each`."""
     correction: Correction | None = None
+    labels: Labels = field(default=LEGS, compare=False)
+    """What people call the sliders."""
     _packed: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -154,21 +154,21 @@ def _refuse_slider(geometry: Geometry, sliders: Array, pose: Array, leg: int, pl
     """Say what is wrong with a slider, or with the angle to which the sliders bring the edge of its leg."""
     slider = float(sliders[leg])
     if not math.isfinite(slider):
-        message = f"{place}slider {LEGS[leg]} is {slider}: it must be finite"
+        message = f"{place}slider {geometry.labels[leg]} is {slider}: it must be finite"
         raise KinematicsError(message, leg=LEGS[leg], value=slider)
     _refuse_angle(geometry, leg, float(pose[2]), place)
 
 
 def _refuse_angle(geometry: Geometry, leg: int, phi: float, place: str) -> NoReturn:
     """Say where the edge of a leg is parallel to its rail."""
-    built, at = geometry.each[leg], worded(phi, "rad")
+    built, at, where = geometry.each[leg], worded(phi, "rad"), f"{place}leg {geometry.labels[leg]}"
     parallel = built.parallel_angle
     if parallel is None:
-        raise KinematicsError(f"{place}leg {LEGS[leg]}: out of all reach at phi = {at}", leg=LEGS[leg], value=phi)
+        raise KinematicsError(f"{where}: out of all reach at phi = {at}", leg=LEGS[leg], value=phi)
     delta = math.remainder(phi - parallel, math.pi)
     what = f"{built.CROSS} parallel to its rail" if abs(delta) <= 2.0 * PARALLEL else "out of all reach"
     raise KinematicsError(
-        f"{place}leg {LEGS[leg]}: {what} at phi = {at} (singular at {worded(phi - delta, 'rad')})",
+        f"{where}: {what} at phi = {at} (singular at {worded(phi - delta, 'rad')})",
         leg=LEGS[leg],
         value=phi,
         limit=phi - delta,

@@ -76,7 +76,7 @@ class Goals:
     def __init__(
         self, geometry: Geometry, limits: Limits, period: float, beat: Callable[[], None] = lambda: None
     ) -> None:
-        bounds = Bounds(limits, period)
+        bounds = Bounds(limits, period, labels=geometry.labels)
         checker = Checker(geometry, limits, bounds, period, beat)
         self._checker = checker
         self._period = period

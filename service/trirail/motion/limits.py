@@ -14,6 +14,7 @@ from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import LEGS
 from trirail.motion.paths import ROUNDING
+from trirail.naming import Labels
 from trirail.quantities import beyond, worded
 
 COORDINATES = ("x", "y", "phi")
@@ -62,6 +63,8 @@ class Violation(NamedTuple):
     value: float
     limit: float
     unit: str
+    label: str = ""
+    """What people call the slider."""
 
     def __str__(self) -> str:
         return beyond(f"{self.subject}: {self.quantity}", self.value, self.limit, self.unit)
@@ -69,7 +72,7 @@ class Violation(NamedTuple):
     @property
     def subject(self) -> str:
         """What is beyond its bound, in words."""
-        return f"slider {self.what}" if self.what in LEGS else f"platform {self.what}"
+        return f"slider {self.label or self.what}" if self.what in LEGS else f"platform {self.what}"
 
     @property
     def bound(self) -> str:
@@ -182,11 +185,12 @@ def gate(
 class Bounds:
     """The limits of a robot, as bounds on the rows of a solved motion and on the pose.
 
-    `edge` [m, rad] is by how much a position may be beyond its limit.
+    `edge` [m, rad] is by how much a position may be beyond its limit, `labels` what people call the sliders.
     """
 
-    def __init__(self, limits: Limits, period: float, edge: float = ROUNDING) -> None:
+    def __init__(self, limits: Limits, period: float, edge: float = ROUNDING, labels: Labels = LEGS) -> None:
         slider, platform = limits.slider, limits.platform
+        self.labels = labels
         self.packed = np.zeros(1, BOUNDS)
         """As compiled code takes them, (1,) of BOUNDS."""
         self.found = np.zeros(2)
@@ -227,5 +231,5 @@ class Bounds:
         subject, quantity, unit = _CHECKS[check]
         value, limit = self.found.tolist()
         if subject == "slider":
-            return Violation(LEGS[n], quantity, value, limit, unit)
+            return Violation(LEGS[n], quantity, value, limit, unit, self.labels[n])
         return Violation(COORDINATES[n], quantity, value, limit, UNITS[n] + unit)

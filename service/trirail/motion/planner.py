@@ -94,10 +94,10 @@ class Planner:
 
     def check_sliders(self, target: Sequence[float]) -> None:
         """Raise RefusedError, with slider, value and limit, if slider positions are beyond their travel."""
-        for name, position, (low, high) in zip(LEGS, target, self._travel, strict=True):
+        for name, label, position, (low, high) in zip(LEGS, self.bounds.labels, target, self._travel, strict=True):
             if not low <= position <= high:
                 limit = low if position < low else high
-                text = beyond(f"slider {name}: position", position, limit, "m")
+                text = beyond(f"slider {label}: position", position, limit, "m")
                 raise RefusedError(RefusalCode.OUT_OF_WORKSPACE, text, slider=name, value=position, limit=limit)
 
     def check_velocity(self, velocity: Sequence[float]) -> None:

@@ -35,6 +35,7 @@ def describe(info: Info, robot: ShownRobot, user: str) -> dict[str, Any]:
         "velocity": platform.velocity,
         "speeds": SPEEDS,
         "homes": info.homes,
+        "sliders": robot.geometry.labels,
         "legs": [
             {
                 "anchor": leg.anchor,

@@ -24,6 +24,7 @@ def info(config: Config) -> Info:
         version=software().trirail,
         geometry=tuple(legs),
         mechanism=config.geometry.kind,
+        labels=config.geometry.labels,
         limits=msgspec.to_builtins(config.limits),
         frames=msgspec.to_builtins(config.frames),
         rate_hz=config.loop.rate_hz,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trirail.config import Range
-from trirail.kinematics.geometry import LEGS
+from trirail.naming import Labels
 from trirail.telemetry import palette
 from trirail.telemetry.palette import Colour
 from trirail.telemetry.shown_robot import ShownRobot
@@ -49,14 +49,14 @@ class Lines(NamedTuple):
 
 def plots(robot: ShownRobot) -> dict[str, Lines]:
     """Return what is plotted, by entity, in the units of the curves."""
-    slider, platform = robot.limits.slider, robot.limits.platform
+    slider, platform, names = robot.limits.slider, robot.limits.platform, robot.geometry.labels
     error = slider.following_error * 1e6
     margin = float(np.degrees(robot.limits.singularity_margin))
     return {
-        POSITION: _sliders(np.multiply(slider.positions, 1e3)),
-        VELOCITY: _sliders(_either_way(slider.velocities, 1e3)),
-        ACCELERATION: _sliders(_either_way(slider.accelerations, 1.0)),
-        ERROR: _sliders(np.tile((-error, error), (3, 1))),
+        POSITION: _sliders(names, np.multiply(slider.positions, 1e3)),
+        VELOCITY: _sliders(names, _either_way(slider.velocities, 1e3)),
+        ACCELERATION: _sliders(names, _either_way(slider.accelerations, 1.0)),
+        ERROR: _sliders(names, np.tile((-error, error), (3, 1))),
         CENTRE: Lines((Curve("x", palette.X), Curve("y", palette.Y)), _window(platform.x, platform.y), NEAR),
         PHI: Lines((Curve("φ", palette.PHI),)),
         SINGULARITY: Lines((Curve("distance", palette.SINGULARITY),), (Limit("margin", margin),)),
@@ -121,11 +121,11 @@ def _either_way(limits: Sequence[float], scale: float) -> NDArray[np.float64]:
     return np.multiply.outer(limits, (-scale, scale))
 
 
-def _sliders(ends: NDArray[np.float64]) -> Lines:
+def _sliders(names: Labels, ends: NDArray[np.float64]) -> Lines:
     """Return the lines of the sliders with their limits, (3, 2), once where all have the same."""
-    lines = tuple(Curve(leg, colour) for leg, colour in zip(LEGS, palette.SLIDERS, strict=True))
+    lines = tuple(Curve(leg, colour) for leg, colour in zip(names, palette.SLIDERS, strict=True))
     alike = bool((ends == ends[0]).all())
-    named = [("", ends[0])] if alike else [(f"{leg} ", own) for leg, own in zip(LEGS, ends, strict=True)]
+    named = [("", ends[0])] if alike else [(f"{leg} ", own) for leg, own in zip(names, ends, strict=True)]
     limits = tuple(
         Limit(f"{name}{end}", float(value))
         for name, own in named

@@ -9,7 +9,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from trirail.config import FramesTable
-from trirail.kinematics.geometry import LEGS, Geometry
+from trirail.kinematics.geometry import Geometry
+from trirail.naming import Labels
 from trirail.telemetry import columns, palette
 from trirail.telemetry.columns import Column
 from trirail.telemetry.palette import Colour
@@ -25,7 +26,7 @@ QUATERNION = rr.Transform3D.descriptor_quaternion()
 _CROSS = (np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]]))
 
 
-def still(parts: Mechanism, frames: FramesTable) -> Iterator[tuple[str, rr.AsComponents]]:
+def still(parts: Mechanism, frames: FramesTable, names: Labels) -> Iterator[tuple[str, rr.AsComponents]]:
     """Yield what is logged once, as static: entity path and archetype."""
     yield "/robot", rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # 2D views have y downwards
     yield "/robot/rails", _lines(parts.rails, [palette.FRAME], 4.5, order=10)
@@ -37,7 +38,7 @@ def still(parts: Mechanism, frames: FramesTable) -> Iterator[tuple[str, rr.AsCom
             parts.anchors,
             radii=rr.Radius.ui_points(6.0),
             colors=[palette.ANCHORS],
-            labels=[f"{leg}₀" for leg in LEGS],
+            labels=[f"{name}₀" for name in names],
             show_labels=True,
             draw_order=13,
         ),
@@ -48,7 +49,7 @@ def still(parts: Mechanism, frames: FramesTable) -> Iterator[tuple[str, rr.AsCom
             parts.names,
             radii=rr.Radius.ui_points(0.0),
             colors=palette.SLIDERS,
-            labels=list(LEGS),
+            labels=list(names),
             show_labels=True,
             draw_order=13,
         ),

@@ -12,8 +12,11 @@ from pathlib import Path
 
 import msgspec
 import trirail_drivers
+from trirail_drivers.interface import NAMES
 
 from trirail.config import Config, parse
+from trirail.errors import ConfigError
+from trirail.naming import Labels
 from trirail.wire.decoding import decoded, prepare
 
 CONFIGURATION, SOFTWARE = "/configuration", "/software"
@@ -59,6 +62,15 @@ def configuration(found: Mapping[str, str]) -> Config | None:
     """Return the configuration among a recording's texts, None where there is none. Raises ConfigError."""
     text = found.get(CONFIGURATION)
     return parse(text) if text is not None else None
+
+
+def labels(found: Mapping[str, str]) -> Labels:
+    """Return what people call the sliders, by a recording's texts; their letters where these do not say it."""
+    try:
+        config = configuration(found)
+    except ConfigError:
+        config = None
+    return config.geometry.labels if config else NAMES
 
 
 def recorded_by(found: Mapping[str, str]) -> Software | None:

@@ -6,14 +6,17 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from trirail_drivers.interface import NAMES
 
+from trirail.naming import Labels
 from trirail.wire.vocabulary import MODES, Mode
 
 PATH = "/readout"
 _SPECIAL = str.maketrans({letter: f"\\{letter}" for letter in "\\`*_{}[]<>()#+-.!|~$&:"})
 """ASCII punctuation that means something in Markdown is plain behind a backslash (CommonMark 2.4)."""
 
-_HEAD = f"| | x [mm] | y [mm] | φ [°] | | A | B | C |\n|---|{'--:|' * 3}---|{'--:|' * 3}"
+_HEAD = "| | x [mm] | y [mm] | φ [°] | | {} | {} | {} |"
+_ALIGNED = f"|---|{'--:|' * 3}---|{'--:|' * 3}"
 
 
 class Standing(NamedTuple):
@@ -29,7 +32,7 @@ class Standing(NamedTuple):
     """Why the robot is in fault."""
 
 
-def markdown(record: np.void, standing: Standing) -> str:
+def markdown(record: np.void, standing: Standing, names: Labels = NAMES) -> str:
     """Return what holds at a record, of wire.records.DTYPE, for people: millimetres, degrees, micrometres."""
     head = f"**{MODES[record['mode']].upper()}**   override {standing.override:.0%}"
     if standing.goal is not None:
@@ -45,7 +48,7 @@ def markdown(record: np.void, standing: Standing) -> str:
         ("commanded", *_pose(record["commanded_pose"]), "v [mm/s]", *(f"{v * 1e3:.1f}" for v in record["velocity"])),
         ("goal", *target, "error [µm]", *(f"{value * 1e6:.0f}" for value in record["following_error"])),
     ]
-    table = "\n".join([_HEAD, *(f"| {' | '.join(row)} |" for row in rows)])
+    table = "\n".join([_HEAD.format(*names), _ALIGNED, *(f"| {' | '.join(row)} |" for row in rows)])
     return "\n\n".join([head, *wrong, table])
 
 

@@ -49,7 +49,7 @@ class Scene:
 
     def still(self) -> Iterator[tuple[str, rr.AsComponents]]:
         """Yield what is logged once, as static: entity path and archetype."""
-        yield from drawing.still(self._parts, self._frames)
+        yield from drawing.still(self._parts, self._frames, self._geometry.labels)
         for path, lines in self._plots.items():
             yield path, _series(lines)
         yield readout.PATH, rr.TextDocument.from_fields(media_type=MARKDOWN)
@@ -88,7 +88,7 @@ class Scene:
         return columns.chunks(self._timelines.of(record.reshape(1)), [drawing.goal(self._parts, pose)])
 
     def _readout(self, record: np.void, standing: Standing) -> list[Chunk]:
-        text = pa.array([[readout.markdown(record, standing)]])
+        text = pa.array([[readout.markdown(record, standing, self._geometry.labels)]])
         return columns.chunks(self._timelines.of(record.reshape(1)), [Column(readout.PATH, TEXT, text)])
 
     def _status(self, records: NDArray[np.void]) -> list[Chunk]:

@@ -38,7 +38,8 @@ class ShownRobot:
     @classmethod
     def told(cls, info: Info) -> ShownRobot:
         """Take it from a service's answer. msgspec.ValidationError or ConfigError where that is of another version."""
-        legs = converted({"kind": info.mechanism, "leg": [_leg(leg) for leg in info.geometry]}, GeometryTable)
+        each = [_leg(leg) for leg in info.geometry]
+        legs = converted({"kind": info.mechanism, "leg": each, "labels": info.labels}, GeometryTable)
         limits, frames = converted(info.limits, Limits), converted(info.frames, FramesTable)
         return cls(info.robot, config.geometry(legs), limits, info.rate_hz, frames)
 

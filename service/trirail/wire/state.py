@@ -236,6 +236,8 @@ class Info(Struct, frozen=True):
     """Of as-built errors; None where the robot is taken for its geometry."""
     mechanism: str = "3-PRP"
     """Key [geometry] kind of the configuration, which says what the keys of its legs are."""
+    labels: tuple[str, str, str] = ("A", "B", "C")
+    """What people call the sliders A, B, C: key [geometry] labels of the configuration."""
 
 
 class NamedPose(Struct, frozen=True):

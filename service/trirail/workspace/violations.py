@@ -25,9 +25,9 @@ def violations(geometry: Geometry, limits: Limits, pose: ArrayLike) -> list[Viol
         ("position", motion.position, limits.slider.positions),
         ("passive position", motion.passive_position, [limits.slider.passive] * 3),
     ):
-        for leg, value, (low, high) in zip(LEGS, values.tolist(), ends, strict=True):
+        for leg, label, value, (low, high) in zip(LEGS, geometry.labels, values.tolist(), ends, strict=True):
             if not low <= value <= high:
-                found.append(Violation(leg, quantity, value, low if value < low else high, "m"))
+                found.append(Violation(leg, quantity, value, low if value < low else high, "m", label))
     distance = float(distance_to_singularity(geometry, pose))
     if distance < limits.singularity_margin:
         found.append(Violation("phi", "distance to singularity", distance, limits.singularity_margin, "rad"))

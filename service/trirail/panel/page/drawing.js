@@ -52,7 +52,7 @@ export class Drawing {
       name.style.fill = colours.sliders[k];
       name.setAttribute("x", x);
       name.setAttribute("y", -y);
-      name.textContent = "ABC"[k];
+      name.textContent = robot.sliders[k];
     });
   }
 

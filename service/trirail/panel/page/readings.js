@@ -11,12 +11,16 @@ export class Readings {
     this.rank = [0, 0];
   }
 
-  robot({ name, user, version, colours }) {
+  robot({ name, user, version, colours, sliders }) {
     this.colours = colours.modes;
     byId("name").textContent = name;
     byId("user").textContent = `as ${user}, trirail ${version}`;
     document.title = `${name} – trirail`;
-    this.sliders.forEach((cells, k) => { cells[0].parentElement.firstChild.style.color = colours.sliders[k]; });
+    this.sliders.forEach((cells, k) => {
+      const head = cells[0].parentElement.firstChild;
+      head.style.color = colours.sliders[k];
+      text(head, sliders[k]);
+    });
   }
 
   state({ mode, pose, goal, sliders, faults, override, lease }) {
