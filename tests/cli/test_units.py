@@ -58,6 +58,13 @@ def test_a_printed_pose_is_one_that_can_be_typed(x: float, y: float, phi: float)
 
 
 @given(st.decimals(-1000, 1000, places=3))
+def test_arcseconds_are_a_sixtieth_of_arcminutes_and_these_of_degrees(value: Decimal) -> None:
+    degrees = quantity(f"{value}deg", ANGLE)
+    assert quantity(f"{value * 60}arcmin", ANGLE) == pytest.approx(degrees, rel=1e-15, abs=1e-18)
+    assert quantity(f"{value * 3600}arcsec", ANGLE) == pytest.approx(degrees, rel=1e-15, abs=1e-18)
+
+
+@given(st.decimals(-1000, 1000, places=3))
 def test_a_unit_and_the_bare_number_are_the_same_number(number: object) -> None:
     assert quantity(f"{number}mm", LENGTH) == float(f"{number}e-3")
     assert quantity(f"{number} um", LENGTH) == quantity(f"{number}µm", LENGTH) == float(f"{number}e-6")

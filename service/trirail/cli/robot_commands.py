@@ -113,7 +113,7 @@ def move(
     Parameters
     ----------
     dx
-        How far along x [m], or with a unit: 5mm, -0.2in.
+        How far along x [m], or with a unit: 5mm, 0.5um, -0.2in.
     dy
         Along y.
     dphi

@@ -65,6 +65,8 @@ _RADIANS: Final = {
     "urad": Decimal("1e-6"),
     "deg": _DEGREE,
     "°": _DEGREE,
+    "arcmin": _DEGREE / 60,
+    "arcsec": _DEGREE / 3600,
 }
 _SECONDS: Final = {
     "s": Decimal(1),
@@ -75,8 +77,8 @@ _SECONDS: Final = {
     "min": Decimal(60),
 }
 
-LENGTH: Final = Dimension("a length", _METRES, "5mm, -0.2in, 0.005")
-ANGLE: Final = Dimension("an angle", _RADIANS, "1.5deg, 10mrad, 0.01")
+LENGTH: Final = Dimension("a length", _METRES, "5mm, 0.5um, -0.2in, 0.005")
+ANGLE: Final = Dimension("an angle", _RADIANS, "1.5deg, 5arcsec, 10mrad, 0.01")
 VELOCITY: Final = Dimension("a velocity", _per(_METRES, "/s"), "5mm/s, -0.2in/s, 0.005")
 ANGULAR_VELOCITY: Final = Dimension("an angular velocity", _per(_RADIANS, "/s"), "1.5deg/s, 10mrad/s, 0.01")
 ACCELERATION: Final = Dimension("an acceleration", _per(_METRES, "/s²", "/s2", "/s^2"), "50mm/s², 0.05")

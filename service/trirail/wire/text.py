@@ -14,7 +14,7 @@ from trirail.wire.sizes import MAX_NAME, MAX_TEXT
 _HIDDEN = frozenset({"Cc", "Cf", "Cs", "Co", "Zl", "Zp"})
 """Unicode's categories of what steers a terminal, reorders or ends a line, or cannot be seen."""
 _NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{MAX_NAME}}}")
-_QUANTITY = re.compile(r"-?[0-9]+([eE]-?[0-9]+)?(m|cm|mm|um|nm|in|rad|mrad|urad|deg|s|ms|us|min)?")
+_QUANTITY = re.compile(r"-?[0-9]+([eE]-?[0-9]+)?(m|cm|mm|um|nm|in|rad|mrad|urad|deg|arcmin|arcsec|s|ms|us|min)?")
 """What is a name by its characters and, on the command line, a number or one with a unit."""
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
