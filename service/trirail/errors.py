@@ -8,6 +8,8 @@ from typing import Self
 from trirail_drivers.errors import TrirailError
 
 __all__ = [
+    "AlignmentError",
+    "AlignmentFault",
     "ConfigError",
     "EmptyRecordingError",
     "KinematicsError",
@@ -39,6 +41,36 @@ class KinematicsError(TrirailError, ValueError):
     def __init__(self, message: str, *, leg: str = "", value: float | None = None, limit: float | None = None) -> None:
         super().__init__(message)
         self.leg = leg
+        self.value = value
+        self.limit = limit
+
+
+class AlignmentFault(StrEnum):
+    """Why marks do not tell how a part lies."""
+
+    MISSING = "missing"
+    """Too few were found, or one is not in the calibration."""
+    DISTANCE = "distance"
+    """Two are too far from each other, or too near: another part, a wrong calibration, heat."""
+    SWAPPED = "swapped"
+    """Their names are exchanged."""
+    STILL = "still"
+    """They do not move when the stage does."""
+    MOVES = "moves"
+    """The moves of a calibration are too few, or all in one direction."""
+
+
+class AlignmentError(TrirailError):
+    """Marks that do not tell how a part lies; nothing moves because of them.
+
+    `fault` says why, for programs; `value` and `limit` are in the fault's own unit, where it is a matter of a limit.
+    """
+
+    def __init__(
+        self, fault: AlignmentFault, message: str, *, value: float | None = None, limit: float | None = None
+    ) -> None:
+        super().__init__(message)
+        self.fault = fault
         self.value = value
         self.limit = limit
 

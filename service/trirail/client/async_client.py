@@ -11,10 +11,10 @@ from __future__ import annotations
 import asyncio
 import functools
 import uuid
-from collections.abc import AsyncGenerator, Callable, Coroutine
+from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine
 from contextlib import AbstractContextManager, AsyncExitStack, aclosing
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, Self, cast
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar, cast
 
 import msgspec
 
@@ -37,10 +37,11 @@ from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
 
 P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class _Draft:
-    """Stands in for Robot: keeps the goal, or the command, that one of its methods would send, and a goal before it."""
+    """Stands in for Robot: keeps what one of its methods would send, a goal with one before it, or a command, or do."""
 
     before: Callable[[str], Goal] | None = None
 
@@ -52,6 +53,9 @@ class _Draft:
 
     def command(self, name: Command, content: CommandContent | bytes | None = None) -> None:
         self.order = name, content
+
+    def _converse(self, *conversation: Any) -> None:
+        self.conversation = conversation
 
 
 def _goal(
@@ -82,6 +86,20 @@ def _order(
         await robot.command(*draft.order)
 
     return order
+
+
+def _conversation(method: Callable[Concatenate[Robot, P], T]) -> Callable[Concatenate[AsyncRobot, P], Awaitable[T]]:
+    """Return the twin of a method of Robot that looks and moves; its `look` may be a coroutine function."""
+
+    @functools.wraps(method)
+    async def converse(robot: AsyncRobot, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        from trirail.client.alignment import drive_async  # numpy
+
+        draft = _Draft()
+        method(cast(Robot, draft), *args, **kwargs)
+        return cast(T, await drive_async(robot, *draft.conversation))
+
+    return converse
 
 
 class AsyncRobot:
@@ -141,6 +159,9 @@ class AsyncRobot:
     resume = _order(Robot.resume)
     override = _order(Robot.override)
     release = _order(Robot.release)
+
+    calibrate_camera = _conversation(Robot.calibrate_camera)
+    align = _conversation(Robot.align)
 
     def jog(self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2) -> AsyncJog:
         """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].

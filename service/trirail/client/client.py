@@ -12,13 +12,14 @@ import os
 import re
 import threading
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import zenoh
+from trirail_drivers.interface import Triple
 
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import GoalHandle, Jog, Result
@@ -45,6 +46,12 @@ from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.stop_door import STOPS
 from trirail.wire.text import check_name, check_new_pose, quoted
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override
+
+if TYPE_CHECKING:  # numpy, which most programs do without
+    from trirail.alignment.calibration import CameraCalibration
+    from trirail.alignment.images import Lens
+    from trirail.alignment.procedure import Alignment
+    from trirail.client.alignment import Look
 
 __all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot", "Track"]
 
@@ -306,6 +313,69 @@ class Robot:
             raise
         goal.reply = reply
         return goal
+
+    def calibrate_camera(
+        self,
+        look: Look,
+        moves: Sequence[Triple] | None = None,
+        *,
+        views: Mapping[str, str] | None = None,
+        lens: Lens = "affine",
+        centre: tuple[float, float] = (0.0, 0.0),
+        looks: int = 1,
+        approach: Triple | None = None,
+        speed: float = 1.0,
+        wait: float = 0.0,
+    ) -> CameraCalibration:
+        """Find how cameras show the marks of a part on the table, by moves of the stage; return there afterwards.
+
+        `look` takes a picture, or one of each camera, and returns {mark: (u, v)} in pixels; a mark that it does not
+        find is missing. `moves` are x, y [m] and phi [rad] from where the robot stands, ±1 mm and ±1° if absent; each
+        must leave the marks in the picture. `views` names for each mark the view that shows it: without it each has
+        one of its own, as with two cameras, or one that is moved to each mark. A `lens` perspective wants more moves,
+        radial too and the `centre` of its picture [pixel]. `looks` pictures are taken at each place, `wait` seconds
+        after the robot stands; with an `approach`, x, y [m] and phi [rad], it goes so far beyond first and back, so
+        that backlash is on the same side each time. Ctrl-C stops the robot. Raises AlignmentError where looks do not
+        tell it, RefusedError where a move is refused.
+        """
+        from trirail.alignment.procedure import MOVES, calibration_by_moves
+
+        meant = MOVES if moves is None else moves
+        return self._converse(look, calibration_by_moves(meant, views, lens, centre, looks, approach), speed, wait)  # type: ignore[no-any-return]
+
+    def align(
+        self,
+        look: Look,
+        targets: Mapping[str, tuple[float, float]],
+        calibration: CameraCalibration,
+        *,
+        tolerance: float = 1e-6,
+        angle: float = 2.4e-5,
+        corrections: int = 3,
+        distance: float = 1e-3,
+        looks: int = 1,
+        approach: Triple | None = None,
+        speed: float = 1.0,
+        wait: float = 0.0,
+    ) -> Alignment:
+        """Move a part until its marks are at their `targets`, {mark: (u, v)} in pixels; return how that went.
+
+        Measure, correct about the marks' middle from where the robot is measured to be, measure again, until every
+        mark is within `tolerance` [m] of where the best rigid motion has it and the part within `angle` [rad], or
+        `corrections` have been made, or the error grows. The first correction with a calibration that is not confirmed
+        goes no farther than twice its moves. Marks whose distance is wrong by more than `distance`, a share, are
+        refused, nothing moves. All else as of calibrate_camera.
+        """
+        from trirail.alignment.procedure import Task, align
+
+        task = Task(calibration, targets, tolerance, angle, corrections, distance, looks, approach)
+        return self._converse(look, align(task), speed, wait)  # type: ignore[no-any-return]
+
+    def _converse(self, look: Look, wishes: Generator[Any, Any, Any], speed: float, wait: float) -> Any:
+        """Do what a conversation of trirail.alignment.procedure wishes; return what it ends with."""
+        from trirail.client.alignment import drive
+
+        return drive(self, look, wishes, speed, wait)
 
     def _arrive(self, make: Callable[[str], Goal]) -> None:
         """Send a goal and wait until it is done. Raises RefusedError where it ends otherwise."""

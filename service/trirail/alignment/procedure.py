@@ -1,0 +1,255 @@
+"""Alignment and calibration as conversations: each asks for looks and motions, and ends with a result.
+
+A generator yields what it wants, LOOK or a StageMotion, and is sent a Sighting; whoever drives it has the camera, the
+robot and the time. It moves nothing itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Mapping, Sequence
+from enum import StrEnum
+from typing import Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from trirail_drivers.interface import Triple
+
+from trirail.alignment.calibration import CameraCalibration, Marks, Sight, calibrate
+from trirail.alignment.images import Lens, Pair
+from trirail.alignment.misplacement import DISTANCE, Misplacement, misplacement
+from trirail.alignment.rigid import turned
+from trirail.errors import AlignmentError, AlignmentFault
+
+MOVES: tuple[Triple, ...] = tuple(
+    (x * 1e-3, y * 1e-3, math.radians(turn))
+    for x, y, turn in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+)
+"""The moves of a calibration where none are given: 1 mm and 1°, each both ways, from where it begins."""
+TOLERANCE, ANGLE = 1e-6, math.radians(5.0 / 3600.0)
+"""How far a mark may be from where it should be [m], and by what angle a part may be turned [rad]: 1 µm, 5 arcsec."""
+CORRECTIONS = 3
+BEYOND = 2.0
+"""The first correction with a calibration that is not confirmed moves no mark farther than so many times as its moves
+did."""
+CONFIRMS = 0.2
+"""A correction confirms the calibration where it misses what it was to leave by no more than this share of its way."""
+
+
+class StageMotion(NamedTuple):
+    """A motion that is wanted: a pose, or with a `tool` a move of that point from where the robot is measured."""
+
+    by: Triple
+    """The pose [m, rad] where there is no tool; else the move."""
+    tool: Pair | None = None
+    """A point of the platform in its own frame [m]."""
+    approach: Triple | None = None
+    """From where it comes: the robot is sent beyond the end by this first, and back then [m, rad]."""
+
+
+LOOK: Literal["look"] = "look"
+"""What a conversation wants beside motions."""
+Wish = Literal["look"] | StageMotion
+
+
+class Sighting(NamedTuple):
+    """What is sent into a conversation: what cameras show, where the robot is measured to be, and when [s]."""
+
+    marks: Marks
+    pose: Triple
+    time: float
+
+
+class AlignmentEnd(StrEnum):
+    """AlignmentEnd an alignment ended."""
+
+    REACHED = "reached"
+    """Every mark is within the tolerance, and the part's angle."""
+    CORRECTIONS = "corrections"
+    """As many corrections have been made as were allowed."""
+    GROWING = "growing"
+    """The error grew by a correction: a sign, a mirror, or a camera that was moved."""
+
+
+class Measurement(msgspec.Struct, frozen=True):
+    """What one look told."""
+
+    marks: dict[str, Pair]
+    """Pixels of the marks; the mean where several pictures were taken."""
+    errors: dict[str, Pair]
+    """How far each mark has to go to its target, x, y in the base frame [m]."""
+    worst: float
+    """The greatest distance that a mark goes by the motion that aligns the part [m]."""
+    shift: Pair
+    """How far the middle of the marks has to go [m]."""
+    turn: float
+    """By what angle the part has to turn [rad]."""
+    misfit: float
+    """The greatest distance of a mark from its target that no motion takes away [m]."""
+    distance: float
+    """By how much the worst distance of two marks is wrong, as a share of it."""
+    pose: Triple
+    """Of the platform, measured: x, y [m], phi [rad]."""
+    time: float
+    """When, on the clock of who looked [s]."""
+
+
+class AlignmentCorrection(msgspec.Struct, frozen=True):
+    """One motion that was made."""
+
+    by: Triple
+    """Of the marks' middle: x, y [m]; phi [rad]."""
+    share: float
+    """Of what the look before it told: below 1 for the first of a calibration that is not confirmed."""
+    seconds: float
+    """From the look before it until the robot stood."""
+
+
+class Alignment(msgspec.Struct, frozen=True):
+    """How an alignment went: one more measurement than corrections."""
+
+    why: AlignmentEnd
+    measurements: tuple[Measurement, ...]
+    corrections: tuple[AlignmentCorrection, ...]
+    seconds: float
+    """From the first look to the last."""
+    confirmed: bool
+    """Whether a correction has gone where it should with this calibration, here or before."""
+
+    @property
+    def reached(self) -> bool:
+        """Whether the part lies right."""
+        return self.why is AlignmentEnd.REACHED
+
+
+class Task(NamedTuple):
+    """What is asked of an alignment."""
+
+    calibration: CameraCalibration
+    targets: Mapping[str, Pair]
+    """Where marks should be in the pictures [pixel]."""
+    tolerance: float = TOLERANCE
+    angle: float = ANGLE
+    corrections: int = CORRECTIONS
+    distance: float = DISTANCE
+    looks: int = 1
+    """Pictures a measurement."""
+    approach: Triple | None = None
+
+
+Conversation = Generator[Wish, Sighting, Alignment]
+
+
+def align(task: Task) -> Conversation:
+    """Measure, correct, measure again, until the part lies right, or no correction is left, or the error grows.
+
+    Raises AlignmentError where a look does not tell how the part lies, before anything is moved because of it.
+    """
+    measurements: list[Measurement] = []
+    corrections: list[AlignmentCorrection] = []
+    confirmed = task.calibration.confirmed
+    while True:
+        sight, found = yield from _measure(task)
+        measurements.append(_measurement(sight, found))
+        if len(measurements) > 1:
+            confirmed = confirmed or _as_meant(task, measurements, corrections[-1].share)
+        if (why := _ended(task, measurements)) is not None:
+            seconds = measurements[-1].time - measurements[0].time
+            confirmed = confirmed and why is not AlignmentEnd.GROWING
+            return Alignment(why, tuple(measurements), tuple(corrections), seconds, confirmed)
+        share = 1.0 if confirmed else min(1.0, BEYOND * task.calibration.reach / max(found.worst, 1e-12))
+        motion = _motion(found, sight.pose, share, task.approach)
+        arrived = yield motion
+        corrections.append(AlignmentCorrection(motion.by, share, arrived.time - sight.time))
+
+
+def look_only(task: Task) -> Generator[Wish, Sighting, Measurement]:
+    """Measure and move nothing."""
+    sight, found = yield from _measure(task)
+    return _measurement(sight, found)
+
+
+def calibration_by_moves(
+    moves: Sequence[Triple] = MOVES,
+    views: Mapping[str, str] | None = None,
+    lens: Lens = "affine",
+    centre: Pair = (0.0, 0.0),
+    looks: int = 1,
+    approach: Triple | None = None,
+) -> Generator[Wish, Sighting, CameraCalibration]:
+    """Look where the robot stands and after each move from there, return there, and calibrate.
+
+    Raises AlignmentError where the looks do not tell it.
+    """
+    first = yield from _look(looks)
+    sights = [first]
+    for move in moves:
+        yield StageMotion(_sum(first.pose, move), approach=approach)
+        sights.append((yield from _look(looks)))
+    yield StageMotion(first.pose, approach=approach)
+    return calibrate([Sight(each.pose, each.marks) for each in sights], views, lens, centre)
+
+
+def _look(pictures: int) -> Generator[Wish, Sighting, Sighting]:
+    """Return the mean of several pictures, for each mark over those that show it."""
+    taken = []
+    for _ in range(pictures):
+        taken.append((yield LOOK))  # noqa: PERF401 - a comprehension cannot yield
+    seen: dict[str, list[Pair]] = {}
+    for each in taken:
+        for name, pixel in each.marks.items():
+            seen.setdefault(name, []).append((float(pixel[0]), float(pixel[1])))
+    for name, pixels in seen.items():
+        if not np.isfinite(pixels).all():
+            raise AlignmentError(AlignmentFault.MISSING, f"mark {name} is at {pixels}: finite pixels are wanted")
+    marks = {
+        name: (math.fsum(u for u, _ in p) / len(p), math.fsum(v for _, v in p) / len(p)) for name, p in seen.items()
+    }
+    x, y, phi = np.mean([each.pose for each in taken], axis=0).tolist()
+    return Sighting(marks, (x, y, phi), taken[-1].time)
+
+
+def _measure(task: Task) -> Generator[Wish, Sighting, tuple[Sighting, Misplacement]]:
+    sight = yield from _look(task.looks)
+    return sight, misplacement(task.calibration, sight.marks, task.targets, task.distance)
+
+
+def _measurement(sight: Sighting, found: Misplacement) -> Measurement:
+    error = found.error
+    errors = {name: _pair(e) for name, e in zip(found.names, (found.to - found.at).tolist(), strict=True)}
+    misfit = float(np.linalg.norm(error.misfit, axis=1).max())
+    shift = _pair(error.shift.tolist())
+    return Measurement(
+        dict(sight.marks), errors, found.worst, shift, error.turn, misfit, found.distance, sight.pose, sight.time
+    )
+
+
+def _ended(task: Task, measurements: Sequence[Measurement]) -> AlignmentEnd | None:
+    now = measurements[-1]
+    if now.worst <= task.tolerance and abs(now.turn) <= task.angle:
+        return AlignmentEnd.REACHED
+    if len(measurements) > 1 and now.worst > measurements[-2].worst + task.tolerance:
+        return AlignmentEnd.GROWING
+    return AlignmentEnd.CORRECTIONS if len(measurements) > task.corrections else None
+
+
+def _as_meant(task: Task, measurements: Sequence[Measurement], share: float) -> bool:
+    """Whether the newest correction, of a share of the error, has left what it was to leave."""
+    before, now = (each.worst for each in measurements[-2:])
+    return abs(now - (1.0 - share) * before) <= max(task.tolerance, CONFIRMS * share * before)
+
+
+def _motion(found: Misplacement, pose: Triple, share: float, approach: Triple | None) -> StageMotion:
+    """Return the correction about the marks' middle."""
+    error = found.error
+    x, y = (share * error.shift).tolist()
+    tool = turned(-pose[2]) @ (error.middle - pose[:2])
+    return StageMotion((x, y, share * error.turn), _pair(tool.tolist()), approach)
+
+
+def _sum(a: Triple, b: Triple) -> Triple:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _pair(values: Sequence[float]) -> Pair:
+    return float(values[0]), float(values[1])

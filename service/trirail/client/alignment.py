@@ -1,0 +1,120 @@
+"""What drives an alignment: the user's camera and a connection to the robot, with a thread or in an event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import time
+from collections.abc import Awaitable, Callable, Generator, Iterator
+from typing import TYPE_CHECKING, TypeVar
+
+from trirail_drivers.interface import Triple
+
+from trirail.alignment.calibration import Marks
+from trirail.alignment.procedure import LOOK, Sighting, StageMotion, Wish
+from trirail.client.goal import Result
+from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.goals import Goal, MoveGoal, PoseGoal
+
+if TYPE_CHECKING:
+    from trirail.client.async_client import AsyncRobot
+    from trirail.client.client import Robot
+
+T = TypeVar("T")
+Look = Callable[[], Marks | Awaitable[Marks]]
+"""Takes a picture, or one of each camera, and returns where it shows the marks, {name: (u, v)} [pixel]; in an event
+loop it may be a coroutine function."""
+GOAL_WITHIN = 60.0
+"""How long one motion may take [s]."""
+STANDS = ("done", "unsettled")
+"""Outcomes with which the robot stands where it was to be, or nearly: the next look tells."""
+
+
+def drive(robot: Robot, look: Look, wishes: Generator[Wish, Sighting, T], speed: float, wait: float) -> T:
+    """Do what a conversation wishes, and return what it ends with.
+
+    `wait` is how long a camera needs after a motion until it shows what is [s]. Whatever ends it before, as Ctrl-C,
+    stops the motion. Raises RefusedError where a motion is refused or ends otherwise, and what `look` raises.
+    """
+    marks: Marks = {}
+    try:
+        wish = next(wishes)
+        while True:
+            if wish == LOOK:
+                seen = look()
+                if inspect.isawaitable(seen):
+                    raise TypeError("look is a coroutine function: it is for AsyncRobot")
+                marks = seen
+            elif isinstance(wish, StageMotion):
+                for goal in goals(wish, speed):
+                    _go(robot, goal)
+                time.sleep(wait)
+            wish = wishes.send(Sighting(marks, robot.state().pose, time.monotonic()))
+    except StopIteration as end:
+        return end.value  # type: ignore[no-any-return]
+
+
+def _go(robot: Robot, goal: Goal) -> None:
+    handle = robot.send(goal)
+    try:
+        check(handle.wait(GOAL_WITHIN))
+    except BaseException:
+        if handle.result is None:
+            robot.stop()
+        raise
+
+
+async def drive_async(
+    robot: AsyncRobot, look: Look, wishes: Generator[Wish, Sighting, T], speed: float, wait: float
+) -> T:
+    """Do the same in an event loop; `look` may be a coroutine function. A call that is cancelled stops the motion."""
+    marks: Marks = {}
+    try:
+        wish = next(wishes)
+        while True:
+            if wish == LOOK:
+                seen = look()
+                marks = await seen if inspect.isawaitable(seen) else seen
+            elif isinstance(wish, StageMotion):
+                for goal in goals(wish, speed):
+                    await _go_async(robot, goal)
+                await asyncio.sleep(wait)
+            wish = wishes.send(Sighting(marks, (await robot.state()).pose, time.monotonic()))
+    except StopIteration as end:
+        return end.value  # type: ignore[no-any-return]
+
+
+async def _go_async(robot: AsyncRobot, goal: Goal) -> None:
+    handle = await robot.send(goal)
+    try:
+        check(await handle.wait(GOAL_WITHIN))
+    except BaseException:
+        if handle.result is None:
+            await robot.stop()
+        raise
+
+
+def goals(motion: StageMotion, speed: float) -> Iterator[Goal]:
+    """Yield the goals of a motion: one, or with an approach one beyond its end first."""
+    by, tool, beyond = motion.by, motion.tool, motion.approach
+    first = by if beyond is None else _sum(by, beyond)
+    if tool is None:
+        yield PoseGoal(*first, speed=speed)
+    else:
+        yield MoveGoal(*first, tool=tool, origin="measured", speed=speed)
+    if beyond is not None:
+        yield PoseGoal(*by, speed=speed) if tool is None else MoveGoal(*_negative(beyond), tool=tool, speed=speed)
+
+
+def check(result: Result) -> None:
+    """Raise RefusedError for a motion after which the robot does not stand where it was to be."""
+    if result.outcome not in STANDS:
+        raise RefusedError(RefusalCode.FAILED, f"a motion of the alignment ended {result.outcome}: {result.message}")
+
+
+def _sum(a: Triple, b: Triple) -> Triple:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _negative(a: Triple) -> Triple:
+    return -a[0], -a[1], -a[2]

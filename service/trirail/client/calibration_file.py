@@ -1,0 +1,47 @@
+"""The file of a camera calibration: JSON, of a version, with its date, the robot, and the looks that made it."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+from trirail_drivers import files
+from trirail_drivers.errors import FileError
+
+from trirail.alignment.calibration import CameraCalibration, Marks
+from trirail.alignment.images import Pair
+
+VERSION: Literal[1] = 1
+
+
+class CalibrationFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is in it."""
+
+    version: Literal[1]
+    robot: str
+    made: datetime
+    """With its time zone."""
+    calibration: CameraCalibration
+    targets: dict[str, Pair] = {}
+    """Where marks should be [pixel]: where they were at the calibration's first look, until others are taught."""
+
+
+def write(path: Path, robot: str, calibration: CameraCalibration, targets: Marks, made: datetime | None = None) -> None:
+    """Write it such that a power cut leaves the old file or the new one. Raises FileError."""
+    content = CalibrationFile(VERSION, robot, made or datetime.now(UTC), calibration, dict(targets))
+    try:
+        files.replace(path, msgspec.json.format(msgspec.json.encode(content)) + b"\n")
+    except OSError as error:
+        raise FileError(f"cannot write {path}: {error.strerror}") from error
+
+
+def read(path: Path) -> CalibrationFile:
+    """Read it. Raises FileError with the file, the field and what would be right."""
+    text = files.text(path)
+    try:
+        return msgspec.json.decode(text, type=CalibrationFile)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        problem = str(error).replace("`", "")
+        raise FileError(f"{path}: {problem}; make it anew with trirail align calibrate") from error

@@ -1,0 +1,85 @@
+"""Random cameras, parts and errors, and an ideal stage, for the tests of alignment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Mapping
+from typing import TypeVar
+
+import numpy as np
+from trirail.alignment.calibration import placed
+from trirail.alignment.images import CameraView, Lens, Pair, pixels
+from trirail.alignment.procedure import LOOK, Sighting, StageMotion, Wish
+from trirail.alignment.rigid import turned
+from trirail_drivers.interface import Triple
+
+T = TypeVar("T")
+FOCUS = 2.6e5
+"""About 3.8 µm a pixel."""
+
+
+def camera(rng: np.random.Generator, at: Pair, lens: Lens = "affine") -> CameraView:
+    """Return a camera above a point: any turn, mirrored or not, scale within 20 %, skewed by a few per cent."""
+    mirror = np.diag([1.0, rng.choice([-1.0, 1.0])])
+    matrix = FOCUS * rng.uniform(0.8, 1.2) * turned(rng.uniform(-math.pi, math.pi)) @ mirror
+    matrix = matrix @ (np.eye(2) + rng.uniform(-0.02, 0.02, (2, 2)))
+    bend = {
+        "affine": (0.0, 0.0),
+        "perspective": tuple(rng.uniform(-4.0, 4.0, 2)),
+        "radial": (rng.uniform(-2e-8, 2e-8), 0.0),
+    }
+    (a, b), (c, d) = matrix.tolist()
+    pixel = (float(rng.uniform(900, 1100)), float(rng.uniform(700, 900)))
+    return CameraView(at, pixel, ((a, b), (c, d)), lens, bend[lens], (1000.0, 800.0))
+
+
+def part_at(part: Mapping[str, Pair], error: Triple) -> dict[str, Pair]:
+    """Return the places of a part's marks on the table when the part lies away by x, y [m] and phi [rad]."""
+    return {name: (float(x), float(y)) for name, (x, y) in ((n, placed(q, error)) for n, q in part.items())}
+
+
+class Stage:
+    """An ideal stage with a part on it, seen by cameras."""
+
+    def __init__(
+        self,
+        views: Mapping[str, CameraView],
+        part: Mapping[str, Pair],
+        rng: np.random.Generator,
+        noise: float = 0.0,
+        moved: Callable[[Triple], Triple] = lambda by: by,
+    ) -> None:
+        self.views, self.part, self._rng, self._noise, self._moved = views, dict(part), rng, noise, moved
+        self.pose: Triple = (0.0, 0.0, 0.0)
+        self.way = 0.0
+        """The longest of the motions that were made about a point [m]."""
+        self.motions = 0
+
+    def look(self) -> dict[str, Pair]:
+        seen = {name: pixels(self.views[name], placed(q, self.pose)[None])[0] for name, q in self.part.items()}
+        noisy = {name: (at + self._noise * self._rng.standard_normal(2)).tolist() for name, at in seen.items()}
+        return {name: (u, v) for name, (u, v) in noisy.items()}
+
+    def go(self, motion: StageMotion) -> None:
+        self.motions += 1
+        if motion.tool is None:
+            self.pose = motion.by
+            return
+        x, y, turn = self._moved(motion.by)
+        self.way = max(self.way, math.hypot(x, y))
+        phi = self.pose[2] + turn
+        at = placed(motion.tool, self.pose) + np.array([x, y]) - turned(phi) @ motion.tool
+        self.pose = (float(at[0]), float(at[1]), phi)
+
+    def drive(self, wishes: Generator[Wish, Sighting, T]) -> T:
+        marks: Mapping[str, Pair] = {}
+        try:
+            wish = next(wishes)
+            while True:
+                if wish == LOOK:
+                    marks = self.look()
+                elif isinstance(wish, StageMotion):
+                    self.go(wish)
+                wish = wishes.send(Sighting(marks, self.pose, float(self.motions)))
+        except StopIteration as end:
+            return end.value  # type: ignore[no-any-return]

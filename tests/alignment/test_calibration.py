@@ -1,0 +1,132 @@
+"""Calibration from moves: against exact cameras of all kinds, by its covariance, and what it refuses."""
+
+import math
+
+import numpy as np
+import pytest
+from alignment.cameras import Stage, camera
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.alignment.calibration import CameraCalibration, Sight, calibrate, placed
+from trirail.alignment.images import LENSES, Lens, pixels, places, slopes
+from trirail.alignment.procedure import MOVES, calibration_by_moves
+from trirail.errors import AlignmentError, AlignmentFault
+from trirail_drivers.interface import Triple
+
+SEEDS = st.integers(0, 2**32 - 1)
+MORE: tuple[Triple, ...] = (
+    *MOVES,
+    *(
+        (x * 1e-3, y * 1e-3, math.radians(phi))
+        for x, y, phi in ((2, 2, 0.5), (2, -2, -1), (-2, 2, -1), (-2, -2, 1), (0, 2, 2))
+    ),
+)
+PART = {"left": (-0.06, 0.01), "right": (0.055, -0.005)}
+
+
+def two_cameras(seed: int, lens: Lens = "affine", noise: float = 0.0) -> Stage:
+    rng = np.random.default_rng(seed)
+    return Stage({name: camera(rng, place, lens) for name, place in PART.items()}, PART, rng, noise)
+
+
+def one_camera(seed: int, lens: Lens = "affine") -> Stage:
+    rng = np.random.default_rng(seed)
+    part = {"left": (0.019, 0.0105), "right": (0.021, 0.0095)}
+    view = camera(rng, (0.02, 0.01), lens)
+    return Stage(dict.fromkeys(part, view), part, rng)
+
+
+@given(SEEDS, st.sampled_from(LENSES), st.booleans())
+def test_exact_looks_give_the_exact_camera_and_marks(seed: int, lens: Lens, one: bool) -> None:
+    stage = one_camera(seed, lens) if one else two_cameras(seed, lens)
+    views = dict.fromkeys(stage.part, "camera") if one else None
+    found = stage.drive(calibration_by_moves(MORE, views, lens, (1000.0, 800.0)))
+    assert found.noise < 1e-6
+    for name, place in stage.part.items():
+        assert found.marks[name].place == pytest.approx(place, abs=1e-9)
+        view, true = found.views[found.marks[name].view], stage.views[name]
+        near = np.array(place) + 1e-3 * np.array([(1.0, 1.0), (-1.0, 0.5), (0.2, -1.0)])
+        assert pixels(view, near) == pytest.approx(pixels(true, near), abs=1e-4)
+        assert view.mirrored == true.mirrored
+    assert found.reach == pytest.approx(
+        max(np.linalg.norm(placed(q, p) - np.array(q)) for q in stage.part.values() for p in MORE), rel=1e-6
+    )
+
+
+@given(SEEDS, st.sampled_from(LENSES))
+def test_places_are_the_inverse_of_pixels_and_slopes_their_derivative(seed: int, lens: Lens) -> None:
+    rng = np.random.default_rng(seed)
+    view = camera(rng, (0.01, -0.02), lens)
+    points = np.array(view.origin) + rng.uniform(-2e-3, 2e-3, (5, 2))
+    assert places(view, pixels(view, points)) == pytest.approx(points, abs=1e-12)
+    step = 1e-7
+    for axis in range(2):
+        d = step * np.eye(2)[axis]
+        difference = (pixels(view, points + d) - pixels(view, points - d)) / (2 * step)
+        assert slopes(view, points)[:, :, axis] == pytest.approx(difference, rel=1e-5, abs=1.0)
+
+
+def test_its_noise_and_deviations_are_those_that_there_are() -> None:
+    marks, noises = [], []
+    for seed in range(300):
+        stage = two_cameras(0, noise=0.1)
+        stage._rng = np.random.default_rng(1000 + seed)
+        found = stage.drive(calibration_by_moves())
+        noises.append(found.noise**2)
+        marks.append(
+            [(np.array(found.marks[name].place) - q) / found.marks[name].deviation for name, q in PART.items()]
+        )
+    assert math.sqrt(np.mean(noises)) == pytest.approx(0.1, rel=0.03)
+    assert np.mean(np.square(marks)) == pytest.approx(1.0, abs=0.35)  # t-distributed, of 12 degrees of freedom
+
+
+def test_marks_that_stand_still_are_refused() -> None:
+    stage = two_cameras(3)
+    frozen = stage.look()
+    stage.look = lambda: frozen  # type: ignore[method-assign]
+    with pytest.raises(AlignmentError, match=r"moved by 0\.00 pixels") as refused:
+        stage.drive(calibration_by_moves())
+    assert refused.value.fault is AlignmentFault.STILL
+
+
+@pytest.mark.parametrize(
+    "moves",
+    [
+        MOVES[:2],
+        [(x * 1e-4, 0.0, 0.0) for x in range(1, 9)],
+        [(x * 1e-4, 2e-4 * x, 0.0) for x in range(1, 9)],
+        [(0.0, 0.0, x * 1e-3) for x in range(1, 9)],
+        [(x * 1e-4, 1e-4 * x * x, 0.0) for x in range(1, 9)],
+    ],
+    ids=["too few", "along x", "along a line", "turns alone", "no turn"],
+)
+def test_moves_that_do_not_tell_it_are_refused(moves: list[Triple]) -> None:
+    with pytest.raises(AlignmentError) as refused:
+        two_cameras(4).drive(calibration_by_moves(moves))
+    assert refused.value.fault is AlignmentFault.MOVES
+
+
+def test_a_lens_that_so_few_looks_cannot_tell_is_refused() -> None:
+    with pytest.raises(AlignmentError) as refused:
+        two_cameras(5, "perspective").drive(calibration_by_moves(MOVES[:4], lens="perspective"))
+    assert refused.value.fault is AlignmentFault.MOVES
+
+
+def test_a_mark_that_is_missing_in_a_look_is_missed_in_none_of_the_others() -> None:
+    stage = two_cameras(6)
+    sights = []
+    for n, pose in enumerate(((0.0, 0.0, 0.0), *MORE)):
+        stage.pose = pose
+        seen = stage.look()
+        if n == 3:
+            del seen["left"]
+        sights.append(Sight(pose, seen))
+    found: CameraCalibration = calibrate(sights)
+    assert found.marks["left"].place == pytest.approx(PART["left"], abs=1e-9)
+    assert "left" not in found.residuals[3]
+
+
+def test_no_mark_at_all_is_refused() -> None:
+    with pytest.raises(AlignmentError) as refused:
+        calibrate([Sight((0.0, 0.0, 0.0), {})])
+    assert refused.value.fault is AlignmentFault.MISSING

@@ -1,0 +1,168 @@
+"""Align with a whole service: one correction on simulated drives, in a thread and in an event loop; files; Ctrl-C."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from alignment.cameras import FOCUS, part_at
+from trirail.alignment.calibration import placed
+from trirail.alignment.images import CameraView, Pair, pixels
+from trirail.client import calibration_file, own_service
+from trirail.client.async_client import AsyncRobot
+from trirail.client.client import Robot
+from trirail.errors import AlignmentError, AlignmentFault, RefusedError, TrirailError
+from trirail.wire.vocabulary import Mode
+
+PART: dict[str, Pair] = {"left": (-0.06, 0.01), "right": (0.06, 0.01)}
+VIEWS = {
+    "left": CameraView((-0.06, 0.01), (1000.0, 800.0), ((FOCUS, 2e4), (1e4, -FOCUS))),
+    "right": CameraView((0.06, 0.01), (1100.0, 700.0), ((-FOCUS, 1e4), (2e4, -FOCUS))),
+}
+ERROR = (0.0008, -0.0006, math.radians(0.35))
+
+
+@pytest.fixture(scope="module")
+def locator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("align")
+    config, locator = own_service.private(folder)
+    with own_service.service(config, folder / "align.rrd"):
+        yield locator
+
+
+def seen(part: dict[str, Pair], pose: tuple[float, float, float]) -> dict[str, Pair]:
+    return {name: tuple(pixels(VIEWS[name], placed(q, pose)[None])[0].tolist()) for name, q in part.items()}
+
+
+@pytest.mark.slow
+def test_one_correction_with_a_thread(locator: str) -> None:
+    with Robot("demo", locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
+        calibration = robot.calibrate_camera(lambda: seen(PART, robot.state().pose))
+        targets = seen(PART, (0.0, 0.0, 0.0))
+        lying = part_at(PART, ERROR)
+        found = robot.align(lambda: seen(lying, robot.state().pose), targets, calibration, tolerance=2e-5, angle=1e-3)
+        assert found.reached
+        assert len(found.corrections) == 1
+        assert found.confirmed
+        now = seen(lying, robot.state().pose)
+        for name in PART:
+            assert now[name] == pytest.approx(targets[name], abs=2e-5 * FOCUS)
+
+
+@pytest.mark.slow
+def test_one_correction_in_an_event_loop_with_a_camera_that_is_waited_for(locator: str) -> None:
+    async def work() -> None:
+        async with AsyncRobot("demo", locator) as robot:
+            await robot.enable()
+            await (await robot.move_to(x=0.0, y=0.0, phi=0.0)).wait(30.0)
+            part = dict(PART)
+
+            async def look() -> dict[str, Pair]:
+                return seen(part, (await robot.state()).pose)
+
+            calibration = await robot.calibrate_camera(look, approach=(1e-3, 0.0, 0.0))
+            part = part_at(PART, ERROR)
+            targets = seen(PART, (0.0, 0.0, 0.0))
+            found = await robot.align(look, targets, calibration, tolerance=2e-5, angle=1e-3, approach=(1e-3, 0.0, 0.0))
+            assert found.reached
+            assert len(found.corrections) == 1
+
+    asyncio.run(work())
+
+
+@pytest.mark.slow
+def test_what_look_raises_ends_it_and_a_correction_out_of_reach_is_refused(locator: str) -> None:
+    with Robot("demo", locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
+        calibration = robot.calibrate_camera(lambda: seen(PART, robot.state().pose))
+        targets = seen(PART, (0.0, 0.0, 0.0))
+        with pytest.raises(ZeroDivisionError):
+            robot.align(lambda: 1 / 0, targets, calibration)  # type: ignore[arg-type, return-value]
+        with pytest.raises(AlignmentError) as refused:
+            robot.align(dict, targets, calibration)
+        assert refused.value.fault is AlignmentFault.MISSING
+        far = calibration_as_confirmed(calibration)
+        with pytest.raises(RefusedError):
+            robot.align(lambda: seen(part_at(PART, (0.5, 0.0, 0.0)), robot.state().pose), targets, far)
+        assert robot.state().pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-4)
+
+
+def calibration_as_confirmed(calibration: Any) -> Any:
+    import msgspec
+
+    return msgspec.structs.replace(calibration, confirmed=True)
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_a_motion_stops_the_robot(locator: str) -> None:
+    main = threading.get_ident()
+
+    def interrupt() -> None:
+        with Robot("demo", locator) as other:
+            for state in other.states(20.0):
+                if state.mode == Mode.MOVING and abs(state.pose[0]) > 1e-3:
+                    break
+        signal.pthread_kill(main, signal.SIGINT)
+
+    with Robot("demo", locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
+        thread = threading.Thread(target=interrupt)
+        thread.start()
+        with pytest.raises(KeyboardInterrupt):
+            robot.calibrate_camera(lambda: seen(PART, robot.state().pose), [(0.05, 0.0, 0.0)], speed=0.02)
+        thread.join()
+        state = robot.state()
+        assert state.mode == Mode.HOLDING
+        assert state.pose[0] < 0.045
+
+
+def test_a_file_keeps_a_calibration_its_date_and_what_made_it(tmp_path: Path, calibrated: Any) -> None:
+    path, made = tmp_path / "camera.json", datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
+    calibration_file.write(path, "demo", calibrated, {"left": (1.0, 2.0)}, made)
+    kept = calibration_file.read(path)
+    assert kept.calibration == calibrated
+    assert (kept.version, kept.robot, kept.made, kept.targets) == (1, "demo", made, {"left": (1.0, 2.0)})
+
+
+@pytest.fixture
+def calibrated() -> Any:
+    from alignment.test_calibration import two_cameras
+    from trirail.alignment.procedure import calibration_by_moves
+
+    return two_cameras(1, noise=0.1).drive(calibration_by_moves())
+
+
+BROKEN: dict[str, Callable[[str], str]] = {
+    "another version": lambda text: text.replace('"version": 1', '"version": 2'),
+    "not JSON": lambda text: text[:-20],
+    "an unknown field": lambda text: text.replace('"noise"', '"nose"'),
+    "no number": lambda text: text.replace('"noise": 0', '"noise": "a", "no": 0'),
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_file_that_is_none_is_refused_with_its_name_and_the_remedy(how: str, tmp_path: Path, calibrated: Any) -> None:
+    path = tmp_path / "camera.json"
+    calibration_file.write(path, "demo", calibrated, {})
+    path.write_text(BROKEN[how](path.read_text(encoding="utf-8")), encoding="utf-8")
+    with pytest.raises(TrirailError, match=r"camera\.json: .*trirail align calibrate"):
+        calibration_file.read(path)
+
+
+def test_numbers_of_a_file_are_kept_to_the_last_digit(tmp_path: Path, calibrated: Any) -> None:
+    path = tmp_path / "camera.json"
+    calibration_file.write(path, "demo", calibrated, {})
+    again = calibration_file.read(path).calibration
+    assert np.array_equal(again.views["left"].matrix, calibrated.views["left"].matrix)
