@@ -1,7 +1,8 @@
 """Setpoints of the paper's robot are the same to the last bit as ever, and as the recursion in plain Python has them.
 
 What is kept in tests/data is the SHA-256 of positions, velocities and accelerations, of sliders and edges, along
-generated goals; sine and cosine are the C library's. Whoever changes the arithmetic on purpose writes it anew: python tests/kinematics/test_golden.py.
+generated goals; sine and cosine are the C library's. Whoever changes the arithmetic on purpose writes it anew:
+python tests/kinematics/test_golden.py.
 """
 
 from __future__ import annotations
