@@ -307,6 +307,25 @@ def test_named_poses_are_buttons_that_come_and_go_with_them(enabled: Page, robot
     enabled.until("document.querySelector('#poses button').disabled")
 
 
+def test_the_last_minutes_are_drawn_and_a_silent_time_is_a_gap(enabled: Page, robot: FakeRobot) -> None:
+    enabled.click("[data-view=charts]")
+    assert enabled.evaluate("document.querySelector('#mechanism').hasAttribute('hidden')")
+    assert enabled.evaluate("document.querySelectorAll('#charts canvas').length") == 4
+    enabled.key_down("ArrowRight")
+    moves(robot)
+    time.sleep(0.5)
+    enabled.key_up("ArrowRight")
+    rows = "(await import('./panel.js')).charts.rows"
+    drawn = enabled.evaluate(f"(async () => {rows})()")
+    assert len(drawn) > 3
+    assert drawn[-1][0] > drawn[0][0] + 2.0
+    assert drawn[-1][1:3] == pytest.approx([5.0, math.degrees(0.1)])
+    robot.silent.set()
+    enabled.until("document.querySelector('#mode-name').textContent === 'no contact'")
+    assert enabled.evaluate(f"(async () => {rows})()")[-1] == [None] * 7
+    robot.silent.clear()
+
+
 # ---------------------------------------------------------------------- poses that are typed, dragged and kept
 
 

@@ -1,5 +1,6 @@
 // The operator's page: a WebSocket to the panel's server, buttons that say what is wanted, and what the robot says.
 
+import { Charts } from "./charts.js";
 import { Drawing } from "./drawing.js";
 import { Going } from "./going.js";
 import { Hold } from "./hold.js";
@@ -16,6 +17,7 @@ const LIGHT = matchMedia("(prefers-color-scheme: light)");
 
 const byId = (id) => document.getElementById(id);
 const readings = new Readings();
+export const charts = new Charts();
 let socket = null;
 let told = null; // the robot, as the server tells of it
 let robot = null; // the same in colours that can be read
@@ -77,6 +79,7 @@ const takes = {
     said = robot = { ...said, colours: { ...said.colours, sliders: said.colours.sliders.map(readable) } };
     drawing = new Drawing(byId("mechanism"), said);
     readings.robot(said);
+    charts.robot(said);
     document.querySelector("[data-command=home]").hidden = said.homes.length === 0;
     showSpeed();
     allow();
@@ -129,6 +132,7 @@ function draw() {
   document.body.dataset.contact = "yes";
   drawing.show(state.state);
   going.stands(state.state.pose);
+  charts.state(state.state, performance.now());
   readings.state(state.state);
   const percent = Math.round(state.state.override * 100);
   const override = byId("override");
@@ -146,6 +150,7 @@ function lost(why) {
   contact = false;
   document.body.dataset.contact = "none";
   readings.lost(why);
+  charts.lost();
   allow();
 }
 
@@ -252,6 +257,14 @@ for (const button of document.querySelectorAll("[data-command]"))
     send({ do: "command", name: button.dataset.command });
   });
 
+for (const view of byId("views").children)
+  view.addEventListener("click", () => {
+    for (const each of byId("views").children) {
+      each.setAttribute("aria-checked", String(each === view));
+      byId(each.dataset.view).toggleAttribute("hidden", each !== view);
+    }
+    charts.draw();
+  });
 byId("steps").replaceChildren(...STEPS.map(stepButton));
 chooseStep(0);
 byId("pose-name").addEventListener("input", allow);

@@ -1,0 +1,77 @@
+// The last minutes as curves: where the robot is, how far its sliders are behind, and how late its loop is.
+
+import uPlot from "./uplot.js";
+
+const KEPT = 180; // seconds
+const EVERY = 100; // between two points [ms]
+const DRAWN = 250; // between two drawings [ms]
+const HEIGHT = 124; // of one chart [px]
+const PHI = 180 / Math.PI;
+
+const byId = (id) => document.getElementById(id);
+const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+export class Charts {
+  constructor() {
+    this.times = [];
+    this.rows = []; // x, y [mm], φ [°], following error of each slider [µm], lateness [µs]
+    this.last = -Infinity;
+    this.drawn = -Infinity;
+    this.plots = [];
+  }
+
+  // Begin anew, for this robot.
+  robot({ sliders, colours }) {
+    for (const plot of this.plots) plot.destroy();
+    this.times.length = this.rows.length = 0;
+    const [x, y, phi] = ["--accent", "--second", "--third"].map(style);
+    this.plots = [
+      plot("x, y [mm]", [["x", x], ["y", y]], [0, 1]),
+      plot("φ [°]", [["φ", phi]], [2]),
+      plot("following error [µm]", sliders.map((name, k) => [name, colours.sliders[k]]), [3, 4, 5]),
+      plot("lateness, 99 % [µs]", [["lateness", x]], [6]),
+    ];
+  }
+
+  state({ pose, sliders, loop }, now) {
+    if (now - this.last < EVERY) return;
+    this.last = now;
+    this.times.push(Date.now() / 1e3);
+    this.rows.push([pose[0] * 1e3, pose[1] * 1e3, pose[2] * PHI, ...sliders.following_error.map((each) => each * 1e6), loop.lateness_us.p99]);
+    while (this.times[this.times.length - 1] - this.times[0] > KEPT) {
+      this.times.shift();
+      this.rows.shift();
+    }
+    if (now - this.drawn < DRAWN || byId("charts").hidden) return;
+    this.drawn = now;
+    this.draw();
+  }
+
+  // A time without contact is a gap.
+  lost() {
+    if (!this.rows.length || this.rows.at(-1)[0] === null) return;
+    this.times.push(Date.now() / 1e3);
+    this.rows.push(Array(7).fill(null));
+  }
+
+  draw() {
+    const width = byId("charts").clientWidth;
+    for (const each of this.plots) {
+      if (each.width !== width) each.setSize({ width, height: HEIGHT });
+      each.setData([this.times, ...each.columns.map((column) => this.rows.map((row) => row[column]))]);
+    }
+  }
+}
+
+function plot(title, lines, columns) {
+  const axis = { stroke: style("--quiet"), grid: { stroke: style("--raised") }, ticks: { stroke: style("--raised") } };
+  const series = lines.map(([label, stroke]) => ({ label, stroke, width: 1.5, spanGaps: false, points: { show: false } }));
+  const clock = (_, times) => times.map((time) => new Date(time * 1e3).toLocaleTimeString("en-GB"));
+  const made = new uPlot(
+    { title, width: 300, height: HEIGHT, legend: { show: lines.length > 1, live: false }, cursor: { show: false }, axes: [{ ...axis, values: clock, space: 90 }, { ...axis, size: 60 }], series: [{}, ...series] },
+    [[], ...lines.map(() => [])],
+    byId("charts"),
+  );
+  made.columns = columns;
+  return made;
+}
