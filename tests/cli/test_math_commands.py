@@ -169,7 +169,7 @@ def test_the_workspace_of_another_robot(answer: Any, tmp_path: Path) -> None:
 def test_the_workspace_in_words(capsys: pytest.CaptureFixture[str]) -> None:
     assert call("workspace --phi 0 0.5") == 0
     words = capsys.readouterr().out
-    for expected in ("-150.00 to 150.00", "-59.38 to 51.41", "0.112627", "0.081484", "28.65"):
+    for expected in ("-150.00 to 150.00", "-59.38 to 51.41", "1126.266", "814.841", "28.65", "cm²"):
         assert expected in words
     assert "-0.00" not in words
 

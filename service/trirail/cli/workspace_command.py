@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 STEPS = (1, 2, 5, 10, 15, 20, 30, 45)
 """From one slice to the next, if no angles are asked for [°]."""
+CM2 = 1e4
+"""Areas are shown in cm²: a stage has some, a large robot a thousand."""
 SLICES = 8
 """So many of them at most."""
 
@@ -116,17 +118,17 @@ def _print_extents(service: Extent, reach: Extent, at_zero: tuple[float, float])
     table.add_row("x", *(_range(each.x, 1e3) for each in both), "mm")
     table.add_row("y", *(_range(each.y, 1e3) for each in both), "mm")
     table.add_row("φ", *(_range(each.phi, math.degrees(1.0)) for each in both), "°")
-    table.add_row("area at φ = 0", *(units.number(each, 6) for each in at_zero), "m²")
-    table.add_row("greatest area", *(units.number(each.best_area, 6) for each in both), "m²")
+    table.add_row("area at φ = 0", *(units.number(each * CM2, 3) for each in at_zero), "cm²")
+    table.add_row("greatest area", *(units.number(each.best_area * CM2, 3) for each in both), "cm²")
     table.add_row("  at φ =", *(units.number(math.degrees(each.best_phi), 2) for each in both), "°")
-    table.add_row("volume", *(units.number(each.volume, 6) for each in both), "m² rad")
+    table.add_row("volume", *(units.number(each.volume * CM2, 3) for each in both), "cm² rad")
     terminal.out.print(table)
 
 
 def _print_slices(slices: list[tuple[float, float, float]]) -> None:
-    table = terminal.table("slice at φ [°]", "permitted [m²]", "reached [m²]")
+    table = terminal.table("slice at φ [°]", "permitted [cm²]", "reached [cm²]")
     for angle, inside, whole in slices:
-        table.add_row(units.number(math.degrees(angle), 2), units.number(inside, 6), units.number(whole, 6))
+        table.add_row(units.number(math.degrees(angle), 2), *(units.number(each * CM2, 3) for each in (inside, whole)))
     terminal.out.print(table)
 
 

@@ -30,8 +30,9 @@ COLOURS, SCALE = colormaps["viridis"], Normalize(0.0, 1.0)
 BEYOND = 0.35  # opacity of what the robot reaches outside the platform's window
 PIXELS = 160  # samples of conditioning across a slice
 COLUMNS, WIDTH, STRIP = 4, 13.0, 3.4  # of the figure, in inches the last two
+AROUND = 2.5  # of a stage, whose travels are small beside its table, so many times what it reaches is shown
 DASHES = (0, (4, 3))
-MM = 1e3
+MM, CM2 = 1e3, 1e4
 
 
 def draw(
@@ -54,7 +55,8 @@ def draw(
         _slice(panel, geometry, limits, parts, phi)
     for panel in panels.flat[len(angles) :]:
         panel.set_axis_off()
-    extent = 1.06 * MM * np.abs([*np.ravel(parts.rails), *reach.x, *reach.y]).max()
+    reached = float(np.abs([*reach.x, *reach.y]).max())
+    extent = MM * min(1.06 * max(reached, float(np.abs(parts.rails).max())), AROUND * reached)
     panels[0, 0].set(xlim=(-extent, extent), ylim=(-extent, extent))
     for panel in panels[:, 0]:
         panel.set_ylabel("y [mm]", color=GREY, fontsize=9)
@@ -88,7 +90,7 @@ def _slice(panel: Axes, geometry: Geometry, limits: Limits, parts: Mechanism, ph
         panel.text(0.5, 0.5, "out of reach", color=GREY, ha="center", va="center", transform=panel.transAxes, zorder=8)
     panel.set_aspect("equal")
     panel.set_title(f"φ = {_degrees(phi)}", loc="left", color=INK, fontsize=11, fontweight="bold", pad=4)
-    panel.set_title(f"{area(service):.4f} m²", loc="right", color=GREY, fontsize=9, pad=4)
+    panel.set_title(f"{CM2 * area(service):.4g} cm²", loc="right", color=GREY, fontsize=9, pad=4)
     _quiet(panel)
 
 
@@ -121,26 +123,31 @@ def _areas(
     for wall, inward in ((low, margin), (high, -margin)):
         strip.axvspan(wall, wall + inward, color=FORBIDDEN, alpha=0.10, linewidth=0)
         strip.axvline(wall, color=FORBIDDEN, linewidth=1.2)
-    strip.fill_between(np.degrees(reach.angles), reach.areas, color=RAIL, alpha=0.45, linewidth=0)
-    strip.plot(np.degrees(reach.angles), reach.areas, color=GREY, linewidth=0.9)
+    strip.fill_between(np.degrees(reach.angles), CM2 * reach.areas, color=RAIL, alpha=0.45, linewidth=0)
+    strip.plot(np.degrees(reach.angles), CM2 * reach.areas, color=GREY, linewidth=0.9)
     shown = np.degrees(service.angles)
     centre = conditioning(geometry, np.column_stack([np.zeros((len(shown), 2)), service.angles]))
-    filled = strip.fill_between(shown, service.areas, alpha=0.0)
+    filled = strip.fill_between(shown, CM2 * service.areas, alpha=0.0)
     image = strip.imshow(
         centre[np.newaxis],
         cmap=COLOURS,
         norm=SCALE,
         aspect="auto",
-        extent=(shown[0], shown[-1], 0.0, service.best_area),
+        extent=(shown[0], shown[-1], 0.0, CM2 * service.best_area),
         interpolation="bilinear",
         zorder=2,
     )
     image.set_clip_path(filled.get_paths()[0], transform=strip.transData)
-    strip.plot(shown, service.areas, color=INK, linewidth=1.4, zorder=3)
+    strip.plot(shown, CM2 * service.areas, color=INK, linewidth=1.4, zorder=3)
     strip.plot(
-        np.degrees(angles), [area(permitted(geometry, limits, phi)) for phi in angles], "o", color=INK, markersize=4
+        np.degrees(angles),
+        [CM2 * area(permitted(geometry, limits, phi)) for phi in angles],
+        "o",
+        color=INK,
+        markersize=4,
     )
-    strip.set(xlim=(low - 3.0, high + 3.0), ylim=(0.0, 1.12 * reach.best_area))
+    first, last = AROUND * np.degrees(reach.phi)
+    strip.set(xlim=(max(low - 3.0, first), min(high + 3.0, last)), ylim=(0.0, 1.12 * CM2 * reach.best_area))
     strip.set_title(
         "Area of the slices along φ, coloured by the conditioning at x = y = 0",
         loc="left",
@@ -149,20 +156,27 @@ def _areas(
         pad=6,
     )
     strip.set_xlabel("φ [°]", color=GREY, fontsize=9)
-    strip.set_ylabel("area [m²]", color=GREY, fontsize=9)
+    strip.set_ylabel("area [cm²]", color=GREY, fontsize=9)
     _quiet(strip)
     strip.legend(
         handles=[
             Patch(
-                facecolor=COLOURS(0.7), edgecolor=INK, label=f"what the service permits: {service.volume:.4f} m²·rad"
+                facecolor=COLOURS(0.7),
+                edgecolor=INK,
+                label=f"what the service permits: {CM2 * service.volume:.4g} cm²·rad",
             ),
-            Patch(facecolor=RAIL, alpha=0.6, edgecolor=GREY, label=f"the robot's own reach: {reach.volume:.4f} m²·rad"),
+            Patch(
+                facecolor=RAIL,
+                alpha=0.6,
+                edgecolor=GREY,
+                label=f"the robot's own reach: {CM2 * reach.volume:.4g} cm²·rad",
+            ),
             Line2D([], [], color=PLATFORM, linewidth=0.9, label="the platform, turned, with its centre at x = y = 0"),
             Line2D([], [], color=INK, linewidth=0.7, linestyle=DASHES, label="limits.platform, the window for x and y"),
             Patch(facecolor=FORBIDDEN, alpha=0.3, label=f"singular, and {margin:.1f}° of margin"),
         ],
         loc="upper left",
-        bbox_to_anchor=(low + margin + 1.0, 1.0),
+        bbox_to_anchor=(max(low + margin + 1.0, first), 1.0),
         bbox_transform=strip.get_xaxis_transform(),
         frameon=False,
         fontsize=9,
