@@ -86,7 +86,8 @@ def test_nothing_that_people_read_of_a_stage_has_the_letter_of_a_slider(stage: s
     said.append(readout.markdown(np.zeros(1, DTYPE)[0], Standing(), labels))
     assert not [words for words in said if LETTER.search(words)]
     assert f"| {' | '.join(labels)} |" in said[-1]
-    assert describe(told, robot, "me")["sliders"] == labels
+    shown = describe(told, robot, "me")
+    assert (shown["sliders"], shown["decimals"]) == (labels, 4)
     drawn = curves.plots(robot)[curves.POSITION].moving
     assert tuple(line.name for line in drawn) == labels
     assert provenance.labels(provenance.texts(config)) == labels

@@ -14,6 +14,11 @@ from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.state import Info
 from trirail.workspace.mechanism import Mechanism
 
+STAGE = 0.05
+"""Whose platform goes no further along x [m] is a stage, of which tenths of a micrometre matter."""
+FINE, COARSE = 4, 2
+"""Decimals of millimetres; of degrees there is one more."""
+
 
 def shown(info: Info) -> ShownRobot:
     """Return the robot that a service tells of. Raises ServiceError where the service is of another version."""
@@ -36,6 +41,7 @@ def describe(info: Info, robot: ShownRobot, user: str) -> dict[str, Any]:
         "speeds": SPEEDS,
         "homes": info.homes,
         "sliders": robot.geometry.labels,
+        "decimals": FINE if platform.x[1] - platform.x[0] <= STAGE else COARSE,
         "legs": [
             {
                 "anchor": leg.anchor,

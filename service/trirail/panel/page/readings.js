@@ -9,9 +9,11 @@ export class Readings {
     this.pose = rows(byId("pose"), ["x", "y", "φ"], 2);
     this.sliders = rows(byId("sliders"), ["A", "B", "C"], 2);
     this.rank = [0, 0];
+    this.decimals = 2;  // of mm; of degrees one more
   }
 
-  robot({ name, user, version, colours, sliders }) {
+  robot({ name, user, version, colours, sliders, decimals }) {
+    this.decimals = decimals;
     this.colours = colours.modes;
     byId("name").textContent = name;
     byId("user").textContent = `as ${user}, trirail ${version}`;
@@ -34,14 +36,14 @@ export class Readings {
     text(byId("doing"), doing.join(" · "));
     byId("lamp").style.background = this.colours[mode] ?? "transparent";
     this.alarm(faults.length ? `Fault: ${faults.join("\n")}\nRemove the cause, then Reset, then Enable.` : "");
-    const shown = (value, k) => (k < 2 ? `${fixed(value * 1e3, 2)} mm` : `${fixed((value * 180) / Math.PI, 3)}°`);
+    const shown = (value, k) => (k < 2 ? `${fixed(value * 1e3, this.decimals)} mm` : `${fixed((value * 180) / Math.PI, this.decimals + 1)}°`);
     this.pose.forEach(([measured, target], k) => {
       text(measured, shown(pose[k], k));
       text(target, goal?.target ? shown(goal.target[k], k) : "–");
     });
     this.sliders.forEach(([position, velocity], k) => {
-      text(position, `${fixed(sliders.position[k] * 1e3, 2)} mm`);
-      text(velocity, `${fixed(sliders.velocity[k] * 1e3, 1)} mm/s`);
+      text(position, `${fixed(sliders.position[k] * 1e3, this.decimals)} mm`);
+      text(velocity, `${fixed(sliders.velocity[k] * 1e3, this.decimals - 1)} mm/s`);
     });
   }
 
