@@ -203,7 +203,7 @@ class Slow:
         yield SimpleNamespace(goal=None)
 
     def info(self) -> SimpleNamespace:
-        return SimpleNamespace(limits=msgspec.to_builtins(load(SIM).limits))
+        return SimpleNamespace(limits=msgspec.to_builtins(load(SIM).limits), labels=("A", "B", "C"))
 
 
 @pytest.mark.parametrize(

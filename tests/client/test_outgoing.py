@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -376,6 +377,8 @@ def of_name(name: str) -> Call:
     return lambda robot, _: getattr(robot, name)()
 
 
+CALIBRATION: Any = SimpleNamespace(confirmed=True)
+"""Of a camera: nobody gets as far as to look into it."""
 CLOSED: dict[str, Call] = {
     **{name: of_name(name) for name in ("enable", "disable", "stop", "quick_stop", "reset", "home")},
     **{name: of_name(name) for name in ("pause", "resume", "release")},
@@ -388,6 +391,8 @@ CLOSED: dict[str, Call] = {
     "forget": lambda robot, _: robot.forget("out"),
     "state": lambda robot, _: robot.state(),
     "records": lambda robot, _: robot.records(print),
+    "calibrate_camera": lambda robot, _: robot.calibrate_camera(dict),
+    "align": lambda robot, _: robot.align(dict, {"a": (0.0, 0.0)}, CALIBRATION),
 }
 
 

@@ -56,7 +56,7 @@ class GoToPose(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", 
     """x, y [m] and phi [rad] in the base frame."""
 
 
-class Check(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="check"):
+class CheckPose(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="check"):
     """Whether such a pose can be gone to is to be said, without moving."""
 
     pose: Coordinates
@@ -65,7 +65,7 @@ class Check(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag
     """By which the page knows the answer."""
 
 
-class Step(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="step"):
+class JogStep(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="step"):
     """A jog button has been pressed where it is for steps."""
 
     by: Coordinates
@@ -88,4 +88,4 @@ class Forget(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", ta
     """The pose's."""
 
 
-FromPage = Seen | Hold | Release | Tell | SetOverride | GoTo | GoToPose | Check | Step | Teach | Forget
+FromPage = Seen | Hold | Release | Tell | SetOverride | GoTo | GoToPose | CheckPose | JogStep | Teach | Forget

@@ -17,16 +17,16 @@ from trirail.client.lease import Lease
 from trirail.errors import TrirailError
 from trirail.panel.feed import Feed, now
 from trirail.panel.messages import (
-    Check,
+    CheckPose,
     Forget,
     FromPage,
     GoTo,
     GoToPose,
     Hold,
+    JogStep,
     Release,
     Seen,
     SetOverride,
-    Step,
     Teach,
     Tell,
 )
@@ -102,14 +102,14 @@ class Tab:
                 self._jog.release()
             case Tell(name):
                 self._tell(name)
-            case Check(pose, number):
+            case CheckPose(pose, number):
                 self._checks.ask(pose, number)
             case _:
                 self._ask(said)
 
     # ------------------------------------------------------------------ doing
 
-    def _ask(self, said: SetOverride | GoTo | GoToPose | Step | Teach | Forget) -> None:
+    def _ask(self, said: SetOverride | GoTo | GoToPose | JogStep | Teach | Forget) -> None:
         """Ask the service for what is answered there, and is under way beside all else."""
         robot = self._robot
         match said:
@@ -119,7 +119,7 @@ class Tab:
                 self._begin(lambda: robot.move_to_named(name), f"go to {name}", "accepted")
             case GoToPose(pose):
                 self._begin(lambda: robot.move_to(*pose), "go there", "accepted")
-            case Step(by, seen):
+            case JogStep(by, seen):
                 if now() - seen <= FRESH:
                     self._begin(lambda: robot.move(*by), "step", "accepted")
             case Teach(name):
