@@ -952,3 +952,20 @@ def test_the_demo(tmp_path: Path) -> None:
     assert shown.returncode == 0, shown.stderr + shown.stdout
     assert "12 of 12 done" in shown.stdout
     assert (tmp_path / "demo.rrd").stat().st_size > 100_000
+
+
+@pytest.mark.alone  # the demo has a port of the machine
+@pytest.mark.parametrize("stage", ["uvw", "uvw-ppr", "xxy"])
+def test_a_stage_is_toured_summed_up_and_replayed_as_the_papers_robot_is(stage: str, tmp_path: Path) -> None:
+    file = tmp_path / "stage.rrd"
+    shown = trirail("demo", stage, "--record", file)
+    assert shown.returncode == 0, shown.stderr + shown.stdout
+    assert "8 of 8 done" in shown.stdout
+    summed = trirail("report", file).stdout
+    for label in load(SIM.with_name(f"{stage}.toml")).geometry.labels:
+        assert f"error of {label}" in summed
+    replayed = trirail("replay", file)
+    assert replayed.returncode == 0, replayed.stderr + replayed.stdout
+    assert "the same to the last bit, in every cycle" in replayed.stdout
+    assert trirail("export", file, "--every", "10ms", "--columns", "pose,error").returncode == 0
+    assert len(file.with_suffix(".csv").read_text().splitlines()) > 100

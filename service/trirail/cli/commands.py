@@ -43,7 +43,7 @@ from trirail.wire.vocabulary import Command
 
 app = App(
     name="trirail",
-    help="Drives a 3-PRP planar parallel robot in real time: goals in over Zenoh, setpoints out over CAN.",
+    help="Drives a 3-PRP planar robot, or a UVW, XXY or 3-PPR stage, in real time: goals by Zenoh, setpoints by CAN.",
     version=f"trirail {__version__}",
 )
 

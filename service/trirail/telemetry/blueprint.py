@@ -96,7 +96,7 @@ def _robot(shown: Shown, timeline: str) -> rrb.Spatial2DView:
     low, high = shown.bounds + MARGIN * np.ptp(shown.bounds) * np.array([[-1.0], [1.0]])
     trace = rrb.VisibleTimeRanges(timeline=timeline, range=_last(WINDOW))
     return rrb.Spatial2DView(
-        name=f"{shown.robot.name}: 3-PRP planar robot",
+        name=f"{shown.robot.name}: {shown.robot.geometry.kind} planar robot",
         origin=shown.root or "/",
         contents=f"{shown.root}/robot/**",
         visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
