@@ -34,6 +34,7 @@ from trirail.wire.records import DTYPE, unpack
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED
 from trirail_drivers.bus.frames import packed, unpacked
+from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
@@ -77,7 +78,7 @@ class Session:
         """Whether the bus does."""
         self.ends = Lockstep(carrier, folder, self)
         self._stack.callback(self.ends.close)
-        driver = PROTOCOLS[config.drives.protocol].driver(
+        self.driver = driver = PROTOCOLS[config.drives.protocol].driver(
             self.ends.bus, config.can.bitrate, config.drives, self.clock_of_driver
         )
         self.setting_up = True
@@ -306,6 +307,7 @@ def test_quiet_cycles_are_those_of_python_to_the_last_bit(
     assert len(one.heard) > CYCLES
     _compare(one.heard, other.heard)
     assert one.sent == other.sent
+    assert one.driver.traffic == other.driver.traffic
     assert one.captured() == other.captured()
 
 
@@ -369,6 +371,7 @@ def test_frames_that_a_full_bus_refuses_are_lost_alone(protocol: str, seed: int,
     assert one.loop.control.fault is None
     _compare(one.heard, other.heard)
     assert one.sent == other.sent
+    assert one.driver.traffic == other.driver.traffic
 
 
 @pytest.mark.parametrize("room", range(8))
@@ -382,6 +385,7 @@ def test_a_socket_that_is_full_within_a_cycle_loses_its_last_frames(protocol: st
     assert one.loop.control.fault is None
     _compare(one.heard, other.heard)
     assert one.sent == other.sent
+    assert one.driver.traffic == other.driver.traffic
 
 
 @pytest.mark.parametrize(
@@ -399,6 +403,7 @@ def test_a_frame_that_is_refused_for_good_stops_the_drives_in_the_same_cycle(
     assert one.loop.quiet_cycles > 100
     _compare(one.heard, other.heard)
     assert one.sent == other.sent
+    assert one.driver.traffic == other.driver.traffic
 
 
 @pytest.mark.parametrize("number", [250, 251, 257])
@@ -434,6 +439,22 @@ def test_what_the_last_gate_refuses_is_a_fault_in_the_same_cycle(protocol: str, 
     assert "time along the path would run backwards" in (one.loop.control.fault or "")
     _compare(one.heard, other.heard)
     assert one.sent == other.sent
+    assert one.driver.traffic == other.driver.traffic
+
+
+def test_a_position_that_comes_twice_now_and_then_is_no_second_nodes(tmp_path: Path) -> None:
+    """They are counted over twenty SYNCs, whoever runs the cycles."""
+
+    def say_once_more(session: Session) -> None:
+        assert isinstance(session.driver, Cia402)
+        (actual,) = (axis.actual for axis in session.driver._axes if axis.node == 1)
+        session.inject(CAN_FRAME.pack(0x281, 4, struct.pack("<i", actual + 1)))
+
+    happens = {number: [Happening(say_once_more)] for number in range(100, 900, 37)}
+    one, other = both_ways(CONFIG, tmp_path, lambda: happens, 900)
+    assert one.loop.quiet_cycles > 100
+    assert one.loop.control.fault is None
+    _compare(one.heard, other.heard)
 
 
 @pytest.mark.parametrize("cycles", [50.0, 50.3, 50.999])

@@ -203,7 +203,6 @@ class Cia402(Driver[Cia402Axis]):
         self._wire.hand_in(self._tables.arrived, arrived, error)
         feedback = self._feedback()
         if synced is not None:
-            self._wire.begin()
             self._synced = synced
             if times["begun"] != NOWHERE:
                 self._begin(synced, self._heartbeat_due, int(times["begun"]))

@@ -164,7 +164,6 @@ class Odrive(Driver[OdriveAxis]):
         self._wire.hand_in(self._tables.arrived, arrived, error)
         feedback = self._feedback()
         if synced is not None:
-            self._wire.begin()
             self._synced = synced
             if times["begun"] != NOWHERE:
                 self._begin(synced, self._errors_due, int(times["begun"]))
