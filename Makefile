@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 
-.PHONY: demo check test test-all hil explore chaos soak ci-packages bench clean
+.PHONY: demo check test test-all hil explore chaos soak ci-packages bench screenshots clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
@@ -51,6 +51,16 @@ $(READY): pyproject.toml
 	$(VENV)/bin/python -m pip install --quiet --editable . --group dev
 	$(VENV)/bin/python -m trirail.processes.compiling
 	touch $(READY)
+
+PICTURES := tools/pictures
+screenshots: $(READY)  ## every picture of the guides anew, from what runs; needs Chromium and the Rerun viewer
+	$(VENV)/bin/python tools/frames_picture.py
+	$(VENV)/bin/python tools/panel_picture.py
+	$(VENV)/bin/trirail workspace --plot $(PICTURES)/workspace.png
+	rm -f $(PICTURES)/demo.rrd
+	$(VENV)/bin/trirail demo --record $(PICTURES)/demo.rrd
+	$(VENV)/bin/python tools/screenshot.py $(PICTURES)/demo.rrd $(PICTURES)/demo.png
+	rm $(PICTURES)/demo.rrd
 
 clean:  ## remove what the commands above made
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
