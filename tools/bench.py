@@ -119,6 +119,14 @@ def recorder(*, seconds: float = 60.0, json: bool = False) -> None:
 
 
 @app.command
+def align(*, parts: int = 200, goals: int = 20, json: bool = False) -> None:
+    """Align seeded parts on computed stages of both kinds, by right and wrong models, and time it on a service."""
+    import bench_align
+
+    report(bench_align.measure(parts, goals), json)
+
+
+@app.command
 def start(*, json: bool = False) -> None:
     """Time the start of a service on simulated drives, and weigh its processes."""
     import bench_start

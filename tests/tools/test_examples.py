@@ -220,3 +220,17 @@ def test_zenoh_and_json_alone_are_enough(service: Service) -> None:
     lines = run("plain_zenoh.py", "demo", service.locator)
     assert lines[-1].startswith("done goal")
     assert pose(service) == pytest.approx((0.0, 0.02, -0.1), abs=1e-9)
+
+
+ALIGN = ["align_with_two_cameras.py", "align_with_one_camera.py", "align_with_a_moved_camera.py"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ALIGN)
+def test_parts_are_laid_right(name: str, service: Service) -> None:
+    with Robot("demo", service.locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN)
+    *_, last = run(name, "demo", service.locator)
+    assert float(last.split(" µm")[0].split()[-1]) < 20.0
+    assert max(map(abs, pose(service))) > 1e-4

@@ -16,6 +16,7 @@ from cyclopts import App, CoercionError, CycloptsError, UnknownOptionError, Unus
 
 from trirail import __version__
 from trirail.cli import (
+    align_command,
     commission,
     config_commands,
     drives_command,
@@ -197,6 +198,7 @@ app.command(fleet_command.fleet)
 app.command(drives_command.app)
 app.command(commission.commission)
 app.command(panel_command.panel)
+app.command(align_command.app)
 for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)

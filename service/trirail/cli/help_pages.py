@@ -65,6 +65,11 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "forget": ("trirail forget pick",),
         "poses": ("trirail poses", "trirail poses --json"),
         "panel": ("trirail panel", "trirail panel --open", "trirail panel --port 9000"),
+        "align": (
+            "trirail align calibrate camera.json --program ./marks",
+            "trirail align run camera.json --camera left=0 --camera right=1 --shape disc --size 80",
+            "trirail align check camera.json --pictures shots --json",
+        ),
         "pause": ("trirail pause",),
         "resume": ("trirail resume",),
         "override": ("trirail override 50",),
