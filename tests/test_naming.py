@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
+import calibrate
 import msgspec
 import numpy as np
 import pytest
@@ -13,10 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail import naming
 from trirail.cli import live
-from trirail.config import Config, load, parse
+from trirail.config import Config, geometry, load, parse
 from trirail.config.loading import SIM
+from trirail.config.tables import GeometryTable
 from trirail.diagnosis.bench import JUDGEMENTS
 from trirail.errors import ConfigError, KinematicsError
+from trirail.kinematics.calibration import corrected
 from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Bounds
 from trirail.panel.description import describe
@@ -100,3 +104,12 @@ def test_no_source_spells_the_letters_where_it_writes_for_people() -> None:
     for file in Path(trirail.__file__).parent.rglob("*"):
         if file.suffix in (".py", ".js"):
             assert not spelt.search(file.read_text(encoding="utf-8")), file
+
+
+@pytest.mark.parametrize("stage", ["uvw", "xxy", "uvw-ppr"])
+def test_a_calibrated_geometry_keeps_its_labels(stage: str) -> None:
+    """The section that is written is put into a configuration as it is."""
+    as_configured = geometry(load(SIM.with_name(f"{stage}.toml")).geometry)
+    written = tomllib.loads(calibrate.section(corrected(as_configured, np.zeros((3, 5)))))
+    read = geometry(msgspec.convert(written["geometry"], GeometryTable))
+    assert (read, read.labels) == (as_configured, as_configured.labels)

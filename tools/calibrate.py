@@ -79,8 +79,9 @@ def _numbers(names: Sequence[str], fields: Sequence[str], line: int) -> list[flo
 
 def section(geometry: Geometry) -> str:
     """Return the [geometry] section of a configuration, exact to the last digit."""
-    lines = ["[geometry]", f'kind = "{geometry.kind}"']
-    for name, leg in zip(LEGS, geometry.each, strict=True):
+    labels = ", ".join(f'"{label}"' for label in geometry.labels)
+    lines = ["[geometry]", f'kind = "{geometry.kind}"', f"labels = [{labels}]"]
+    for name, leg in zip(geometry.labels, geometry.each, strict=True):
         lines += ["", f"[[geometry.leg]]  # {name}"]
         for key, value in leg.keys().items():
             lines.append(f"{key} = {np.asarray(value).tolist()}")
@@ -96,7 +97,7 @@ def describe(found: Calibration, lines: Sequence[int]) -> str:
         said.append(f"{f'{name} [{unit}]':<36}{rms * scale:>10.3f}{column[worst] * scale:>12.3f}  line {lines[worst]}")
 
     said += ["", f"{'correction':<36}{'change':>10}{'std. error':>12}"]
-    for leg, changes, errors in zip(LEGS, found.corrections, found.standard_errors, strict=True):
+    for leg, changes, errors in zip(found.geometry.labels, found.corrections, found.standard_errors, strict=True):
         for name, change, error in zip(found.geometry.parameters, changes, errors, strict=True):
             unit = "mrad" if name.endswith("angle") else "mm"
             known = f"{error * 1e3:.4f}" if math.isfinite(error) else "open"

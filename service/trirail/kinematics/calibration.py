@@ -128,7 +128,7 @@ def identify(
 def corrected(start: Geometry, corrections: Array) -> Geometry:
     """Return the geometry with corrections, (3, 5) in m and rad, to its parameters. KinematicsError as Geometry."""
     first, second, third = (leg.corrected(row) for leg, row in zip(start.each, corrections.tolist(), strict=True))
-    return Geometry(legs=(first, second, third))
+    return Geometry(legs=(first, second, third), labels=start.labels)
 
 
 def pose_derivatives(geometry: Geometry, start: Geometry, poses: Array) -> Array:

@@ -176,7 +176,7 @@ def other_kind(geometry: Geometry) -> Geometry:
         carriage = x + along * math.cos(leg.rail_angle), y + along * math.sin(leg.rail_angle)
         kind = PprLeg if isinstance(leg, Leg) else Leg
         legs.append(kind(leg.anchor, leg.rail_angle, leg.home, carriage, leg.cross_angle))
-    return Geometry(legs=(legs[0], legs[1], legs[2]))
+    return Geometry(legs=(legs[0], legs[1], legs[2]), labels=geometry.labels)
 
 
 def gains(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
