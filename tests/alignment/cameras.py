@@ -49,7 +49,7 @@ class Stage:
         noise: float = 0.0,
         moved: Callable[[Triple], Triple] = lambda by: by,
     ) -> None:
-        self.views, self.part, self._rng, self._noise, self._moved = views, dict(part), rng, noise, moved
+        self.views, self.part, self._rng, self._noise, self._moved = dict(views), dict(part), rng, noise, moved
         self.pose: Triple = (0.0, 0.0, 0.0)
         self.way = 0.0
         """The longest of the motions that were made about a point [m]."""

@@ -1,7 +1,9 @@
 """Alignment on an ideal stage: one correction, and what ends it or is refused before anything moves."""
 
+import contextlib
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from alignment.cameras import Stage, camera, part_at
@@ -80,6 +82,30 @@ def test_a_stage_that_moves_otherwise_does_not_walk_away(wrong: str, seed: int, 
         assert len(found.corrections) == 1
 
 
+CHANGED = {
+    "turned by 90°": np.array([(0.0, -1.0), (1.0, 0.0)]),
+    "turned about": -np.eye(2),
+    "mirrored": np.diag([-1.0, 1.0]),
+}
+
+
+@pytest.mark.parametrize("how", CHANGED)
+@given(SEEDS, ERRORS)
+def test_cameras_that_were_turned_or_mirrored_since_do_not_lead_away(how: str, seed: int, error: Triple) -> None:
+    stage, calibration, targets = ready(seed)
+    lay(stage, error)
+    first = stage.drive(look_only(Task(calibration, targets))).worst
+    for name, view in stage.views.items():
+        (a, b), (c, d) = (CHANGED[how] @ np.array(view.matrix)).tolist()
+        stage.views[name] = msgspec.structs.replace(view, matrix=((a, b), (c, d)))
+    with contextlib.suppress(AlignmentError):
+        stage.drive(align(Task(calibration, targets)))
+    truth = Stage({name: calibration.views[name] for name in PART}, stage.part, np.random.default_rng(0))
+    truth.pose = stage.pose
+    left = truth.drive(look_only(Task(calibration, targets, distance=1.0))).worst
+    assert left <= 3.5 * first + 1e-9
+
+
 def test_the_first_correction_of_a_fresh_calibration_is_bounded_and_the_others_are_not() -> None:
     stage, calibration, targets = ready(7)
     lay(stage, (0.004, 0.003, 0.0))
@@ -92,8 +118,6 @@ def test_the_first_correction_of_a_fresh_calibration_is_bounded_and_the_others_a
 
 
 def test_a_confirmed_calibration_goes_all_the_way() -> None:
-    import msgspec
-
     stage, calibration, targets = ready(7)
     lay(stage, (0.004, 0.003, 0.0))
     found = stage.drive(align(Task(msgspec.structs.replace(calibration, confirmed=True), targets)))

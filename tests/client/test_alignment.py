@@ -54,6 +54,8 @@ def test_one_correction_with_a_thread(locator: str) -> None:
         assert found.reached
         assert len(found.corrections) == 1
         assert found.confirmed
+        newest = [event for event in robot.events(history=True, timeout=0.2) if event.kind == "goal"][-1]
+        assert (newest.id or "").startswith("align-")
         now = seen(lying, robot.state().pose)
         for name in PART:
             assert now[name] == pytest.approx(targets[name], abs=2e-5 * FOCUS)

@@ -104,7 +104,8 @@ def demo(name: str = "sim", /, *, stay: Annotated[bool, Flag] = False, record: P
     Parameters
     ----------
     name
-        A shipped configuration, as `trirail config` lists it: sim, or a stage as uvw, xxy, uvw-ppr.
+        A shipped configuration, as `trirail config` lists it: sim, or a stage as uvw, xxy, uvw-ppr; or align: parts
+        that are laid right on uvw by two simulated cameras.
     stay
         Keep the service and its live view up afterwards, until Ctrl-C.
     record
@@ -112,6 +113,8 @@ def demo(name: str = "sim", /, *, stay: Annotated[bool, Flag] = False, record: P
     """
     from trirail.cli import demo as shown
 
+    if name == "align":
+        return shown.run_align(record)
     return shown.run(name, stay=stay, record=record)
 
 

@@ -106,6 +106,15 @@ def run(name: str = "sim", *, stay: bool, record: Path | None) -> int:
     return 0 if code == 0 and all(row.result.outcome == "done" for row in rows) else 1
 
 
+def run_align(record: Path | None) -> int:
+    """Run the demo of alignment; return 0 if every part lies right."""
+    from trirail.cli import demo_align
+
+    file = shipped_file("uvw")
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    return demo_align.run(file, record or Path(load(file).telemetry.directory) / f"align-{stamp}.rrd")
+
+
 def _tour(robot: Robot, stages: Sequence[Stage]) -> Iterator[_Row]:
     columns = (
         TextColumn("{task.description:28}"),

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import itertools
 import time
+import uuid
 from collections.abc import Awaitable, Callable, Generator, Iterator
 from typing import TYPE_CHECKING, TypeVar
 
+from msgspec import structs
 from trirail_drivers.interface import Triple
 
 from trirail.alignment.calibration import Marks
@@ -37,6 +40,7 @@ def drive(robot: Robot, look: Look, wishes: Generator[Wish, Sighting, T], speed:
     stops the motion. Raises RefusedError where a motion is refused or ends otherwise, and what `look` raises.
     """
     marks: Marks = {}
+    ids = _ids()
     try:
         wish = next(wishes)
         while True:
@@ -47,15 +51,15 @@ def drive(robot: Robot, look: Look, wishes: Generator[Wish, Sighting, T], speed:
                 marks = seen
             elif isinstance(wish, StageMotion):
                 for goal in goals(wish, speed):
-                    _go(robot, goal)
+                    _go(robot, goal, next(ids))
                 time.sleep(wait)
             wish = wishes.send(Sighting(marks, robot.state().pose, time.monotonic()))
     except StopIteration as end:
         return end.value  # type: ignore[no-any-return]
 
 
-def _go(robot: Robot, goal: Goal) -> None:
-    handle = robot.send(goal)
+def _go(robot: Robot, goal: Goal, goal_id: str) -> None:
+    handle = robot.send(structs.replace(goal, id=goal_id))
     try:
         check(handle.wait(GOAL_WITHIN))
     except BaseException:
@@ -69,6 +73,7 @@ async def drive_async(
 ) -> T:
     """Do the same in an event loop; `look` may be a coroutine function. A call that is cancelled stops the motion."""
     marks: Marks = {}
+    ids = _ids()
     try:
         wish = next(wishes)
         while True:
@@ -77,21 +82,27 @@ async def drive_async(
                 marks = await seen if inspect.isawaitable(seen) else seen
             elif isinstance(wish, StageMotion):
                 for goal in goals(wish, speed):
-                    await _go_async(robot, goal)
+                    await _go_async(robot, goal, next(ids))
                 await asyncio.sleep(wait)
             wish = wishes.send(Sighting(marks, (await robot.state()).pose, time.monotonic()))
     except StopIteration as end:
         return end.value  # type: ignore[no-any-return]
 
 
-async def _go_async(robot: AsyncRobot, goal: Goal) -> None:
-    handle = await robot.send(goal)
+async def _go_async(robot: AsyncRobot, goal: Goal, goal_id: str) -> None:
+    handle = await robot.send(structs.replace(goal, id=goal_id))
     try:
         check(await handle.wait(GOAL_WITHIN))
     except BaseException:
         if handle.result is None:
             await robot.stop()
         raise
+
+
+def _ids() -> Iterator[str]:
+    """Yield the ids of one alignment's goals, by which recordings, reports and events show them together."""
+    name = uuid.uuid4().hex[:8]
+    return (f"align-{name}-{number}" for number in itertools.count(1))
 
 
 def goals(motion: StageMotion, speed: float) -> Iterator[Goal]:

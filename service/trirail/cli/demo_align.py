@@ -1,0 +1,157 @@
+"""`trirail demo align`: parts laid right by two simulated cameras, with pictures, marks and residuals in Rerun."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from trirail_drivers.interface import Triple
+
+from trirail.alignment.calibration import placed
+from trirail.alignment.finding import find
+from trirail.alignment.images import CameraView, Pair
+from trirail.alignment.procedure import Alignment
+from trirail.alignment.shapes import MarkShape
+from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
+from trirail.cli.terminal import counted, out, plain
+from trirail.client import own_service
+from trirail.client.client import Robot
+from trirail.config import load
+from trirail.wire.records import unpack
+
+PARTS = 5
+OFF, TURNED = 0.4e-3, math.radians(0.25)
+"""How far parts lie away at most [m, rad]."""
+DISC = MarkShape("disc", 160e-6)
+PLACES: dict[str, Pair] = {"left": (-0.05, 0.0), "right": (0.05, 0.0)}
+VIEWS = {
+    "left": CameraView(PLACES["left"], (480.0, 360.0), ((2.6e5, 1.2e4), (1.5e4, -2.6e5))),
+    "right": CameraView(PLACES["right"], (480.0, 360.0), ((-2.6e5, 2e4), (1e4, 2.6e5))),
+}
+BY, TURN = 0.5e-3, math.radians(0.5)
+"""Moves of the calibration [m, rad]."""
+WAIT = 0.05
+"""How long the cameras need to show what is: exposure, delay, and the time until records come [s]."""
+HISTORY = 2000
+COLOURS = {"mark": (90, 200, 250), "target": (250, 200, 60), "residual": (240, 90, 90)}
+
+
+class PoseHistory:
+    """Where the robot was measured to be in its newest cycles, from the records that the service publishes."""
+
+    def __init__(self) -> None:
+        self._poses: deque[tuple[float, Triple]] = deque(maxlen=HISTORY)
+
+    def take(self, batch: bytes) -> None:
+        """Take a batch of records."""
+        for row in unpack(batch):
+            x, y, phi = row["pose"].tolist()
+            self._poses.append((float(row["deadline_ns"]) * 1e-9, (x, y, phi)))
+
+    def at(self, time: float) -> Triple:
+        """Return the pose at a time of the monotonic clock [s]: that of the cycle nearest to it."""
+        return min(tuple(self._poses), key=lambda each: abs(each[0] - time))[1]
+
+    def __bool__(self) -> bool:
+        return bool(self._poses)
+
+
+class DrawnCameras:
+    """Two simulated cameras over a part, whose pictures go to Rerun as they are taken."""
+
+    def __init__(self, history: PoseHistory, stream: rr.RecordingStream, seed: int) -> None:
+        self.part: Mapping[str, Pair] = PLACES
+        self.targets: Mapping[str, Pair] = {}
+        self._history, self._stream = history, stream
+        self._rng = np.random.default_rng(seed)
+
+    def look(self) -> dict[str, Pair]:
+        """Take a picture with each, find the disc in it, and show both."""
+        marks: dict[str, Pair] = {}
+        now = time.monotonic()
+        self._stream.set_time("time", duration=now)
+        for name, place in self.part.items():
+            camera = SimulatedCamera(
+                VIEWS[name], {name: DrawnMark(DISC, place)}, 960, 720, noise=3.0, shade=0.4, exposure=0.004, delay=0.01
+            )
+            picture = camera.picture(self._history.at, now, self._rng)
+            found = find(picture, MarkShape("disc", DISC.size * VIEWS[name].scale))
+            if found is not None:
+                marks[name] = (found.u, found.v)
+            self._show(name, picture, marks.get(name))
+        return marks
+
+    def _show(self, name: str, picture: NDArray[np.uint8], mark: Pair | None) -> None:
+        camera, target = f"cameras/{name}", self.targets.get(name)
+        self._stream.log(camera, rr.Image(picture, "L").compress(80))
+        shown = [] if mark is None else [mark]
+        self._stream.log(f"{camera}/mark", rr.Points2D(shown, radii=6.0, colors=COLOURS["mark"]))
+        if target is None:
+            return
+        self._stream.log(f"{camera}/target", rr.Points2D([target], radii=6.0, colors=COLOURS["target"]))
+        ways = [] if mark is None else [np.subtract(target, mark)]
+        arrows = rr.Arrows2D(origins=shown, vectors=ways, colors=COLOURS["residual"])
+        self._stream.log(f"{camera}/residual", arrows)
+
+
+def run(file: Path, recording: Path, parts: int = PARTS, seed: int = 0) -> int:
+    """Calibrate, then lay so many parts right; return 0 if each was. Pictures go to `recording` and the live view."""
+    config = load(file)
+    recording.parent.mkdir(parents=True, exist_ok=True)
+    pictures = recording.with_name(f"{recording.stem}-pictures.rrd")
+    out.print(f"[bold]trirail demo align[/]: starting the service on {plain(file.name)}")
+    history, results = PoseHistory(), []
+    with own_service.service(file, recording), rr.RecordingStream("trirail_align") as stream:
+        sinks: list[rr.FileSink | rr.GrpcSink] = [rr.FileSink(pictures)]
+        if config.telemetry.live_port:
+            sinks.append(rr.GrpcSink(f"rerun+http://127.0.0.1:{config.telemetry.live_port}/proxy"))
+        stream.set_sinks(*sinks)
+        with Robot(config.robot.name, config.zenoh.listen[0], user="demo") as robot, robot.records(history.take):
+            robot.enable()
+            while not history:
+                time.sleep(0.01)
+            cameras = DrawnCameras(history, stream, seed)
+            results = list(_parts(robot, cameras, stream, parts, seed))
+            robot.disable()
+    out.print(f"[bold]recording[/]  {plain(str(recording))}", soft_wrap=True)
+    out.print(f"[bold]pictures[/]   {plain(str(pictures))}: look at them with trirail view", soft_wrap=True)
+    return 0 if len(results) == parts and all(result.reached for result in results) else 1
+
+
+def _parts(robot: Robot, cameras: DrawnCameras, stream: rr.RecordingStream, parts: int, seed: int) -> list[Alignment]:
+    moves = [(BY, 0, 0), (-BY, 0, 0), (0, BY, 0), (0, -BY, 0), (0, 0, TURN), (0, 0, -TURN)]
+    robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
+    time.sleep(WAIT)
+    calibration = robot.calibrate_camera(cameras.look, moves, looks=4, wait=WAIT)
+    cameras.targets = cameras.look()
+    out.print(f"calibrated in {counted(len(moves), 'move')}: residual {calibration.noise:.3f} pixel")
+    rng, results = np.random.default_rng(seed), []
+    for number in range(parts):
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
+        time.sleep(WAIT)
+        x, y = rng.uniform(-OFF, OFF, 2).tolist()
+        error = x, y, float(rng.uniform(-TURNED, TURNED))
+        cameras.part = _placed(error)
+        result = robot.align(cameras.look, cameras.targets, calibration, looks=4, wait=WAIT)
+        left = [f"{1e6 * each.worst:.2f}" for each in result.measurements]
+        made = counted(len(result.corrections), "correction")
+        line = f"part {number + 1}: {' → '.join(left)} µm, {made}: {result.why}"
+        stream.log("alignments", rr.TextLog(line))
+        for each in result.measurements:
+            stream.set_time("time", duration=each.time)
+            stream.log("residual/worst_um", rr.Scalars(1e6 * each.worst))
+            stream.log("residual/turn_urad", rr.Scalars(1e6 * each.turn))
+        out.print(f"  [{'green' if result.reached else 'red'}]{line}[/]")
+        results.append(result)
+    return results
+
+
+def _placed(error: Triple) -> dict[str, Pair]:
+    lying = {name: placed(place, error).tolist() for name, place in PLACES.items()}
+    return {name: (x, y) for name, (x, y) in lying.items()}
