@@ -115,6 +115,27 @@ def test_marks_of_pictures_are_found_and_older_pictures_are_not_taken(
         assert look() == {}
 
 
+def test_marks_of_what_opencv_opens_are_found_in_pictures_that_are_newer_than_the_look(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    view = CameraView((0.0, 0.0), (160.0, 120.0), ((2.5e5, 0.0), (0.0, -2.5e5)))
+    camera = SimulatedCamera(view, {"m": DrawnMark(MarkShape("disc", 200e-6), (0.0, 0.0))}, 320, 240)
+    for n in range(4):  # OpenCV takes numbered pictures for a film
+        x = 1e-4 * n
+        picture = camera.picture(lambda _: (x, 0.0, 0.0), 0.0, np.random.default_rng(0))  # noqa: B023
+        cv2.imwrite(str(tmp_path / f"film_{n:02d}.png"), picture)
+    with mark_source.cameras({"m": str(tmp_path / "film_%02d.png")}, MarkShape("disc", 50.0), 0.0) as look:
+        assert look() == {"m": pytest.approx((185.0, 120.0), abs=0.05)}
+        assert look() == {"m": pytest.approx((235.0, 120.0), abs=0.05)}
+        with pytest.raises(TrirailError, match="gives no picture any more"):
+            look()
+
+
+def test_a_camera_that_is_not_there_is_named() -> None:
+    pytest.importorskip("cv2")
+    with pytest.raises(TrirailError, match="cannot open camera /no/such of left"):
+        mark_source.cameras({"left": "/no/such"}, MarkShape("disc", 50.0), 0.0).__enter__()
+
+
 @pytest.mark.parametrize("given", [(), ("--program", "true", "--pictures", "x")], ids=["no source", "two of them"])
 def test_one_source_of_marks_is_wanted(given: tuple[str, ...], tmp_path: Path) -> None:
     done = trirail("align", "calibrate", tmp_path / "camera.json", *given, code=1)
