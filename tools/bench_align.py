@@ -101,6 +101,14 @@ class ComputedStage:
 def measure(parts: int, goals: int) -> dict[str, Any]:
     """Return for each kind and case what became of so many parts, and the seconds of corrections of a service."""
     found: dict[str, Any] = {"aims": [f"{name}: {aim}, {share:.0%}" for name, (aim, share) in AIMS.items()]}
+    found |= computed(parts)
+    found["seconds of a correction, a service"] = seconds(goals)
+    return found
+
+
+def computed(parts: int) -> dict[str, Any]:
+    """Return for each kind and case what became of so many parts."""
+    found: dict[str, Any] = {}
     for kind, file in FILES.items():
         ideal = geometry(load(SIM.with_name(file)).geometry)
         mistaken = other_kind(ideal)
@@ -114,7 +122,6 @@ def measure(parts: int, goals: int) -> dict[str, Any]:
             "the other kind's model": (lambda _, robot=ideal: robot, other),
         }
         found[kind] = {name: _case(parts, *case) for name, case in cases.items()}
-    found["seconds of a correction, a service"] = seconds(goals)
     return found
 
 

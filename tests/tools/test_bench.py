@@ -9,6 +9,7 @@ from typing import Any
 
 import bench
 import bench_aims
+import bench_align
 import bench_fairness
 import bench_frames
 import bench_latency
@@ -132,3 +133,12 @@ def test_a_rate_that_is_not_kept_is_said_and_not_met() -> None:
     assert any("9 faults" in line for line in bench.lines({"rates": [found]}))
     (row,) = bench_aims.table({"loop": {"rates": [found]}})
     assert (row["name"], row["measured"], row["met"]) == ("ticks missed at 4 kHz beyond the machine's", (), False)
+
+
+def test_alignment_needs_one_correction_by_the_right_model_and_more_by_the_others() -> None:
+    for kind, cases in bench_align.computed(4).items():
+        right, built = cases["ideal"], cases["as built"]
+        assert right["reached"] == built["reached"] == 1.0, kind
+        assert right["reached after at most two"] == built["reached after at most two"] == 1.0, kind
+        for wrong in ("small angles", "the other kind's model"):
+            assert max(cases[wrong]["µm after one, p50/p95/max"]) > max(right["µm after one, p50/p95/max"]), kind

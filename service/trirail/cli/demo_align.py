@@ -119,8 +119,7 @@ def run(file: Path, recording: Path, parts: int = PARTS, seed: int = 0) -> int:
             cameras = DrawnCameras(history, stream, seed)
             results = list(_parts(robot, cameras, stream, parts, seed))
             robot.disable()
-        stream.flush()
-        stream.disconnect()  # before the live view goes with its service
+            stream.disconnect()  # while the live view is there to take the rest
     out.print(f"[bold]recording[/]  {plain(str(recording))}", soft_wrap=True)
     out.print(f"[bold]pictures[/]   {plain(str(pictures))}: look at them with trirail view", soft_wrap=True)
     return 0 if len(results) == parts and all(result.reached for result in results) else 1
