@@ -26,6 +26,7 @@ GUIDES = sorted(
         *(ROOT / "service").glob("*.md"),
         *(ROOT / name / "README.md" for name in ("drivers", "configs", "tools")),
         ROOT / "configs/stages.md",
+        ROOT / "configs/align.md",
     }
 )
 PACKAGES = {"service": "service/trirail", "drivers": "drivers/trirail_drivers", "CONTRIBUTING.md": "service/trirail"}
