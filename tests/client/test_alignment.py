@@ -83,6 +83,18 @@ def test_one_correction_in_an_event_loop_with_a_camera_that_is_waited_for(locato
 
 
 @pytest.mark.slow
+def test_without_a_calibration_one_is_made_first(locator: str) -> None:
+    part = part_at(PART, (0.0004, -0.0003, math.radians(0.2)))
+    targets = seen(PART, (0.0, 0.0, 0.0))
+    with Robot("demo", locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
+        found = robot.align(lambda: seen(part, robot.state().pose), targets, tolerance=2e-5, angle=1e-3)
+        assert found.reached
+        assert len(found.corrections) == 1
+
+
+@pytest.mark.slow
 def test_what_look_raises_ends_it_and_a_correction_out_of_reach_is_refused(locator: str) -> None:
     with Robot("demo", locator) as robot:
         robot.enable()

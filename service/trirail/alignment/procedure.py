@@ -7,7 +7,7 @@ robot and the time. It moves nothing itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from enum import StrEnum
 from typing import Literal, NamedTuple
 
@@ -161,6 +161,12 @@ def align(task: Task) -> Conversation:
         motion = _motion(found, sight.pose, share, task.approach)
         arrived = yield motion
         corrections.append(AlignmentCorrection(motion.by, share, arrived.time - sight.time))
+
+
+def calibrated_first(task: Callable[[CameraCalibration], Task], looks: int, approach: Triple | None) -> Conversation:
+    """Do the same with a calibration that is made first, by MOVES."""
+    calibration = yield from calibration_by_moves(looks=looks, approach=approach)
+    return (yield from align(task(calibration)))
 
 
 def look_only(task: Task) -> Generator[Wish, Sighting, Measurement]:

@@ -347,7 +347,7 @@ class Robot:
         self,
         look: Look,
         targets: Mapping[str, tuple[float, float]],
-        calibration: CameraCalibration,
+        calibration: CameraCalibration | None = None,
         *,
         tolerance: float = 1e-6,
         angle: float = 2.4e-5,
@@ -363,13 +363,17 @@ class Robot:
         Measure, correct about the marks' middle from where the robot is measured to be, measure again, until every
         mark is within `tolerance` [m] of where the best rigid motion has it and the part within `angle` [rad], or
         `corrections` have been made, or the error grows. The first correction with a calibration that is not confirmed
-        goes no farther than twice its moves. Marks whose distance is wrong by more than `distance`, a share, are
-        refused, nothing moves. All else as of calibrate_camera.
+        goes no farther than twice its moves. Without a `calibration` one is made first, by moves of ±1 mm and ±1°.
+        Marks whose distance is wrong by more than `distance`, a share, are refused, nothing moves. All else as of
+        calibrate_camera.
         """
-        from trirail.alignment.procedure import Task, align
+        from trirail.alignment.procedure import Task, align, calibrated_first
 
-        task = Task(calibration, targets, tolerance, angle, corrections, distance, looks, approach)
-        return self._converse(look, align(task), speed, wait)  # type: ignore[no-any-return]
+        def task(known: CameraCalibration) -> Task:
+            return Task(known, targets, tolerance, angle, corrections, distance, looks, approach)
+
+        wishes = align(task(calibration)) if calibration is not None else calibrated_first(task, looks, approach)
+        return self._converse(look, wishes, speed, wait)  # type: ignore[no-any-return]
 
     def _converse(self, look: Look, wishes: Generator[Any, Any, Any], speed: float, wait: float) -> Any:
         """Do what a conversation of trirail.alignment.procedure wishes; return what it ends with."""
