@@ -14,12 +14,15 @@ from typing import IO, TYPE_CHECKING, Any, cast
 import msgspec
 from trirail_drivers.errors import TrirailError
 
+from trirail.wire.decoding import decoded, prepare
+
 if TYPE_CHECKING:
     from trirail.alignment.calibration import Marks
     from trirail.alignment.shapes import MarkShape
 
 Look = Callable[[], "Marks"]
 LINE = dict[str, tuple[float, float]]
+prepare(LINE)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 NEWER_WITHIN, POLL = 30.0, 0.02
 """How long newer pictures are waited for, and how often it is looked [s]."""
@@ -49,10 +52,11 @@ def program(command: str) -> Iterator[Look]:
             code = process.wait(ENDS_WITHIN)
             raise TrirailError(f"{command!r} has ended with exit code {code}: it is to print a line for each it reads")
         try:
-            return msgspec.json.decode(line, type=LINE)
+            marks: Marks = decoded(line, LINE)
         except (msgspec.MsgspecError, ValueError) as error:
             wanted = 'wanted is {"mark": [u, v], …} in pixels'
             raise TrirailError(f"{command!r} printed {line.strip()[:80]!r}: {error}; {wanted}") from error
+        return marks
 
     try:
         yield look

@@ -12,6 +12,7 @@ from trirail_drivers.errors import FileError
 
 from trirail.alignment.calibration import CameraCalibration, Marks
 from trirail.alignment.images import Pair
+from trirail.wire.decoding import decoded, prepare
 
 VERSION: Literal[1] = 1
 
@@ -28,6 +29,9 @@ class CalibrationFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where marks should be [pixel]: where they were at the calibration's first look, until others are taught."""
 
 
+prepare(CalibrationFile)
+
+
 def write(path: Path, robot: str, calibration: CameraCalibration, targets: Marks, made: datetime | None = None) -> None:
     """Write it such that a power cut leaves the old file or the new one. Raises FileError."""
     content = CalibrationFile(VERSION, robot, made or datetime.now(UTC), calibration, dict(targets))
@@ -41,7 +45,7 @@ def read(path: Path) -> CalibrationFile:
     """Read it. Raises FileError with the file, the field and what would be right."""
     text = files.text(path)
     try:
-        return msgspec.json.decode(text, type=CalibrationFile)
+        return decoded(text, CalibrationFile)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         problem = str(error).replace("`", "")
         raise FileError(f"{path}: {problem}; make it anew with trirail align calibrate") from error
