@@ -270,7 +270,7 @@ def test_what_a_drive_does_without_stands_in_every_place_where_one_looks(tmp_pat
         words = "its watch on SYNC; without: it goes on without SYNC"
         said = trirail("doctor", tmp_path / "robot.toml", "--quick").stdout
         assert f"drives B, C may lack 1006, {words}" in said
-        assert f"drives B, C: 1006, {words}" in trirail("status", locator=service.locator).stdout
+        assert f"drive B, drive C: 1006, {words}" in trirail("status", locator=service.locator).stdout
         missing = json.loads(trirail("status", "--json", locator=service.locator).stdout)["missing_protections"]
         assert missing == [{"drive": name, "object": "1006", "means": words} for name in "BC"]
         with service.robot() as robot:

@@ -174,9 +174,9 @@ class Loop:
             yield what, now_ns
 
     def _mark(self, part: Part) -> None:
-        """Note how long a part of the cycle has taken, at its end."""
+        """Note how long a part of the cycle has taken, at its end; nothing where a simulated time was ahead."""
         now = time.perf_counter_ns()
-        self._parts_ns[part] = min(now - self._marked_ns, LONGEST)
+        self._parts_ns[part] = min(max(0, now - self._marked_ns), LONGEST)
         self._marked_ns = now
 
     def _requests(self) -> Iterator[Request]:

@@ -135,9 +135,10 @@ class QuietCycles:
         return self._lent is not None
 
     def add(self, part: Part) -> None:
-        """Count what has passed since the newest cycle into a part of it."""
+        """Count what has passed since the newest cycle into a part of it; none where a simulated time is ahead."""
         parts = self._state[0]["parts_ns"]
-        parts[part] = min(int(parts[part]) + time.perf_counter_ns() - int(self._state[0]["marked_ns"]), LONGEST)
+        passed = max(0, time.perf_counter_ns() - int(self._state[0]["marked_ns"]))
+        parts[part] = min(int(parts[part]) + passed, LONGEST)
 
     def _take(self, calm: Calm) -> None:
         """Write what cycles come to into the state."""
