@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import random
 import struct
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
@@ -59,8 +60,10 @@ class Happening(NamedTuple):
 class Session:
     """A loop, what is around it, and everything that it has said; one turn of it is a cycle."""
 
+    begins_ns = 100_000_000_000
+
     def __init__(self, config: Config, folder: Path, carrier: str, *, quiet: bool) -> None:
-        self.now_ns = 100_000_000_000
+        self.now_ns = self.begins_ns
         self.config = config
         self.late_ns = 0
         """By how much the next tick comes late."""
@@ -454,6 +457,15 @@ def test_a_position_that_comes_twice_now_and_then_is_no_second_nodes(tmp_path: P
     one, other = both_ways(CONFIG, tmp_path, lambda: happens, 900)
     assert one.loop.quiet_cycles > 100
     assert one.loop.control.fault is None
+    _compare(one.heard, other.heard)
+
+
+def test_a_simulated_time_may_be_ahead_of_the_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is measured of a cycle is then nothing, in whichever way it is run."""
+    monkeypatch.setattr(Session, "begins_ns", time.perf_counter_ns() + 3_600_000_000_000)
+    happens = {30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))]}
+    one, other = both_ways(CONFIG, tmp_path, lambda: happens, 200)
+    assert one.loop.quiet_cycles > 50
     _compare(one.heard, other.heard)
 
 
