@@ -107,6 +107,7 @@ def test_the_recording_is_whole(recording: Recording) -> None:
     assert [what.seq for what in recording.requests] == list(range(1, len(recording.requests) + 1))
     kinds = {type(what.given) for what in recording.requests}
     assert {GoalRequest, CommandRequest, Disturbance} <= kinds
+    assert {what.waiting for what in recording.requests} == {False, True}  # behind a cycle, and before the next tick
 
 
 def test_it_comes_out_the_same_to_the_last_bit(recording: Recording, config: Config) -> None:

@@ -118,7 +118,7 @@ class Session:
             self.planner.send(encode(self.motion.plan(decode_plan_request(packet))))
         if self.beats:
             self.hearts.of("gateway").beat()
-        self.now_ns = deadline_ns + self.late_ns
+        self.now_ns = max(self.now_ns, deadline_ns + self.late_ns)
         self.late_ns = 0
         self.pump()
         if self.room is not None:
@@ -161,7 +161,9 @@ class Session:
         for number in range(cycles):
             for what in script.get(number, ()):
                 what.does(self)
-            self.loop.turn(self.ticker)
+            before = self.loop.control.cycles
+            while self.loop.control.cycles == before:
+                self.loop.turn(self.ticker)
             while self.gateway.receive() is not None:
                 pass
             while (packet := self.recorder.receive()) is not None:

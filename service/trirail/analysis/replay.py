@@ -128,16 +128,20 @@ def _cycle(
 ) -> None:
     """Do what the loop does in a cycle after its SYNC."""
     said = [what for what in given if not isinstance(what.given, DrivesFault)]
-    inputs: list[Given] = [(what.given, what.now_ns) for what in said if not what.urgent]  # type: ignore[misc]
-    if isinstance(planner, LocalPlanner):
-        inputs += [(answer, 0) for answer in planner.answers()]
-    else:
-        planner.compare(given)
+    decided = [what for what in said if not what.urgent]
     if isinstance(drives, _Recorded):
         for what in given:
             if isinstance(what.given, DrivesFault):
                 drives.fail(what.given.message)
-    control.decide(inputs)
+    for waiting in (False, True):
+        heard = [what for what in decided if what.waiting is waiting]
+        inputs: list[Given] = [(what.given, what.now_ns) for what in heard]  # type: ignore[misc]
+        if isinstance(planner, LocalPlanner):
+            inputs += [(answer, 0) for answer in planner.answers()]
+        else:
+            planner.compare(heard)
+        if inputs or not waiting:
+            control.decide(inputs)
     for what in said:
         if what.urgent:
             control.handle(what.given, what.now_ns)  # type: ignore[arg-type]

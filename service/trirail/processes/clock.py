@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+from trirail.processes.waiting import Doors
+
 
 class Tick(NamedTuple):
     """One tick, as it came."""
@@ -47,14 +49,26 @@ class Ticker:
         """
         if self._now is time.monotonic_ns:
             return -1
-        self._sleep(self.deadline_ns + self._period_ns)
+        self._sleep_on()
         return self._now()
+
+    def listen(self, doors: Doors) -> bool:
+        """Wait for the next deadline or, with time left before it, for somebody at a door; whether somebody is."""
+        if self._now is time.monotonic_ns:
+            return doors.wait(self.deadline_ns + self._period_ns)
+        self._sleep_on()
+        return doors.called()
 
     def wait(self) -> Tick:
         """Sleep until the next deadline that is not over yet by a whole period."""
+        self._sleep_on()
         self.deadline_ns += self._period_ns
-        self._sleep(self.deadline_ns)
         return self.tick()
+
+    def _sleep_on(self) -> None:
+        """Sleep to the next deadline, if it is not over."""
+        if self._now() < self.deadline_ns + self._period_ns:
+            self._sleep(self.deadline_ns + self._period_ns)
 
     def tick(self) -> Tick:
         """Return the tick whose deadline has come; somebody else has waited for it."""

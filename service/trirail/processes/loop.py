@@ -26,6 +26,7 @@ from trirail.processes.ports import Ports
 from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
 from trirail.processes.reports import Reports
+from trirail.processes.waiting import SPARE_NS, Doors
 from trirail.wire.packets import (
     Disturbance,
     DrivesFault,
@@ -82,9 +83,13 @@ class Loop:
         patience = max(LEAST_PATIENCE, round(self._gateway_timeout * config.loop.rate_hz))
         self._gateway_watch = Watch(heartbeats.of("gateway"), patience)
         self._gateway_frozen = False
+        self._doors = Doors(ports)
+        self._never_listens = self._period_ns <= SPARE_NS
+        self._listened = self._never_listens
+        """Whether nobody else is to be heard before the next tick."""
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
-            beside = self._reports, heartbeats, ports, self._gateway_watch, self._haste
+            beside = self._reports, heartbeats, ports.gateway, self._doors, self._gateway_watch, self._haste
             self._quiet = QuietCycles(self.control, drives, *beside)
         self._fault: DriveFault | None = None
         self._marked_ns = 0
@@ -110,14 +115,19 @@ class Loop:
         return self._quiet.cycles if self._quiet is not None else 0
 
     def turn(self, ticker: Ticker) -> None:
-        """Run the cycles in which nothing happens, or one in which something does; then decide what comes next."""
+        """Run the cycles in which nothing happens, or one in which something does; then decide what comes next.
+
+        Or only the last, where somebody calls while the next tick is waited for: once before each tick.
+        """
         quiet, newest = self._quiet, None
         disturbed = self.ending or self._late_streak or self._gateway_frozen or not self._planner.idle
         if quiet is not None and not disturbed:
-            newest = quiet.run(ticker, self._overruns)
+            newest = quiet.run(ticker, self._overruns, listens=not self._listened)
         elif quiet is not None:
             quiet.leave()
-        if newest is None:
+        if newest is None and not self._listened and ticker.listen(self._doors):
+            self._hear(ticker)
+        elif newest is None:
             self.cycle(ticker.wait())
         elif newest.reached is Reached.WAITED:
             self.cycle(ticker.tick())
@@ -125,11 +135,15 @@ class Loop:
             self._marked_ns = newest.marked_ns
             self._parts_ns[Part.SYNC], self._parts_ns[Part.RECORD] = newest.sync_ns, newest.record_ns
             self._go_on(Tick(newest.deadline_ns, newest.lateness_ns, 0))
-        elif quiet is not None and (newest.called or self._reports.full):
-            if newest.called:
+        elif quiet is not None:
+            self._listened = self._never_listens
+            if newest.reached is Reached.CALLED:
+                self._hear(ticker)
+            elif newest.called:
                 self._decide(newest.deadline_ns + self._period_ns)
-            self._flush_full()
-            quiet.add(Part.RECORD)
+            if newest.called or self._reports.full:
+                self._flush_full()
+                quiet.add(Part.RECORD)
 
     def cycle(self, tick: Tick) -> None:
         """Run one cycle. Nothing in it waits, and nothing that goes wrong in it leaves the robot moving."""
@@ -140,6 +154,7 @@ class Loop:
 
     def _go_on(self, tick: Tick) -> None:
         """Run what a cycle is from its SYNC on: the setpoints leave before anything is decided that can wait."""
+        self._listened = self._never_listens
         now_ns = tick.deadline_ns + tick.lateness_ns
         if self._haste.hurried() or self._gateway.ended:
             self._handle_urgent(self._requests(), now_ns)
@@ -167,10 +182,18 @@ class Loop:
         self._reports.listen()
         self._reports.pass_on()
 
-    def _noted(self, now_ns: int) -> Iterator[Given]:
+    def _hear(self, ticker: Ticker) -> None:
+        """Decide by what is said while the next tick is waited for: it has its effect then, and not a cycle later."""
+        self._listened = True
+        if given := list(self._noted(ticker.deadline_ns + self._period_ns, waiting=True)):
+            self.control.decide(given)
+        self._reports.listen()
+        self._reports.pass_on()
+
+    def _noted(self, now_ns: int, *, waiting: bool = False) -> Iterator[Given]:
         """Yield what gateway and planner have sent, and keep it for the recorder."""
         for what in itertools.chain(self._requests(), self._planner.answers()):
-            self._reports.note(now_ns, what)
+            self._reports.note(now_ns, what, waiting=waiting)
             yield what, now_ns
 
     def _mark(self, part: Part) -> None:

@@ -16,7 +16,7 @@ from enum import IntEnum
 from typing import Any, Final
 
 import numpy as np
-from numba import f8, from_dtype, i4, i8, types, u1, u8
+from numba import f8, from_dtype, i8, types, u1, u8
 from numpy.typing import NDArray
 from trirail_drivers.bus.frames import BITS
 from trirail_drivers.driver.cyclic import MOST_FRAMES
@@ -37,23 +37,13 @@ from trirail.processes.exchange import (
 )
 from trirail.processes.heartbeats import HASTE
 from trirail.processes.packet_calls import memcpy, receive_frames, send_frames
+from trirail.processes.waiting import DOORS, SPARE_NS, called, now_ns, sleep, wait
 from trirail.wire.records import LONGEST, Part
 
 __all__ = ["COMMAND", "FOLLOW", "HOLD", "STATE", "Reached", "run"]
 
-# Of libc, by name: time.h, poll.h.
-_clock_nanosleep: Any = types.ExternalFunction("clock_nanosleep", i4(i4, i4, types.intp, types.intp))
-_clock_gettime: Any = types.ExternalFunction("clock_gettime", i4(i4, types.intp))
-_poll: Any = types.ExternalFunction("poll", i4(types.intp, u8, i4))
-
-_MONOTONIC: Final = 1
-_ABSOLUTE: Final = 1
-"""Of clock_nanosleep: to a deadline."""
-_INTERRUPTED: Final = 4
-"""EINTR of errno.h."""
 _GONE: Final = (0x008 | 0x010) << 16
 """POLLERR and POLLHUP of poll.h, where poll leaves them."""
-_SECOND: Final = 1_000_000_000
 
 
 class Reached(IntEnum):
@@ -67,6 +57,8 @@ class Reached(IntEnum):
     """All is done, but for setpoints that the bus has not taken."""
     DONE = 3
     """All is done."""
+    CALLED = 4
+    """All is done, and somebody has called while the next tick was waited for."""
 
 
 FOLLOW, HOLD, COMMAND = 0, 1, 2
@@ -101,6 +93,7 @@ STATE = np.dtype(
         ("settles", "u1"),  # whether a goal waits for the robot to be in position, and until which cycle
         ("timeout", "<i8"),
         ("haste", "<u8"),  # the count of hastes when it was last looked at
+        ("listens", "u1"),  # whether who calls while the next tick is waited for is heard at once
         ("called", "u1"),  # whether there is something to decide behind the newest cycle
         ("gateway_seen", "<u8"),  # trirail.processes.heartbeats.Watch
         ("gateway_turns", "<i8"),
@@ -115,7 +108,7 @@ STATE = np.dtype(
 )
 """What the call goes on from, and what it leaves."""
 
-_STATE, _DOORS = from_dtype(STATE)[::1], i4[:, ::1]
+_STATE = from_dtype(STATE)[::1]
 
 
 @compiled()
@@ -123,18 +116,18 @@ def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
     """Return the time [ns]."""
     if state[0].injected_ns >= 0:
         return int(state[0].injected_ns)
-    _clock_gettime(_MONOTONIC, moment.ctypes.data)
-    return int(moment[0] * _SECOND + moment[1])
+    return int(now_ns(moment))
 
 
 @compiled()
-def _wait(state: NDArray[np.void], moment: NDArray[np.int64]) -> None:
-    """Wait for the deadline, whatever interrupts that."""
+def _wait(state: NDArray[np.void], moment: NDArray[np.int64], doors: NDArray[np.int32]) -> bool:
+    """Wait for the deadline; return whether somebody is at a door who is to be heard before."""
     if state[0].injected_ns >= 0:
-        return
-    moment[0], moment[1] = state[0].deadline_ns // _SECOND, state[0].deadline_ns % _SECOND
-    while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, moment.ctypes.data, 0) == _INTERRUPTED:
-        pass
+        return bool(state[0].listens and called(doors))
+    if state[0].listens:
+        return bool(wait(state[0].deadline_ns, doors, moment))
+    sleep(state[0].deadline_ns, moment)
+    return False
 
 
 @compiled()
@@ -167,7 +160,7 @@ def _send(
     i8(
         *(_STATE, i8[:, ::1], i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
-        *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], _DOORS, u8[::1], FRAMES),
+        *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], DOORS, u8[::1], FRAMES),
         *(cycle.LEGS, cycle.BOUND, cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
         *(cycle.MOTION, cycle.SLIDERS, cycle.KEPT, f8[::1], cycle.FEEDBACKS, f8[:, ::1], types.b1[::1], f8[:, ::1]),
         *(cycle.MONITORED, cycle.RECORD, u1[::1]),
@@ -224,8 +217,11 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):
         s.deadline_ns += s.period_ns
-        _wait(state, moment)
-        now = _now_ns(state, moment)
+        if _wait(state, moment, doors):
+            s.deadline_ns -= s.period_ns
+            s.marked_ns, s.arrived, s.error = _now_ns(state, moment), 0, 0
+            return Reached.CALLED
+        now, s.listens = _now_ns(state, moment), s.period_ns > SPARE_NS
         s.marked_ns, s.arrived, s.sent, s.error, s.called = now, 0, 0, 0, 0
         s.lateness_ns = now - s.deadline_ns
         if s.lateness_ns >= s.period_ns:
@@ -275,7 +271,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             *(jumps, room, monitored, record),
         )
         in_position = s.settles and (monitored[0].inside >= monitored[0].dwell or s.cycle + 1 >= s.timeout)
-        called = _poll(doors.ctypes.data, np.uint64(len(doors)), 0) != 0
+        somebody = called(doors)
         count = hearts[s.gateway_place]  # as trirail.processes.heartbeats.Watch looks at it
         turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
         hurried = hearts[HASTE] != s.haste or doors[0, 1] & _GONE != 0
@@ -304,7 +300,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             return Reached.SYNCED
         _mark(state, moment, Part.KINEMATICS)
 
-        s.called, s.found = in_position or called or code != s.found or s.cycle + 1 >= s.due, code
+        s.called, s.found = in_position or somebody or code != s.found or s.cycle + 1 >= s.due, code
         s.arrived, s.time, s.gateway_seen, s.gateway_turns = 0, time, count, turns
         s.sent = _send(bus, departures, setpoints, times)
         _mark(state, moment, Part.WRITE)

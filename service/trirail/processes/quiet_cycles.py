@@ -14,13 +14,13 @@ from trirail.motion.paths import Path, constant
 from trirail.processes import quiet
 from trirail.processes.clock import Ticker
 from trirail.processes.heartbeats import HASTE, PROCESSES, Haste, Heartbeats, Watch
-from trirail.processes.ports import Ports
 from trirail.processes.quiet import Reached
 from trirail.processes.reports import Reports
+from trirail.processes.waiting import Doors
+from trirail.wire.links import Port
 from trirail.wire.records import LONGEST, Part
 from trirail.wire.vocabulary import MODES
 
-_POLLIN = 1
 _NAMES = quiet.STATE.names or ()
 _MOST = 1 << 40
 """Cycles that are run at once: more than any batch has."""
@@ -55,7 +55,8 @@ class QuietCycles:
         drives: Lender,
         reports: Reports,
         hearts: Heartbeats,
-        ports: Ports,
+        gateway: Port,
+        doors: Doors,
         watch: Watch,
         haste: Haste,
     ) -> None:
@@ -64,13 +65,13 @@ class QuietCycles:
         self._control = control
         self._drives = drives
         self._reports = reports
-        self._ports = ports
+        self._gateway = gateway
         self._watch = watch
         self._haste = haste
         self._hearts = np.frombuffer(hearts.counts, np.uint64)[: HASTE + 1]
         self._state = np.zeros(1, quiet.STATE)
         self._moment = np.zeros(2, np.int64)
-        self._doors = np.zeros((len(ports), 2), np.int32)
+        self._doors = doors
         self._lent: Cyclic | None = None
         self._calm: Calm | None = None
         self._nothing = np.zeros(1)
@@ -84,13 +85,14 @@ class QuietCycles:
         state["fastest"], state["limit"], state["step"] = measured.fastest, measured.limit, setpoints.step
         state["gateway_place"], state["gateway_patience"] = PROCESSES.index("gateway"), watch.patience
 
-    def run(self, ticker: Ticker, overruns: int) -> Newest | None:
+    def run(self, ticker: Ticker, overruns: int, *, listens: bool) -> Newest | None:
         """Run cycles until something happens; return how far the newest has come, None where none was begun.
 
-        At the end of a batch the next call goes on, if nothing has been said meanwhile.
+        `listens`: who calls while the first tick is waited for is heard before it. At the end of a batch the next call
+        goes on, if nothing has been said meanwhile.
         """
         control, state = self._control, self._state[0]
-        if not (self._reports.idle and self._ports.gateway.calm and (self._lent is not None or self._borrow())):
+        if not (self._reports.idle and self._gateway.calm and (self._lent is not None or self._borrow())):
             self.leave()
             return None
         lent, calm, watch = self._lent, self._calm, self._watch
@@ -100,18 +102,18 @@ class QuietCycles:
         state["until"] = control.cycles + (1 if state["injected_ns"] >= 0 else _MOST)
         state["batched"] = self._reports.batched
         state["gateway_seen"], state["gateway_turns"], state["haste"] = watch.seen, watch.turns, self._haste.seen
-        for door, port in zip(self._doors, self._ports, strict=True):
-            door[:] = port.fileno(), _POLLIN
+        state["listens"] = listens
         reached = Reached(self._call(lent, calm))
         left = dict(zip(_NAMES, state.item(), strict=True))  # one by one, from the array, it would take longer
         watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
         self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
         self.cycles += left["cycle"] - control.cycles
-        called = bool(left["called"]) and reached is not Reached.SYNCED
+        decides = bool(left["called"]) and reached not in (Reached.SYNCED, Reached.CALLED)
+        called = decides or reached is Reached.CALLED
         if called or reached is not Reached.DONE:
             synced = left["synced"] if reached is Reached.SYNCED else None
             self.leave(left["arrived"], synced=synced, error=max(left["error"], 0))
-        control.go_on(left["cycle"], left["time"], left["found"] if called else None)
+        control.go_on(left["cycle"], left["time"], left["found"] if decides else None)
         if reached is Reached.WRITTEN:
             self._drives.send_on(left["sent"])
         parts = left["parts_ns"]
@@ -172,7 +174,15 @@ class QuietCycles:
             *(lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
             *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
             *(lent.expected, lent.axes, lent.times, lent.history),
-            *(self._doors, self._hearts, self._reports.batch, measured.legs, setpoints.bounds, path.knots, path.pieces),
+            *(
+                self._doors.now,
+                self._hearts,
+                self._reports.batch,
+                measured.legs,
+                setpoints.bounds,
+                path.knots,
+                path.pieces,
+            ),
             *(path.tools, law.knots, law.pieces, furthest, schedule.motion, setpoints.sliders, measured.backlash),
             *(setpoints.found, measured.numbers, measured.written, measured.jumping, measured.room),
             *(measured.settling.monitored, measured.record, self._made),

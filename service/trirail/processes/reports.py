@@ -51,7 +51,7 @@ class Reports:
         self._capture = capture
         self._period = config.period
         self._welcome = message(Welcome(lacking, drives.bus_load, time.time(), drives.missing_protections))
-        self._status = message(Status(None, 1.0, None))
+        self._status = Status(None, 1.0, None)
         self._bitrate = config.can.bitrate
         self._bus_load = 0.0
         self._bits = drives.traffic
@@ -72,10 +72,13 @@ class Reports:
         self._recorded = False
         self._unrecorded = ""
 
-    def note(self, now_ns: int, given: GivenInput, *, urgent: bool = False) -> None:
-        """Keep what the control is given before the next cycle or, `urgent`, in the one under way: for the recorder."""
+    def note(self, now_ns: int, given: GivenInput, *, urgent: bool = False, waiting: bool = False) -> None:
+        """Keep what the control is given before the next cycle or, `urgent`, in the one under way: for the recorder.
+
+        `waiting` as of a ControlInput.
+        """
         self._inputs += 1
-        self._given.append(ControlInput(self._inputs, self._control.modes.cycle, now_ns, given, urgent))
+        self._given.append(ControlInput(self._inputs, self._control.modes.cycle, now_ns, given, urgent, waiting))
 
     def record(self, tick: Tick, overruns: int, parts_ns: Sequence[int]) -> None:
         """Append the newest cycle's record."""
@@ -130,7 +133,7 @@ class Reports:
         for port in (self._gateway, self._recorder):
             if port.accept():
                 port.send(self._welcome)
-                port.send(self._status)
+                port.send(message(self._status))
                 if port is self._gateway:
                     self._told = 0
 
@@ -191,11 +194,11 @@ class Reports:
         goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
         fault, lag = quoted(control.fault) if control.fault else None, goal.lag if goal else None
         said = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user, lag
-        status = message(Status(*said, self._unrecorded))
+        status = Status(*said, self._unrecorded)
         if status != self._status:
-            self._status = status
-            self._gateway.send(status)
-            self._recorder.send(status)
+            self._status, packet = status, message(status)
+            self._gateway.send(packet)
+            self._recorder.send(packet)
 
     def _send_answers(self) -> None:
         """Answer some requests; what the gateway is too slow for waits, what it has gone without is nobody's."""

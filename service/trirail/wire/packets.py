@@ -194,6 +194,8 @@ class ControlInput(Struct, frozen=True, tag="Input"):  # as recordings have it
     given: GivenInput
     urgent: bool = False
     """Whether it was given behind the cycle's SYNC; else before it, with all that was decided then."""
+    waiting: bool = False
+    """Whether it was heard while the cycle's tick was waited for, behind what else was decided before it."""
 
 
 class Unrecorded(Struct, frozen=True, tag=True):
