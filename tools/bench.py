@@ -59,16 +59,6 @@ def latency(*, goals: int = 100, json: bool = False) -> None:
 
 
 @app.command
-def settle(*, goals: int = 100, json: bool = False) -> None:
-    """Time from the end of a goal's path until the robot is measured to be there, on simulated drives."""
-    import bench_rig
-    import bench_settle
-
-    with bench_rig.rig(1000, own=True) as made:
-        report(bench_settle.measure(made, goals), json)
-
-
-@app.command
 def fairness(*, goals: int = 1000, json: bool = False) -> None:
     """Time until one user's goals and stops are answered, quiet and while another floods, and the ratio of the two."""
     import bench_fairness
@@ -95,27 +85,11 @@ def peers(*, seconds: float = 15.0, json: bool = False) -> None:
 
 
 @app.command
-def planning(*, goals: int = 1500, json: bool = False) -> None:
-    """Time the planning of goals."""
-    import bench_planning
-
-    report(bench_planning.measure(goals), json)
-
-
-@app.command
 def kinematics(*, json: bool = False) -> None:
     """Time the recursion against a straightforward numpy port of the paper's matrices."""
     import bench_kinematics
 
     report(bench_kinematics.measure(), json)
-
-
-@app.command
-def recorder(*, seconds: float = 60.0, json: bool = False) -> None:
-    """Run the whole service on simulated drives, moving, and measure what its recorder takes, watched and not."""
-    import bench_recorder
-
-    report(bench_recorder.measure(seconds), json)
 
 
 @app.command
