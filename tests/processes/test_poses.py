@@ -260,14 +260,16 @@ def test_what_is_kept_and_what_is_under_way_is_bounded(make: Make, monkeypatch: 
     asked = make(CONFIG)
     for number in range(UNDER_WAY):
         asked.ask("teach", f"p{number}")
-    with pytest.raises(RefusedError, match="send fewer"):
+    with pytest.raises(RefusedError) as refused:
         asked.ask("teach", "pick")
+    assert refused.value.code is RefusalCode.BUSY
     monkeypatch.setattr(poses, "MOST", 2)
     full = make(CONFIG)
     for name in ("a", "b", "a"):
         full.teach(name)
-    with pytest.raises(RefusedError, match="2 poses are kept already"):
+    with pytest.raises(RefusedError) as refused:
         full.ask("teach", "c")
+    assert refused.value.code is RefusalCode.BUSY
     assert MOST == 1000
 
 
