@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 
-.PHONY: demo check test test-all hil explore chaos soak ci-packages bench screenshots clean
+.PHONY: demo check test test-all test-side-by-side test-alone hil explore chaos soak ci-packages bench screenshots clean
 
 demo: $(READY)  ## the service on simulated drives, driven through a tour; options: make demo ARGS=--stay
 	$(VENV)/bin/trirail demo $(ARGS)
@@ -15,12 +15,16 @@ check: $(READY)  ## lint, format, types and import contracts alone
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
-test test-all: export PYTHONHASHSEED = 0
+test test-side-by-side test-alone: export PYTHONHASHSEED = 0
 test: check  ## before each commit, five minutes: lint, format, types, import contracts, tests of every room, whole services
 	$(VENV)/bin/pytest --numprocesses auto --dist worksteal --effort 0.1 -m "core or not (slow or viewer or long or alone)"
 
-test-all: check  ## everything that decides: the same with every test and every example
+test-all: test-side-by-side test-alone  ## everything that decides: the same with every test and every example
+
+test-side-by-side: check
 	$(VENV)/bin/pytest --numprocesses auto --dist worksteal -m "not alone"
+
+test-alone: $(READY)
 	$(VENV)/bin/pytest -m alone
 
 hil: $(READY)  ## the service on real SocketCAN, in an emulated machine; installs what that needs, as root on Debian
