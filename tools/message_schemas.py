@@ -15,7 +15,7 @@ from typing import Any
 import docstrings
 import msgspec
 from trirail.errors import RefusalCode
-from trirail.wire import goals, messages, state, vocabulary
+from trirail.wire import goals, looks, messages, state, vocabulary
 from trirail.wire.vocabulary import Command, NoContent
 
 FOLDER = Path(messages.__file__).parent / "schemas"
@@ -38,10 +38,11 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "role": (messages.RoleReply, "The reply to a query on role/<user>."),
     "pose": (state.NamedPose, "The reply to a query on teach/<user>/<name> or forget/<user>/<name>."),
     "poses": (state.NamedPoses, "The reply to a query on poses."),
+    "alignment": (looks.AlignmentLook, "What is sent to alignment/<user>, and the reply where it is taken."),
     "info": (state.Info, "The reply to a query on info."),
 }
 """By file: the type, and where the message is met."""
-MODULES = (*(sys.modules[kind.__module__] for kind in goals.KINDS), vocabulary, messages, state)
+MODULES = (*(sys.modules[kind.__module__] for kind in goals.KINDS), vocabulary, looks, messages, state)
 """Where the types in them are."""
 
 

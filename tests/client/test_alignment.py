@@ -56,6 +56,13 @@ def test_one_correction_with_a_thread(locator: str) -> None:
         assert found.confirmed
         newest = [event for event in robot.events(history=True, timeout=0.2) if event.kind == "goal"][-1]
         assert (newest.id or "").startswith("align-")
+        told = [event.alignment for event in robot.events(history=True, timeout=0.2) if event.alignment is not None]
+        before, after = told[-2:]
+        assert (newest.id or "").startswith(after.id)
+        assert (before.correction, after.end) == (found.corrections[0].by, "reached")
+        assert [{mark.name: mark.to_go for mark in look.marks} for look in (before, after)] == [
+            each.errors for each in found.measurements
+        ]
         now = seen(lying, robot.state().pose)
         for name in PART:
             assert now[name] == pytest.approx(targets[name], abs=2e-5 * FOCUS)
@@ -138,6 +145,8 @@ def test_ctrl_c_in_a_motion_stops_the_robot(locator: str) -> None:
             robot.calibrate_camera(lambda: seen(PART, robot.state().pose), [(0.05, 0.0, 0.0)], speed=0.02)
         thread.join()
         state = robot.state()
+        told = [event.alignment for event in robot.events(history=True, timeout=0.2) if event.alignment is not None]
+        assert (told[-1].end, told[-1].words) == ("failed", "KeyboardInterrupt")
         assert state.mode == Mode.HOLDING
         assert state.pose[0] < 0.045
 

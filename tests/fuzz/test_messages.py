@@ -184,7 +184,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gateway,
 
 
 @given(
-    kind=st.sampled_from(("goal", "cmd", "info", "role", "poses", "teach", "forget")),
+    kind=st.sampled_from(("goal", "cmd", "info", "role", "poses", "teach", "forget", "alignment")),
     key=keys,
     payload=payloads,
     encoding=st.sampled_from(ENCODINGS),

@@ -176,7 +176,7 @@ class FakeRobot:
 
     # ------------------------------------------------------------------ what happens to it
 
-    def say(self, message: str, level: str = "info", **fields: str) -> None:
+    def say(self, message: str, level: str = "info", **fields: object) -> None:
         with self._lock:
             seq = len(self._events) + 1
             base = {"seq": seq, "t": seq * 1.0, "cycle": seq, "time": 1.7e9 + seq, "kind": "service"}

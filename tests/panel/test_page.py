@@ -307,6 +307,32 @@ def test_named_poses_are_buttons_that_come_and_go_with_them(enabled: Page, robot
     enabled.until("document.querySelector('#poses button').disabled")
 
 
+def test_the_last_alignment_is_shown_with_what_each_mark_had_to_go(page: Page, robot: FakeRobot, panel: Panel) -> None:
+    def told(number: int, ways: dict[str, float], **more: Any) -> None:
+        marks = [{"name": name, "pixel": (10.0, 20.0), "to_go": (way, 0.0)} for name, way in ways.items()]
+        look = {"id": "align-1", "purpose": "alignment", "number": number, "marks": marks} | more
+        robot.say("a look", kind="alignment", user="bob", alignment=look)
+
+    shown = "document.querySelector('#alignment').innerText"
+    button = "document.querySelector('[data-view=alignment]')"
+    assert page.evaluate(f"{button}.hidden")
+    told(1, {"left": 4.123e-4, "<b>": 1e-4}, correction=(1e-4, 0.0, 0.0))
+    page.until(f"{button}.innerText === 'Alignment: …'")
+    told(2, {"left": 3.1e-7, "<b>": 2e-7}, end="reached", seconds=0.25)
+    page.until(f"{button}.innerText === 'Alignment: reached'")
+    page.click("[data-view=alignment]")
+    for words in ("align-1 of bob", "reached in 0.25 s, 1 correction", "look 2", "412.3 µm", "0.31 µm", "<b>"):
+        assert words in page.evaluate(shown), words
+    robot.say("a look", kind="alignment", user="bob", alignment={"id": "align-2", "purpose": "check", "number": 1})
+    for _ in range(300):
+        robot.say("much else")
+    later = page.another()
+    later.open(panel.url)
+    later.until("document.querySelector('#alignment').innerText !== ''")
+    later.until(f"{button}.innerText === 'Check: …'")
+    later.close()
+
+
 def test_the_last_minutes_are_drawn_and_a_silent_time_is_a_gap(enabled: Page, robot: FakeRobot) -> None:
     enabled.click("[data-view=charts]")
     assert enabled.evaluate("document.querySelector('#mechanism').hasAttribute('hidden')")

@@ -8,6 +8,7 @@ from msgspec import structs
 from trirail.errors import RefusalCode
 from trirail.wire import packets
 from trirail.wire.goals import PoseGoal
+from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import Event
 from trirail.wire.packets import (
     Accepted,
@@ -17,6 +18,7 @@ from trirail.wire.packets import (
     GoalRequest,
     Happened,
     Kind,
+    Looked,
     PoseChanged,
     Refused,
     RefusedRequest,
@@ -37,6 +39,7 @@ from trirail.wire.vocabulary import Command
         CommandRequest(2, "ann", Command.STOP),
         RefusedRequest("ann", "no"),
         PoseChanged("ann", "pose pick removed by ann"),
+        Looked("ann", "info", "a look", AlignmentLook("a", "check", 1)),
         Remark("info", "linked to the router tls/192.0.2.9:7447"),
     ],
 )

@@ -1,25 +1,42 @@
 """Alignment and calibration as conversations: each asks for looks and motions, and ends with a result.
 
 A generator yields what it wants, LOOK or a StageMotion, and is sent a Sighting; whoever drives it has the camera, the
-robot and the time. It moves nothing itself.
+robot and the time. It moves nothing itself. It also yields a LookReport of each look, for which it wants nothing.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
-from enum import StrEnum
 from typing import Literal, NamedTuple
 
-import msgspec
 import numpy as np
 from trirail_drivers.interface import Triple
 
-from trirail.alignment.calibration import CameraCalibration, Marks, Sight, calibrate
+from trirail.alignment.calibration import CameraCalibration, Sight, calibrate
 from trirail.alignment.images import Lens, Pair
 from trirail.alignment.misplacement import DISTANCE, Misplacement, misplacement
+from trirail.alignment.results import Alignment, AlignmentCorrection, AlignmentEnd, Measurement
 from trirail.alignment.rigid import turned
+from trirail.alignment.wishes import LOOK, LookReport, Sighting, StageMotion, Wish
 from trirail.errors import AlignmentError, AlignmentFault
+
+__all__ = [
+    "LOOK",
+    "MOVES",
+    "Alignment",
+    "AlignmentCorrection",
+    "AlignmentEnd",
+    "Measurement",
+    "Sighting",
+    "StageMotion",
+    "Task",
+    "Wish",
+    "align",
+    "calibrated_first",
+    "calibration_by_moves",
+    "look_only",
+]
 
 MOVES: tuple[Triple, ...] = tuple(
     (x * 1e-3, y * 1e-3, math.radians(turn))
@@ -34,92 +51,6 @@ BEYOND = 2.0
 did."""
 CONFIRMS = 0.2
 """A correction confirms the calibration where it misses what it was to leave by no more than this share of its way."""
-
-
-class StageMotion(NamedTuple):
-    """A motion that is wanted: a pose, or with a `tool` a move of that point from where the robot is measured."""
-
-    by: Triple
-    """The pose [m, rad] where there is no tool; else the move."""
-    tool: Pair | None = None
-    """A point of the platform in its own frame [m]."""
-    approach: Triple | None = None
-    """From where it comes: the robot is sent beyond the end by this first, and back then [m, rad]."""
-
-
-LOOK: Literal["look"] = "look"
-"""What a conversation wants beside motions."""
-Wish = Literal["look"] | StageMotion
-
-
-class Sighting(NamedTuple):
-    """What is sent into a conversation: what cameras show, where the robot is measured to be, and when [s]."""
-
-    marks: Marks
-    pose: Triple
-    time: float
-
-
-class AlignmentEnd(StrEnum):
-    """AlignmentEnd an alignment ended."""
-
-    REACHED = "reached"
-    """Every mark is within the tolerance, and the part's angle."""
-    CORRECTIONS = "corrections"
-    """As many corrections have been made as were allowed."""
-    GROWING = "growing"
-    """The error grew by a correction: a sign, a mirror, or a camera that was moved."""
-
-
-class Measurement(msgspec.Struct, frozen=True):
-    """What one look told."""
-
-    marks: dict[str, Pair]
-    """Pixels of the marks; the mean where several pictures were taken."""
-    errors: dict[str, Pair]
-    """How far each mark has to go to its target, x, y in the base frame [m]."""
-    worst: float
-    """The greatest distance that a mark goes by the motion that aligns the part [m]."""
-    shift: Pair
-    """How far the middle of the marks has to go [m]."""
-    turn: float
-    """By what angle the part has to turn [rad]."""
-    misfit: float
-    """The greatest distance of a mark from its target that no motion takes away [m]."""
-    distance: float
-    """By how much the worst distance of two marks is wrong, as a share of it."""
-    pose: Triple
-    """Of the platform, measured: x, y [m], phi [rad]."""
-    time: float
-    """When, on the clock of who looked [s]."""
-
-
-class AlignmentCorrection(msgspec.Struct, frozen=True):
-    """One motion that was made."""
-
-    by: Triple
-    """Of the marks' middle: x, y [m]; phi [rad]."""
-    share: float
-    """Of what the look before it told: below 1 for the first of a calibration that is not confirmed."""
-    seconds: float
-    """From the look before it until the robot stood."""
-
-
-class Alignment(msgspec.Struct, frozen=True):
-    """How an alignment went: one more measurement than corrections."""
-
-    why: AlignmentEnd
-    measurements: tuple[Measurement, ...]
-    corrections: tuple[AlignmentCorrection, ...]
-    seconds: float
-    """From the first look to the last."""
-    confirmed: bool
-    """Whether a correction has gone where it should with this calibration, here or before."""
-
-    @property
-    def reached(self) -> bool:
-        """Whether the part lies right."""
-        return self.why is AlignmentEnd.REACHED
 
 
 class Task(NamedTuple):
@@ -149,16 +80,18 @@ def align(task: Task) -> Conversation:
     corrections: list[AlignmentCorrection] = []
     confirmed = task.calibration.confirmed
     while True:
-        sight, found = yield from _measure(task)
-        measurements.append(_measurement(sight, found))
+        sight, found = yield from _measure(task, "alignment")
+        measurements.append(measured := _measurement(sight, found))
         if len(measurements) > 1:
             confirmed = confirmed or _as_meant(task, measurements, corrections[-1].share)
         if (why := _ended(task, measurements)) is not None:
+            yield LookReport("alignment", sight, measured, end=why)
             seconds = measurements[-1].time - measurements[0].time
             confirmed = confirmed and why is not AlignmentEnd.GROWING
             return Alignment(why, tuple(measurements), tuple(corrections), seconds, confirmed)
         share = 1.0 if confirmed else min(1.0, BEYOND * task.calibration.reach / max(found.worst, 1e-12))
         motion = _motion(found, sight.pose, share, task.approach)
+        yield LookReport("alignment", sight, measured, motion.by)
         arrived = yield motion
         corrections.append(AlignmentCorrection(motion.by, share, arrived.time - sight.time))
 
@@ -171,8 +104,10 @@ def calibrated_first(task: Callable[[CameraCalibration], Task], looks: int, appr
 
 def look_only(task: Task) -> Generator[Wish, Sighting, Measurement]:
     """Measure and move nothing."""
-    sight, found = yield from _measure(task)
-    return _measurement(sight, found)
+    sight, found = yield from _measure(task, "check")
+    measured = _measurement(sight, found)
+    yield LookReport("check", sight, measured, end="checked")
+    return measured
 
 
 def calibration_by_moves(
@@ -189,11 +124,19 @@ def calibration_by_moves(
     """
     first = yield from _look(looks)
     sights = [first]
+    yield LookReport("calibration", first)
     for move in moves:
         yield StageMotion(_sum(first.pose, move), approach=approach)
         sights.append((yield from _look(looks)))
+        yield LookReport("calibration", sights[-1])
     yield StageMotion(first.pose, approach=approach)
-    return calibrate([Sight(each.pose, each.marks) for each in sights], views, lens, centre)
+    try:
+        found = calibrate([Sight(each.pose, each.marks) for each in sights], views, lens, centre)
+    except AlignmentError as error:
+        yield LookReport("calibration", end=error.fault, words=str(error))
+        raise
+    yield LookReport("calibration", end="calibrated", noise=found.noise)
+    return found
 
 
 def _look(pictures: int) -> Generator[Wish, Sighting, Sighting]:
@@ -215,9 +158,15 @@ def _look(pictures: int) -> Generator[Wish, Sighting, Sighting]:
     return Sighting(marks, (x, y, phi), taken[-1].time)
 
 
-def _measure(task: Task) -> Generator[Wish, Sighting, tuple[Sighting, Misplacement]]:
+def _measure(
+    task: Task, purpose: Literal["alignment", "check"]
+) -> Generator[Wish, Sighting, tuple[Sighting, Misplacement]]:
     sight = yield from _look(task.looks)
-    return sight, misplacement(task.calibration, sight.marks, task.targets, task.distance)
+    try:
+        return sight, misplacement(task.calibration, sight.marks, task.targets, task.distance)
+    except AlignmentError as error:
+        yield LookReport(purpose, sight, end=error.fault, words=str(error))
+        raise
 
 
 def _measurement(sight: Sighting, found: Misplacement) -> Measurement:

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
+from trirail.analysis.residual_chart import RESIDUALS, draw_residuals
 from trirail.analysis.summary import ENABLED_MODES, GoalSummary, Incident, Summary
 from trirail.config import Limits
 from trirail.errors import ConfigError
@@ -56,10 +57,11 @@ def draw(file: Path, recording: Recording, summed: Summary) -> None:
     ValueError for one that matplotlib does not write, OSError if the file cannot be written.
     """
     listed = _listed(summed.faults)
-    figure = Figure(figsize=(WIDTH, sum(PANELS.values()) + 1.2 + 0.17 * len(listed)), dpi=150, layout="constrained")
+    heights = PANELS | ({RESIDUALS: 1.3} if any(each.residuals for each in summed.alignments) else {})
+    figure = Figure(figsize=(WIDTH, sum(heights.values()) + 1.2 + 0.17 * len(listed)), dpi=150, layout="constrained")
     figure.suptitle(_title(summed), x=0.008, ha="left", color=INK, fontsize=14, fontweight="bold")
-    axes = figure.subplots(len(PANELS), 1, sharex=True, height_ratios=[*PANELS.values()])
-    panels: dict[str, Axes] = dict(zip(PANELS, axes, strict=True))
+    axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=[*heights.values()])
+    panels: dict[str, Axes] = dict(zip(heights, axes, strict=True))
     for name, panel in panels.items():
         panel.set_ylabel(name, color=GREY, fontsize=9)
     records, t = recording.records, recording.t
@@ -67,6 +69,9 @@ def draw(file: Path, recording: Recording, summed: Summary) -> None:
     _modes(panels["goals"], records, t, summed)
     _motion(panels, records, t, _limits(recording), summed.labels)
     _timing(panels["loop [µs]"], records, t, 1e6 / summed.rate_hz)
+    if RESIDUALS in panels:
+        colours = draw_residuals(panels[RESIDUALS], recording.alignments)
+        _names(panels[RESIDUALS], list(colours), list(colours.values()))
     worst = [
         f"{label(each.slider, summed.labels)}  max {each.max * 1e6:.0f}, rms {each.rms * 1e6:.1f} µm"
         for each in summed.tracking

@@ -11,6 +11,7 @@ from trirail_drivers.interface import NAMES
 
 from trirail.naming import Labels
 from trirail.telemetry import provenance
+from trirail.telemetry.alignments import RecordedAlignment
 from trirail.telemetry.reading import Line, Recording
 from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, GoalRequest
@@ -35,6 +36,27 @@ class GoalSummary(msgspec.Struct, frozen=True):
     message: str
     settle: float | None = None
     """From the end of its path until the robot was in position; None of one that did not settle."""
+
+
+class AlignmentSummary(msgspec.Struct, frozen=True):
+    """An alignment, a calibration of cameras, or a check."""
+
+    id: str
+    """The ids of its goals begin with it."""
+    user: str
+    purpose: str
+    end: str
+    """Why it ended; unknown where that was not told."""
+    message: str
+    """With an end by an error what that says."""
+    began: float
+    """Nominal time of its first look, since the loop's start [s]."""
+    seconds: float
+    """From the first look to the end."""
+    looks: int
+    corrections: int
+    residuals: dict[str, list[float | None]]
+    """How far each mark was from its target at each look [m]; None where that is not known."""
 
 
 class Incident(msgspec.Struct, frozen=True):
@@ -83,6 +105,7 @@ class Summary(msgspec.Struct, frozen=True):
     commands: dict[str, int]
     """How often each command was given."""
     goals: list[GoalSummary]
+    alignments: list[AlignmentSummary]
     faults: list[Incident]
     warnings: list[Incident]
 
@@ -111,6 +134,7 @@ def summary(recording: Recording) -> Summary:
         cycle_us=_percentiles(records["parts_ns"].sum(axis=1)),
         commands=_commands(recording),
         goals=list(_goals(recording, period)),
+        alignments=[_alignment(each) for each in recording.alignments],
         faults=[_incident(line) for line in recording.events if _is_fault(line)],
         warnings=[
             _incident(line)
@@ -173,6 +197,28 @@ def _end(event: Event | None, given: float) -> tuple[str, float, float | None, s
     if event is None:
         return UNKNOWN, given, None, "its end is not in the recording", None
     return event.outcome or UNKNOWN, given, round(event.t, 6), event.reason or event.message, event.settle
+
+
+def _alignment(told: RecordedAlignment) -> AlignmentSummary:
+    last, seen = told.looks[-1], [bool(look.marks) for look in told.looks]
+    rows = {
+        name: [None if np.isnan(way) else float(way) for way in row[seen]]
+        for name, row in zip(told.marks, told.residuals, strict=True)
+        if not np.isnan(row).all()
+    }
+    corrections = sum(look.correction is not None for look in told.looks)
+    return AlignmentSummary(
+        told.id,
+        told.user,
+        told.purpose,
+        told.end,
+        last.words,
+        round(told.t[0], 6),
+        last.seconds,
+        sum(seen),
+        corrections,
+        rows,
+    )
 
 
 def _is_fault(line: Line) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.text import Text
 
-from trirail.cli import terminal, units
+from trirail.cli import alignment_lines, terminal, units
 from trirail.cli.options import Flag
 from trirail.errors import ServiceError, TrirailError
 from trirail.naming import Labels, label
@@ -235,6 +235,8 @@ def _print_summary(summed: Summary) -> None:
     lines.show()
     if summed.goals:
         _print_goals(summed.goals)
+    if summed.alignments:
+        alignment_lines.show(summed.alignments)
     for title, colour, incidents in (("faults", "bold red", summed.faults), ("warnings", "yellow", summed.warnings)):
         if incidents:
             terminal.out.print(f"\n[{colour}]{title}[/]")

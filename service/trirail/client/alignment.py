@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import itertools
 import time
-import uuid
 from collections.abc import Awaitable, Callable, Generator, Iterator
 from typing import TYPE_CHECKING, TypeVar
 
@@ -14,9 +12,10 @@ from msgspec import structs
 from trirail_drivers.interface import Triple
 
 from trirail.alignment.calibration import Marks
-from trirail.alignment.procedure import LOOK, Sighting, StageMotion, Wish
+from trirail.alignment.wishes import LookReport, Sighting, StageMotion, Wish
 from trirail.client.goal import Result
-from trirail.errors import RefusalCode, RefusedError
+from trirail.client.look_reports import LookReports
+from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal
 
 if TYPE_CHECKING:
@@ -27,6 +26,7 @@ T = TypeVar("T")
 Look = Callable[[], Marks | Awaitable[Marks]]
 """Takes a picture, or one of each camera, and returns where it shows the marks, {name: (u, v)} [pixel]; in an event
 loop it may be a coroutine function."""
+NOTHING_SEEN = Sighting({}, (0.0, 0.0, 0.0), 0.0)
 GOAL_WITHIN = 60.0
 """How long one motion may take [s]."""
 STANDS = ("done", "unsettled")
@@ -39,23 +39,45 @@ def drive(robot: Robot, look: Look, wishes: Generator[Wish, Sighting, T], speed:
     `wait` is how long a camera needs after a motion until it shows what is [s]. Whatever ends it before, as Ctrl-C,
     stops the motion. Raises RefusedError where a motion is refused or ends otherwise, and what `look` raises.
     """
-    marks: Marks = {}
-    ids = _ids()
+    sight = NOTHING_SEEN
+    reports = LookReports()
+    ids = reports.goal_ids()
     try:
         wish = next(wishes)
         while True:
-            if wish == LOOK:
-                seen = look()
-                if inspect.isawaitable(seen):
-                    raise TypeError("look is a coroutine function: it is for AsyncRobot")
-                marks = seen
-            elif isinstance(wish, StageMotion):
-                for goal in goals(wish, speed):
-                    _go(robot, goal, next(ids))
-                time.sleep(wait)
-            wish = wishes.send(Sighting(marks, robot.state().pose, time.monotonic()))
+            if isinstance(wish, LookReport):
+                _report(robot, reports, reports.message(wish))
+            else:
+                if isinstance(wish, StageMotion):
+                    for goal in goals(wish, speed):
+                        _go(robot, goal, next(ids))
+                    time.sleep(wait)
+                    marks = sight.marks
+                else:
+                    marks = _marks(look)
+                sight = Sighting(marks, robot.state().pose, time.monotonic())
+            wish = wishes.send(sight)
     except StopIteration as end:
         return end.value  # type: ignore[no-any-return]
+    except BaseException as error:
+        _report(robot, reports, reports.failure(error))
+        raise
+
+
+def _marks(look: Look) -> Marks:
+    seen = look()
+    if inspect.isawaitable(seen):
+        raise TypeError("look is a coroutine function: it is for AsyncRobot")
+    return seen
+
+
+def _report(robot: Robot, reports: LookReports, message: bytes | None) -> None:
+    if message is None:
+        return
+    try:
+        robot._report_look(message)
+    except TrirailError as error:
+        reports.lost(error)
 
 
 def _go(robot: Robot, goal: Goal, goal_id: str) -> None:
@@ -72,21 +94,39 @@ async def drive_async(
     robot: AsyncRobot, look: Look, wishes: Generator[Wish, Sighting, T], speed: float, wait: float
 ) -> T:
     """Do the same in an event loop; `look` may be a coroutine function. A call that is cancelled stops the motion."""
-    marks: Marks = {}
-    ids = _ids()
+    sight = NOTHING_SEEN
+    reports = LookReports()
+    ids = reports.goal_ids()
     try:
         wish = next(wishes)
         while True:
-            if wish == LOOK:
-                seen = look()
-                marks = await seen if inspect.isawaitable(seen) else seen
-            elif isinstance(wish, StageMotion):
-                for goal in goals(wish, speed):
-                    await _go_async(robot, goal, next(ids))
-                await asyncio.sleep(wait)
-            wish = wishes.send(Sighting(marks, (await robot.state()).pose, time.monotonic()))
+            if isinstance(wish, LookReport):
+                await _report_async(robot, reports, reports.message(wish))
+            else:
+                if isinstance(wish, StageMotion):
+                    for goal in goals(wish, speed):
+                        await _go_async(robot, goal, next(ids))
+                    await asyncio.sleep(wait)
+                    marks = sight.marks
+                else:
+                    seen = look()
+                    marks = await seen if inspect.isawaitable(seen) else seen
+                sight = Sighting(marks, (await robot.state()).pose, time.monotonic())
+            wish = wishes.send(sight)
     except StopIteration as end:
         return end.value  # type: ignore[no-any-return]
+    except BaseException as error:
+        await _report_async(robot, reports, reports.failure(error))
+        raise
+
+
+async def _report_async(robot: AsyncRobot, reports: LookReports, message: bytes | None) -> None:
+    if message is None:
+        return
+    try:
+        await robot._report_look(message)
+    except TrirailError as error:
+        reports.lost(error)
 
 
 async def _go_async(robot: AsyncRobot, goal: Goal, goal_id: str) -> None:
@@ -97,12 +137,6 @@ async def _go_async(robot: AsyncRobot, goal: Goal, goal_id: str) -> None:
         if handle.result is None:
             await robot.stop()
         raise
-
-
-def _ids() -> Iterator[str]:
-    """Yield the ids of one alignment's goals, by which recordings, reports and events show them together."""
-    name = uuid.uuid4().hex[:8]
-    return (f"align-{name}-{number}" for number in itertools.count(1))
 
 
 def goals(motion: StageMotion, speed: float) -> Iterator[Goal]:

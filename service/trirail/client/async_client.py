@@ -22,7 +22,7 @@ from trirail.client.async_connection import AsyncConnection
 from trirail.client.async_goal import AsyncGoalHandle, AsyncJog
 from trirail.client.async_lease import AsyncLease
 from trirail.client.async_track import AsyncTrack
-from trirail.client.client import HOME_WITHIN, Robot, address, identity, result_of
+from trirail.client.client import HOME_WITHIN, REPORT_WITHIN, Robot, address, identity, result_of
 from trirail.client.connection import REPLY_WITHIN
 from trirail.client.goal import GoalHandle
 from trirail.client.outgoing import content_message, goal_message, id_of, seconds
@@ -30,6 +30,7 @@ from trirail.client.track import Taker
 from trirail.client.trajectory import check_arrived
 from trirail.errors import RefusedError, ServiceError
 from trirail.wire.goals import Goal
+from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import CommandReply, Event, GoalReply
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.stop_door import STOPS
@@ -162,6 +163,9 @@ class AsyncRobot:
 
     calibrate_camera = _conversation(Robot.calibrate_camera)
     align = _conversation(Robot.align)
+
+    async def _report_look(self, look: bytes) -> None:
+        await self._connection.ask(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)
 
     def jog(self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2) -> AsyncJog:
         """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].

@@ -40,6 +40,7 @@ from trirail.wire.goals import (
     Tool,
     TrajectoryGoal,
 )
+from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import CommandReply, Event, GoalReply
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
@@ -57,6 +58,8 @@ __all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot", "Track"]
 
 SEEN_WITHIN = 1.0
 """How long a state is waited for by who looks where the robot is [s]."""
+REPORT_WITHIN = 2.0
+"""How long the answer may take to what is told of an alignment [s]."""
 HOME_WITHIN = 600.0
 """How long homing may take [s]: three drives of the greatest time-out there is."""
 
@@ -380,6 +383,10 @@ class Robot:
         from trirail.client.alignment import drive
 
         return drive(self, look, wishes, speed, wait)
+
+    def _report_look(self, look: bytes) -> None:
+        """Tell the service of a look of an alignment: a trirail.wire.looks.AlignmentLook as JSON."""
+        self._connection.ask(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)
 
     def _arrive(self, make: Callable[[str], Goal]) -> None:
         """Send a goal and wait until it is done. Raises RefusedError where it ends otherwise."""

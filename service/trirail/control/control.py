@@ -35,6 +35,7 @@ from trirail.wire.packets import (
     CommandRequest,
     Disturbance,
     GoalRequest,
+    Looked,
     PlannerLost,
     PoseChanged,
     RefusedRequest,
@@ -286,7 +287,7 @@ class Control:
             match what:
                 case Disturbance():
                     self.modes.happen(ModeEvent[what.event], what.reason)
-                case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged() | Remark():
+                case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged() | Looked() | Remark():
                     self._answer(what, now_ns)
                 case PlannerLost():
                     self._planner.lose(what.reason)
@@ -304,6 +305,9 @@ class Control:
                 self._commands.take(request)
             elif isinstance(request, PoseChanged):
                 self.ledger.tell("pose", "info", request.message, user=request.user)
+            elif isinstance(request, Looked):
+                look, words = request.look, request.message
+                self.ledger.tell("alignment", request.level, words, user=request.user, alignment=look)
             elif isinstance(request, Remark):
                 self.ledger.tell("service", request.level, request.message)
             else:

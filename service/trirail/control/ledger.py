@@ -14,6 +14,7 @@ from trirail.control.notices import REMEMBERED_IDS, Notice
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.goals import Goal
+from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import FaultDetail, Level, Outcome
 from trirail.wire.packets import (
     Accepted,
@@ -21,6 +22,7 @@ from trirail.wire.packets import (
     CommandRequest,
     Confirmed,
     GoalRequest,
+    Looked,
     PoseChanged,
     Refused,
     RefusedRequest,
@@ -202,7 +204,7 @@ class Ledger:
 
         Everyone is told, of renewals that come often once: hundreds may follow before their sender hears of it.
         """
-        if isinstance(request, RefusedRequest | PoseChanged | Remark):
+        if isinstance(request, RefusedRequest | PoseChanged | Looked | Remark):
             return
         text = str(refusal)
         self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))
@@ -294,9 +296,11 @@ class Ledger:
         goal: str | None = None,
         user: str | None = None,
         fault: FaultDetail | None = None,
+        alignment: AlignmentLook | None = None,
     ) -> None:
         """Note something that everyone is to know."""
-        self.notices.append(Notice(kind, level, message, mode, id, outcome, reason, goal, user, fault=fault))
+        said = Notice(kind, level, message, mode, id, outcome, reason, goal, user, fault=fault, alignment=alignment)
+        self.notices.append(said)
 
 
 def _not_renewed(goal_id: str) -> RefusedError:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from trirail_drivers.interface import Triple
 
+from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import FaultDetail, Level, Outcome, Residual
 
 REMEMBERED_IDS = 10_000
@@ -28,3 +29,4 @@ class Notice(NamedTuple):
     residual: Residual | None = None
     overshoot: Triple | None = None
     fault: FaultDetail | None = None
+    alignment: AlignmentLook | None = None

@@ -15,12 +15,15 @@ from trirail.client.client import Robot
 from trirail.errors import TrirailError
 from trirail.panel import path_check
 from trirail.panel.description import describe, shown
+from trirail.wire.looks import AlignmentLook
 from trirail.wire.state import Info
 
 SILENT = 1.0
 """After so long without a state the service is taken for gone [s]."""
 EVENTS = 200
 """So many events are kept for tabs that come later."""
+LOOKS = 50
+"""And so many of the last alignment's."""
 
 
 class Feed:
@@ -42,6 +45,9 @@ class Feed:
         """When that came: milliseconds of this process's monotonic clock."""
         self._closed = False
         self._events: deque[tuple[int, bytes]] = deque(maxlen=EVENTS)
+        self._aligned: list[tuple[int, bytes]] = []
+        """Those of the last alignment, however many have come since."""
+        self._alignment = ("", "")
 
     def start(self) -> None:
         """Begin to hear."""
@@ -54,7 +60,7 @@ class Feed:
 
     def events(self, after: int) -> list[tuple[int, bytes]]:
         """Return the events that came after that number, numbered as they came, as JSON."""
-        return [event for event in self._events if event[0] > after]
+        return [event for event in sorted({*self._aligned, *self._events}) if event[0] > after]
 
     def _hear_states(self) -> None:
         while not self._closed:
@@ -106,7 +112,15 @@ class Feed:
             with self.changed:
                 self.poses = poses
                 self._events.append((number, content))
+                if event.alignment is not None:
+                    self._keep(event.alignment, (number, content))
                 self.changed.notify_all()
+
+    def _keep(self, look: AlignmentLook, event: tuple[int, bytes]) -> None:
+        """Keep a look beside those of the same alignment."""
+        name = look.id, look.purpose
+        self._aligned = [*(self._aligned if name == self._alignment else ()), event][-LOOKS:]
+        self._alignment = name
 
 
 def now() -> int:

@@ -25,6 +25,7 @@ from trirail.processes.inbox import Inbox
 from trirail.processes.incoming import Incoming
 from trirail.processes.info import info
 from trirail.processes.last_words import LastWords
+from trirail.processes.looks import Looks
 from trirail.processes.measured import Meter
 from trirail.processes.memory import give_back
 from trirail.processes.poses import Poses
@@ -94,6 +95,7 @@ class Gateway:
         self._refusals = Refusals(link, self._replies)
         self._inbox = Inbox(opened, self._robot, self._refusals.too_much)
         self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._tell, self._inbox.wake)
+        self._looks = Looks(self._robot, lambda looked: link.send(message(looked)))
         self._requests = Requests(config, link, guard, self._replies, self._last_words, hurrying)
         self._commands = CommandReader(
             self._robot, self._requests, self._replies, self._states, self._inbox, self._refusals.refuse
@@ -169,6 +171,8 @@ class Gateway:
                 self._replies.send(incoming, self._poses.table())
             elif incoming.kind in ("teach", "forget"):
                 self._poses.take(incoming)
+            elif incoming.kind == "alignment":
+                self._replies.send(incoming, self._looks.take(incoming))
             else:
                 self._commands.take(incoming)
         except RefusedError as refusal:

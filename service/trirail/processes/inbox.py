@@ -86,6 +86,7 @@ class Inbox:
             declare(key("poses"), queries("poses")),
             declare(key("teach", "*", "*"), queries("teach")),
             declare(key("forget", "*", "*"), queries("forget")),
+            declare(key("alignment", "*"), queries("alignment")),
             self._session.declare_subscriber(key("goal", "*"), on_sample),
             self._session.liveliness().declare_token(key("alive")),
         ]

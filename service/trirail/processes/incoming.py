@@ -9,7 +9,7 @@ import zenoh
 
 from trirail.wire import boundary
 
-Kind = Literal["goal", "cmd", "info", "role", "poses", "teach", "forget"]
+Kind = Literal["goal", "cmd", "info", "role", "poses", "teach", "forget", "alignment"]
 
 
 class Incoming(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from trirail.telemetry import curves, journal, readout
+from trirail.telemetry import curves, journal, readout, shown_alignment
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.workspace.mechanism import Points
 
@@ -41,7 +41,10 @@ def layout(shown: Shown) -> rrb.Blueprint:
     platform = rrb.Vertical(
         _plot("Centre x, y  [mm]", curves.CENTRE, window, legend=True),
         _plot("Angle φ  [°]", curves.PHI, window),
-        _plot("Distance to singularity  [°]", curves.SINGULARITY, window),
+        rrb.Tabs(
+            _plot("Distance to singularity  [°]", curves.SINGULARITY, window),
+            _plot("Alignment: marks to go  [µm]", shown_alignment.RESIDUALS, window, legend=True),
+        ),
         _plot("Loop timing  [µs]", curves.TIMING, window, legend=True),
         row_shares=[18, 19, 25, 20],
     )
@@ -74,7 +77,7 @@ def _whole(views: rrb.Horizontal, timeline: str) -> rrb.Blueprint:
     )
 
 
-def _situation(shown: Shown, window: rrb.TimeAxis, timeline: str) -> list[rrb.View]:
+def _situation(shown: Shown, window: rrb.TimeAxis, timeline: str) -> list[rrb.View | rrb.Tabs]:
     """Return the robot, its numbers, its mode and its events."""
     events = rrb.TextLogView(
         name="Events",
@@ -84,11 +87,12 @@ def _situation(shown: Shown, window: rrb.TimeAxis, timeline: str) -> list[rrb.Vi
             text_log_columns=["LogLevel", "Body"],
         ),
     )
+    aligned = f"{shown.root}{shown_alignment.TABLE}"
     return [
         _robot(shown, timeline),
         rrb.TextDocumentView(name="Now", origin=f"{shown.root}{readout.PATH}"),
         rrb.StateTimelineView(name="Mode", origin=f"{shown.root}/mode", time_view=window),
-        events,
+        rrb.Tabs(events, rrb.TextDocumentView(name="Alignment", origin=aligned)),
     ]
 
 

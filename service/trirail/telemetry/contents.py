@@ -15,7 +15,7 @@ from trirail.telemetry import provenance
 from trirail.telemetry.reading import read
 from trirail.telemetry.retention import BLACK_BOX
 from trirail.wire.messages import Event, FaultDetail
-from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, RefusedRequest
+from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Looked, RefusedRequest
 from trirail.wire.records import DTYPE, unpack
 
 _PART = re.compile(r"-part\d+(-\d+)?$")
@@ -78,7 +78,9 @@ class Contents(msgspec.Struct):
     def given(self, what: ControlInput) -> None:
         """Take what the control was given."""
         match what.given:
-            case GoalRequest(user=user) | CommandRequest(user=user) | RefusedRequest(user=user) if user:
+            case GoalRequest(user=user) | CommandRequest(user=user) | RefusedRequest(user=user) | Looked(user=user) if (
+                user
+            ):
                 self.users[user] = None
 
 

@@ -23,6 +23,7 @@ from trirail.wire.packets import (
     Disturbance,
     DrivesFault,
     GoalRequest,
+    Looked,
     PlannerLost,
     PoseChanged,
     RefusedRequest,
@@ -105,5 +106,5 @@ def _words(what: ControlInput) -> str:
             return f"plan {number}: {message}"
         case PlannerLost(reason=reason):
             return reason
-        case RefusedRequest(message=message) | PoseChanged(message=message) | Remark(message=message):
-            return message
+        case RefusedRequest() | PoseChanged() | Looked() | Remark() as told:
+            return told.message

@@ -40,6 +40,8 @@ from trirail.wire.records import DTYPE
 if TYPE_CHECKING:
     import pandas as pd
 
+    from trirail.telemetry.alignments import RecordedAlignment
+
 # What an RRD file is made of: Rerun's crate re_log_encoding, src/rrd/frames.rs.
 _MAGIC = b"RRF2"
 _FILE_HEADER = 12
@@ -111,6 +113,13 @@ class Recording(NamedTuple):
         from trirail.telemetry import tables
 
         return tables.part(self, begin, end, goal=goal, every=every)
+
+    @property
+    def alignments(self) -> list[RecordedAlignment]:
+        """Alignments, calibrations of cameras and checks that clients told of, in order, with every look."""
+        from trirail.telemetry import alignments
+
+        return alignments.of(self.events)
 
     def table(self, every: float | str | None = None, columns: Sequence[str] = ()) -> pd.DataFrame:
         """Return the records as a DataFrame of pandas, by `t` [s], a row `every` so many seconds, or as "10ms".

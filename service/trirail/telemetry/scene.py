@@ -15,7 +15,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from trirail.telemetry import columns, curves, drawing, palette, readout
+from trirail.telemetry import columns, curves, drawing, palette, readout, shown_alignment
 from trirail.telemetry.columns import FIELDS, RECORD, Column
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.shown_robot import ShownRobot
@@ -52,7 +52,8 @@ class Scene:
         yield from drawing.still(self._parts, self._frames, self._geometry.labels)
         for path, lines in self._plots.items():
             yield path, _series(lines)
-        yield readout.PATH, rr.TextDocument.from_fields(media_type=MARKDOWN)
+        for path in (readout.PATH, shown_alignment.TABLE):
+            yield path, rr.TextDocument.from_fields(media_type=MARKDOWN)
         yield (
             "/mode",
             rr.StateConfiguration(

@@ -18,6 +18,7 @@ from trirail.telemetry.columns import SECOND
 from trirail.telemetry.journal import EVENTS, Entry
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.scene import Scene
+from trirail.telemetry.shown_alignment import ShownAlignment
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.messages import Event, Level
 from trirail.wire.packets import ControlInput
@@ -59,6 +60,7 @@ class Streams:
         self._newest = bytes(DTYPE.itemsize)
         self._standing = Standing()
         self._goal_drawn = True
+        self._alignment = ShownAlignment()
 
     def open(self, sink: rr.FileSink | rr.GrpcServerSink) -> rr.RecordingStream:
         """Return a stream of this recording to a sink of Rerun's, with what stands still and the layout in it."""
@@ -113,6 +115,8 @@ class Streams:
     def event(self, event: Event) -> None:
         """Take an event."""
         self._entries.append(journal.said(event))
+        if event.alignment is not None:
+            self._waiting += self._alignment.take(event, event.alignment)
 
     def given(self, what: ControlInput) -> None:
         """Take what the control was given."""

@@ -15,7 +15,7 @@ from trirail.wire.vocabulary import Command, Role
 from trirail.wire.zenoh_session import key
 
 GOALS = Role.OPERATOR
-"""The least role that may send goals."""
+"""The least role that may send goals, and tell of the looks of an alignment, which sends some."""
 POSES = Role.MAINTAINER
 """The least role that may teach and remove poses."""
 
@@ -27,7 +27,7 @@ _Rule = dict[str, Any]
 
 def least_role(*parts: str) -> Role:
     """Return the least role that may use the resource of these parts of a robot's key, as ("cmd", user, "enable")."""
-    if parts[0] == "goal":
+    if parts[0] in ("goal", "alignment"):
         return GOALS
     if parts[0] in ("teach", "forget"):
         return POSES
@@ -108,7 +108,7 @@ def _of_every_user(robot: str) -> Iterator[_Rule]:
     past, alive = key(robot, "event", "@adv", "**"), key(robot, "alive")
     told = [key(robot, "info"), key(robot, "poses")]
     taught = [key(robot, name, "*", "*") for name in ("teach", "forget")]
-    asked = [key(robot, "goal", "*"), key(robot, "cmd", "*", "*"), *taught, *told]
+    asked = [key(robot, "goal", "*"), key(robot, "alignment", "*"), key(robot, "cmd", "*", "*"), *taught, *told]
     yield _rule("publish", "egress", ("put",), *published, past)
     yield _rule("subscribe", "ingress", ("declare_subscriber",), *published, past)
     # A fleet's clients subscribe to all robots at once; what they then see of this one is its own.
@@ -132,6 +132,7 @@ def _of_user(robot: str, user: str, role: Role) -> Iterator[_Rule]:
         yield _rule(f"{user} teaches poses", "ingress", ("query",), *poses)
     if role.includes(GOALS):
         yield _rule(f"{user} sends goals", "ingress", ("query", "put"), key(robot, "goal", user))
+        yield _rule(f"{user} aligns", "ingress", ("query",), key(robot, "alignment", user))
 
 
 def _rule(name: str, flow: str, messages: tuple[str, ...], *keys: str) -> _Rule:

@@ -14,6 +14,7 @@ import msgspec
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.decoding import decoder, prepare
 from trirail.wire.goals import Goal
+from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply, RoleReply
 from trirail.wire.sizes import MAX_MESSAGE
 from trirail.wire.state import Info, NamedPose, NamedPoses, RobotSummary, State
@@ -34,7 +35,7 @@ _READ_AS = {
 _NULL = {JSON: b"null", MSGPACK: b"\xc0"}
 
 prepare(Goal, *(command.accepts for command in Command), GoalReply, CommandReply, RoleReply, ErrorReply)
-prepare(State, Event, Info, NamedPose, NamedPoses, RobotSummary)
+prepare(State, Event, Info, NamedPose, NamedPoses, RobotSummary, AlignmentLook)
 
 
 def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:

@@ -12,6 +12,7 @@ from msgspec import Struct
 from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode
+from trirail.wire.looks import AlignmentLook
 
 Level = Literal["info", "warning", "error"]
 Outcome = Literal["done", "rejected", "preempted", "stopped", "expired", "faulted", "unsettled"]
@@ -103,9 +104,9 @@ class Event(Struct, frozen=True, omit_defaults=True):
     """Its cycle, as in records."""
     time: float
     """Wall clock [s since 1970]."""
-    kind: Literal["goal", "mode", "fault", "refused", "pose", "lease", "service"]
+    kind: Literal["goal", "mode", "fault", "refused", "pose", "lease", "alignment", "service"]
     """What it is about: the end of a goal, a new mode, a fault, something refused, a named pose that was taught or
-    removed, a new holder of the lease, the service itself."""
+    removed, a new holder of the lease, a look of an alignment, the service itself."""
     level: Level
     """How much it matters to people."""
     message: str
@@ -121,8 +122,8 @@ class Event(Struct, frozen=True, omit_defaults=True):
     goal: str | None = None
     """The id of the goal that set the robot in motion, with kind mode."""
     user: str | None = None
-    """Who sent the goal, or what was refused, or has taught or removed the pose; with kind lease who holds it from now
-    on, None for nobody."""
+    """Who sent the goal, or what was refused, has taught or removed the pose, or aligns; with kind lease who holds it
+    from now on, None for nobody."""
     settle: float | None = None
     """With outcome done: time from the end of the path until the robot was in position, to the first cycle of the dwell
     [s]. None of a goal that was not to settle: a jog, one that was passed on the way to the next."""
@@ -134,3 +135,5 @@ class Event(Struct, frozen=True, omit_defaults=True):
     direction in which it was last commanded to move; of one that was not to move, to either side [m]."""
     fault: FaultDetail | None = None
     """What it is about, with kind fault."""
+    alignment: AlignmentLook | None = None
+    """The look, with kind alignment."""

@@ -11,6 +11,7 @@ from trirail_drivers.interface import Counts, MissingProtection, Triple
 from trirail.errors import RefusalCode
 from trirail.wire.decoding import converted, decoder, prepare
 from trirail.wire.goals import Goal
+from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import Event, Level
 from trirail.wire.planning import PlanAnswer
 from trirail.wire.sizes import MAX_PACKET
@@ -68,6 +69,15 @@ class PoseChanged(Struct, frozen=True, tag=True):
 
     user: str
     message: str
+
+
+class Looked(Struct, frozen=True, tag=True):
+    """Gateway to loop: a client's alignment has looked; wants an event."""
+
+    user: str
+    level: Level
+    message: str
+    look: AlignmentLook
 
 
 class Remark(Struct, frozen=True, tag=True):
@@ -176,7 +186,7 @@ class PlannerLost(Struct, frozen=True, tag=True):
     reason: str
 
 
-Request = GoalRequest | CommandRequest | RefusedRequest | PoseChanged | Remark
+Request = GoalRequest | CommandRequest | RefusedRequest | PoseChanged | Looked | Remark
 GivenInput = Request | Disturbance | DrivesFault | PlanAnswer | PlannerLost
 
 

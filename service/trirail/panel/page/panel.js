@@ -1,5 +1,6 @@
 // The operator's page: a WebSocket to the panel's server, buttons that say what is wanted, and what the robot says.
 
+import { Alignment } from "./alignment.js";
 import { Charts } from "./charts.js";
 import { Drawing } from "./drawing.js";
 import { Going } from "./going.js";
@@ -17,6 +18,7 @@ const LIGHT = matchMedia("(prefers-color-scheme: light)");
 
 const byId = (id) => document.getElementById(id);
 const readings = new Readings();
+const alignment = new Alignment(byId("alignment"), document.querySelector("[data-view=alignment]"));
 export const charts = new Charts();
 let socket = null;
 let told = null; // the robot, as the server tells of it
@@ -93,6 +95,7 @@ const takes = {
   },
   event({ event }) {
     readings.event(event);
+    alignment.event(event);
   },
   silent() {
     lost("No contact with the robot's service: what is shown is old. STOP here reaches nobody.");

@@ -1,0 +1,57 @@
+// The last alignment: what each mark had to go at each look, when, and how it ended; its button is there once there is one.
+
+const LOOKS = 5; // columns, the newest
+const WELL = ["reached", "calibrated", "checked"];
+
+export class Alignment {
+  constructor(section, button) {
+    this.section = section;
+    this.button = button;
+    this.looks = [];
+    this.newest = [0, 0];
+  }
+
+  event({ alignment: look, user, seq, time }) {
+    if (!look || (seq <= this.newest[0] && time <= this.newest[1])) return; // told again, on a new connection
+    this.newest = [seq, time];
+    const first = this.looks[0];
+    if (first && (first.id !== look.id || first.purpose !== look.purpose)) this.looks = [];
+    this.looks.push(look);
+    this.show(user, time);
+  }
+
+  show(user, time) {
+    const last = this.looks.at(-1);
+    const seen = this.looks.filter((look) => look.marks).slice(-LOOKS);
+    const when = new Date(time * 1e3).toLocaleTimeString("en-GB");
+    const corrections = this.looks.filter((look) => look.correction).length;
+    const made = last.purpose === "alignment" ? `, ${corrections} correction${corrections === 1 ? "" : "s"}` : "";
+    const how = last.end ? `${last.end} in ${(last.seconds ?? 0).toFixed(2)} s${made}` : "under way";
+    const names = [...new Set(seen.flatMap((look) => look.marks.map((mark) => mark.name)))];
+    const table = made_of("table", [
+      made_of("tr", [made_of("th", ["mark"]), ...seen.map((look) => made_of("th", [`look ${look.number}`]))]),
+      ...names.map((name) => made_of("tr", [made_of("th", [name]), ...seen.map((look) => made_of("td", [way(look, name)]))])),
+    ]);
+    const says = made_of("p", [`${when} ${how}${last.words ? `: ${last.words}` : ""}`]);
+    if (last.end && !WELL.includes(last.end)) says.className = "warning";
+    const title = last.purpose[0].toUpperCase() + last.purpose.slice(1);
+    this.section.replaceChildren(made_of("h2", [`${title} `, made_of("small", [`${last.id} of ${user}`])]), says, table);
+    this.button.textContent = `${title}: ${last.end ?? "…"}`;
+    this.button.hidden = false;
+  }
+}
+
+// What a mark has to go to its target, or in a calibration where it is in the picture.
+function way({ marks }, name) {
+  const mark = marks.find((each) => each.name === name);
+  if (!mark) return "–";
+  if (!mark.to_go) return mark.pixel.map((value) => value.toFixed(1)).join(", ");
+  const microns = Math.hypot(...mark.to_go) * 1e6;
+  return `${microns.toFixed(microns < 100 ? 2 : 1)} µm`;
+}
+
+function made_of(kind, children) {
+  const element = document.createElement(kind);
+  element.append(...children);
+  return element;
+}

@@ -1,0 +1,184 @@
+"""What a client tells of an alignment: every look, what follows and how it ended; it never ends because of that."""
+
+from __future__ import annotations
+
+import asyncio
+import warnings
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from alignment.cameras import Stage, camera, part_at
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.alignment.images import Pair
+from trirail.alignment.procedure import Alignment, Task, align, calibration_by_moves, look_only
+from trirail.client.alignment import drive, drive_async
+from trirail.client.look_reports import UnrecordedAlignmentWarning
+from trirail.errors import AlignmentError, ServiceError
+from trirail.wire import boundary
+from trirail.wire.looks import AlignmentLook
+from trirail_drivers.interface import Triple
+
+PART: dict[str, Pair] = {"left": (-0.06, 0.01), "right": (0.06, 0.01)}
+
+
+class Told:
+    """A robot that is an ideal stage, and keeps what it is told of alignments."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.stage = Stage({name: camera(rng, place) for name, place in PART.items()}, PART, rng, 0.05)
+        self.looks: list[AlignmentLook] = []
+        self.trouble: ServiceError | None = None
+
+    def state(self) -> Any:
+        return SimpleNamespace(pose=self.stage.pose)
+
+    def send(self, goal: Any) -> Any:
+        motion = (goal.x, goal.y, goal.phi)
+        from trirail.alignment.procedure import StageMotion
+
+        self.stage.go(StageMotion(motion, getattr(goal, "tool", None)))
+        return SimpleNamespace(wait=lambda _: SimpleNamespace(outcome="done"), result=None)
+
+    def _report_look(self, message: bytes) -> None:
+        if self.trouble is not None:
+            raise self.trouble
+        self.looks.append(boundary.decode(message, AlignmentLook, "no look"))
+
+    def drive(self, wishes: Any, look: Callable[[], Any] | None = None) -> Any:
+        return drive(self, look or self.stage.look, wishes, 1.0, 0.0)  # type: ignore[arg-type]
+
+
+def task(told: Told, error: Triple) -> Task:
+    calibration = told.drive(calibration_by_moves())
+    targets = told.stage.look()
+    told.stage.part = part_at(PART, error)
+    told.looks.clear()
+    return Task(calibration, targets, tolerance=5e-6, angle=1e-4)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_every_look_is_told_with_what_each_mark_has_to_go_and_what_follows(seed: int) -> None:
+    told = Told(seed)
+    x, y, phi = np.random.default_rng(seed).uniform(-1.0, 1.0, 3) * (5e-4, 5e-4, 4e-3)
+    wanted = task(told, (x, y, phi))
+    found: Alignment = told.drive(align(wanted))
+    assert len(told.looks) == len(found.measurements)
+    assert len({look.id for look in told.looks}) == 1
+    for number, (look, measured) in enumerate(zip(told.looks, found.measurements, strict=True), 1):
+        assert (look.number, look.purpose, look.pose) == (number, "alignment", measured.pose)
+        assert {mark.name: mark.pixel for mark in look.marks} == measured.marks
+        assert {mark.name: mark.to_go for mark in look.marks} == measured.errors
+        assert look.error is not None
+        assert (look.error.worst, look.error.turn) == (measured.worst, measured.turn)
+    assert [look.correction for look in told.looks[:-1]] == [each.by for each in found.corrections]
+    assert [look.end for look in told.looks] == [None] * len(found.corrections) + [found.why]
+
+
+def test_a_calibration_is_told_look_by_look_and_with_its_noise_at_the_end() -> None:
+    told = Told(1)
+    calibration = told.drive(calibration_by_moves())
+    *looks, last = told.looks
+    assert [look.number for look in looks] == [1, 2, 3, 4, 5, 6, 7]
+    assert all(set(PART) == {mark.name for mark in look.marks} for look in looks)
+    assert (last.number, last.end, last.noise) == (7, "calibrated", calibration.noise)
+
+
+def test_a_check_and_a_refusal_are_told() -> None:
+    told = Told(2)
+    wanted = task(told, (1e-4, 0.0, 0.0))
+    told.drive(look_only(wanted))
+    told.stage.part = {"left": (-0.06, 0.01), "right": (0.061, 0.01)}
+    with pytest.raises(AlignmentError):
+        told.drive(align(wanted))
+    with pytest.raises(AlignmentError):
+        told.drive(align(wanted), dict)
+    assert [(look.purpose, look.end, len(look.marks)) for look in told.looks] == [
+        ("check", "checked", 2),
+        ("alignment", "distance", 2),
+        ("alignment", "missing", 0),
+    ]
+    assert "ppm" in told.looks[1].words
+
+
+class Interrupted:
+    """Looks so often, then raises."""
+
+    def __init__(self, told: Told, looks: int, error: BaseException) -> None:
+        self._told, self._left, self._error = told, looks, error
+
+    def __call__(self) -> Any:
+        if self._left == 0:
+            raise self._error
+        self._left -= 1
+        return self._told.stage.look()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("no picture"), ServiceError("gone")])
+@pytest.mark.parametrize("looks", [0, 1, 3])
+def test_whatever_ends_it_is_told_once_it_has_looked(looks: int, error: BaseException) -> None:
+    told = Told(3)
+    with pytest.raises(type(error)):
+        told.drive(calibration_by_moves(), Interrupted(told, looks, error))
+    assert [look.end for look in told.looks] == [None] * looks + ["failed"] * (looks > 0)
+    assert all(look.words == (str(error) or "KeyboardInterrupt") for look in told.looks[looks:])
+
+
+def test_a_service_that_takes_nothing_is_warned_of_once_and_the_result_is_the_same() -> None:
+    told = Told(4)
+    wanted = task(told, (1e-4, -2e-4, 1e-3))
+    told.trouble = ServiceError("nobody answers")
+    with pytest.warns(UnrecordedAlignmentWarning, match="nobody answers") as warned:
+        assert told.drive(align(wanted)).reached
+    assert len(warned) == 1
+    assert told.looks == []
+
+
+ODD: dict[str, Callable[[], dict[Any, Pair]]] = {
+    "a name that cannot be shown": lambda: {"a\x1b": (1.0, 2.0)},
+    "a name that is none": lambda: {"": (1.0, 2.0)},
+}
+
+
+@pytest.mark.parametrize("marks", ODD.values(), ids=ODD)
+def test_a_name_that_cannot_be_told_is_warned_of_and_ends_nothing(marks: Callable[[], dict[Any, Pair]]) -> None:
+    told = Told(5)
+    wanted = task(told, (1e-4, -2e-4, 1e-3))
+    with pytest.warns(UnrecordedAlignmentWarning):
+        assert told.drive(align(wanted), lambda: marks() | told.stage.look()).reached
+
+
+def test_an_event_loop_tells_the_same() -> None:
+    told = Told(6)
+    wanted = task(told, (1e-4, -2e-4, 1e-3))
+
+    class Robot:
+        async def state(self) -> Any:
+            return told.state()
+
+        async def send(self, goal: Any) -> Any:
+            told.send(goal)
+            return SimpleNamespace(wait=self._done, result=None)
+
+        async def _done(self, _: float) -> Any:
+            return SimpleNamespace(outcome="done")
+
+        async def _report_look(self, message: bytes) -> None:
+            told._report_look(message)
+
+    async def look() -> Any:
+        return told.stage.look()
+
+    found = asyncio.run(drive_async(Robot(), look, align(wanted), 1.0, 0.0))  # type: ignore[arg-type]
+    assert [look.end for look in told.looks] == [None] * len(found.corrections) + ["reached"]
+
+
+@pytest.fixture(autouse=True)
+def no_other_warnings() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield

@@ -1,0 +1,91 @@
+"""The gateway and looks of alignments: each becomes an event of whom the key names, and nobody sends too many."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from conftest import Rig
+from hypothesis import given
+from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.incoming import Incoming
+from trirail.processes.looks import BURST, RATE, Looks, in_words
+from trirail.wire import boundary
+from trirail.wire.looks import WELL, AlignmentLook
+from trirail.wire.packets import Looked
+from trirail.wire.text import printable
+from wire.looks import LARGEST, looks
+
+
+class Asked:
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.sent: list[Looked] = []
+        self.room = True
+        self.looks = Looks("demo", self._send, lambda: self.now)
+
+    def _send(self, looked: Looked) -> bool:
+        if self.room:
+            self.sent.append(looked)
+        return self.room
+
+    def take(self, look: AlignmentLook, key: str = "trirail/demo/alignment/ann") -> AlignmentLook:
+        content = boundary.encode(look)
+        return self.looks.take(Incoming("alignment", key, len(content), content, "", None, time.monotonic_ns()))
+
+
+@given(looks)
+def test_a_look_is_passed_on_in_a_line_that_a_terminal_shows(look: AlignmentLook) -> None:
+    asked = Asked()
+    taken = asked.take(look)
+    (sent,) = asked.sent
+    assert sent.user == "ann"
+    assert sent.look == taken
+    assert sent.look.marks == look.marks
+    assert sent.level == ("info" if look.end in WELL else "warning")
+    assert sent.message == printable(sent.message)
+    for words in (look.id, look.purpose, look.end or ""):
+        assert words in sent.message
+
+
+def test_the_largest_is_a_line_of_bounded_length() -> None:
+    assert len(in_words(LARGEST)) < 6000
+
+
+LOOK = AlignmentLook("a", "check", 1)
+
+
+def test_who_sends_too_many_is_refused_until_he_has_waited_and_others_are_not() -> None:
+    asked = Asked()
+    for _ in range(BURST):
+        asked.take(LOOK)
+    with pytest.raises(RefusedError) as refused:
+        asked.take(LOOK)
+    assert refused.value.code is RefusalCode.BUSY
+    asked.take(LOOK, "trirail/demo/alignment/bob")
+    asked.now += 1.5 / RATE
+    asked.take(LOOK)
+    assert [sent.user for sent in asked.sent] == ["ann"] * BURST + ["bob", "ann"]
+
+
+def test_what_the_loop_does_not_take_is_refused() -> None:
+    asked = Asked()
+    asked.room = False
+    with pytest.raises(RefusedError) as refused:
+        asked.take(LOOK)
+    assert refused.value.code is RefusalCode.BUSY
+
+
+@pytest.mark.parametrize("key", ["alignment/*", "alignment/a b", "alignment/ann/more", "alignment"])
+def test_a_key_that_names_nobody_is_refused(key: str) -> None:
+    asked = Asked()
+    with pytest.raises(RefusedError):
+        asked.take(LOOK, f"trirail/demo/{key}")
+    assert asked.sent == []
+
+
+def test_it_is_told_to_everyone(rig: Rig) -> None:
+    rig.cycle(Looked("ann", "warning", "so it looked", LOOK))
+    (notice,) = [notice for notice in rig.notices if notice.kind == "alignment"]
+    assert (notice.level, notice.user, notice.message) == ("warning", "ann", "so it looked")
+    assert notice.alignment == LOOK
