@@ -165,27 +165,28 @@ def _setpoints(log: Sequence[Frame], drive: Drive) -> list[Setpoint]:
 
 def _setpoint_problems(log: Sequence[Frame], drive: Drive, config: Config) -> Iterator[str]:
     """Within the limits, and continuous: each step is a velocity, each change of it an acceleration in the limits."""
-    limits, period = config.limits.slider, config.period
+    limits, period, leg = config.limits.slider, config.period, config.drives.each.index(drive)
+    velocity, acceleration = limits.velocities[leg], limits.accelerations[leg]
     count = 1.0 / drive.counts_per_metre
     points = _setpoints(log, drive)
     if not points:
         yield "no setpoint at all"
         return
-    low, high = limits.position
+    low, high = limits.positions[leg]
     for point in points:
         if not low - count <= point.position <= high + count:
             yield f"setpoint {point.position:.6f} m is outside of [{low:g}, {high:g}]"
-        if abs(point.velocity) > limits.velocity + count:
-            yield f"velocity feed-forward {point.velocity:.6f} m/s is above {limits.velocity:g}"
+        if abs(point.velocity) > velocity + count:
+            yield f"velocity feed-forward {point.velocity:.6f} m/s is above {velocity:g}"
     for before, after in itertools.pairwise(points):
         step = after.position - before.position
-        if abs(step) > limits.velocity * period + 2 * count:
+        if abs(step) > velocity * period + 2 * count:
             yield f"step of {step * 1e3:.4f} mm at {after.t:.6f}: {abs(step) / period:.3f} m/s"
         # Velocity changes within the step by a·T at most, so that the step is its mean over the period.
         mean = 0.5 * (before.velocity + after.velocity) * period
-        if abs(step - mean) > 0.25 * limits.acceleration * period**2 + 3 * count:
+        if abs(step - mean) > 0.25 * acceleration * period**2 + 3 * count:
             yield f"step of {step * 1e3:.4f} mm at {after.t:.6f}, but its feed-forward says {mean * 1e3:.4f} mm"
-        if abs(after.velocity - before.velocity) > limits.acceleration * period * 1.01 + 2 * count:
+        if abs(after.velocity - before.velocity) > acceleration * period * 1.01 + 2 * count:
             yield f"velocity feed-forward jumps by {after.velocity - before.velocity:.6f} m/s at {after.t:.6f}"
     since_sync = 0
     for frame in log:

@@ -257,9 +257,9 @@ class Rig:
         for node in NODES:
             for setpoints in self._followed(node):
                 step, bend = (np.abs(np.diff(setpoints, order)).max(initial=0.0) for order in (1, 2))
-                if step > self.limits.velocity * self.period * 1.01:
+                if step > self.limits.fastest * self.period * 1.01:
                     raise Failed(f"drive {node}: a setpoint steps by {step * 1e3:.2f} mm in a cycle")
-                if bend > self.limits.acceleration * self.period**2 * 1.05 + 1e-6:
+                if bend > max(self.limits.accelerations) * self.period**2 * 1.05 + 1e-6:
                     raise Failed(f"drive {node}: the velocity of setpoints steps by {bend / self.period:.3f} m/s")
 
     def _followed(self, node: int) -> list[np.ndarray[tuple[int], np.dtype[np.float64]]]:

@@ -29,12 +29,10 @@ service, which stops all three at once and whose limit should be the lower one.
 """
 
 BOUNDS = (
-    Bound("Travel of sliders and platform", ("limits.slider.position", "limits.slider.A.position",
-          "limits.slider.passive", "limits.platform.x", "limits.platform.y",
-          "limits.platform.phi"), "a goal is refused, `out_of_workspace`"),
+    Bound("Travel of sliders and platform", ("limits.slider.position", "limits.slider.passive", "limits.platform.x",
+          "limits.platform.y", "limits.platform.phi"), "a goal is refused, `out_of_workspace`"),
     Bound("Nearness to a singular angle", ("limits.singularity_margin",), "the configuration is refused"),
     Bound("Velocity, acceleration, jerk", ("limits.slider.velocity", "limits.slider.acceleration", "limits.slider.jerk",
-          "limits.slider.A.velocity", "limits.slider.A.acceleration", "limits.slider.A.jerk",
           "limits.platform.velocity", "limits.platform.acceleration", "limits.platform.jerk"),
           "a goal is slowed; a trajectory without `stretch` is refused, `too_fast`"),
     Bound("Rest in position after a path", ("limits.in_position.sliders", "limits.in_position.pose",

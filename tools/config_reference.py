@@ -97,6 +97,8 @@ def names() -> set[str]:
 def allowed(kind: mi.Type) -> str:
     """Say in words which values a type takes."""
     match kind:
+        case mi.Metadata(type=inner, extra_json_schema={"description": said}):
+            return f"{said}; each {_number(inner)}"
         case mi.UnionType(types=types):
             return " or ".join(allowed(part) for part in types if not isinstance(part, mi.NoneType))
         case mi.EnumType(cls=cls):
@@ -115,6 +117,17 @@ def allowed(kind: mi.Type) -> str:
             return f"table of {allowed(value)}"
         case mi.VarTupleType(item_type=item):
             return f"list of {allowed(item)}"
+    raise TypeError(f"no words for {kind}: add them here")
+
+
+def _number(kind: mi.Type) -> str:
+    """Say what the numbers of a type may be that takes one or several."""
+    match kind:
+        case (
+            mi.UnionType(types=(mi.FloatType() as number, *_))
+            | mi.VarTupleType(item_type=mi.UnionType(types=(mi.FloatType() as number, *_)))
+        ):
+            return _bounds(number).removeprefix(", ")
     raise TypeError(f"no words for {kind}: add them here")
 
 

@@ -116,7 +116,7 @@ def show(comparisons: Sequence[Comparison]) -> None:
             + f"  {quantity.unit}"
         )
     if with_service:
-        limit = load(SIM).limits.slider.jerk
+        limit = min(load(SIM).limits.slider.jerks)
         print(
             f"\nservice: its setpoints in every cycle, t = 1 period to {DURATION:g} s, read from its recording;\n"
             "measured: the simulated drives' positions at the SYNC at which they were to reach these.\n"

@@ -110,7 +110,7 @@ def test_limits_are_shown_only_where_they_are_near() -> None:
 
 @given(st.floats(-1.0, 1.0))
 def test_a_position_beyond_its_limit_is_always_said(at: float) -> None:
-    low, high = LIMITS.slider.position
+    low, high = LIMITS.slider.positions[0]
     sliders = Sliders((at, 0.0, 0.0), REST, REST, REST, ("ready",) * 3, (COUNTS,) * 3)
     said = [words for words in near(a_state(sliders=sliders)) if words.startswith("slider A")]
     close = min(abs(at - low), abs(high - at)) <= 0.05 * (high - low)

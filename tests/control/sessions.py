@@ -157,7 +157,7 @@ def shares(config: Config, records: NDArray[np.void]) -> dict[str, float]:
     found = {}
     for name, prefix, limits in (
         ("platform", "commanded_pose", (platform.velocity, platform.acceleration, platform.jerk)),
-        ("slider", "commanded", (slider.velocity, slider.acceleration, slider.jerk)),
+        ("slider", "commanded", (slider.velocities, slider.accelerations, slider.jerks)),
     ):
         velocity, acceleration = records[f"{prefix}_velocity"], records[f"{prefix}_acceleration"]
         jerk = np.diff(acceleration, axis=0)[both] / config.period

@@ -71,10 +71,10 @@ def test_a_slider_with_play_is_where_it_was_told_to_be(widths: tuple[float, floa
     assert not taking_up(kept)
     assert np.abs(offsets[-1]) == pytest.approx(np.array(widths) / 2.0, abs=1e-15)
     # Its rates are those of the offset, and no more than the limits keep for it.
-    assert np.abs(rates).max() <= taken.velocity * (1.0 + 1e-9) <= SHARE * SLIDER.velocity * (1.0 + 1e-9)
-    assert np.abs(changes).max() <= taken.acceleration * (1.0 + 1e-9) <= SHARE * SLIDER.acceleration * (1.0 + 1e-9)
+    assert np.abs(rates).max() <= taken.velocity * (1.0 + 1e-9) <= SHARE * SLIDER.velocities[0] * (1.0 + 1e-9)
+    assert np.abs(changes).max() <= taken.acceleration * (1.0 + 1e-9) <= SHARE * SLIDER.accelerations[0] * (1.0 + 1e-9)
     assert np.abs(np.diff(changes, axis=0)).max() / PERIOD <= taken.jerk * (1.0 + 1e-9)
-    assert taken.jerk <= SHARE * SLIDER.jerk * (1.0 + 1e-9)
+    assert taken.jerk <= SHARE * SLIDER.jerks[0] * (1.0 + 1e-9)
     drift = np.diff(offsets, axis=0) - PERIOD * (rates[1:] + rates[:-1]) / 2.0
     assert np.abs(drift).max() <= taken.jerk * PERIOD**3
 
@@ -100,11 +100,11 @@ def test_without_backlash_nothing_is_taken_from_the_limits() -> None:
 @given(widths=st.tuples(*[st.floats(0.0, 1e-3)] * 3))
 def test_motion_and_take_up_together_stay_within_the_limits(widths: tuple[float, float, float]) -> None:
     taken, less = take_up(widths, SLIDER), planned_limits(CONFIG.limits, widths).slider
-    assert less.velocity + taken.velocity <= SLIDER.velocity * (1.0 + 1e-12)
-    assert less.acceleration + taken.acceleration <= SLIDER.acceleration * (1.0 + 1e-12)
-    assert less.jerk + taken.jerk <= SLIDER.jerk * (1.0 + 1e-12)
-    assert less.position[0] - max(widths) / 2.0 >= SLIDER.position[0] - 1e-15
-    assert less.position[1] + max(widths) / 2.0 <= SLIDER.position[1] + 1e-15
+    assert less.velocities[0] + taken.velocity <= SLIDER.velocities[0] * (1.0 + 1e-12)
+    assert less.accelerations[0] + taken.acceleration <= SLIDER.accelerations[0] * (1.0 + 1e-12)
+    assert less.jerks[0] + taken.jerk <= SLIDER.jerks[0] * (1.0 + 1e-12)
+    assert less.positions[0][0] - max(widths) / 2.0 >= SLIDER.positions[0][0] - 1e-15
+    assert less.positions[0][1] + max(widths) / 2.0 <= SLIDER.positions[0][1] + 1e-15
 
 
 @pytest.mark.parametrize("width", [5e-5, 5e-4])
@@ -123,7 +123,7 @@ def test_sliders_that_go_to_and_fro_break_no_limit(width: float) -> None:
     assert (rows[:, 0] <= high).all()
     assert np.abs(rows[:, 1]).max() <= SLIDER.velocity
     assert np.abs(rows[:, 2]).max() <= SLIDER.acceleration
-    assert np.abs(np.diff(rows[:, 2], axis=0)).max() / PERIOD <= SLIDER.jerk * (1.0 + 1e-3)
+    assert np.abs(np.diff(rows[:, 2], axis=0)).max() / PERIOD <= SLIDER.jerks[0] * (1.0 + 1e-3)
     rig.bus.shutdown()
 
 

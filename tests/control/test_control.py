@@ -48,10 +48,10 @@ def assert_within_limits(rig: Rig) -> None:
     velocity = np.diff(rows[:, 0], axis=0) / PERIOD
     acceleration = np.diff(velocity, axis=0) / PERIOD
     jerk = np.diff(rows[:, 2], axis=0) / PERIOD
-    assert np.abs(velocity).max() <= limits.velocity * 1.001
-    assert np.abs(acceleration).max() <= limits.acceleration * 1.001
-    assert np.abs(jerk).max() <= limits.jerk * 1.001
-    assert np.abs(velocity - rows[1:, 1]).max() <= limits.acceleration * PERIOD  # the feed-forward is the velocity
+    assert np.abs(velocity).max() <= limits.velocities[0] * 1.001
+    assert np.abs(acceleration).max() <= limits.accelerations[0] * 1.001
+    assert np.abs(jerk).max() <= limits.jerks[0] * 1.001
+    assert np.abs(velocity - rows[1:, 1]).max() <= limits.accelerations[0] * PERIOD  # the feed-forward is the velocity
     assert_frames_within_limits(rig)
 
 
@@ -63,10 +63,11 @@ def assert_frames_within_limits(rig: Rig) -> None:
     jerk = np.diff(acceleration, axis=0) / PERIOD
     between = (velocity[1:] + velocity[:-1]) / 2.0
     assert np.isfinite(velocity).sum() >= 0.9 * velocity.size
-    assert np.nanmax(np.abs(np.diff(position, axis=0) / PERIOD - between)) <= limits.jerk * PERIOD**2 + count / PERIOD
-    assert np.nanmax(np.abs(velocity)) <= limits.velocity * 1.001
-    assert np.nanmax(np.abs(acceleration)) <= limits.acceleration * 1.001 + count / PERIOD
-    assert np.nanmax(np.abs(jerk)) <= limits.jerk * 1.001 + 2.0 * count / PERIOD**2
+    apart = np.abs(np.diff(position, axis=0) / PERIOD - between)
+    assert np.nanmax(apart) <= limits.jerks[0] * PERIOD**2 + count / PERIOD
+    assert np.nanmax(np.abs(velocity)) <= limits.velocities[0] * 1.001
+    assert np.nanmax(np.abs(acceleration)) <= limits.accelerations[0] * 1.001 + count / PERIOD
+    assert np.nanmax(np.abs(jerk)) <= limits.jerks[0] * 1.001 + 2.0 * count / PERIOD**2
 
 
 # ---------------------------------------------------------------------- enabling

@@ -103,7 +103,7 @@ def reachable(poses: list[tuple[float, float, float]]) -> Iterator[tuple[float, 
     for pose in poses:
         found = inverse(PLAIN, pose)
         places = np.array([found.position, found.passive_position])
-        if (places > slider.position[0] + 0.003).all() and (places < slider.position[1] - 0.003).all():
+        if (places > slider.positions[0][0] + 0.003).all() and (places < slider.positions[0][1] - 0.003).all():
             yield pose
 
 

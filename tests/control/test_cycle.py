@@ -28,7 +28,7 @@ from trirail_drivers.interface import DriveGroup, Feedback, PowerState
 ROBOT = geometry(CONFIG.geometry)
 LEGS = ROBOT.packed()
 PERIOD = CONFIG.period
-STEP = CONFIG.limits.slider.velocity * PERIOD
+STEP = CONFIG.limits.slider.velocities[0] * PERIOD
 ON = (PowerState.OPERATION_ENABLED,) * 3
 
 PLACES = st.tuples(*[st.floats(-0.03, 0.03)] * 2, st.floats(-0.2, 0.2))

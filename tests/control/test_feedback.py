@@ -13,7 +13,7 @@ from trirail_drivers.interface import Feedback, PowerState
 
 PERIOD = CONFIG.period
 ROBOT = geometry(CONFIG.geometry)
-STEP = CONFIG.limits.slider.velocity * PERIOD
+STEP = CONFIG.limits.slider.velocities[0] * PERIOD
 ON = (PowerState.OPERATION_ENABLED,) * 3
 Triple = tuple[float, float, float]
 

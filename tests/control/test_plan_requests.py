@@ -541,7 +541,7 @@ def test_warming_up_plans_each_motion_from_the_one_before(monkeypatch: pytest.Mo
 
 
 def test_a_planner_with_other_limits_plans_nothing(rig: Rig, meddler: Meddler) -> None:
-    limits = msgspec.structs.replace(CONFIG.limits.slider, velocity=CONFIG.limits.slider.velocity / 2.0)
+    limits = msgspec.structs.replace(CONFIG.limits.slider, velocity=CONFIG.limits.slider.velocities[0] / 2.0)
     other = msgspec.structs.replace(CONFIG, limits=msgspec.structs.replace(CONFIG.limits, slider=limits))
     assert revision(other) != revision(CONFIG)
     meddler.planner = MotionPlanner(other)

@@ -26,7 +26,7 @@ from trirail.wire.packets import Refused
 
 FAR = st.floats(-3.0, 3.0)
 """Metres or radians: most are out of reach."""
-EDGES = (*CONFIG.limits.platform.x, *CONFIG.limits.platform.phi, *CONFIG.limits.slider.position)
+EDGES = (*CONFIG.limits.platform.x, *CONFIG.limits.platform.phi, *CONFIG.limits.slider.positions[0])
 HARDLY = st.builds(lambda edge, more: edge * (1.0 + more), st.sampled_from(EDGES), st.floats(-1e-3, 1e-3))
 VALUES = FAR | HARDLY
 THREE = st.tuples(VALUES, VALUES, VALUES)

@@ -11,7 +11,7 @@ from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.interface import PowerState
 
-STEP = 0.5 * CONFIG.limits.slider.velocity * CONFIG.period
+STEP = 0.5 * CONFIG.limits.slider.velocities[0] * CONFIG.period
 """How far a slider is pushed in a cycle [m]."""
 ELSEWHERE = (0.02, -0.015, 0.1)
 """Where the platform is pushed to by hand: x, y [m], phi [rad]."""

@@ -234,6 +234,29 @@ def test_whatever_stands_in_a_file_all_of_it_is_told(data: st.DataObject, name: 
     assert {each.text for each in alone} == {each.text for each in found}
 
 
+@pytest.mark.parametrize("leg", range(3))
+@pytest.mark.parametrize("name", ["uvw.toml", "uvw-ppr.toml"])
+def test_of_three_limits_the_one_that_is_wrong_is_named(name: str, leg: int) -> None:
+    config = load(SIM.with_name(name))
+    slider, label = config.limits.slider, "UVW"[leg]
+
+    def found(**own: object) -> list[tuple[str, str]]:
+        three = {
+            key: tuple(value if k == leg else getattr(slider, key) for k in range(3)) for key, value in own.items()
+        }
+        limits = msgspec.structs.replace(config.limits, slider=msgspec.structs.replace(slider, **three))
+        checks = diagnose(msgspec.structs.replace(config, limits=limits))
+        return [(each.key, each.found) for each in checks if each.name == "limits" and each.verdict == "warning"]
+
+    assert found() == []
+    for quantity, factor in (("velocity", 1e-3), ("acceleration", 1e3), ("jerk", 1e-3)):
+        warnings = found(**{quantity: getattr(slider, quantity) * factor})
+        assert f"limits.slider.{quantity}[{leg}]" in {key for key, _ in warnings}
+        assert any(said.startswith(f"limits.slider {label}: ") for _, said in warnings)
+    ((key, said),) = found(position=(-0.01, 10.0))
+    assert (key, said.partition(":")[0]) == (f"limits.slider.position[{leg}]", f"{key} = [-0.01, 10]")
+
+
 @given(v=st.floats(1e-3, 10.0), a=st.floats(0.01, 100.0), j=st.floats(0.1, 1e5), q=st.floats(0.01, 100.0))
 def test_stops_are_those_of_the_motion_itself(v: float, a: float, j: float, q: float) -> None:
     """A controlled stop, integrated: jerk -j until -a is reached or half of v is gone, then -a, then j."""

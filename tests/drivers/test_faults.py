@@ -98,11 +98,11 @@ class Cia402Rig(FaultRig):
             position = np.array([target for target, _ in targets]) / counts
             enabled = np.array([enabled for _, enabled in targets])
             velocity = np.diff(position) / PERIOD
-            back = ~(enabled[1:] | enabled[:-1]) & (np.abs(np.diff(position)) > FAR * limits.velocity * PERIOD)
-            assert np.nanmax(np.abs(velocity[~back])) <= limits.velocity * 1.001 + rounding
+            back = ~(enabled[1:] | enabled[:-1]) & (np.abs(np.diff(position)) > FAR * limits.velocities[0] * PERIOD)
+            assert np.nanmax(np.abs(velocity[~back])) <= limits.velocities[0] * 1.001 + rounding
             always = enabled[2:] & enabled[1:-1] & enabled[:-2]
             acceleration = np.diff(velocity)[always] / PERIOD
-            assert np.nanmax(np.abs(acceleration)) <= limits.acceleration * 1.001 + 2.0 * rounding / PERIOD
+            assert np.nanmax(np.abs(acceleration)) <= limits.accelerations[0] * 1.001 + 2.0 * rounding / PERIOD
 
 
 def holding(rig: FaultRig) -> None:

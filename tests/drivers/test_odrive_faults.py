@@ -160,11 +160,11 @@ class OdriveRig(FaultRig):
             for before, after in itertools.pairwise(taken.values()):
                 cycles = after.cycle - before.cycle
                 if cycles > 1:  # there was to be no power in between, or the queue was full
-                    most = min(cycles, UNSENT_CYCLES) * limits.velocity * PERIOD
+                    most = min(cycles, UNSENT_CYCLES) * limits.velocities[0] * PERIOD
                     assert not after.armed or abs(after.position - before.position) <= most
                     continue
                 step = (after.position - before.position) / PERIOD
-                assert abs(step) <= limits.velocity * 1.001 + ROUNDING
+                assert abs(step) <= limits.velocities[0] * 1.001 + ROUNDING
                 if before.armed and after.armed:
                     change, mean = after.velocity - before.velocity, 0.5 * (after.velocity + before.velocity)
                     assert abs(change) <= 2.0 * DECELERATION * PERIOD + ROUNDING

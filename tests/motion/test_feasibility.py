@@ -62,7 +62,7 @@ def test_a_look_along_a_path_gives_signs_of_life_between_its_parts(knots: int, s
 @pytest.mark.parametrize(("share", "within_limits"), [(0.9, True), (1.5, False)])
 def test_a_change_of_rate_counts_with_what_the_velocities_tell(share: float, within_limits: bool) -> None:
     """Within one cycle the accelerations before and after are zero; a slider's velocity takes a step all the same."""
-    by = share * LIMITS.slider.jerk * PERIOD**2 / 2.0 / SPEED
+    by = share * LIMITS.slider.jerks[0] * PERIOD**2 / 2.0 / SPEED
     law = slower(by, PERIOD, PERIOD / 20.0)
     assert CHECKER.look(straight(), law, 0.0, 0.9, (-SPEED / 2.0, 0.0, 0.0)).within_limits is within_limits
 
@@ -124,7 +124,7 @@ def test_what_a_motion_may_use_of_each_limit_while_its_rate_changes(row: int, qu
 
 def test_what_plans_may_use_of_the_sliders_limits() -> None:
     slider = LIMITS.slider
-    expected = PLANS[0] * (slider.velocity, slider.acceleration, slider.jerk)
+    expected = PLANS[0] * (slider.velocities[0], slider.accelerations[0], slider.jerks[0])
     assert CHECKER.slider_limits == pytest.approx(expected)
 
 

@@ -213,8 +213,8 @@ def rows(leg: int, **values: float) -> list[list[float]]:
 @pytest.mark.parametrize(
     ("quantity", "limit", "slack"),
     [
-        ("velocity", SLIDER.velocity, SLIDER.velocity * EXCESS),
-        ("acceleration", SLIDER.acceleration, SLIDER.acceleration * EXCESS),
+        ("velocity", SLIDER.velocities[0], SLIDER.velocities[0] * EXCESS),
+        ("acceleration", SLIDER.accelerations[0], SLIDER.accelerations[0] * EXCESS),
         ("position", SLIDER.position, EDGE),
         ("passive", SLIDER.passive, EDGE),
     ],
@@ -235,7 +235,7 @@ def test_the_gates_slack(
 @pytest.mark.parametrize("end", range(2))
 def test_a_limit_itself_is_within(n: int, end: int) -> None:
     exact = Bounds(LIMITS, PERIOD, 0.0)
-    for name, limits in (("position", SLIDER.position), ("passive", SLIDER.passive)):
+    for name, limits in (("position", SLIDER.positions[n]), ("passive", SLIDER.passive)):
         assert exact.setpoint(rows(n, **{name: limits[end]})) is None
         assert exact.setpoint(rows(n, **{name: np.nextafter(limits[end], (-1.0, 1.0)[end])})) is not None
     pose = np.zeros(3)
@@ -259,7 +259,7 @@ def test_the_controls_own_gate_has_the_slack_of_rounding(rig: Rig, coordinate: i
 
 @pytest.mark.parametrize("leg", range(3))
 def test_the_gate_knows_how_far_a_slider_goes_in_a_cycle(leg: int) -> None:
-    velocity = SLIDER.velocity
+    velocity = SLIDER.velocities[leg]
     before, most = rows(leg, velocity=velocity), velocity * (1.0 + EXCESS) * PERIOD
     assert at_the_gate(rows(leg, velocity=velocity, position=velocity * PERIOD), before) is None
     violation = at_the_gate(rows(leg, velocity=velocity, position=most * (1.0 + HAIR)), before)
@@ -270,7 +270,7 @@ def test_the_gate_knows_how_far_a_slider_goes_in_a_cycle(leg: int) -> None:
 @pytest.mark.parametrize("leg", range(3))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_gate_knows_jerk_by_what_each_row_tells(leg: int, sign: float) -> None:
-    most = sign * SLIDER.jerk * (1.0 + EXCESS)
+    most = sign * SLIDER.jerks[0] * (1.0 + EXCESS)
     for share, refused in ((1.0 - HAIR, False), (1.0 + 1e-4, True)):
         j = share * most
         told = (
@@ -497,7 +497,7 @@ def test_a_slider_beyond_its_travel_is_not_enabled() -> None:
     low, high = 0.0, LIMITS.platform.phi[0]
     for _ in range(50):
         middle = (low + high) / 2.0
-        inside = min(sliders_at(0.0, 0.0, middle)) >= LIMITS.slider.position[0] - 1e-4
+        inside = min(sliders_at(0.0, 0.0, middle)) >= LIMITS.slider.positions[0][0] - 1e-4
         low, high = (middle, high) if inside else (low, middle)
     assert abs(high) < abs(LIMITS.platform.phi[0])
     rig = Rig(changed(CONFIG, start=sliders_at(0.0, 0.0, high)))
@@ -510,7 +510,7 @@ def test_a_slider_beyond_its_travel_is_not_enabled() -> None:
 
 @pytest.mark.parametrize("drive", range(3))
 def test_a_position_jumps_beyond_twice_what_a_slider_can_do_in_a_cycle(drive: int) -> None:
-    step = SLIDER.velocity * PERIOD
+    step = SLIDER.velocities[0] * PERIOD
     for share, jumps in ((0.999, False), (1.001, True)):
         measured = Measured(ROBOT.packed(), PERIOD, step)
         here = Feedback((0.0, 0.0, 0.0), (PowerState.SWITCH_ON_DISABLED,) * 3, None)

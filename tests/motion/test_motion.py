@@ -57,7 +57,7 @@ def outermost(direction: NDArray[np.float64]) -> NDArray[np.float64]:
             limits[0] <= value <= limits[1]
             for values, bounds in (
                 (pose, (platform.x, platform.y, platform.phi)),
-                (solved.position, [slider.position] * 3),
+                (solved.position, slider.positions),
                 (solved.passive_position, [slider.passive] * 3),
             )
             for value, limits in zip(values, bounds, strict=True)
@@ -124,7 +124,7 @@ def test_the_corners_of_the_workspace(config: Config) -> None:
 @pytest.mark.parametrize("leg", range(3))
 @pytest.mark.parametrize("beyond", [-1e-5, 0.0, 2e-6])
 def test_the_very_end_of_a_sliders_travel(rig: Rig, leg: int, beyond: float) -> None:
-    limits = CONFIG.limits.slider.position
+    limits = CONFIG.limits.slider.positions[leg]
     target = inverse(ROBOT, np.array([0.02, -0.01, 0.2])).position
     target[leg] = limits[0] - beyond
     rig.enable()

@@ -85,7 +85,7 @@ class Session:
             self.ends.bus, config.can.bitrate, config.drives, self.clock_of_driver
         )
         self.setting_up = True
-        driver.configure(config.period, config.limits.slider.velocity)
+        driver.configure(config.period, config.limits.slider.velocities[0])
         self.setting_up = False
         names = ("gateway", "recorder", "planner")
         ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))

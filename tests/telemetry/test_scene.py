@@ -120,12 +120,12 @@ def test_sliders_follow_their_rails() -> None:
 def test_curves_are_in_the_units_of_people(scene: Scene) -> None:
     records = made.records(0.5)
     slider = CONFIG.limits.slider
-    records["position"][9] = *slider.position, 0.0
+    records["position"][9] = *slider.positions[0], 0.0
     drawn = by_entity(scene.drawn(records, Standing()))
     newest = records[9::10]
     position = values(drawn["/sliders/position"], "Scalars:scalars")
     assert position[:, :3] == pytest.approx(newest["position"] * 1e3)
-    assert np.all(position[:, 3:] == [slider.position[0] * 1e3, slider.position[1] * 1e3])
+    assert np.all(position[:, 3:] == [slider.positions[0][0] * 1e3, slider.positions[0][1] * 1e3])
     phi = values(drawn["/pose/phi"], "Scalars:scalars")
     assert phi[:, 0] == pytest.approx(np.degrees(newest["pose"][:, 2]))
     t = drawn["/pose/phi"].to_record_batch().column("t").to_numpy().astype(int)

@@ -35,7 +35,6 @@ def test_every_key_says_what_it_means(headings: tuple[str, ...], key: str, row: 
 def test_every_limit_and_time_out_is_in_the_table_of_where_they_stand(ends: str) -> None:
     told = {place for bound in config_limits.BOUNDS for place in bound.places}
     homing = {f"drives.{drive}.homing." for drive in "BC"}  # as those of A
-    homing |= {f"limits.slider.{slider}." for slider in "BC"}
     for key in config_reference.names():
         own = key.startswith(("can.", "drives.A.simulated", *homing)) or (".homing." in key and ends != "timeout")
         assert own or not key.endswith(ends) or key in told, key
@@ -69,7 +68,6 @@ def test_every_key_of_a_file_that_is_shipped_is_in_the_reference() -> None:
         for key in leaves(msgspec.to_builtins(load(path))):
             tables = {
                 "geometry.leg",
-                *(f"limits.slider.{name}" for name in "ABC"),
                 "drives.A.homing",
                 "drives.B.homing",
                 "drives.C.homing",

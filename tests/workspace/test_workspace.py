@@ -196,7 +196,7 @@ def slack(robot: Geometry, limits: Limits, poses: Array) -> Array:
     """
     motion = inverse(robot, poses)
     position, passive = motion.position, motion.passive_position
-    (low, high), (inner, outer) = limits.slider.position, limits.slider.passive
+    (low, high), (inner, outer) = limits.slider.positions[0], limits.slider.passive
     start, end = range_of_phi(robot)
     phi, margin = poses[:, 2], limits.singularity_margin
     left = np.minimum(phi - start, end - phi) - margin

@@ -67,7 +67,7 @@ def _check_velocity(name: str, drive: Drive, required: Requirements) -> None:
     key = f"drives.{name}.velocity_unit"
     unit = units.written(key, drive.velocity_unit, 1) if drive.velocity_unit is not None else None
     per_metre = unit.per_metre(drive.counts_per_metre, drive.revolutions_per_metre) if unit is not None else None
-    if per_metre is not None and (why := units.unfit(required.velocity, per_metre)):
+    if per_metre is not None and (why := units.unfit(required.velocity[NAMES.index(name)], per_metre)):
         raise DriveError(f'{key} = "{drive.velocity_unit}": {why}')
 
 
@@ -77,18 +77,19 @@ def _finer(widest: float) -> str:
 
 def _check_counts(name: str, drive: Drive, required: Requirements) -> None:
     """Setpoints, positions and feed-forward are 32-bit integers."""
-    scale = scale_of(name, drive)
-    reach = max(abs(scale.exact(required.low)), abs(scale.exact(required.high)))
+    scale, leg = scale_of(name, drive), NAMES.index(name)
+    low, high, velocity = required.low[leg], required.high[leg], required.velocity[leg]
+    reach = max(abs(scale.exact(low)), abs(scale.exact(high)))
     # A position may be a following error beyond the travel, and a velocity a little beyond its limit.
     if reach + drive.counts_per_metre * required.following_error >= INT32_MAX:
         raise DriveError(
             f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}, offset = {drive.offset:g}: "
-            f"limits.slider.position = [{required.low:g}, {required.high:g}] is {reach:g} counts, and a drive takes "
+            f"limits.slider.position = [{low:g}, {high:g}] is {reach:g} counts, and a drive takes "
             f"{INT32_MAX}; wanted fewer counts, or an offset nearer to the travel"
         )
-    if 2.0 * required.velocity * drive.counts_per_metre >= INT32_MAX:
+    if 2.0 * velocity * drive.counts_per_metre >= INT32_MAX:
         raise DriveError(
             f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}: limits.slider.velocity = "
-            f"{required.velocity:g} is {required.velocity * drive.counts_per_metre:g} counts/s, and twice that must be "
-            f"below {INT32_MAX}; wanted at most {INT32_MAX / (2.0 * required.velocity):.4g} counts_per_metre"
+            f"{velocity:g} is {velocity * drive.counts_per_metre:g} counts/s, and twice that must be "
+            f"below {INT32_MAX}; wanted at most {INT32_MAX / (2.0 * velocity):.4g} counts_per_metre"
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -42,14 +42,14 @@ class Window(NamedTuple):
 
 
 class Requirements(NamedTuple):
-    """What the drives are to be able to do."""
+    """What the drives are to be able to do, A, B, C."""
 
     period: float
     """Of the cycle [s]."""
-    low: float
-    high: float
+    low: Sequence[float]
+    high: Sequence[float]
     """Travel of the sliders [m]."""
-    velocity: float
+    velocity: Triple
     """Of the sliders at most [m/s]."""
     following_error: float
     """Beyond which the service stops everything [m]."""
@@ -68,7 +68,7 @@ def resolution(
     limits = (
         ("limits.slider.following_error", "m", required.following_error, FINE_ENOUGH),
         ("drives.following_error", "m", drives.following_error, FINE_ENOUGH),
-        ("limits.slider.velocity", "m in a cycle", required.velocity * required.period, 1),
+        ("limits.slider.velocity", "m in a cycle", required.velocity[NAMES.index(name)] * required.period, 1),
     )
     reads = *scale, "loop.rate_hz", *(key for key, *_ in limits)
     yield Rule(f"drives.{name}.counts_per_metre", reads, partial(_check_limits, name, drive, step, limits, remedy))

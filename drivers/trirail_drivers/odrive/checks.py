@@ -32,12 +32,13 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
         for key in _CANOPEN_ONLY:
             yield Rule(f"drives.{name}.{key}", (), partial(_check_canopen_only, name, drive, key))
     yield Rule("drives", tuple(f"drives.{name}.node" for name in NAMES), partial(setup.check_nodes, drives))
-    for name, drive in zip(NAMES, drives.each, strict=True):
+    for leg, (name, drive) in enumerate(zip(NAMES, drives.each, strict=True)):
         counts, scale = f"drives.{name}.counts_per_metre", (f"drives.{name}.offset", f"drives.{name}.direction")
         yield Rule(counts, scale, partial(scale_of, name, drive))
-        farthest = max(abs(required.low - drive.offset), abs(required.high - drive.offset))
+        farthest = max(abs(required.low[leg] - drive.offset), abs(required.high[leg] - drive.offset))
         yield from resolution(name, drive, drives, required, farthest * 2.0**-_FLOAT_DIGITS, _nearer)
-        yield Rule("limits.slider.velocity", (counts,), partial(_check_feed_forward, name, drive, required))
+        fastest = required.velocity[leg]
+        yield Rule("limits.slider.velocity", (counts,), partial(_check_feed_forward, name, drive, fastest))
 
 
 def files(drives: Drives) -> Iterator[Rule]:
@@ -58,12 +59,12 @@ def _nearer(widest: float) -> str:
     return f"wanted an offset nearer to the travel than {widest * 2**_FLOAT_DIGITS:g} m"
 
 
-def _check_feed_forward(name: str, drive: Drive, required: Requirements) -> None:
+def _check_feed_forward(name: str, drive: Drive, velocity: float) -> None:
     """CANSimple has 16 bits for the velocity feed-forward; without it an ODrive lags out of its window."""
-    turns = required.velocity * drive.counts_per_metre
+    turns = velocity * drive.counts_per_metre
     if turns > MAX_FEED_FORWARD:
         raise DriveError(
-            f"limits.slider.velocity = {required.velocity:g}: with drives.{name}.counts_per_metre = "
+            f"limits.slider.velocity = {velocity:g}: with drives.{name}.counts_per_metre = "
             f"{drive.counts_per_metre:g} that is {turns:g} turns/s, and an ODrive's feed-forward ends at "
             f"{MAX_FEED_FORWARD:g}; lower the velocity, or use a longer lead"
         )

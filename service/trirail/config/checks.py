@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 from trirail_drivers.driver.requirements import Requirements, Rule, Window
 from trirail_drivers.errors import DriveError, TrirailError
-from trirail_drivers.interface import NAMES
 
 from trirail.config import as_built
 from trirail.config.as_built import AsBuilt
@@ -77,12 +76,9 @@ def rules(config: Config) -> Iterator[Rule]:
         "limits.platform.x": platform.x,
         "limits.platform.y": platform.y,
         "limits.platform.phi": platform.phi,
-        "limits.slider.position": slider.position,
+        **dict(zip(slider.keys("position"), slider.positions, strict=True)),
         "limits.slider.passive": slider.passive,
     }
-    for name, own in zip(NAMES, slider.own, strict=True):
-        if own.position is not None:
-            ranges[f"limits.slider.{name}.position"] = own.position
     for key, both in ranges.items():
         yield Rule(key, (), partial(_check_range, key, *both))
     yield Rule("geometry", (), partial(geometry, config.geometry))
@@ -154,16 +150,15 @@ def _check_rate(config: Config) -> None:
 def _required(config: Config) -> Requirements:
     """Return what the robot asks of its drives; without the windows of a robot that is singular, or none."""
     slider = config.limits.slider
-    places = (
-        *itertools.chain(*slider.positions),
-        *(config.can.simulated.start if config.can.interface == "simulated" else ()),
-    )
+    simulated, starts = config.can.interface == "simulated", config.can.simulated.start
+    places = [(*ends, at) if simulated else ends for ends, at in zip(slider.positions, starts, strict=True)]
     try:
         _check_singular_angles(config)
         windows = tuple(_windows(config))
     except ConfigError:
         windows = ()
-    return Requirements(config.period, min(places), max(places), slider.fastest, slider.following_error, windows)
+    low, high = [*map(min, places)], [*map(max, places)]
+    return Requirements(config.period, low, high, slider.velocities, slider.following_error, windows)
 
 
 def _windows(config: Config) -> Iterator[Window]:
@@ -195,22 +190,22 @@ def _check_pose(config: Config, name: str) -> None:
     if is_quantity(name):
         raise ConfigError(f"poses.{name}: {name} {QUANTITY_RULE}")
     places = [
-        (key, at, key, getattr(platform, key), "platform") for key, at in zip(("x", "y", "phi"), pose, strict=True)
+        (key, at, f"limits.platform.{key}", getattr(platform, key))
+        for key, at in zip(("x", "y", "phi"), pose, strict=True)
     ]
     robot = corrected_geometry(config)
     position, passive = travels(robot, pose).tolist()
     places += [
-        (f"slider {label}", at, "position" if own.position is None else f"{leg}.position", ends, "slider")
-        for leg, label, at, own, ends in zip(NAMES, robot.labels, position, slider.own, slider.positions, strict=True)
+        (f"slider {label}", at, key, ends)
+        for label, at, key, ends in zip(robot.labels, position, slider.keys("position"), slider.positions, strict=True)
     ]
     places += [
-        (f"cross slide {label}", at, "passive", slider.passive, "slider")
+        (f"cross slide {label}", at, "limits.slider.passive", slider.passive)
         for label, at in zip(robot.labels, passive, strict=True)
     ]
-    for what, at, key, (low, high), section in places:
+    for what, at, key, (low, high) in places:
         if not low <= at <= high:
             numbers = ", ".join(f"{value:g}" for value in pose)
             raise ConfigError(
-                f"poses.{name} = [{numbers}]: {what} would be {at:.6g}, outside of "
-                f"limits.{section}.{key} = [{low:g}, {high:g}]"
+                f"poses.{name} = [{numbers}]: {what} would be {at:.6g}, outside of {key} = [{low:g}, {high:g}]"
             )

@@ -36,6 +36,8 @@ _AT = re.compile(r"^(?P<what>.*?)(?: - at (?P<key>`key` in )?`\$(?P<path>[^`]*)`
 NAMED = "[...]"
 """What msgspec says in the place of a key of a table whose keys are names."""
 _FIELD = re.compile(r"^Object (?P<how>contains unknown|missing required) field `(?P<name>[^`]*)`")
+_SHAPE = re.compile(r"^Field `(?P<name>[^`]*)`")
+"""What a table itself says of a field of it."""
 
 
 class Mistake(NamedTuple):
@@ -107,7 +109,12 @@ def _explained(error: str, raw: dict[str, Any], kind: Any) -> tuple[Place, str]:
         if keys:
             return (*names, name), f"{table}: {name!r} is no name here: {what[0].lower()}{what[1:].replace('`', '')}"
         place = (*names, name, *_place(rest))
+    if field := _SHAPE.match(what):
+        place = (*place, field["name"])
     said = f"{_key(place)} = {_at(place, raw)!r}"
+    if field or what.startswith(("Expected `float | array`", "Expected `array`")):
+        wanted = _described(place, kind)
+        return place, f"{said}: {f'wanted {wanted}' if wanted else what[0].lower() + what[1:].replace('`', '')}"
     if what.startswith("Invalid enum value"):
         enum = _type_at(place, kind)
         values = [str(each) for each in enum] if enum is Role else get_args(enum)
@@ -134,7 +141,8 @@ def _stand_in(kind: Any) -> object:
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         return {field.name: _stand_in(field.type) for field in msgspec.structs.fields(kind) if field.required}
     if get_origin(kind) is tuple:
-        return [_stand_in(each) for each in get_args(kind) if each is not Ellipsis]
+        kinds = get_args(kind)
+        return [_stand_in(each) for each in (kinds[:1] * 2 if Ellipsis in kinds else kinds)]
     allowed = get_args(kind) if get_origin(kind) is Literal else tuple(kind) if kind is Role else _POSSIBLE
     for value in allowed:
         try:
@@ -169,6 +177,15 @@ def _culprit(table: Any, kind: Any, *, of_keys: bool) -> str:
         except msgspec.ValidationError:
             return str(name)
     return NAMED
+
+
+def _described(place: Place, kind: Any) -> str | None:
+    """What a key takes, where its type has words of its own for that."""
+    *path, name = place
+    table = _type_at(tuple(path), kind)
+    fields = msgspec.structs.fields(table) if isinstance(table, type) and issubclass(table, msgspec.Struct) else ()
+    metas = [meta for field in fields if field.name == name for meta in getattr(field.type, "__metadata__", ())]
+    return next((meta.description for meta in metas if isinstance(meta, msgspec.Meta)), None)
 
 
 def _type_at(place: Place, kind: Any) -> Any:

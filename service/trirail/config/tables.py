@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import msgspec
 import numpy as np
@@ -94,76 +94,76 @@ class PlatformLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """Least and greatest angle of the platform [rad], singularity_margin away from every singular one."""
 
 
-class OneSlider(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [limits.slider.A], B or C: what is this slider's own; the rest is as of all three."""
-
-    position: Range | None = None
-    """Travel of this slider [m]."""
-    velocity: Velocity | None = None
-    """Greatest rate of this slider [m/s]."""
-    acceleration: Acceleration | None = None
-    """Greatest acceleration of this slider [m/s²]."""
-    jerk: Jerk | None = None
-    """Greatest jerk of this slider [m/s³]."""
-
-
-_NOTHING = OneSlider()
+_THREE = Meta(min_length=3, max_length=3)
+_EACH = Meta(description="one number for all sliders, or three: of A, B, C")
+# msgspec 0.22 keeps bounds of a number and the length of a fixed array in one place: a union of both ends the
+# interpreter. So these arrays are of any length by their type.
+EachVelocity = Annotated[Velocity | Annotated[tuple[Velocity, ...], _THREE], _EACH]
+EachAcceleration = Annotated[Acceleration | Annotated[tuple[Acceleration, ...], _THREE], _EACH]
+EachJerk = Annotated[Jerk | Annotated[tuple[Jerk, ...], _THREE], _EACH]
+EachRange = Annotated[
+    tuple[Coordinate | Annotated[tuple[Coordinate, ...], Meta(min_length=2, max_length=2)], ...],
+    Meta(description="a pair for all sliders, or three pairs: of A, B, C"),
+]
 
 
 class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [limits.slider]: of all three, but for what a slider has of its own."""
+    """Section [limits.slider]."""
 
-    position: Range
+    position: EachRange
     """Travel of lambda_10 [m]."""
     passive: Range
     """Travel of what slides without a drive [m]: lambda_32 along the platform's edges, or the cross slides of 3-PPR."""
-    velocity: Velocity
+    velocity: EachVelocity
     """Greatest rate of each slider [m/s]."""
-    acceleration: Acceleration
+    acceleration: EachAcceleration
     """Greatest acceleration of each slider [m/s²]."""
-    jerk: Jerk
+    jerk: EachJerk
     """Greatest jerk of each slider [m/s³]."""
     following_error: Distance
     """Setpoint less measured position beyond which everything stops [m]; less than `[drives] following_error`."""
-    A: OneSlider | None = None
-    B: OneSlider | None = None
-    C: OneSlider | None = None
 
-    @property
-    def own(self) -> tuple[OneSlider, OneSlider, OneSlider]:
-        """What the sliders A, B, C have of their own."""
-        return self.A or _NOTHING, self.B or _NOTHING, self.C or _NOTHING
+    def __post_init__(self) -> None:
+        pairs = sum(isinstance(each, tuple) for each in self.position)
+        if (len(self.position), pairs) not in {(2, 0), (3, 3)}:
+            raise ValueError("Field `position` has neither shape")
+
+    def keys(self, limit: str) -> tuple[str, str, str]:
+        """Where each slider's position, velocity, acceleration or jerk stands: its key, with [0] if there are three."""
+        given = getattr(self, limit)
+        own = isinstance(given, tuple) and len(given) == len(NAMES)
+        a, b, c = (f"limits.slider.{limit}[{k}]" if own else f"limits.slider.{limit}" for k in range(3))
+        return a, b, c
 
     @property
     def positions(self) -> tuple[Range, Range, Range]:
         """Travel of each slider [m]."""
-        a, b, c = (self.position if one.position is None else one.position for one in self.own)
-        return a, b, c
+        return cast("tuple[Range, Range, Range]", self.position if len(self.position) == 3 else (self.position,) * 3)
 
     @property
     def velocities(self) -> Triple:
         """Greatest rate of each slider [m/s]."""
-        return self._each("velocity")
+        return _of_each(self.velocity)
 
     @property
     def accelerations(self) -> Triple:
         """Greatest acceleration of each slider [m/s²]."""
-        return self._each("acceleration")
+        return _of_each(self.acceleration)
 
     @property
     def jerks(self) -> Triple:
         """Greatest jerk of each slider [m/s³]."""
-        return self._each("jerk")
-
-    def _each(self, name: str) -> Triple:
-        common = getattr(self, name)
-        a, b, c = (common if (own := getattr(one, name)) is None else own for one in self.own)
-        return a, b, c
+        return _of_each(self.jerk)
 
     @property
     def fastest(self) -> float:
         """The greatest rate of any slider [m/s]."""
         return max(self.velocities)
+
+
+def _of_each(limit: float | tuple[float, ...]) -> Triple:
+    a, b, c = limit if isinstance(limit, tuple) else (limit,) * 3
+    return a, b, c
 
 
 Window = Annotated[float, Meta(ge=1e-9, le=1.0)]

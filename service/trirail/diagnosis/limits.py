@@ -9,9 +9,8 @@ import numpy as np
 from trirail_drivers.interface import Triple
 
 from trirail.config import Config, SliderLimits, geometry, room
-from trirail.config.tables import OneSlider
 from trirail.diagnosis.check import Check, Judgement, is_simulated, value
-from trirail.kinematics.geometry import LEGS, gains, travels
+from trirail.kinematics.geometry import gains, travels
 
 RAMP = 1e-3, 10.0
 """Between these is what any slider takes to its limit of velocity, or of acceleration [s]."""
@@ -38,10 +37,12 @@ def _ramps(config: Config) -> Iterator[Check]:
     """Nothing reaches its velocity within a millisecond, or takes ten seconds; so for acceleration."""
     slider, platform = config.limits.slider, config.limits.platform
     for rate, by, _, _ in _ORDERS:
+        sliders = list(zip(_each(slider, rate), _each(slider, by), strict=True))
+        alike = len(set(sliders)) == 1
         tables: list[tuple[str, float, float]] = [
             *dict.fromkeys(
-                (f"limits.slider {leg}" if any(own != OneSlider() for own in slider.own) else "limits.slider", v, a)
-                for leg, v, a in zip(LEGS, _each(slider, rate), _each(slider, by), strict=True)
+                ("limits.slider" if alike else f"limits.slider {label}", *each)
+                for label, each in zip(config.geometry.labels, sliders, strict=True)
             ),
             *(
                 (f"limits.platform {axis}", getattr(platform, rate)[k], getattr(platform, by)[k])
@@ -60,9 +61,8 @@ def _ramps(config: Config) -> Iterator[Check]:
 def _ranges(config: Config) -> Iterator[Check]:
     platform, slider = config.limits.platform, config.limits.slider
     ranges = {f"limits.platform.{axis}": getattr(platform, axis) for axis, _ in _AXES}
-    ranges |= {"limits.slider.position": slider.position, "limits.slider.passive": slider.passive}
-    own = zip(LEGS, slider.own, strict=True)
-    ranges |= {f"limits.slider.{leg}.position": one.position for leg, one in own if one.position is not None}
+    ranges |= dict(zip(slider.keys("position"), slider.positions, strict=True))
+    ranges["limits.slider.passive"] = slider.passive
     for key, (low, high) in ranges.items():
         small, large = sorted((abs(low), abs(high)))
         said = f"{key} = [{low:g}, {high:g}]"
@@ -98,14 +98,11 @@ def _rates(config: Config) -> Iterator[Check]:
         return
     for quantity in ("velocity", "acceleration", "jerk"):
         every = (per_pose @ np.array(getattr(platform, quantity))).tolist()
-        limit, asked = _each(slider, quantity)[0], max(every)
-        pairs = [("", limit, asked)]
-        if len(set(_each(slider, quantity))) > 1:
-            pairs = list(zip((f"{leg}." for leg in LEGS), _each(slider, quantity), every, strict=True))
-        for leg, limit, asked in pairs:
-            if not 1.0 / OUT_OF_STEP < limit / asked < OUT_OF_STEP:
-                key = f"limits.slider.{leg}{quantity}"
-                found = f"{value(key, limit)}, and limits.platform.{quantity} asks for {asked:.3g}"
+        limits, keys = _each(slider, quantity), slider.keys(quantity)
+        asked = every if len(set(keys)) > 1 else [max(every)] * 3
+        for key, limit, most in dict.fromkeys(zip(keys, limits, asked, strict=True)):
+            if not 1.0 / OUT_OF_STEP < limit / most < OUT_OF_STEP:
+                found = f"{value(key, limit)}, and limits.platform.{quantity} asks for {most:.3g}"
                 yield Check("limits", "warning", found, "one of them cannot be used", key)
 
 

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import msgspec
 
 from trirail.config import Limits, SliderLimits
-from trirail.config.tables import OneSlider
 
 SHARE = 0.1
 """Of the sliders' limits of velocity, acceleration and jerk, that taking up backlash may make use of."""
@@ -59,21 +58,11 @@ def planned_limits(limits: Limits, widths: Sequence[float]) -> Limits:
     if not any(widths):
         return limits
     slider, taken, half = limits.slider, take_up(widths, limits.slider), max(widths) / 2.0
-    a, b, c = (
-        OneSlider((low + half, high - half), v - taken.velocity, acceleration - taken.acceleration, jerk - taken.jerk)
-        for (low, high), v, acceleration, jerk in zip(
-            slider.positions, slider.velocities, slider.accelerations, slider.jerks, strict=True
-        )
-    )
-    low, high = slider.position
     less = msgspec.structs.replace(
         slider,
-        position=(low + half, high - half),
-        velocity=slider.velocity - taken.velocity,
-        acceleration=slider.acceleration - taken.acceleration,
-        jerk=slider.jerk - taken.jerk,
-        A=a,
-        B=b,
-        C=c,
+        position=tuple((low + half, high - half) for low, high in slider.positions),
+        velocity=tuple(each - taken.velocity for each in slider.velocities),
+        acceleration=tuple(each - taken.acceleration for each in slider.accelerations),
+        jerk=tuple(each - taken.jerk for each in slider.jerks),
     )
     return msgspec.structs.replace(limits, slider=less)
