@@ -130,7 +130,7 @@ def test_a_sound_robot_passes_every_step(robot: Config, tmp_path: Path) -> None:
     assert [entry for entry in report.steps if entry.verdict != "ok"] == []
     switches = [] if robot.drives.protocol == "odrive" else ["switches"]
     each = [name for step in ("push", "power", "move", *switches, "watchdog") for name in [step] * 3]
-    assert [entry.step for entry in report.steps] == ["bus", "setup", *each, "square"]
+    assert [entry.step for entry in report.steps] == ["bus", "setup", *each, "square", "kind"]
     assert (report.ok, report.complete, report.changes, run.written) == (True, True, {}, None)
     for name in NAMES:
         assert run.of("move", name).measured["out"] == pytest.approx(0.001, abs=1e-6)

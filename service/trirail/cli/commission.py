@@ -40,9 +40,9 @@ def commission(
     """Guide through the first hour with drives: one at a time, 1 mm at 5 mm/s, each step asked for and judged.
 
     Who is on the bus, set-up, each slider by hand, power on one drive alone, 1 mm there and back, homing, watchdogs, a
-    square of the platform; then a new configuration with what was found. Every step can be refused and repeated, Ctrl-C
-    stops all drives at once, and a report is kept. Answers are lines of standard input, of a person or a script.
-    Exit 0 only if nothing that was done was found wrong. Not while the service runs.
+    square of the platform, of which kind it is; then a new configuration with what was found. Every step can be refused
+    and repeated, Ctrl-C stops all drives at once, and a report is kept. Answers are lines of standard input, of a
+    person or a script. Exit 0 only if nothing that was done was found wrong. Not while the service runs.
 
     Parameters
     ----------

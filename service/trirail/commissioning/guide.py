@@ -144,6 +144,17 @@ def plan(steps: Steps, config: Config) -> list[GuideStep]:
             tuple(("watchdog", name) for name in NAMES),
         )
     )
+    made.append(
+        GuideStep(
+            "kind",
+            "",
+            "3-PRP or 3-PPR",
+            "MOTION of all three: the platform turns, goes along x or y, and back, 5 mm/s at most. You read a dial "
+            "gauge or microscope; refuse it (s) without one.",
+            steps.kind,
+            (("square", ""),),
+        )
+    )
     return made
 
 

@@ -23,6 +23,9 @@ ACCELERATION = 0.05
 JERK = 1.0
 """Greatest jerk [m/s³]."""
 
+STILL = 1e-9
+"""Who goes less far stays where they are [m]."""
+
 
 class SlowMove(NamedTuple):
     """A motion of the three sliders from where they stand, a row for each cycle."""
@@ -49,6 +52,14 @@ def profile(distance: float, limits: SliderLimits, period: float) -> tuple[Array
     times = np.arange(1, math.ceil(trajectory.duration / period) + 1) * period
     rows = np.array([trajectory.at_time(min(time, trajectory.duration))[:2] for time in times])
     return rows[:, 0, 0], rows[:, 1, 0]
+
+
+def together(ways: Array, limits: SliderLimits, period: float) -> SlowMove:
+    """Return the way of all three over `ways` (3,) [m], on a straight line between them."""
+    longest = float(np.abs(ways).max())
+    along, rate = profile(max(longest, STILL), limits, period)
+    shares = ways / max(longest, STILL)
+    return SlowMove(along[:, None] * shares, rate[:, None] * shares)
 
 
 def of_slider(index: int, distance: float, limits: SliderLimits, period: float) -> SlowMove:

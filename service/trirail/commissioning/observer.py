@@ -62,6 +62,18 @@ class Observer:
         text = f"What does the rule at slider {self._labels[index]} read now, in mm?"
         return self.number(text, None if rules is None else rules[index])
 
+    def instrument(self) -> float:
+        """Return how finely an instrument beside the platform can be read [m]."""
+        text = "To how many mm can you read the instrument? (a dial gauge 0.001, a microscope 0.005)"
+        question = Question(text, None if self._simulated is None else "0.001")
+        return number(self._person, self._idle, question, 0.00001, 5.0) / 1e3
+
+    def mark(self, axis: str, simulated: float | None) -> float:
+        """Return what an instrument reads along an axis at a mark on the platform [m]."""
+        default = None if simulated is None else f"{simulated * 1e3 + 0.0:.4f}"
+        question = Question(f"What does the instrument read along {axis} now, in mm?", default)
+        return number(self._person, self._idle, question) / 1e3
+
     def number(self, text: str, simulated: float | None) -> float:
         """Return a length that is asked for in mm [m]."""
         default = None if simulated is None else f"{simulated * 1e3 + 0.0:.2f}"

@@ -20,6 +20,7 @@ from trirail.commissioning.judgement import (
     judge_switches,
     judge_watchdog,
 )
+from trirail.commissioning.kind_step import KindStep
 from trirail.commissioning.observer import Observer, Reading, apart
 from trirail.commissioning.person import Question, choose
 from trirail.commissioning.report import Number
@@ -227,6 +228,10 @@ class Steps:
         following = dict(zip(NAMES, bench.worst, strict=True))
         judged = judge_square(deviation, bench.worst, seen, stopped, self._labels)
         return judged, {"deviation": deviation, "missed_cycles": bench.missed, **following}
+
+    def kind(self) -> Done:
+        """Tell whether the robot is of the configured kind, by a mark that is measured from outside."""
+        return KindStep(self.session, self._see).run()
 
     def _moved(self, index: int, way: float) -> _Moved:
         """Move one slider, its drive alone with power; it has none afterwards."""
