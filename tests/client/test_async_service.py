@@ -14,6 +14,7 @@ from trirail.errors import RefusalCode
 from trirail.wire.goals import TrajectoryPoint
 from trirail.wire.records import unpack
 from trirail.wire.state import State
+from trirail.wire.vocabulary import Role
 
 pytestmark = pytest.mark.slow
 
@@ -51,6 +52,8 @@ async def until(robot: AsyncRobot, condition: Callable[[State], bool]) -> State:
 def test_a_session(locator: str) -> None:
     async def work(robot: AsyncRobot) -> None:
         assert (await robot.info()).robot == "demo"
+        assert await robot.role() is Role.MAINTAINER
+        assert robot.user in await robot.users()
         first, second = await asyncio.gather(
             robot.move(x=0.01, blend=0.005, id="first"), robot.move(y=0.01, speed=0.5, id="second")
         )

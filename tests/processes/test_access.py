@@ -30,6 +30,7 @@ KEYS = [
     *PUBLISHED, "info", "alive", "role/ME", "role/bob", "goal/ME", "goal/bob", "goal/*",
     "alignment/ME", "alignment/bob", "alignment/*",
     *(f"cmd/{who}/{name}" for who in ("ME", "bob", "*") for name in Command), "cmd/ME/dance", "cmd/*/*", "role/*",
+    "here/ME", "here/bob",
     "poses", *(f"{what}/{who}/pick" for what in ("teach", "forget") for who in ("ME", "bob", "*")), "teach/*/*",
     "event/@adv/pub/1/2/_", "nothing", "../other/state", "../../elsewhere", "../../@/1/peer/config",
 ]  # fmt: skip
@@ -48,19 +49,20 @@ def allowed(role: Role | None, flow: str, message: str) -> set[str]:
     )
     roles = {"role/ME", "role/bob", "role/*"}
     of_all = {key for key in KEYS if key.split("/")[0] in ("goal", "alignment", "cmd", "teach", "forget")}
-    told = {"info", "poses"}
+    told, here = {"info", "poses"}, {"here/ME", "here/bob"}
     adv = {"event/@adv/pub/1/2/_"}
     table: dict[tuple[str, str], set[str]] = {
         ("ingress", "query"): roles | (mine | told | adv if seeing else set()),
         ("ingress", "put"): {"goal/ME"} if sends else set(),
         ("ingress", "declare_subscriber"): PUBLISHED | adv | {"../other/state"} if seeing else set(),
-        ("ingress", "liveliness_query"): {"alive"} | adv if seeing else set(),
-        ("ingress", "declare_liveliness_subscriber"): {"alive"} | adv if seeing else set(),
+        ("ingress", "liveliness_token"): {"here/ME"} if seeing else set(),
+        ("ingress", "liveliness_query"): {"alive"} | here | adv if seeing else set(),
+        ("ingress", "declare_liveliness_subscriber"): {"alive"} | here | adv if seeing else set(),
         ("egress", "put"): PUBLISHED | adv if seeing else set(),
-        ("egress", "reply"): roles | (of_all | told | {"alive"} | PUBLISHED | adv if seeing else set()),
+        ("egress", "reply"): roles | (of_all | told | {"alive"} | here | PUBLISHED | adv if seeing else set()),
         ("egress", "declare_subscriber"): {"goal/ME", "goal/bob", "goal/*"} if seeing else set(),
         ("egress", "declare_queryable"): roles | (of_all | told | adv if seeing else set()),
-        ("egress", "liveliness_token"): {"alive"} | adv if seeing else set(),
+        ("egress", "liveliness_token"): {"alive"} | here | adv if seeing else set(),
     }
     return table.get((flow, message), set())
 
@@ -270,7 +272,9 @@ def test_what_is_tried_does_pass_where_it_is_allowed(
     assert line.passed(flow, message) >= {"state", "goal/bob", "cmd/ME/reset", "alive", "role/bob", "../other/state"}
 
 
-@pytest.mark.parametrize("key", ["info", "poses", *(key for key in KEYS if "/ME" in key and "dance" not in key)])
+@pytest.mark.parametrize(
+    "key", ["info", "poses", *(key for key in KEYS if "/ME" in key and key not in ("here/ME", "cmd/ME/dance"))]
+)
 def test_a_client_is_told_the_least_role_that_may(key: str) -> None:
     may = [role for role in Role if key in allowed(role, "ingress", "query")]
     assert least_role(*key.split("/")) is may[0]

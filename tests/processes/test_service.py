@@ -607,6 +607,16 @@ def test_the_service_is_seen_alive(shared: tuple[Service, Robot, zenoh.Session])
     assert [reply.ok is not None for reply in session.liveliness().get("trirail/demo/alive")] == [True]
 
 
+def test_clients_see_who_is_connected_while_it_is(shared: tuple[Service, Robot, zenoh.Session]) -> None:
+    service, robot, _ = shared
+    with Robot("demo", service.locator, user="guest") as guest:
+        deadline = time.monotonic() + 10.0
+        while not robot.users() == guest.users() == sorted({robot.user, "guest"}):
+            assert time.monotonic() < deadline
+    while robot.users() != [robot.user]:
+        assert time.monotonic() < deadline
+
+
 # ---------------------------------------------------------------------- ends, asked for and not
 
 

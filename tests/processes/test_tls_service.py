@@ -16,6 +16,7 @@ from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import zenoh_session
 from trirail.wire.credentials import Credentials
+from trirail.wire.vocabulary import Role
 
 pytestmark = pytest.mark.slow
 
@@ -82,6 +83,8 @@ def test_a_viewer_sees_it_and_is_refused_at_once_naming_the_role(served: Served)
         before = eva.state()
         assert before.mode == "holding"
         assert eva.info().robot == "demo"
+        assert eva.role() is Role.VIEWER
+        assert {"ann", "eva"} <= set(eva.users())
         for ask in (lambda: eva.move_to(x=0.0, y=0.0, phi=0.0), eva.disable, eva.acquire):
             began = time.monotonic()
             with pytest.raises(RefusedError, match=r"eva is a viewer at demo: \S+ needs operator") as refused:

@@ -31,11 +31,11 @@ from trirail.client.trajectory import check_arrived
 from trirail.errors import RefusedError, ServiceError
 from trirail.wire.goals import Goal
 from trirail.wire.looks import AlignmentLook
-from trirail.wire.messages import CommandReply, Event, GoalReply
+from trirail.wire.messages import CommandReply, Event, GoalReply, RoleReply
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.stop_door import STOPS
 from trirail.wire.text import check_name, check_new_pose
-from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
+from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Role, Stop
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -126,7 +126,7 @@ class AsyncRobot:
         self._goals: dict[str, AsyncGoalHandle] = {}
 
     async def __aenter__(self) -> Self:
-        self._open = await AsyncConnection.open(self.name, self._connect, self._credentials)
+        self._open = await AsyncConnection.open(self.name, self._connect, self._credentials, self.user)
         self._opened.push_async_callback(self._open.close)
         self._opened.enter_context(self._open.subscribe_to_events(self._on_event, history=True))
         return self
@@ -231,6 +231,15 @@ class AsyncRobot:
     async def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""
         return await self._connection.ask(("info",), Info)
+
+    async def role(self) -> Role | None:
+        """Ask what this user may, as Robot.role does."""
+        role = (await self._connection.ask(("role", self.user), RoleReply)).role
+        return None if role is None else Role(role)
+
+    async def users(self) -> list[str]:
+        """Return who is connected, as Robot.users does."""
+        return await self._connection.users()
 
     async def poses(self) -> dict[str, NamedPose]:
         """Ask for the named poses, as Robot.poses does."""

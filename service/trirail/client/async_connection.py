@@ -33,9 +33,9 @@ class AsyncConnection:
         self._loop = asyncio.get_running_loop()
 
     @classmethod
-    async def open(cls, robot: str, connect: str, credentials: Credentials | None) -> AsyncConnection:
+    async def open(cls, robot: str, connect: str, credentials: Credentials | None, user: str) -> AsyncConnection:
         """Open one. Raises ServiceError where the service cannot be reached."""
-        opening = asyncio.get_running_loop().run_in_executor(None, Connection, robot, connect, credentials)
+        opening = asyncio.get_running_loop().run_in_executor(None, Connection, robot, connect, credentials, user)
         try:
             return cls(await asyncio.shield(opening))
         except asyncio.CancelledError:  # what is being opened is closed again
@@ -50,6 +50,10 @@ class AsyncConnection:
     def skipped(self) -> int:
         """How often something was published on this robot's keys that was none of its messages."""
         return self._connection.skipped
+
+    async def users(self) -> list[str]:
+        """Return the users who have a session to this robot, by name."""
+        return await asyncio.get_running_loop().run_in_executor(None, self._connection.users)
 
     async def ask(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes | None = None, within: float = REPLY_WITHIN

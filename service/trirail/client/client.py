@@ -41,12 +41,12 @@ from trirail.wire.goals import (
     TrajectoryGoal,
 )
 from trirail.wire.looks import AlignmentLook
-from trirail.wire.messages import CommandReply, Event, GoalReply
+from trirail.wire.messages import CommandReply, Event, GoalReply, RoleReply
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.stop_door import STOPS
 from trirail.wire.text import check_name, check_new_pose, quoted
-from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override
+from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override, Role
 
 if TYPE_CHECKING:  # numpy, which most programs do without
     from trirail.alignment.calibration import CameraCalibration
@@ -86,7 +86,7 @@ class Robot:
         name, connect, tls = address(name, connect, tls)
         self.name = check_name(name, "robot")
         self.user, credentials = identity(self.name, connect, user, tls)
-        self._connection = Connection(self.name, connect, credentials)
+        self._connection = Connection(self.name, connect, credentials, self.user)
         self._goals: dict[str, GoalHandle] = {}
         self._goals_lock = threading.Lock()
         self._results = self._connection.subscribe_to_events(self._on_event, history=True)
@@ -464,6 +464,15 @@ class Robot:
     def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""
         return self._connection.ask(("info",), Info)
+
+    def role(self) -> Role | None:
+        """Ask what this user may; None where he may nothing. Where nobody is asked for a certificate: all."""
+        role = self._connection.ask(("role", self.user), RoleReply).role
+        return None if role is None else Role(role)
+
+    def users(self) -> list[str]:
+        """Return who is connected to the robot now, by name, this user too."""
+        return self._connection.users()
 
     def poses(self) -> dict[str, NamedPose]:
         """Ask for the named poses: those of the configuration, and those that were taught."""

@@ -28,6 +28,8 @@ ROLE_WITHIN = 0.8
 """How long the answer may take which role a user has [s]."""
 REPLY_WITHIN = 20.0
 """How long a command may take to be carried out [s]."""
+HERE_WITHIN = 1.0
+"""How long the answer may take who is connected [s]."""
 POST_WITHIN = 2.0
 """How long the answer may take to what is posted [s]."""
 
@@ -39,9 +41,14 @@ class SilenceError(ServiceError):
 
 
 class Connection:
-    """A session to the service of a robot at a Zenoh locator. Raises ServiceError where that cannot be reached."""
+    """A session to the service of a robot at a Zenoh locator. Raises ServiceError where that cannot be reached.
 
-    def __init__(self, robot: str, connect: str, credentials: Credentials | None = None) -> None:
+    Whose it is, if that is said, all others see while it lasts.
+    """
+
+    def __init__(
+        self, robot: str, connect: str, credentials: Credentials | None = None, user: str | None = None
+    ) -> None:
         self.robot = robot
         self._connect = connect
         self._credentials = credentials
@@ -50,6 +57,7 @@ class Connection:
         self.close = weakref.finalize(self, zenoh_session.close, self._opened)
         """End it; calls after the first do nothing."""
         self._reader = SampleReader()
+        self._here = self._opened.liveliness().declare_token(self._key("here", user)) if user is not None else None
 
     @property
     def skipped(self) -> int:
@@ -240,6 +248,11 @@ class Connection:
     def records(self, take: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
         """Have every batch of records taken, until the subscriber's context ends."""
         return self._session.declare_subscriber(self._key("records"), self._reader.batches(take))
+
+    def users(self) -> list[str]:
+        """Return the users who have a session to this robot, by name."""
+        here = self._session.liveliness().get(self._key("here", "*"), timeout=HERE_WITHIN)
+        return sorted({str(reply.ok.key_expr).rpartition("/")[2] for reply in here if reply.ok is not None})
 
     @property
     def session(self) -> zenoh.Session:

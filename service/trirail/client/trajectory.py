@@ -71,14 +71,19 @@ def check_arrived(result: Result) -> None:
 
 def read(path: Path) -> list[TrajectoryPoint]:
     """Read the points of a trajectory. Raises TrirailError with file, line and what would be right."""
-    points = _points(path)
+    return parse(path, files.text(path))
+
+
+def parse(name: Path | str, text: str) -> list[TrajectoryPoint]:
+    """Return the points that are in a file of a name, .json or any other for CSV. Raises as read."""
+    path = Path(name)
+    points = _points(path, text)
     if len(points) < FEWEST:
         raise TrirailError(f"{path}: {'one point' if points else 'no points'}: a trajectory has {FEWEST} at least")
     return points
 
 
-def _points(path: Path) -> list[TrajectoryPoint]:
-    text = files.text(path)
+def _points(path: Path, text: str) -> list[TrajectoryPoint]:
     if path.suffix == ".json":
         try:
             return decoded(text, list[TrajectoryPoint])

@@ -32,6 +32,7 @@ def info(config: Config) -> Info:
         recordings=str(Path(config.telemetry.directory).resolve()),
         live=f"rerun+http://127.0.0.1:{live}/proxy" if live else "",
         lease=config.control.lease,
+        takeover=config.control.takeover.value,
         homes=tuple(name for name, drive in zip(NAMES, config.drives.each, strict=True) if drive.homing is not None),
         versions=versions(),
         correction=as_built.told(config.correction.map, config.correction.as_built, config.correction.backlash),

@@ -119,14 +119,16 @@ def _of_every_user(robot: str) -> Iterator[_Rule]:
     yield _rule("answer", "egress", ("reply",), *asked, past, *published)
     # Clients look for every robot's at once; what they then see of this one is its own.
     looked = ("liveliness_query", "declare_liveliness_subscriber")
-    yield _rule("look who is there", "ingress", looked, key("*", "alive"), past)
-    yield _rule("be there", "egress", ("liveliness_token", "reply"), alive, past)
+    here = key(robot, "here", "*")
+    yield _rule("look who is there", "ingress", looked, key("*", "alive"), here, past)
+    yield _rule("be there", "egress", ("liveliness_token", "reply"), alive, here, past)
 
 
 def _of_user(robot: str, user: str, role: Role) -> Iterator[_Rule]:
     """Yield what has a user's name in its key."""
     commands = [key(robot, "cmd", user, command) for command in Command if role.includes(command.role)]
     yield _rule(f"{user} commands", "ingress", ("query",), *commands)
+    yield _rule(f"{user} is there", "ingress", ("liveliness_token",), key(robot, "here", user))
     if role.includes(POSES):
         poses = [key(robot, name, user, "*") for name in ("teach", "forget")]
         yield _rule(f"{user} teaches poses", "ingress", ("query",), *poses)

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Struct
 from trirail_drivers.interface import MissingProtection, Triple
 
-from trirail.wire.vocabulary import LeasePolicy
+from trirail.wire.vocabulary import LeasePolicy, Role
 
 
 class Commanded(Struct, frozen=True):
@@ -238,6 +238,9 @@ class Info(Struct, frozen=True):
     """Key [geometry] kind of the configuration, which says what the keys of its legs are."""
     labels: tuple[str, str, str] = ("A", "B", "C")
     """What people call the sliders A, B, C: key [geometry] labels of the configuration."""
+    takeover: str = Role.MAINTAINER.value
+    """A trirail.wire.vocabulary.Role, the least that may take the lease over: key [control] takeover of the
+    configuration."""
 
 
 class NamedPose(Struct, frozen=True):
