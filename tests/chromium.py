@@ -71,8 +71,12 @@ class Page:
         # In a window of its own: pages behind others draw nothing.
         self._target = self._pipe.call("Target.createTarget", url="about:blank", newWindow=True)["targetId"]
         self._session = self._pipe.call("Target.attachToTarget", targetId=self._target, flatten=True)["sessionId"]
+        self.navigate(url)
+
+    def navigate(self, url: str) -> None:
+        """Show another address in the same tab."""
         self._call("Page.navigate", url=url)
-        self.until("document.readyState === 'complete'")
+        self.until(f"location.href.startsWith({url!r}) && document.readyState === 'complete'")
 
     def picture(self) -> Image.Image:
         shot = self._call("Page.captureScreenshot", format="png")["data"]
@@ -104,6 +108,11 @@ class Page:
     def colours(self, scheme: str) -> None:
         """Show the page as to somebody who likes it light, or dark."""
         self._call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+
+    def languages(self, wished: str) -> None:
+        """Be the browser of somebody who wishes pages in this language."""
+        agent = self.evaluate("navigator.userAgent")
+        self._call("Emulation.setUserAgentOverride", userAgent=agent, acceptLanguage=wished)
 
     # ------------------------------------------------------------------ using
 
@@ -138,6 +147,21 @@ class Page:
         self.evaluate(
             f"(() => {{ const field = document.querySelector({selector!r}); field.focus(); field.value = {words!r};"
             " field.dispatchEvent(new Event('input', {bubbles: true})); })()"
+        )
+
+    def choose(self, selector: str, value: str) -> None:
+        """Choose one of a list, as by its keys."""
+        self.evaluate(
+            f"(() => {{ const list = document.querySelector({selector!r}); list.value = {value!r};"
+            " list.dispatchEvent(new Event('change', {bubbles: true})); })()"
+        )
+
+    def choose_file(self, selector: str, name: str, text: str) -> None:
+        """Choose a file of this name and content."""
+        self.evaluate(
+            f"(() => {{ const files = new DataTransfer(); files.items.add(new File([{json.dumps(text)}], {name!r}));"
+            f" const field = document.querySelector({selector!r}); field.files = files.files;"
+            " field.dispatchEvent(new Event('change', {bubbles: true})); })()"
         )
 
     def touch(self, selector: str) -> None:

@@ -90,7 +90,7 @@ def test_nothing_that_people_read_of_a_stage_has_the_letter_of_a_slider(stage: s
     said.append(readout.markdown(np.zeros(1, DTYPE)[0], Standing(), labels))
     assert not [words for words in said if LETTER.search(words)]
     assert f"| {' | '.join(labels)} |" in said[-1]
-    shown = describe(told, robot, "me")
+    shown = describe(told, robot, "me", None)
     assert (shown["sliders"], shown["decimals"]) == (labels, 4)
     drawn = curves.plots(robot)[curves.POSITION].moving
     assert tuple(line.name for line in drawn) == labels

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import queue
 import threading
 import time
@@ -17,7 +18,7 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse
 from trirail.processes.info import info
-from trirail.wire.goals import Goal, VelocityGoal
+from trirail.wire.goals import Goal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import CommandReply, Event
 from trirail.wire.state import (
     Commanded,
@@ -30,7 +31,7 @@ from trirail.wire.state import (
     Sliders,
     State,
 )
-from trirail.wire.vocabulary import Command
+from trirail.wire.vocabulary import Command, Role
 from trirail_drivers.interface import Triple
 
 PERIOD = 0.02
@@ -53,6 +54,11 @@ class FakeRobot:
         self.faults: tuple[str, ...] = ()
         self.share = 1.0
         self.holder: str | None = None
+        self.granted: Role | None = Role.MAINTAINER
+        self.moved_to: list[tuple[Triple, str | None, str]] = []
+        self.followed: list[tuple[TrajectoryPoint, ...]] = []
+        self.connected = ["ann", "bob"]
+        self.forced: list[bool] = []
         self.named = {"park": (0.0, 0.05, 0.0)}
         self.gone_to: list[str] = []
         self.sent: list[VelocityGoal] = []
@@ -78,6 +84,12 @@ class FakeRobot:
 
     def info(self) -> Info:
         return self.told
+
+    def role(self) -> Role | None:
+        return self.granted
+
+    def users(self) -> list[str]:
+        return self.connected
 
     def send(self, make: Callable[[str], Goal], goal_id: str) -> GoalHandle:
         goal = make(goal_id)
@@ -109,15 +121,26 @@ class FakeRobot:
             self._hanging["goal"].wait()
         return GoalHandle(name, self.robot().command)
 
-    def move_to(self, x: float, y: float, phi: float) -> GoalHandle:
+    def move_to(self, x: float, y: float, phi: float, tool: str | None = None, frame: str = "base") -> GoalHandle:
         with self._lock:
             if self.refusal is not None:
                 raise self.refusal
+            self.moved_to.append(((x, y, phi), tool, frame))
             self.pose = (x, y, phi)
         return GoalHandle("there", self.robot().command)
 
-    def move(self, x: float, y: float, phi: float) -> GoalHandle:
-        return self.move_to(*(a + b for a, b in zip(self.pose, (x, y, phi), strict=True)))
+    def move(self, x: float, y: float, phi: float, tool: str | None = None, frame: str = "base") -> GoalHandle:
+        at, by = self.pose, (x, y, phi)
+        return self.move_to(at[0] + by[0], at[1] + by[1], at[2] + by[2], tool=tool, frame=frame)
+
+    def follow(self, points: tuple[TrajectoryPoint, ...], *, stretch: bool) -> GoalHandle:
+        with self._lock:
+            if self.refusal is not None:
+                raise self.refusal
+            self.followed.append(tuple(points))
+            self.goal = GoalState("followed", 0.25, 3.0, target=self.pose)
+            self.mode, self._alive_until = "moving", math.inf
+        return self._handles.setdefault("followed", GoalHandle("followed", self.robot().command))
 
     def teach(self, name: str) -> NamedPose:
         self.named[name] = self.pose
@@ -130,8 +153,9 @@ class FakeRobot:
         self.say(f"pose {name} removed by ann", kind="pose")
         return NamedPose(name, *self.named.pop(name), taught=True)
 
-    def lease(self) -> Lease:
-        return Lease(self.command, force=False, timeout=0.2)
+    def lease(self, *, force: bool = False) -> Lease:
+        self.forced.append(force)
+        return Lease(self.command, force=force, timeout=0.2)
 
     def command(self, name: str, _content: bytes = b"") -> CommandReply:
         with self._lock:

@@ -20,8 +20,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.panel.connections import ASKING, TABS
+from trirail.panel.orders import UNDER_WAY
 from trirail.panel.server import Panel
-from trirail.panel.tab import UNDER_WAY
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.errors import ServiceError
 from trirail.panel.guard import refused
-from trirail.panel.server import Panel
+from trirail.panel.server import LONGEST, Panel
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -219,7 +219,7 @@ def test_a_tab_that_goes_in_whatever_way_is_no_error(panel: Panel, end: str, cap
     if end == "cut off":
         opened.socket.shutdown(socket.SHUT_RDWR)
     elif end == "too large":
-        opened.send("x" * 10_000)
+        opened.send("x" * (LONGEST + 1))
     else:
         opened.close()
     for thread in serving:

@@ -270,7 +270,7 @@ def test_a_fault_is_told_with_its_reason_and_reset(enabled: Page, robot: FakeRob
 def test_a_refusal_is_told(page: Page, robot: FakeRobot) -> None:
     robot.refusal = RefusedError(RefusalCode.NOT_AT_REST, "slider A is moved from outside")
     page.click("[data-command=enable]")
-    page.until("document.querySelector('#answer').textContent === 'enable: slider A is moved from outside'")
+    page.until("document.querySelector('#answer').textContent === 'Enable: slider A is moved from outside'")
 
 
 def test_the_override_is_shown_and_set(enabled: Page, robot: FakeRobot) -> None:
@@ -321,7 +321,7 @@ def test_the_last_alignment_is_shown_with_what_each_mark_had_to_go(page: Page, r
     told(2, {"left": 3.1e-7, "<b>": 2e-7}, end="reached", seconds=0.25)
     page.until(f"{button}.innerText === 'Alignment: reached'")
     page.click("[data-view=alignment]")
-    for words in ("align-1 of bob", "reached in 0.25 s, 1 correction", "look 2", "412.3 µm", "0.31 µm", "<b>"):
+    for words in ("align-1 of bob", "reached in 0.25 s, corrections: 1", "look 2", "412.3 µm", "0.31 µm", "<b>"):
         assert words in page.evaluate(shown), words
     robot.say("a look", kind="alignment", user="bob", alignment={"id": "align-2", "purpose": "check", "number": 1})
     for _ in range(300):
@@ -594,9 +594,12 @@ def test_everything_fits_and_stop_is_always_in_reach(enabled: Page, robot: FakeR
 
 
 def test_every_control_is_reached_by_tab_named_and_seen_to_have_the_focus(enabled: Page) -> None:
-    wanted = enabled.evaluate("document.querySelectorAll('button:enabled:not([hidden]), input:enabled').length")
+    wanted = enabled.evaluate(
+        "[...document.querySelectorAll('button, input, select')]"
+        ".filter((each) => !each.disabled && each.checkVisibility()).length"
+    )
     reached: dict[str, Any] = {}
-    for _ in range(40):
+    for _ in range(50):
         enabled.type_key("Tab")
         found = enabled.evaluate(
             "(({id, dataset, tagName, innerText, labels, ariaLabel}, style) => [id || JSON.stringify(dataset), tagName,"
@@ -604,7 +607,7 @@ def test_every_control_is_reached_by_tab_named_and_seen_to_have_the_focus(enable
             " style.outlineStyle, parseFloat(style.outlineWidth)])"
             "(document.activeElement, getComputedStyle(document.activeElement))"
         )
-        if found[1] in ("BUTTON", "INPUT"):
+        if found[1] in ("BUTTON", "INPUT", "SELECT"):
             reached[found[0]] = found
     assert len(reached) == wanted, reached
     for name, _, words, style, outline in reached.values():

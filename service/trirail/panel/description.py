@@ -9,9 +9,12 @@ import numpy as np
 
 from trirail.client.held_jog import SPEEDS
 from trirail.errors import ConfigError, ServiceError
+from trirail.panel.permissions import permissions
 from trirail.telemetry import palette
 from trirail.telemetry.shown_robot import ShownRobot
+from trirail.wire.sizes import MAX_MESSAGE
 from trirail.wire.state import Info
+from trirail.wire.vocabulary import Role
 from trirail.workspace.mechanism import Mechanism
 
 STAGE = 0.05
@@ -28,15 +31,21 @@ def shown(info: Info) -> ShownRobot:
         raise ServiceError(f"the service is of another version, {info.version}: {error}") from error
 
 
-def describe(info: Info, robot: ShownRobot, user: str) -> dict[str, Any]:
-    """Return what a tab must know, ready to be encoded."""
+def describe(info: Info, robot: ShownRobot, user: str, role: Role | None) -> dict[str, Any]:
+    """Return what a tab must know, ready to be encoded, whose user has a role."""
     parts = Mechanism.of(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform
     return {
         "tell": "robot",
         "name": info.robot,
         "user": user,
+        "role": role,
+        "permissions": sorted(permissions(role, Role(info.takeover))),
+        "largest_file": MAX_MESSAGE,
         "version": info.version,
+        "lease": info.lease,
+        "tools": robot.frames.tool,
+        "frames": robot.frames.work,
         "velocity": platform.velocity,
         "speeds": SPEEDS,
         "homes": info.homes,

@@ -1,73 +1,82 @@
-"""Whether a pose can be gone to from where the robot stands, said while it is typed or dragged; the service decides."""
+"""Whether a pose can be gone to, or a file followed, said before anything moves; the service decides."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
+from msgspec import Struct
 from trirail_drivers.interface import Triple
 
-from trirail.errors import KinematicsError
+from trirail.client import trajectory
+from trirail.client.outgoing import goal_message
+from trirail.errors import KinematicsError, RefusedError, TrirailError
 from trirail.telemetry.shown_robot import ShownRobot
+from trirail.wire.goals import TrajectoryGoal
 
 LOOKS = 40
 """Poses on the way, straight in pose space, that are looked at, its end first."""
-Asked = tuple[Triple, int]
-"""A pose, x, y [m] and phi [rad], and the number of the question."""
+DRAWN = 200
+"""Places of a path, evenly in time, that are drawn."""
 
 
-def problem(robot: ShownRobot, start: Triple, end: Triple) -> str:
-    """Return what is in the way from one pose to another, straight in pose space; empty where nothing is known to be.
+def problem(robot: ShownRobot, start: Triple, end: Triple, tool: str | None, frame: str) -> tuple[str, bool]:
+    """Return what is in the way from a pose to another, straight in pose space, and whether it is before the end.
 
-    Poses are x, y [m] and phi [rad] in the base frame. Positions, passive travel and the singular margin are looked
-    at, at LOOKS places; speeds and what the planner finds between them are the service's to judge.
+    `start` is the centre's in the base frame, `end` the tool's in a frame of the robot's, x, y [m] and phi [rad]; the
+    tool goes straight. Empty where nothing is known to be in the way: positions, passive travel and the singular
+    margin are looked at, at LOOKS places; speeds and what the planner finds between them are the service's to judge.
     """
+    from trirail.motion.frames import NamedFrames, rotated
+    from trirail.motion.runs import of_centre, of_tool, rest
     from trirail.workspace.violations import violations
 
-    for place, share in enumerate(np.linspace(1.0, 0.0, LOOKS, endpoint=False)):
-        pose = share * np.asarray(end) + (1.0 - share) * np.asarray(start)
+    names = NamedFrames(robot.frames)
+    try:
+        point, (x, y, angle) = names.tool(tool), names.frame(frame)
+    except RefusedError as error:
+        return str(error), False
+    u, v = rotated(end[0], end[1], angle)
+    first, last = np.array(of_tool(rest(start), point).pose), np.array((x + u, y + v, angle + end[2]))
+    for share in np.linspace(1.0, 0.0, LOOKS, endpoint=False):
+        pose = of_centre(rest((share * last + (1.0 - share) * first).tolist()), point).pose
         try:
-            found = violations(robot.geometry, robot.limits, pose)
+            found = violations(robot.geometry, robot.limits, np.asarray(pose))
         except KinematicsError as error:
-            return f"{error}" if place == 0 else f"on the way: {error}"
+            return str(error), bool(share < 1.0)
         if found:
-            return str(found[0]) if place == 0 else f"on the way: {found[0]}"
-    return ""
+            return str(found[0]), bool(share < 1.0)
+    return "", False
 
 
-class PathCheck:
-    """Answers the newest question of a tab in a thread of its own, that begins with the first one."""
+class CheckedPath(Struct, frozen=True, omit_defaults=True):
+    """What a file's path comes to."""
 
-    def __init__(self, find: Callable[[Triple], str], answer: Callable[[int, str], None]) -> None:
-        self._find = find
-        self._answer = answer
-        self._changed = threading.Condition()
-        self._asked: Asked | None = None
-        self._thread: threading.Thread | None = None
-        self._closed = False
+    why: str = ""
+    """Why it cannot be followed; empty where it can."""
+    line: Sequence[Triple] = ()
+    """Poses along it, in the base frame [m, rad]; its points alone where it cannot be followed."""
+    duration: float = 0.0
+    """How long it takes at full speed [s]."""
+    slowed: float = 1.0
+    """How many times slower that is than was asked for."""
 
-    def ask(self, pose: Triple, number: int) -> None:
-        """Have it answered; one that still waits is left out for it."""
-        with self._changed:
-            self._asked = pose, number
-            self._changed.notify()
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="path check", daemon=True)
-            self._thread.start()
 
-    def close(self) -> None:
-        """Answer no more."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
+def checked_path(robot: ShownRobot, name: str, text: str, stretch: bool) -> CheckedPath:
+    """Read a trajectory and plan it as the service would from its first point: its whole path is checked."""
+    from trirail.motion.goals import Goals
+    from trirail.motion.runs import nominal, rest
+    from trirail.motion.schedule import Schedule
 
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                while self._asked is None and not self._closed:
-                    self._changed.wait()
-                if self._closed:
-                    return
-                (pose, number), self._asked = self._asked, None  # type: ignore[misc]
-            self._answer(number, self._find(pose))
+    line: list[Triple] = []
+    try:
+        points = tuple(trajectory.parse(name, text))
+        line = [(point.x, point.y, point.phi) for point in points]
+        goal, period = TrajectoryGoal(points, stretch=stretch), 1.0 / robot.rate_hz
+        goal_message(goal, "checked")  # as the client does
+        planned = Goals(robot.geometry, robot.limits, period).plan(goal, Schedule(rest(line[0]), period), 1.0, 0)
+    except (TrirailError, ValueError) as error:
+        return CheckedPath(str(error), line)
+    path = planned.run.path
+    poses = [nominal(path, float(s)).pose for s in np.linspace(0.0, path.duration, DRAWN)]
+    return CheckedPath("", [(float(x), float(y), float(phi)) for x, y, phi in poses], planned.duration, planned.slowed)

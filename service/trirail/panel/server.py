@@ -9,7 +9,9 @@ import threading
 from collections.abc import Iterator
 from http import HTTPStatus
 from importlib import resources
+from urllib.parse import unquote
 
+import msgspec
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
@@ -19,18 +21,30 @@ from trirail.errors import ServiceError
 from trirail.panel.connections import Connections
 from trirail.panel.feed import Feed
 from trirail.panel.guard import refused
+from trirail.panel.recordings import Recordings
 from trirail.panel.tab import Tab
+from trirail.wire.sizes import MAX_MESSAGE
 
 HOST = "127.0.0.1"
 PORT = 9880
 """The page's port, where it is free and no other is asked for."""
 SOCKET = "socket"
 """The name below the token under which the page's WebSocket is."""
-LONGEST = 4096
-"""Messages of the page are shorter than that [bytes]."""
+LONGEST = 3 * MAX_MESSAGE
+"""Messages of the page are shorter than that: a file that is to be followed, as a text of JSON [bytes]."""
+LANGUAGES = "languages.json"
+"""The page's languages: code, and what those call it who speak it."""
+SESSIONS, RECORDING, REPORT = "sessions", "recording", "report"
+"""What of the recordings can be asked for."""
 OPENING = 5.0
 """So long may a request take: it comes from this machine [s]."""
-TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+TYPES = {
+    "html": "text/html",
+    "css": "text/css",
+    "js": "text/javascript",
+    "svg": "image/svg+xml",
+    "json": "application/json",
+}
 HEADERS = {
     # Nothing from elsewhere, in no frame of elsewhere (clickjacking), and the token is told to nobody.
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
@@ -50,6 +64,7 @@ class Panel:
         self._feed = Feed(robot)
         self._token = secrets.token_urlsafe(16)
         self._files = dict(_files())
+        self._recordings = Recordings(robot.name, self._feed.recordings)
         listening = _listen(port)
         self.url = f"http://{HOST}:{listening.getsockname()[1]}/{self._token}/"
         """The address to open; whoever has it can move the robot."""
@@ -93,14 +108,25 @@ class Panel:
             if self._connections.keep(opened.socket):
                 return None
             return _response(HTTPStatus.SERVICE_UNAVAILABLE, b"the panel is open in too many tabs: close one\n", "txt")
+        if name == SESSIONS:
+            return _response(HTTPStatus.OK, msgspec.json.encode(self._recordings.listed()), "json")
+        folder, _, rest = name.partition("/")
+        if folder == RECORDING and (sent := self._recordings.send(opened, rest, HEADERS)):
+            return sent
+        if folder == REPORT and (words := self._recordings.report(unquote(rest))):
+            return _response(HTTPStatus.OK, words.encode(), "txt")
         if name not in self._files:
             return _response(HTTPStatus.NOT_FOUND, b"no such file\n", "txt")
         return _response(HTTPStatus.OK, self._files[name], name.rpartition(".")[2])
 
 
 def _files() -> Iterator[tuple[str, bytes]]:
+    languages = {}
     for file in (resources.files("trirail.panel") / "page").iterdir():
         yield file.name, file.read_bytes()
+        if file.name.endswith(".json"):
+            languages[file.name.removesuffix(".json")] = msgspec.json.decode(file.read_bytes())["language"]
+    yield LANGUAGES, msgspec.json.encode(dict(sorted(languages.items())))
 
 
 def _response(status: HTTPStatus, body: bytes, suffix: str) -> Response:

@@ -1,5 +1,7 @@
 // The last alignment: what each mark had to go at each look, when, and how it ended; its button is there once there is one.
 
+import { onLanguage, quoted, say } from "./words.js";
+
 const LOOKS = 5; // columns, the newest
 const WELL = ["reached", "calibrated", "checked"];
 
@@ -9,6 +11,9 @@ export class Alignment {
     this.button = button;
     this.looks = [];
     this.newest = [0, 0];
+    this.user = "";
+    this.time = 0;
+    onLanguage(() => this.looks.length && this.show());
   }
 
   event({ alignment: look, user, seq, time }) {
@@ -17,26 +22,28 @@ export class Alignment {
     const first = this.looks[0];
     if (first && (first.id !== look.id || first.purpose !== look.purpose)) this.looks = [];
     this.looks.push(look);
-    this.show(user, time);
+    [this.user, this.time] = [user, time];
+    this.show();
   }
 
-  show(user, time) {
+  show() {
     const last = this.looks.at(-1);
     const seen = this.looks.filter((look) => look.marks).slice(-LOOKS);
-    const when = new Date(time * 1e3).toLocaleTimeString("en-GB");
+    const when = new Date(this.time * 1e3).toLocaleTimeString("en-GB");
     const corrections = this.looks.filter((look) => look.correction).length;
-    const made = last.purpose === "alignment" ? `, ${corrections} correction${corrections === 1 ? "" : "s"}` : "";
-    const how = last.end ? `${last.end} in ${(last.seconds ?? 0).toFixed(2)} s${made}` : "under way";
+    const values = { end: last.end && say(`alignment.${last.end}`), seconds: (last.seconds ?? 0).toFixed(2), corrections };
+    const how = !last.end ? "alignment.under_way" : last.purpose === "alignment" ? "alignment.corrected" : "alignment.ended";
     const names = [...new Set(seen.flatMap((look) => look.marks.map((mark) => mark.name)))];
     const table = made_of("table", [
-      made_of("tr", [made_of("th", ["mark"]), ...seen.map((look) => made_of("th", [`look ${look.number}`]))]),
-      ...names.map((name) => made_of("tr", [made_of("th", [name]), ...seen.map((look) => made_of("td", [way(look, name)]))])),
+      made_of("tr", [made_of("th", [say("alignment.mark")]), ...seen.map((look) => made_of("th", [say("alignment.look", { number: look.number })]))]),
+      ...names.map((name) => made_of("tr", [made_of("th", [quoted(name)]), ...seen.map((look) => made_of("td", [way(look, name)]))])),
     ]);
-    const says = made_of("p", [`${when} ${how}${last.words ? `: ${last.words}` : ""}`]);
+    const says = made_of("p", [`${when} ${say(how, values)}`, ...(last.words ? [": ", quoted(last.words)] : [])]);
     if (last.end && !WELL.includes(last.end)) says.className = "warning";
-    const title = last.purpose[0].toUpperCase() + last.purpose.slice(1);
-    this.section.replaceChildren(made_of("h2", [`${title} `, made_of("small", [`${last.id} of ${user}`])]), says, table);
-    this.button.textContent = `${title}: ${last.end ?? "…"}`;
+    const title = say(`alignment.${last.purpose}`);
+    const whose = made_of("small", [say("alignment.of", { id: last.id, user: this.user })]);
+    this.section.replaceChildren(made_of("h2", [`${title} `, whose]), says, table);
+    this.button.textContent = `${title}: ${values.end ?? "…"}`;
     this.button.hidden = false;
   }
 }

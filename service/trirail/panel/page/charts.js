@@ -1,6 +1,7 @@
 // The last minutes as curves: where the robot is, how far its sliders are behind, and how late its loop is.
 
 import uPlot from "./uplot.js";
+import { say } from "./words.js";
 
 const KEPT = 180; // seconds
 const EVERY = 100; // between two points [ms]
@@ -20,16 +21,15 @@ export class Charts {
     this.plots = [];
   }
 
-  // Begin anew, for this robot.
+  // Draw anew, for this robot and in the language of now.
   robot({ sliders, colours }) {
     for (const plot of this.plots) plot.destroy();
-    this.times.length = this.rows.length = 0;
     const [x, y, phi] = ["--accent", "--second", "--third"].map(style);
     this.plots = [
       plot("x, y [mm]", [["x", x], ["y", y]], [0, 1]),
       plot("φ [°]", [["φ", phi]], [2]),
-      plot("following error [µm]", sliders.map((name, k) => [name, colours.sliders[k]]), [3, 4, 5]),
-      plot("lateness, 99 % [µs]", [["lateness", x]], [6]),
+      plot(say("chart.error"), sliders.map((name, k) => [name, colours.sliders[k]]), [3, 4, 5]),
+      plot(say("chart.lateness"), [[say("chart.late"), x]], [6]),
     ];
   }
 

@@ -32,6 +32,7 @@ export class Drawing {
     this.chosen = add("g", "");
     lines(parts.outline, "wanted", this.chosen);
     lines(parts.arms, "wanted", this.chosen);
+    this.route = add("polyline", "");
     this.wanted(null, null);
     this.platform = add("g", "");
     lines(parts.outline, "platform", this.platform);
@@ -61,6 +62,12 @@ export class Drawing {
     this.chosen.style.display = pose ? "" : "none";
     this.chosen.setAttribute("class", may === null ? "" : may ? "free" : "barred");
     if (pose) place(this.chosen, pose);
+  }
+
+  // Show a path of poses, and whether it can be followed.
+  path(poses, may) {
+    this.route.setAttribute("class", may ? "route free" : "route barred");
+    this.route.setAttribute("points", points(poses));
   }
 
   // Where a pointer is, in metres.

@@ -54,7 +54,7 @@ export class Hold {
     if (event.ctrlKey || event.metaKey || event.altKey) return this.end(); // the key's end may be told to nobody
     const onButton = event.key === "Enter" && this.buttons.includes(event.target);
     const axis = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    if (!onButton && (!axis || event.target.matches("input, #events"))) return;
+    if (!onButton && (!axis || event.target.matches("input, select, #events, #sessions"))) return;
     event.preventDefault();
     if (event.repeat) return;
     const [name, sign] = axis ?? [];
@@ -63,7 +63,7 @@ export class Hold {
   }
 
   #down(by, button) {
-    if (button.disabled) return;
+    if (button.disabled) return; // as where the role does not allow it
     this.held.set(by, button);
     button.classList.add("held");
     this.press(button.dataset);

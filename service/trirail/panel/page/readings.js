@@ -1,5 +1,7 @@
 // What the robot says in words and numbers: mode, faults, pose, sliders, events, and answers to what was pressed.
 
+import { quoted, say } from "./words.js";
+
 const KEPT = 200; // so many events are shown
 const byId = (id) => document.getElementById(id);
 
@@ -12,11 +14,15 @@ export class Readings {
     this.decimals = 2;  // of mm; of degrees one more
   }
 
-  robot({ name, user, version, colours, sliders, decimals }) {
+  waits() {
+    text(byId("mode-name"), say("connecting"));
+  }
+
+  robot({ name, user, role, version, colours, sliders, decimals }) {
     this.decimals = decimals;
     this.colours = colours.modes;
     byId("name").textContent = name;
-    byId("user").textContent = `as ${user}, trirail ${version}`;
+    byId("user").textContent = say("user", { user, role: say(`role.${role ?? "none"}`), version });
     document.title = `${name} – trirail`;
     this.sliders.forEach((cells, k) => {
       const head = cells[0].parentElement.firstChild;
@@ -25,17 +31,19 @@ export class Readings {
     });
   }
 
-  state({ mode, pose, goal, sliders, faults, override, lease }) {
+  state({ mode, pose, goal, sliders, faults, override }) {
     const doing = [];
     const waits = mode === "holding" || override === 0;  // half-way, paused or at override 0
-    if (goal?.lag != null) doing.push(`follows a target, ${(goal.lag * 1000).toFixed(1)} mm behind`);
-    else if (goal) doing.push(goal.target ? `${goal.id} ${Math.round(goal.progress * 100)} %, ${waits && goal.progress < 1 ? "waits" : `${goal.remaining.toFixed(1)} s left`}` : "jog");
-    if (override !== 1) doing.push(`override ${Math.round(override * 100)} %`);
-    if (lease) doing.push(`lease: ${lease}`);
-    text(byId("mode-name"), mode);
+    if (goal?.lag != null) doing.push(say("doing.track", { lag: (goal.lag * 1000).toFixed(1) }));
+    else if (goal?.target) {
+      const key = waits && goal.progress < 1 ? "doing.waits" : "doing.goal";
+      doing.push(say(key, { id: goal.id, percent: Math.round(goal.progress * 100), left: goal.remaining.toFixed(1) }));
+    } else if (goal) doing.push(say("doing.jog"));
+    if (override !== 1) doing.push(say("doing.override", { percent: Math.round(override * 100) }));
+    text(byId("mode-name"), say(`mode.${mode}`, {}, mode));
     text(byId("doing"), doing.join(" · "));
     byId("lamp").style.background = this.colours[mode] ?? "transparent";
-    this.alarm(faults.length ? `Fault: ${faults.join("\n")}\nRemove the cause, then Reset, then Enable.` : "");
+    this.alarm(...(faults.length ? [say("fault"), faults.join("\n"), say("fault.remedy")] : []));
     const shown = (value, k) => (k < 2 ? `${fixed(value * 1e3, this.decimals)} mm` : `${fixed((value * 180) / Math.PI, this.decimals + 1)}°`);
     this.pose.forEach(([measured, target], k) => {
       text(measured, shown(pose[k], k));
@@ -48,16 +56,20 @@ export class Readings {
   }
 
   lost(why) {
-    text(byId("mode-name"), "no contact");
+    text(byId("mode-name"), say("no_contact"));
     text(byId("doing"), "");
     byId("lamp").style.background = "transparent";
     for (const cell of [...this.pose, ...this.sliders].flat()) text(cell, "–");
     this.alarm(why);
   }
 
-  alarm(words) {
-    byId("alarm").hidden = !words;
-    text(byId("alarm"), words); // the same words again are not said again
+  // The page's words, what the robot says, and the page's again.
+  alarm(words = "", said = "", remedy = "") {
+    const whole = words + said + remedy;
+    byId("alarm").hidden = !whole;
+    if (whole === this.alarmed) return; // the same words again are not said again
+    this.alarmed = whole;
+    byId("alarm").replaceChildren(words, " ", quoted(said), "\n", remedy);
   }
 
   event({ seq, time, level, message, outcome }) {
@@ -73,9 +85,10 @@ export class Readings {
     while (byId("events").childElementCount > KEPT) byId("events").lastChild.remove();
   }
 
-  answer(words, refused = false) {
+  // The page's words, and what the service says.
+  answer(words, refused = false, said = "") {
     byId("answer").classList.toggle("refused", refused);
-    text(byId("answer"), words);
+    byId("answer").replaceChildren(words, ...(said ? [words && " ", quoted(said)] : []));
   }
 }
 

@@ -1,0 +1,94 @@
+// Following a path in a file: checked and drawn when it is chosen, followed when it is told, and how far it is meanwhile.
+
+import { onLanguage, quoted, say } from "./words.js";
+
+const byId = (id) => document.getElementById(id);
+const shown = (seconds) => String(Number(seconds.toPrecision(3)));
+
+export class Following {
+  // `send` says a message to the server; `now()` has the robot and its drawing; `allow` looks anew what may be pressed.
+  constructor(send, now, allow, answer) {
+    this.send = send;
+    this.now = now;
+    this.allow = allow;
+    this.number = 0;
+    this.file = null; // name and text of what is chosen
+    this.found = null; // what the server says of it
+    this.goal = null; // its goal's id, while it is under way
+    byId("choose-file").addEventListener("click", () => byId("file").click());
+    byId("file").addEventListener("change", () => this.#choose(byId("file").files[0]));
+    byId("stretch").addEventListener("change", () => this.#check());
+    byId("file-start").addEventListener("click", () => {
+      answer(say("answer.asked", { what: say("do.pose") }));
+      send({ do: "pose", pose: this.found.line[0] });
+    });
+    byId("following").addEventListener("submit", (event) => {
+      event.preventDefault();
+      answer(say("answer.asked", { what: say("do.follow", this.file) }));
+      send({ do: "follow", ...this.file, stretch: byId("stretch").checked });
+    });
+    onLanguage(() => this.#show());
+  }
+
+  // Whether there is a path that can be followed.
+  get may() {
+    return this.found !== null && !this.found.why;
+  }
+
+  // The server says what the file comes to.
+  checked({ number, found }) {
+    if (number !== this.number) return;
+    this.found = { why: "", line: [], slowed: 1, ...found };
+    this.#show();
+  }
+
+  accepted(id) {
+    this.goal = id;
+  }
+
+  // How far it is, where it is what the robot does; the file's words again when it has ended.
+  state({ goal }) {
+    const runs = goal !== null && goal.id === this.goal;
+    byId("file-progress").hidden = !runs;
+    if (!runs) return this.running && ((this.running = false), this.#show());
+    this.running = true;
+    byId("file-progress").value = goal.progress;
+    const words = say("file.under_way", { ...this.file, percent: Math.round(goal.progress * 100), left: goal.remaining.toFixed(1) });
+    if (byId("file-says").textContent !== words) byId("file-says").textContent = words;
+  }
+
+  // Its drawing once more, on a robot that is drawn anew.
+  draw() {
+    this.now().drawing?.path(this.found?.line ?? [], this.may);
+  }
+
+  async #choose(file) {
+    byId("file").value = ""; // so that the same one can be chosen again, when it has been changed
+    if (!file) return;
+    this.file = this.found = null;
+    if (file.size > this.now().robot.largest_file) {
+      byId("file-says").textContent = say("file.large", file);
+      return this.draw();
+    }
+    this.file = { name: file.name, text: await file.text() };
+    this.#check();
+  }
+
+  #check() {
+    if (!this.file) return;
+    this.found = null;
+    this.send({ do: "check path", ...this.file, stretch: byId("stretch").checked, number: ++this.number });
+    this.#show();
+  }
+
+  #show() {
+    const { file, found } = this;
+    this.draw();
+    this.allow();
+    byId("following").dataset.may = found ? (this.may ? "yes" : "no") : "";
+    if (!file) return;
+    const values = { name: file.name, duration: shown(found?.duration ?? 0), slowed: shown(found?.slowed ?? 1) };
+    const key = !found ? "checking" : found.why ? "barred" : found.slowed > 1 ? "slowed" : "free";
+    byId("file-says").replaceChildren(say(`file.${key}`, values), ...(found?.why ? [" ", quoted(found.why)] : []));
+  }
+}

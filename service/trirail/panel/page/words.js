@@ -1,0 +1,53 @@
+// The page's words: a JSON file for each language, chosen by the browser's language, or by the switch.
+
+const KEPT = "trirail language";
+const ATTRIBUTES = { sayLabel: "aria-label", sayTitle: "title", sayPlaceholder: "placeholder" };
+let words = {};
+const listeners = [];
+
+// What stands for a key, with values in it; for a key that there is not, `otherwise`.
+export function say(key, values = {}, otherwise = key) {
+  return (words[key] ?? otherwise).replace(/\{(\w+)\}/g, (_, name) => values[name] ?? "");
+}
+
+// Call it whenever the language has changed.
+export function onLanguage(listener) {
+  listeners.push(listener);
+}
+
+// What the robot says, in its own words, beside the page's.
+export function quoted(text) {
+  const span = document.createElement("span");
+  span.translate = false;
+  span.textContent = text;
+  return span;
+}
+
+async function fetched(name) {
+  try {
+    return await (await fetch(name)).json();
+  } catch {
+    return {}; // the page works, and STOP with it
+  }
+}
+
+async function show(code) {
+  words = await fetched(`${code}.json`);
+  document.documentElement.lang = code;
+  for (const element of document.querySelectorAll("[data-say]")) element.textContent = say(element.dataset.say);
+  for (const [name, attribute] of Object.entries(ATTRIBUTES))
+    for (const element of document.querySelectorAll(`[data-${name.replace(/[A-Z]/, (letter) => `-${letter.toLowerCase()}`)}]`))
+      element.setAttribute(attribute, say(element.dataset[name]));
+  for (const listener of listeners) listener();
+}
+
+const languages = await fetched("languages.json");
+const wished = [localStorage.getItem(KEPT), ...navigator.languages.map((each) => each.split("-")[0]), "en"];
+const chosen = wished.find((each) => each in languages) ?? "en";
+const choice = document.getElementById("language");
+for (const [code, name] of Object.entries(languages)) choice.add(new Option(name, code, false, code === chosen));
+choice.addEventListener("change", () => {
+  localStorage.setItem(KEPT, choice.value);
+  show(choice.value);
+});
+await show(chosen);

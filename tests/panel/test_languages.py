@@ -1,0 +1,161 @@
+"""The page's languages: each has every word, and no word of the page is outside of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import trirail
+from chromium import Page, chromium, needs_chromium
+from panel.fake_robot import FakeRobot
+from trirail.panel.server import LANGUAGES, Panel
+from trirail.wire.vocabulary import Command, Mode, Role
+
+PAGE = Path(str(trirail.__file__)).parent / "panel/page"
+FILES = {file.stem: msgspec.json.decode(file.read_bytes(), type=dict[str, str]) for file in PAGE.glob("*.json")}
+SHOWN = "document.body.dataset.contact === 'yes'"
+WORDS = re.compile(r"[^\W\d_]{3,}")
+"""Three letters or more: what is shorter is a coordinate or a unit."""
+
+
+def places(text: str) -> list[str]:
+    return sorted(re.findall(r"\{(\w+)\}", text))
+
+
+def test_german_and_english_are_there() -> None:
+    assert {"en", "de"} <= set(FILES)
+
+
+@pytest.mark.parametrize("code", FILES)
+def test_every_language_has_every_word_with_the_same_values_in_it(code: str) -> None:
+    assert set(FILES[code]) == set(FILES["en"])
+    for key, text in FILES[code].items():
+        assert text.strip(), key
+        assert places(text) == places(FILES["en"][key]), key
+
+
+def test_every_word_is_used_and_every_one_used_is_there() -> None:
+    """Where a key has a part that is not known before, all that are possible are there."""
+    source = "\n".join(file.read_text() for file in (*PAGE.glob("*.js"), PAGE / "index.html") if file.stem != "uplot")
+    used = set(re.findall(r"""data-say(?:-\w+)?="([\w.]+)\"""", source)) | set(re.findall(r'say\("([\w.]+)"', source))
+    assert used <= set(FILES["en"])
+    made = {f"mode.{mode}" for mode in Mode} | {f"do.{name}" for name in Command} | {f"role.{role}" for role in Role}
+    assert made <= set(FILES["en"])
+    literals = set(re.findall(r"""["'`]([\w.]+)["'`]""", source)) | {"language"}
+    stems = tuple(set(re.findall(r"`([a-z_]+\.)\$\{", source)))
+    unused = {key for key in FILES["en"] if key not in used | literals and not key.startswith(stems)}
+    assert not unused
+
+
+# ---------------------------------------------------------------------- in a browser
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with chromium("chromium", tmp_path_factory.mktemp("profile"), ["--disable-gpu"]) as page:
+        yield page
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> FakeRobot:
+    robot = FakeRobot(homes=("A",))
+    frames = {"tool": {"tip": (0.02, 0.0)}, "work": {"table": (0.01, 0.0, 0.2)}}
+    robot.told = msgspec.structs.replace(robot.told, frames=frames, recordings=str(tmp_path))
+    return robot
+
+
+MARKED = {key: f"⟦{text}⟧" for key, text in FILES["en"].items()}
+FOUND = """(() => {
+  const found = [];
+  const own = (element) => element.closest('[translate=no]') === null;
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  for (let node = walker.nextNode(); node; node = walker.nextNode())
+    if (own(node.parentElement) && !node.parentElement.closest('script, style')) found.push(node.data);
+  for (const element of document.querySelectorAll('*'))
+    for (const name of ['aria-label', 'title', 'placeholder', 'alt'])
+      if (element.hasAttribute(name)) found.push(element.getAttribute(name));
+  return found;
+})()"""
+
+
+def outside(page: Page) -> list[str]:
+    """The page's words that come from no language file; of the robot is what is not to be translated."""
+    return [text for text in page.evaluate(FOUND) if WORDS.search(unmarked(text))]
+
+
+def unmarked(text: str) -> str:
+    """What is in no marks; words may be values in others."""
+    while (rest := re.sub(r"⟦[^⟦⟧]*⟧", "", text)) != text:
+        text = rest
+    return text
+
+
+@pytest.mark.viewer
+@needs_chromium
+def test_no_word_of_the_page_is_outside_of_the_languages(browser: Page, robot: FakeRobot) -> None:
+    with Panel(robot.robot(), 0) as panel:
+        panel._files["xx.json"] = msgspec.json.encode(MARKED)
+        panel._files[LANGUAGES] = msgspec.json.encode({"xx": "marked"})
+        page = browser.another()
+        page.open("about:blank")
+        page.languages("xx")
+        page.navigate(panel.url)
+        page.until(f"{SHOWN} && document.querySelector('#people').textContent")
+        assert page.evaluate("document.querySelector('#mode-name').textContent") == "⟦disabled⟧"
+        assert outside(page) == []
+        page.click("[data-command=enable]")
+        page.until("document.querySelector('#answer').textContent.includes('done')")
+        for view in ("charts", "sessions", "mechanism", "following", "to-pose"):
+            page.click(f"[data-view={view}]")
+            assert outside(page) == [], view
+        for step in range(5):
+            page.click(f"[data-step='{step}']")
+        for words in ("900", "ten", "1"):
+            for field in ("x", "y", "phi"):
+                page.write(f"#to-{field}", words)
+            page.evaluate("new Promise((done) => setTimeout(done, 150))")
+            assert outside(page) == [], words
+        robot.fault("drive B: EMCY 8700")
+        page.until("!document.querySelector('#alarm').hidden")
+        assert outside(page) == []
+        robot.silent.set()
+        page.until("document.body.dataset.contact === 'none'")
+        assert outside(page) == []
+        page.close()
+
+
+@pytest.mark.viewer
+@needs_chromium
+def test_the_language_is_the_browser_s_or_that_of_the_switch_and_keeps_the_lease(
+    browser: Page, robot: FakeRobot
+) -> None:
+    with Panel(robot.robot(), 0) as panel:
+
+        def opened() -> Page:
+            page = browser.another()
+            page.open("about:blank")
+            page.languages("de-CH")
+            page.navigate(panel.url)
+            page.until(SHOWN)
+            return page
+
+        page = opened()
+        shown: dict[str, Any] = {"en": "Enable", "de": "Ein"}
+        assert page.text("[data-command=enable]") == shown["de"]
+        page.click("[data-command=enable]")
+        page.click("[data-command=acquire]")
+        page.until("document.querySelector('#lease').textContent.startsWith('Sie')")
+        page.choose("#language", "en")
+        page.until(f"document.querySelector('[data-command=enable]').innerText === {shown['en']!r}")
+        assert page.evaluate("document.documentElement.lang") == "en"
+        page.until("document.querySelector('#lease').textContent.startsWith('You')")
+        assert "release" not in robot.commands
+        page.close()
+        again = opened()  # what was chosen is kept
+        assert again.text("[data-command=enable]") == shown["en"]
+        again.evaluate("localStorage.clear()")
+        again.close()

@@ -1,0 +1,122 @@
+"""What a role may do at the page: all else is not offered there, and refused where it is asked for all the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from chromium import Page, chromium, needs_chromium
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from panel.fake_robot import FakeRobot
+from trirail.panel.permissions import permissions
+from trirail.panel.server import Panel
+from trirail.wire.vocabulary import Command, Role
+from websockets.sync.client import connect
+
+OPERATOR = {"goal", "enable", "disable", "quick_stop", "pause", "resume", "override", "acquire", "release"}
+MAINTAINER = OPERATOR | {"poses", "takeover", "reset", "home"}
+MAY: dict[Role | None, set[str]] = {
+    None: set(),
+    Role.VIEWER: {"stop"},
+    Role.OPERATOR: OPERATOR | {"stop"},
+    Role.MAINTAINER: MAINTAINER | {"stop"},
+}
+"""Once more, by hand."""
+PATH = "t,x,y,phi\n0,0.01,0.005,0.1\n1,0.011,0.005,0.1\n"
+ACTIONS: list[tuple[str, dict[str, Any]]] = [
+    *((name, {"do": "command", "name": name}) for name in Command if name is not Command.OVERRIDE),
+    ("override", {"do": "override", "percent": 50.0}),
+    ("takeover", {"do": "takeover"}),
+    ("goal", {"do": "hold", "velocity": [0.01, 0.0, 0.0], "seen": 10**15}),
+    ("goal", {"do": "step", "by": [0.001, 0.0, 0.0], "seen": 10**15}),
+    ("goal", {"do": "goto", "name": "park"}),
+    ("goal", {"do": "pose", "pose": [0.0, 0.0, 0.0]}),
+    ("goal", {"do": "follow", "name": "path.csv", "text": PATH}),
+    ("poses", {"do": "teach", "name": "here"}),
+    ("poses", {"do": "forget", "name": "park"}),
+]
+
+
+@pytest.mark.parametrize("role", MAY)
+@pytest.mark.parametrize("takeover", Role)
+def test_a_role_may_what_the_table_says(role: Role | None, takeover: Role) -> None:
+    taking = {"takeover"} if role is not None and role.includes(takeover) else set()
+    assert permissions(role, takeover) == MAY[role] - {"takeover"} | taking
+
+
+def done(robot: FakeRobot) -> list[Any]:
+    """All that has reached the robot."""
+    return [*robot.commands, *robot.sent, *robot.gone_to, *robot.moved_to, *robot.followed, *robot.forced, *robot.named]
+
+
+@settings(max_examples=60, deadline=None)
+@given(role=st.sampled_from(list(MAY)), action=st.sampled_from(ACTIONS), enabled=st.booleans())
+def test_what_a_role_may_not_reaches_no_robot(
+    role: Role | None, action: tuple[str, dict[str, Any]], enabled: bool
+) -> None:
+    needs, message = action
+    robot = FakeRobot()
+    robot.granted, robot.mode = role, "holding" if enabled else "disabled"
+    before = done(robot)
+    with (
+        Panel(robot.robot(), 0) as panel,
+        connect(f"{panel.url.replace('http', 'ws')}socket", legacy=True) as opened,
+    ):
+        opened.send(msgspec.json.encode(message))
+        if message["do"] == "hold" and needs in MAY[role]:
+            while not robot.sent:
+                opened.recv(10.0)
+            return
+        while True:
+            said = msgspec.json.decode(opened.recv(10.0))
+            if said["tell"] in ("refused", "done", "accepted"):
+                break
+    if needs in MAY[role]:
+        assert done(robot) != before
+    else:
+        assert said["tell"] == "refused"
+        assert "role" in said["message"]
+        assert done(robot) == before
+
+
+# ---------------------------------------------------------------------- the page
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with chromium("chromium", tmp_path_factory.mktemp("profile"), ["--disable-gpu"]) as page:
+        yield page
+
+
+@pytest.mark.viewer
+@needs_chromium
+@pytest.mark.parametrize("role", MAY)
+def test_the_page_offers_what_a_role_may_and_nothing_else(browser: Page, role: Role | None, tmp_path: Path) -> None:
+    robot = FakeRobot(homes=("A",))
+    robot.granted, robot.mode = role, "holding"
+    with Panel(robot.robot(), 0) as panel:
+        page = browser.another()
+        page.open(panel.url)
+        page.until("document.body.dataset.contact === 'yes'")
+        offered = set(
+            page.evaluate(
+                "[...document.querySelectorAll('[data-command]')].filter((each) => each.checkVisibility())"
+                ".map((each) => each.dataset.command)"
+            )
+        )
+        for what, selector in {"goal": "#pad", "poses": "#teach", "override": "#override", "stop": "#stop"}.items():
+            if page.evaluate(f"document.querySelector({selector!r}).checkVisibility()"):
+                offered.add(what)
+        assert offered == MAY[role] | {"stop"}  # that is pressed whoever one is; the service decides
+        before = done(robot)
+        for key in ("ArrowRight", "a"):
+            page.key_down(key)
+        page.evaluate("new Promise((done) => setTimeout(done, 200))")
+        for key in ("ArrowRight", "a"):
+            page.key_up(key)
+        assert (done(robot) != before) == ("goal" in MAY[role])
+        page.close()
