@@ -7,7 +7,6 @@ cameras alone; drives' own errors are not in them. The seconds are a running ser
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 import tempfile
@@ -23,6 +22,7 @@ from trirail.alignment.procedure import LOOK, Sighting, StageMotion, Task, Wish,
 from trirail.alignment.rigid import Floats, rigid_error, turned
 from trirail.client import own_service
 from trirail.client.client import Robot
+from trirail.client.stage_as_built import built_otherwise
 from trirail.config import SIM, geometry, load
 from trirail.kinematics.geometry import Geometry, Leg, PprLeg, other_kind
 from trirail.kinematics.robot import forward, inverse
@@ -116,7 +116,7 @@ def computed(parts: int) -> dict[str, Any]:
         other: Model = lambda pose, robot=mistaken: inverse(robot, pose).position  # type: ignore[misc]  # noqa: E731
         cases: dict[str, tuple[Any, ...]] = {
             "ideal": (lambda _, robot=ideal: robot, exact),
-            "as built": (lambda rng, robot=ideal: as_built(robot, rng), exact),
+            "as built": (lambda rng, robot=ideal: built_otherwise(robot, rng, PLACES, ANGLES), exact),
             "ideal, one picture of a part": (lambda _, robot=ideal: robot, exact, 1),
             "small angles": (lambda _, robot=ideal: robot, small_angles(ideal)),
             "the other kind's model": (lambda _, robot=ideal: robot, other),
@@ -163,29 +163,6 @@ def _left(stage: ComputedStage, aim: Floats) -> tuple[float, float]:
     """Return how far the farthest mark truly is from its place [m], and by what angle the part is turned [rad]."""
     at = np.array([placed(q, stage.true) for q in stage.part.values()])
     return float(np.linalg.norm(at - aim, axis=1).max()), abs(rigid_error(at, aim).turn)
-
-
-def as_built(robot: Geometry, rng: np.random.Generator) -> Geometry:
-    """Return a stage whose legs differ from their configuration by up to PLACES and ANGLES."""
-
-    def near(place: Pair) -> Pair:
-        x, y = (np.array(place) + rng.uniform(-PLACES, PLACES, 2)).tolist()
-        return x, y
-
-    def angle(value: float) -> float:
-        return value + float(rng.uniform(-ANGLES, ANGLES))
-
-    legs: list[Any] = []
-    for leg in robot.each:
-        names = ("pivot", "cross_angle") if isinstance(leg, PprLeg) else ("edge_point", "edge_angle")
-        changes = {
-            "anchor": near(leg.anchor),
-            "rail_angle": angle(leg.rail_angle),
-            names[0]: near(getattr(leg, names[0])),
-            names[1]: angle(getattr(leg, names[1])),
-        }
-        legs.append(dataclasses.replace(cast(Any, leg), **changes))
-    return Geometry(tuple(legs))
 
 
 def small_angles(robot: Geometry) -> Model:

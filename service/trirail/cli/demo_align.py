@@ -1,10 +1,12 @@
-"""`trirail demo align`: parts laid right by two simulated cameras, with pictures, marks and residuals in Rerun."""
+"""`trirail demo align`: parts laid right by two simulated cameras, with pictures, marks and residuals in Rerun.
+
+The cameras see a stage that is built otherwise than configured, with play in its drives.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -22,8 +24,8 @@ from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
 from trirail.cli.terminal import counted, out, plain
 from trirail.client import own_service
 from trirail.client.client import Robot
-from trirail.config import load
-from trirail.wire.records import unpack
+from trirail.client.stage_as_built import StageAsBuilt, built_otherwise
+from trirail.config import corrected_geometry, load
 
 PARTS = 5
 OFF, TURNED = 0.4e-3, math.radians(0.25)
@@ -36,39 +38,22 @@ VIEWS = {
 }
 BY, TURN = 0.5e-3, math.radians(0.5)
 """Moves of the calibration [m, rad]."""
-WAIT = 0.05
-"""How long the cameras need to show what is: exposure, delay, and the time until records come [s]."""
-HISTORY = 2000
+SIZE = 960, 720
+EXPOSURE, DELAY = 0.004, 0.01
+WAIT = 0.02
+"""How long the cameras need to show what is: exposure and delay, and the drives' settling [s]."""
+BUILT_OFF, BUILT_TURNED, PLAY = 50e-6, 0.1e-3, 0.5e-6
+"""By how much the stage is built otherwise than configured, in each place [m] and angle [rad]; the drives' play [m]."""
 COLOURS = {"mark": (90, 200, 250), "target": (250, 200, 60), "residual": (240, 90, 90)}
-
-
-class PoseHistory:
-    """Where the robot was measured to be in its newest cycles, from the records that the service publishes."""
-
-    def __init__(self) -> None:
-        self._poses: deque[tuple[float, Triple]] = deque(maxlen=HISTORY)
-
-    def take(self, batch: bytes) -> None:
-        """Take a batch of records."""
-        for row in unpack(batch):
-            x, y, phi = row["pose"].tolist()
-            self._poses.append((float(row["deadline_ns"]) * 1e-9, (x, y, phi)))
-
-    def at(self, time: float) -> Triple:
-        """Return the pose at a time of the monotonic clock [s]: that of the cycle nearest to it."""
-        return min(tuple(self._poses), key=lambda each: abs(each[0] - time))[1]
-
-    def __bool__(self) -> bool:
-        return bool(self._poses)
 
 
 class DrawnCameras:
     """Two simulated cameras over a part, whose pictures go to Rerun as they are taken."""
 
-    def __init__(self, history: PoseHistory, stream: rr.RecordingStream, seed: int) -> None:
+    def __init__(self, stage: StageAsBuilt, stream: rr.RecordingStream, seed: int) -> None:
         self.part: Mapping[str, Pair] = PLACES
         self.targets: Mapping[str, Pair] = {}
-        self._history, self._stream = history, stream
+        self._stage, self._stream = stage, stream
         self._rng = np.random.default_rng(seed)
 
     def look(self) -> dict[str, Pair]:
@@ -77,10 +62,11 @@ class DrawnCameras:
         now = time.monotonic()
         self._stream.set_time("time", duration=now)
         for name, place in self.part.items():
+            marks_there = {name: DrawnMark(DISC, place)}
             camera = SimulatedCamera(
-                VIEWS[name], {name: DrawnMark(DISC, place)}, 960, 720, noise=3.0, shade=0.4, exposure=0.004, delay=0.01
+                VIEWS[name], marks_there, *SIZE, noise=3.0, shade=0.4, exposure=EXPOSURE, delay=DELAY
             )
-            picture = camera.picture(self._history.at, now, self._rng)
+            picture = camera.picture(self._stage.pose_at, now, self._rng)
             found = find(picture, MarkShape("disc", DISC.size * VIEWS[name].scale))
             if found is not None:
                 marks[name] = (found.u, found.v)
@@ -106,17 +92,16 @@ def run(file: Path, recording: Path, parts: int = PARTS, seed: int = 0) -> int:
     recording.parent.mkdir(parents=True, exist_ok=True)
     pictures = recording.with_name(f"{recording.stem}-pictures.rrd")
     out.print(f"[bold]trirail demo align[/]: starting the service on {plain(file.name)}")
-    history, results = PoseHistory(), []
+    built = built_otherwise(corrected_geometry(config), np.random.default_rng(seed), BUILT_OFF, BUILT_TURNED)
+    stage, results = StageAsBuilt(built, (PLAY, PLAY, PLAY)), []
     with own_service.service(file, recording), rr.RecordingStream("trirail_align") as stream:
         sinks: list[rr.FileSink | rr.GrpcSink] = [rr.FileSink(pictures)]
         if config.telemetry.live_port:
             sinks.append(rr.GrpcSink(f"rerun+http://127.0.0.1:{config.telemetry.live_port}/proxy"))
         stream.set_sinks(*sinks)
-        with Robot(config.robot.name, config.zenoh.listen[0], user="demo") as robot, robot.records(history.take):
+        with Robot(config.robot.name, config.zenoh.listen[0], user="demo") as robot, robot.records(stage.take):
             robot.enable()
-            while not history:
-                time.sleep(0.01)
-            cameras = DrawnCameras(history, stream, seed)
+            cameras = DrawnCameras(stage, stream, seed)
             results = list(_parts(robot, cameras, stream, parts, seed))
             robot.disable()
             stream.disconnect()  # while the live view is there to take the rest

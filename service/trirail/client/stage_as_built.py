@@ -1,0 +1,97 @@
+"""Where a stage really stands that is not as its service believes: built otherwise, and with play in its drives.
+
+For simulated cameras: it takes the records that a service publishes, and has from them what its encoders measured.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections import deque
+from typing import Any, cast
+
+import numpy as np
+from trirail_drivers.interface import Triple
+
+from trirail.errors import ServiceError
+from trirail.kinematics.geometry import Geometry, PprLeg
+from trirail.kinematics.robot import forward
+from trirail.wire.records import unpack
+
+HISTORY = 5000
+"""Cycles that are kept."""
+COMES_WITHIN = 2.0
+"""How long the records of a time may take until they are there [s]."""
+
+
+def built_otherwise(robot: Geometry, rng: np.random.Generator, places: float, angles: float) -> Geometry:
+    """Return a robot whose legs differ from those given by up to so much in each coordinate [m] and angle [rad]."""
+
+    def near(place: tuple[float, float]) -> tuple[float, float]:
+        x, y = (np.array(place) + rng.uniform(-places, places, 2)).tolist()
+        return x, y
+
+    def angle(value: float) -> float:
+        return value + float(rng.uniform(-angles, angles))
+
+    legs: list[Any] = []
+    for leg in robot.each:
+        point, turn = ("pivot", "cross_angle") if isinstance(leg, PprLeg) else ("edge_point", "edge_angle")
+        changes = {
+            "anchor": near(leg.anchor),
+            "rail_angle": angle(leg.rail_angle),
+            point: near(getattr(leg, point)),
+            turn: angle(getattr(leg, turn)),
+        }
+        legs.append(dataclasses.replace(cast(Any, leg), **changes))
+    return dataclasses.replace(robot, legs=tuple(legs))
+
+
+class StageAsBuilt:
+    """The sliders and the table of a robot, from its records: `robot.records(stage.take)`.
+
+    `built` is the geometry of the stage itself, with its own errors as a correction; `play` is how far each motor turns
+    before its slider goes along, where it turns back [m]. Motors begin in the middle of it.
+    """
+
+    def __init__(self, built: Geometry, play: Triple = (0.0, 0.0, 0.0)) -> None:
+        self._built = built
+        self._half = np.abs(play) / 2.0
+        self._changed = threading.Condition()
+        self._cycles: deque[tuple[float, tuple[float, ...]]] = deque(maxlen=HISTORY)
+        self._sliders: np.ndarray[tuple[int], np.dtype[np.float64]] | None = None
+
+    def take(self, batch: bytes) -> None:
+        """Take a batch of records."""
+        rows = unpack(batch)
+        motors = rows["position"]
+        sliders = np.array(motors[0]) if self._sliders is None else self._sliders
+        with self._changed:
+            for time, motor in zip((rows["deadline_ns"] * 1e-9).tolist(), motors, strict=True):
+                sliders = np.clip(sliders, motor - self._half, motor + self._half)
+                self._cycles.append((time, tuple(sliders.tolist())))
+            self._sliders = sliders
+            self._changed.notify_all()
+
+    def sliders_at(self, time: float) -> Triple:
+        """Return where the sliders were at a time of the monotonic clock [s], between two cycles in a straight line.
+
+        In metres. It waits for records of then. Raises ServiceError where none come, or those are not kept any more.
+        """
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._cycles and self._cycles[-1][0] >= time, COMES_WITHIN):
+                raise ServiceError(f"no records of time {time:.3f} s within {COMES_WITHIN:g} s: does the service run?")
+            after = len(self._cycles) - 1
+            while after > 0 and self._cycles[after - 1][0] >= time:
+                after -= 1
+            (begin, first), (end, last) = self._cycles[max(0, after - 1)], self._cycles[after]
+        if time < begin:
+            raise ServiceError(f"time {time:.3f} s is before the records that are kept: they begin at {begin:.3f} s")
+        share = (time - begin) / (end - begin) if end > begin else 1.0
+        a, b, c = (p + share * (q - p) for p, q in zip(first, last, strict=True))
+        return a, b, c
+
+    def pose_at(self, time: float) -> Triple:
+        """Return where the table was then: x, y [m], phi [rad]. Raises ServiceError, and KinematicsError for none."""
+        x, y, phi = forward(self._built, self.sliders_at(time)).tolist()
+        return x, y, phi
