@@ -7,16 +7,22 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from trirail.alignment.images import CameraView
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from trirail.alignment.images import CameraView, Pair
 from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
 from trirail.cli import mark_source
+from trirail.cli.mark_options import MarkSource
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
+from trirail_drivers.interface import Triple
 
 WITHIN = 60.0
 MARKS = """
@@ -74,6 +80,8 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
     assert found["reached"]
     assert len(found["corrections"]) == 1
     assert json.loads(kept.read_text(encoding="utf-8"))["calibration"]["confirmed"]
+    told = json.loads(trirail("align", "check", kept, *marks, "--moves", "--json").stdout)
+    assert [(view["view"], view["changed"]) for view in told["views"]] == [("left", False), ("right", False)]
     assert "the part lies right" in trirail("align", "run", kept, *marks, *loose).stdout
     part.write_text(json.dumps({"left": [-0.06, 0.01], "right": [0.061, 0.01]}), encoding="utf-8")
     refused = trirail("align", "run", kept, *marks, *loose, code=1).stderr
@@ -91,7 +99,7 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
 )
 def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(program: str, words: str) -> None:
     def look() -> None:
-        with mark_source.program(program) as ask:
+        with mark_source.program(program) as (ask, _):
             ask()
 
     with pytest.raises(TrirailError, match=words):
@@ -107,12 +115,126 @@ def test_marks_of_pictures_are_found_and_older_pictures_are_not_taken(
     camera = SimulatedCamera(view, {"m": DrawnMark(MarkShape("cross", 200e-6), (1e-4, 0.0))}, 320, 240, noise=1.0)
     picture = camera.picture(lambda _: (0.0, 0.0, 0.0), 0.0, np.random.default_rng(0))
     cv2.imwrite(str(tmp_path / "left.png"), picture)
-    with mark_source.folder(tmp_path, MarkShape("cross", 50.0), 0.0) as look:
+    with mark_source.folder(tmp_path, MarkShape("cross", 50.0), 0.0) as (look, _):
         assert look() == {"left": pytest.approx((185.0, 120.0), abs=0.05)}
         with pytest.raises(TrirailError, match="no newer pictures"):
             look()
         cv2.imwrite(str(tmp_path / "left.png"), np.full_like(picture, 90))
         assert look() == {}
+
+
+def drawn(places: dict[str, Pair], pose: Triple = (0.0, 0.0, 0.0)) -> NDArray[np.uint8]:
+    """Return a picture of discs on the table, 320 × 240 pixels."""
+    view = CameraView((0.0, 0.0), (160.0, 120.0), ((2.5e5, 0.0), (0.0, -2.5e5)))
+    marks = {name: DrawnMark(MarkShape("disc", 160e-6), place) for name, place in places.items()}
+    return SimulatedCamera(view, marks, 320, 240).picture(lambda _: pose, 0.0, np.random.default_rng(0))
+
+
+TWO: dict[str, Pair] = {"a": (-3e-4, 0.0), "b": (3e-4, 1e-4)}
+WINDOWS = {"a": (0, 0, 160, 240), "b": (160, 0, 160, 240)}
+
+
+def test_several_marks_of_one_picture_are_each_found_in_its_window(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    cv2.imwrite(str(tmp_path / "top.png"), drawn(TWO))
+    options = [f"{name}=top:{','.join(map(str, at))}" for name, at in WINDOWS.items()]
+    with MarkSource(pictures=tmp_path, window=tuple(options), shape="disc", size=40.0).opened() as (look, views):
+        assert look() == {"a": pytest.approx((85.0, 120.0), abs=0.05), "b": pytest.approx((235.0, 95.0), abs=0.05)}
+        assert views == {"a": "top", "b": "top"}
+    with (
+        MarkSource(pictures=tmp_path, window=("a=top:200,0,160,240",)).opened() as (look, _),
+        pytest.raises(TrirailError, match="beyond its picture of 320 × 240"),
+    ):
+        look()
+    with (
+        MarkSource(pictures=tmp_path, window=("a=side:0,0,1,1",)).opened() as (look, _),
+        pytest.raises(TrirailError, match="no picture side for mark a; there are top"),
+    ):
+        look()
+
+
+def film(path: Path, frames: list[NDArray[np.uint8]]) -> str:
+    """Write a film without loss; return its path."""
+    cv2 = pytest.importorskip("cv2")
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30.0, (320, 240), False)
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no films")
+    writer.set(cv2.VIDEOWRITER_PROP_QUALITY, 100)
+    for frame in frames:
+        writer.write(frame)
+    writer.release()
+    return str(path)
+
+
+def test_one_camera_that_shows_several_marks_is_opened_once_and_read_once_a_look(tmp_path: Path) -> None:
+    """A film whose part moves: were each mark read by itself, they would be of different pictures."""
+    poses = [(1e-5 * n, 0.0, 0.0) for n in range(8)]
+    path = film(tmp_path / "film.avi", [drawn(TWO, pose) for pose in poses])
+    windows = tuple(f"{name}={','.join(map(str, at))}" for name, at in WINDOWS.items())
+    source = MarkSource(camera=(f"a={path}", f"b={path}"), window=windows, shape="disc", size=40.0)
+    with source.opened() as (look, views):
+        assert views is not None
+        assert len(set(views.values())) == 1
+        for n in (1, 3, 5, 7):
+            seen = look()
+            assert seen["a"] == pytest.approx((85.0 + 2.5 * n, 120.0), abs=0.1)
+            assert seen["b"] == pytest.approx((235.0 + 2.5 * n, 95.0), abs=0.1)
+        with pytest.raises(TrirailError, match="gives no picture any more"):
+            look()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"camera": ("a=0", "b=0")}, "give each a --window"),
+        ({"camera": ("a=0", "b=0"), "window": ("a=0,0,9,9",)}, "give each a --window"),
+        ({"camera": ("a=0",), "window": ("b=0,0,9,9",)}, "no --camera shows that mark"),
+        ({"camera": ("a=0",), "window": ("a=0,0,9",)}, "MARK=U,V,WIDTH,HEIGHT is wanted"),
+        ({"camera": ("a=0",), "window": ("a=0,0,-9,9",)}, "MARK=U,V,WIDTH,HEIGHT is wanted"),
+        ({"camera": ("a",)}, "MARK=DEVICE is wanted"),
+        ({"program": "true", "window": ("a=0,0,9,9",)}, "--window is for pictures"),
+    ],
+)
+def test_what_cannot_be_meant_of_a_source_is_said(options: dict[str, Any], words: str) -> None:
+    pytest.importorskip("cv2")
+    with pytest.raises(TrirailError, match=words), MarkSource(**options).opened():
+        pass
+
+
+class Camera:
+    """A camera whose driver keeps pictures that nobody has read: those are handed out at once, a new one when it comes.
+
+    Time passes as it is waited.
+    """
+
+    def __init__(self, period: float, kept: int, frames: float = -1.0) -> None:
+        self._period, self._frames, self.now = period, frames, 100.0
+        self._begun = [self.now - period * (n + 1) for n in range(kept)][::-1]
+        self._held = -1.0
+        self._phase = self.now + 0.3 * period
+
+    def get(self, _: int) -> float:
+        return self._frames
+
+    def grab(self) -> bool:
+        if self._begun:
+            self._held = self._begun.pop(0)
+            self.now += 1e-4
+        else:
+            self._held, self.now = self._phase - self._period, max(self.now, self._phase)
+            self._phase += self._period
+        return True
+
+    def read(self) -> tuple[bool, float]:
+        return self.grab(), self._held
+
+
+@given(st.floats(0.008, 0.2), st.integers(0, 8))
+def test_a_picture_of_a_camera_was_begun_after_it_was_asked_for(period: float, kept: int) -> None:
+    camera = Camera(period, kept)
+    begun = mark_source.newest(camera, 7, lambda: camera.now)
+    assert begun >= 100.0
+    assert camera.now < 100.0 + 3.0 * period
 
 
 def test_marks_of_what_opencv_opens_are_found_in_pictures_that_are_newer_than_the_look(tmp_path: Path) -> None:
@@ -123,7 +245,7 @@ def test_marks_of_what_opencv_opens_are_found_in_pictures_that_are_newer_than_th
         x = 1e-4 * n
         picture = camera.picture(lambda _: (x, 0.0, 0.0), 0.0, np.random.default_rng(0))  # noqa: B023
         cv2.imwrite(str(tmp_path / f"film_{n:02d}.png"), picture)
-    with mark_source.cameras({"m": str(tmp_path / "film_%02d.png")}, MarkShape("disc", 50.0), 0.0) as look:
+    with mark_source.cameras({"m": str(tmp_path / "film_%02d.png")}, MarkShape("disc", 50.0), 0.0) as (look, _):
         assert look() == {"m": pytest.approx((185.0, 120.0), abs=0.05)}
         assert look() == {"m": pytest.approx((235.0, 120.0), abs=0.05)}
         with pytest.raises(TrirailError, match="gives no picture any more"):

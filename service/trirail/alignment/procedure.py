@@ -34,8 +34,10 @@ __all__ = [
     "Wish",
     "align",
     "calibrated_first",
+    "calibration_again",
     "calibration_by_moves",
     "look_only",
+    "moves_for",
 ]
 
 MOVES: tuple[Triple, ...] = tuple(
@@ -69,6 +71,14 @@ class Task(NamedTuple):
 
 
 Conversation = Generator[Wish, Sighting, Alignment]
+
+
+def moves_for(lens: Lens, by: float, turn: float) -> tuple[Triple, ...]:
+    """Return the moves that tell a lens: ±by along x and y [m], ±turn [rad], for a bent one into the corners too."""
+    straight = ((by, 0.0), (-by, 0.0), (0.0, by), (0.0, -by))
+    corners = () if lens == "affine" else ((by, by), (-by, by), (-by, -by), (by, -by))
+    ways = tuple((x, y, 0.0) for x, y in (*straight, *corners))
+    return (*ways, (0.0, 0.0, turn), (0.0, 0.0, -turn))
 
 
 def align(task: Task) -> Conversation:
@@ -137,6 +147,15 @@ def calibration_by_moves(
         raise
     yield LookReport("calibration", end="calibrated", noise=found.noise)
     return found
+
+
+def calibration_again(kept: CameraCalibration, looks: int = 1) -> Generator[Wish, Sighting, CameraCalibration]:
+    """Calibrate the same views by the same moves, from where the robot stands."""
+    x, y, phi = kept.poses[0]
+    moves = [(each[0] - x, each[1] - y, each[2] - phi) for each in kept.poses[1:]]
+    views = {name: mark.view for name, mark in kept.marks.items()}
+    view = next(iter(kept.views.values()))
+    return (yield from calibration_by_moves(moves, views, view.lens, view.centre, looks))
 
 
 def _look(pictures: int) -> Generator[Wish, Sighting, Sighting]:

@@ -2,73 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
-from cyclopts import App, Parameter
+from cyclopts import App
 
-from trirail.cli import mark_source, terminal, units
+from trirail.cli import alignment_lines, mark_source, terminal, units
+from trirail.cli.mark_options import MarkSource
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
 
 if TYPE_CHECKING:
-    from trirail.alignment.calibration import CameraCalibration
-    from trirail.alignment.procedure import Alignment, Measurement
     from trirail.client.calibration_file import CalibrationFile
 
 app = App(name="align", help="Lay a part right by marks in cameras: calibrate once, then run for each part.")
 FILE = Path("camera.json")
-ARCSECONDS = 3600.0 * 180.0 / math.pi
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class MarkSource:
-    """Where the marks are from: one of --program, --pictures and --camera."""
-
-    program: str | None = None
-    'A program that prints a line of JSON, {"mark": [u, v], …} in pixels, for each line that it reads.'
-    pictures: Path | None = None
-    "A folder with the newest picture for each mark, as left.png."
-    camera: Annotated[tuple[str, ...], Parameter(negative="")] = ()
-    "MARK=DEVICE, a camera's number or address for OpenCV, as left=0; again for another mark."
-    shape: Literal["cross", "disc", "corner"] = "cross"
-    "What is looked for in pictures."
-    size: float = 100.0
-    "Its size in pixels: a disc's diameter, a cross's bars, a corner's sides."
-    turn: float = 0.0
-    "By what angle it is turned in the picture, from u to v, in degrees."
-
-    @contextlib.contextmanager
-    def opened(self) -> Iterator[mark_source.Look]:
-        """Open it. Raises TrirailError."""
-        from trirail.alignment.shapes import MarkShape
-
-        given = [self.program is not None, self.pictures is not None, bool(self.camera)]
-        if sum(given) != 1:
-            raise TrirailError("marks are from one of --program, --pictures and --camera; give one of them")
-        shape, turn = MarkShape(self.shape, self.size), math.radians(self.turn)
-        with contextlib.ExitStack() as stack:
-            if self.program is not None:
-                yield stack.enter_context(mark_source.program(self.program))
-            elif self.pictures is not None:
-                yield stack.enter_context(mark_source.folder(self.pictures, shape, turn))
-            else:
-                yield stack.enter_context(mark_source.cameras(dict(map(_device, self.camera)), shape, turn))
-
-
-def _device(text: str) -> tuple[str, str]:
-    name, equals, device = text.partition("=")
-    if not (name and equals and device):
-        raise TrirailError(f"--camera {text}: MARK=DEVICE is wanted, as left=0")
-    return name, device
-
-
 PROGRAM = MarkSource()
 
 
@@ -80,6 +29,9 @@ def calibrate(
     by: units.Length = 1e-3,
     angle: units.Angle = "1deg",
     one_camera: Annotated[bool, Flag] = False,
+    lens: Literal["affine", "perspective", "radial"] = "affine",
+    centre: tuple[float, float] | None = None,
+    approach: units.PoseWay = units.AT_REST,
     looks: int = 1,
     wait: float = 0.0,
     speed: units.Share = 1.0,
@@ -100,7 +52,13 @@ def calibrate(
     angle
         How far to turn, both ways.
     one_camera
-        One camera sees all marks; else each mark has a camera, or a place of one, of its own.
+        The program's marks are all seen by one camera; else each has a camera, or a place of one, of its own.
+    lens
+        What the pictures are like: perspective and radial lenses take four more moves, into the corners.
+    centre
+        Of a radial lens: the pixel U V on its axis, the middle of the picture for most.
+    approach
+        How far beyond each place to go first, X Y PHI, so that backlash is always on the same side.
     looks
         Pictures at each place.
     wait
@@ -108,22 +66,33 @@ def calibrate(
     speed
         Fraction of full speed, above 0 and up to 1.
     """
-    from trirail.alignment.procedure import MOVES
+    from trirail.alignment.procedure import moves_for
     from trirail.client import calibration_file
     from trirail.client.client import Robot
 
-    turn = units.radians(angle, False)
-    moves = [(x / 1e-3 * by, y / 1e-3 * by, math.copysign(turn, phi) if phi else 0.0) for x, y, phi in MOVES]
-    with source.opened() as look, Robot(service.robot, service.connect, tls=service.tls) as robot:
-        told = _telling(look, service, len(moves) + 1)
-        views = dict.fromkeys(look(), "camera") if one_camera else None
-        found = robot.calibrate_camera(told, moves, views=views, looks=looks, wait=wait, speed=speed)
+    if lens == "radial" and centre is None:
+        raise TrirailError(
+            "a radial lens wants --centre U V, the pixel on its axis: the middle of the picture for most"
+        )
+    moves = moves_for(lens, by, units.radians(angle, False))
+    with source.opened() as (look, known), Robot(service.robot, service.connect, tls=service.tls) as robot:
+        found = robot.calibrate_camera(
+            _telling(look, service, len(moves) + 1),
+            moves,
+            views=dict.fromkeys(look(), "camera") if one_camera else known,
+            lens=lens,
+            centre=centre or (0.0, 0.0),
+            looks=looks,
+            approach=_approach(approach),
+            wait=wait,
+            speed=speed,
+        )
         targets = dict(look())
     calibration_file.write(file, service.robot, found, targets)
     if service.json:
         terminal.json({"file": str(file), "targets": targets, "calibration": msgspec.to_builtins(found)})
     else:
-        _print_calibration(found, file)
+        alignment_lines.show_calibration(found, file)
     return 0
 
 
@@ -136,6 +105,7 @@ def run(
     angle: units.Angle = "24urad",
     corrections: int = 3,
     distance_ppm: float = 1000.0,
+    approach: units.PoseWay = units.AT_REST,
     looks: int = 1,
     wait: float = 0.0,
     speed: units.Share = 1.0,
@@ -156,6 +126,8 @@ def run(
         How many may be made.
     distance_ppm
         By how much the marks' distance may differ from their targets'.
+    approach
+        As at the calibration: how far beyond each place to go first, X Y PHI.
     looks
         Pictures a measurement.
     wait
@@ -167,7 +139,7 @@ def run(
     from trirail.client.client import Robot
 
     kept = _kept(file, service)
-    with source.opened() as look, Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with source.opened() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
         found = robot.align(
             _telling(look, service, None),
             kept.targets,
@@ -177,6 +149,7 @@ def run(
             corrections=corrections,
             distance=distance_ppm * 1e-6,
             looks=looks,
+            approach=_approach(approach),
             wait=wait,
             speed=speed,
         )
@@ -186,7 +159,7 @@ def run(
     if service.json:
         terminal.json({"reached": found.reached} | msgspec.to_builtins(found))
     else:
-        _print_alignment(found)
+        alignment_lines.show_alignment(found)
     return 0 if found.reached else 1
 
 
@@ -196,11 +169,16 @@ def check(
     /,
     *,
     distance_ppm: float = 1000.0,
+    moves: Annotated[bool, Flag] = False,
     looks: int = 1,
+    wait: float = 0.0,
+    speed: units.Share = 1.0,
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
-    """Look once, say how the part lies, and move nothing.
+    """Look once, say how the part lies, and move nothing; with --moves also whether the cameras stand as they did.
+
+    Exit 1 where a camera was shifted or turned.
 
     Parameters
     ----------
@@ -208,22 +186,41 @@ def check(
         The calibration, from `trirail align calibrate`.
     distance_ppm
         By how much the marks' distance may differ from their targets'.
+    moves
+        Make the calibration's moves again, with any part, and compare the cameras with how they were then.
     looks
-        Pictures of the measurement.
+        Pictures of a measurement, or at each place.
+    wait
+        How long the cameras take to show what is [s].
+    speed
+        Fraction of full speed, above 0 and up to 1.
     """
-    from trirail.alignment.procedure import Task, look_only
+    from trirail.alignment.changes import view_changes
+    from trirail.alignment.procedure import Task, calibration_again, look_only
     from trirail.client.alignment import drive
     from trirail.client.client import Robot
 
     kept = _kept(file, service)
     task = Task(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=looks)
-    with source.opened() as look, Robot(service.robot, service.connect, tls=service.tls) as robot:
+    changes = []
+    with source.opened() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
+        if moves:
+            now = drive(robot, look, calibration_again(kept.calibration, looks), speed, wait)
+            changes = view_changes(kept.calibration, now)
+            if not service.json:
+                alignment_lines.show_changes(changes)
         found = drive(robot, look, look_only(task), 1.0, 0.0)
     if service.json:
-        terminal.json(msgspec.to_builtins(found))
+        told = [msgspec.to_builtins(each) | {"changed": each.is_changed} for each in changes]
+        terminal.json(msgspec.to_builtins(found) | ({"views": told} if moves else {}))
     else:
-        terminal.say(_measured(found))
-    return 0
+        terminal.say(alignment_lines.measured(found))
+    return 1 if any(each.is_changed for each in changes) else 0
+
+
+def _approach(way: tuple[float, float, str]) -> tuple[float, float, float] | None:
+    x, y, phi = way[0], way[1], units.radians(way[2], False)
+    return (x, y, phi) if any((x, y, phi)) else None
 
 
 def _kept(file: Path, service: Service) -> CalibrationFile:
@@ -250,33 +247,3 @@ def _telling(look: mark_source.Look, service: Service, total: int | None) -> mar
         return seen
 
     return told
-
-
-def _print_calibration(found: CameraCalibration, file: Path) -> None:
-    for name, view in found.views.items():
-        mirrored = ", mirrored" if view.mirrored else ""
-        terminal.say(f"view {name}: {1e6 / view.scale:.3f} µm a pixel{mirrored}")
-    for name, mark in found.marks.items():
-        (x, y), (dx, dy) = mark.place, mark.deviation
-        terminal.say(f"mark {name}: x {x * 1e3:.3f} ± {dx * 1e3:.3f} mm, y {y * 1e3:.3f} ± {dy * 1e3:.3f} mm")
-    terminal.say(f"residual {found.noise:.3f} pixel; kept in {file}")
-
-
-def _measured(found: Measurement) -> str:
-    x, y = found.shift
-    return (
-        f"to go: x {x * 1e6:.2f} µm, y {y * 1e6:.2f} µm, φ {found.turn * ARCSECONDS:.2f} arcsec; "
-        f"a mark {found.worst * 1e6:.2f} µm at most; distance {found.distance * 1e6:+.0f} ppm"
-    )
-
-
-def _print_alignment(found: Alignment) -> None:
-    for measurement in found.measurements:
-        terminal.say(_measured(measurement))
-    reasons = {
-        "reached": "the part lies right",
-        "corrections": "no correction is left: raise --corrections or --tolerance, or look at backlash and noise",
-        "growing": "the error grew: the calibration is not of these cameras as they stand; calibrate anew",
-    }
-    made = terminal.counted(len(found.corrections), "correction")
-    terminal.say(f"{made} in {found.seconds:.2f} s: {reasons[found.why]}")

@@ -1,18 +1,25 @@
-"""Alignments of a recorded session as lines of its report."""
+"""Alignments in lines: calibrations, measurements, how they ended; those of a recorded session in its report."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from trirail.cli import terminal
 
 if TYPE_CHECKING:
+    from trirail.alignment.calibration import CameraCalibration
+    from trirail.alignment.changes import ViewChange
+    from trirail.alignment.procedure import Alignment, Measurement
     from trirail.analysis.summary import AlignmentSummary
 
+ARCSECONDS = 3600.0 * 180.0 / math.pi
 ENDED_WELL = ("reached", "calibrated", "checked")
 
 
-def show(alignments: list[AlignmentSummary]) -> None:
+def show_recorded(alignments: list[AlignmentSummary]) -> None:
     """Print each with what its marks had to go, look by look."""
     terminal.out.print("\nalignments")
     for each in alignments:
@@ -25,3 +32,49 @@ def show(alignments: list[AlignmentSummary]) -> None:
         for name, ways in each.residuals.items():
             shown = " → ".join("–" if way is None else f"{way * 1e6:.2f}" for way in ways)
             terminal.out.print(f"               {terminal.plain(name)}  {shown} µm to its target", soft_wrap=True)
+
+
+def show_calibration(found: CameraCalibration, file: Path) -> None:
+    """Print what a calibration has found, and where it is kept."""
+    for name, view in found.views.items():
+        mirrored = ", mirrored" if view.mirrored else ""
+        terminal.say(f"view {name}: {1e6 / view.scale:.3f} µm a pixel{mirrored}")
+    for name, mark in found.marks.items():
+        (x, y), (dx, dy) = mark.place, mark.deviation
+        terminal.say(f"mark {name}: x {x * 1e3:.3f} ± {dx * 1e3:.3f} mm, y {y * 1e3:.3f} ± {dy * 1e3:.3f} mm")
+    terminal.say(f"residual {found.noise:.3f} pixel; kept in {file}")
+
+
+def show_changes(changes: Iterable[ViewChange]) -> None:
+    """Print how each camera stands beside how it was calibrated."""
+    for each in changes:
+        (x, y), (dx, dy) = each.shift, each.shift_deviation
+        verdict = "[red]was moved: calibrate anew[/]" if each.is_changed else "as it was"
+        terminal.out.print(
+            f"view {terminal.plain(each.view)}: {verdict}; shifted by x {x * 1e6:.0f} ± {dx * 1e6:.0f} µm, "
+            f"y {y * 1e6:.0f} ± {dy * 1e6:.0f} µm, turned by {each.turn * 1e3:.2f} mrad, "
+            f"scale {each.scale * 1e6:+.0f} ppm, both ± {each.deviation * 1e6:.0f} ppm",
+            soft_wrap=True,
+        )
+
+
+def measured(found: Measurement) -> str:
+    """Return how a part lies, in a line."""
+    x, y = found.shift
+    return (
+        f"to go: x {x * 1e6:.2f} µm, y {y * 1e6:.2f} µm, φ {found.turn * ARCSECONDS:.2f} arcsec; "
+        f"a mark {found.worst * 1e6:.2f} µm at most; distance {found.distance * 1e6:+.0f} ppm"
+    )
+
+
+def show_alignment(found: Alignment) -> None:
+    """Print each look of an alignment, and how it ended."""
+    for measurement in found.measurements:
+        terminal.say(measured(measurement))
+    reasons = {
+        "reached": "the part lies right",
+        "corrections": "no correction is left: raise --corrections or --tolerance, or look at backlash and noise",
+        "growing": "the error grew: the calibration is not of these cameras as they stand; calibrate anew",
+    }
+    made = terminal.counted(len(found.corrections), "correction")
+    terminal.say(f"{made} in {found.seconds:.2f} s: {reasons[found.why]}")

@@ -7,9 +7,10 @@ import importlib
 import shlex
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, cast
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, cast
 
 import msgspec
 from trirail_drivers.errors import TrirailError
@@ -29,10 +30,33 @@ NEWER_WITHIN, POLL = 30.0, 0.02
 ENDS_WITHIN = 5.0
 """How long a program may take to end when it is told to [s]."""
 INSTALL = "pip install 'trirail[vision]'"
+AT_ONCE, MOST_KEPT = 0.002, 16
+"""A picture that comes sooner was waiting [s]; so many may wait."""
+
+
+class Window(NamedTuple):
+    """Where in which picture a mark is [pixel]; anywhere without a width."""
+
+    picture: str
+    u: int = 0
+    v: int = 0
+    width: int = 0
+    height: int = 0
+
+
+NO_WINDOWS: Mapping[str, Window] = {}
+
+
+class Source(NamedTuple):
+    """What tells of marks, and which of them one camera shows that stands still: the name of its view by the mark's."""
+
+    look: Look
+    views: Mapping[str, str] | None = None
+    """None where nobody knows, or each mark has a camera of its own."""
 
 
 @contextlib.contextmanager
-def program(command: str) -> Iterator[Look]:
+def program(command: str) -> Iterator[Source]:
     """Run a program that prints a line of JSON, {"mark": [u, v], …} [pixel], for each line that it reads.
 
     Raises TrirailError where it cannot be run, ends, or prints something else.
@@ -59,7 +83,7 @@ def program(command: str) -> Iterator[Look]:
         return marks
 
     try:
-        yield look
+        yield Source(look)
     finally:
         process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -72,11 +96,12 @@ def program(command: str) -> Iterator[Look]:
 
 
 @contextlib.contextmanager
-def folder(path: Path, shape: MarkShape, turn: float) -> Iterator[Look]:
-    """Find a mark in each of the newest pictures of a folder: of each mark the picture named after it, as left.png.
+def folder(path: Path, shape: MarkShape, turn: float, windows: Mapping[str, Window] = NO_WINDOWS) -> Iterator[Source]:
+    """Find marks in the newest pictures of a folder: of each mark the picture named after it, as left.png.
 
-    What takes the pictures replaces them: each look but the first waits until all are newer than at the one before.
-    Raises TrirailError, also where none comes within NEWER_WITHIN seconds.
+    With `windows` each of their marks is found there instead. What takes the pictures replaces them: each look but the
+    first waits until all are newer than at the one before. Raises TrirailError, also where none comes within
+    NEWER_WITHIN seconds.
     """
     cv2 = _opencv()
     if not path.is_dir():
@@ -90,57 +115,92 @@ def folder(path: Path, shape: MarkShape, turn: float) -> Iterator[Look]:
             if time.monotonic() > deadline:
                 raise TrirailError(f"{path}: no newer pictures within {NEWER_WITHIN:g} s: does what takes them run?")
             time.sleep(POLL)
-        pictures = sorted(each for each in path.iterdir() if each.suffix.lower() in PICTURES)
+        pictures = {each.stem: each for each in sorted(path.iterdir()) if each.suffix.lower() in PICTURES}
         if not pictures:
             raise TrirailError(f"{path}: no picture in it; wanted is one for each mark, as left.png")
+        wanted = windows or {name: Window(name) for name in pictures}
         marks: dict[str, tuple[float, float]] = {}
-        for each in pictures:
-            grey = cv2.imread(str(each), cv2.IMREAD_GRAYSCALE)
+        for name, window in wanted.items():
+            if (file := pictures.get(window.picture)) is None:
+                raise TrirailError(
+                    f"{path}: no picture {window.picture} for mark {name}; there are {', '.join(pictures)}"
+                )
+            grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
             if grey is None:
-                raise TrirailError(f"{each}: no picture that OpenCV reads; is it written while it is read?")
-            seen[each] = each.stat().st_mtime_ns
-            marks.update(_marks(each.stem, grey, shape, turn))
+                raise TrirailError(f"{file}: no picture that OpenCV reads; is it written while it is read?")
+            seen[file] = file.stat().st_mtime_ns
+            marks.update(_marks(name, grey, window, shape, turn))
         return marks
 
-    yield look
+    yield Source(look, {name: window.picture for name, window in windows.items()} or None)
 
 
 @contextlib.contextmanager
-def cameras(devices: dict[str, str], shape: MarkShape, turn: float) -> Iterator[Look]:
+def cameras(
+    devices: dict[str, str], shape: MarkShape, turn: float, windows: Mapping[str, Window] = NO_WINDOWS
+) -> Iterator[Source]:
     """Open cameras through OpenCV, {mark: device}, a number or an address, and find a mark in a picture of each.
 
-    Raises TrirailError.
+    Marks of one device are found in one picture, each in its window. Raises TrirailError.
     """
     cv2 = _opencv()
+    shown = Counter(devices.values())
+    for name, device in devices.items():
+        if shown[device] > 1 and name not in windows:
+            raise TrirailError(f"camera {device} shows several marks: give each a --window, as {name}=0,0,640,960")
+    if unknown := ", ".join(set(windows) - set(devices)):
+        raise TrirailError(f"--window of {unknown}: no --camera shows that mark")
     with contextlib.ExitStack() as opened:
         captures = {}
-        for name, device in devices.items():
+        for device in dict.fromkeys(devices.values()):
             capture = cv2.VideoCapture(int(device) if device.isdigit() else device)
             opened.callback(capture.release)
             if not capture.isOpened():
-                raise TrirailError(f"cannot open camera {device} of {name}: is it plugged in, and may you read it?")
-            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-            captures[name] = capture
+                names = ", ".join(name for name in devices if devices[name] == device)
+                raise TrirailError(f"cannot open camera {device} of {names}: is it plugged in, and may you read it?")
+            captures[device] = capture
 
         def look() -> Marks:
             marks: dict[str, tuple[float, float]] = {}
-            for name, capture in captures.items():
-                capture.grab()  # the one that was waiting is older than this look
-                read, frame = capture.read()
-                if not read:
-                    raise TrirailError(f"camera {devices[name]} of {name} gives no picture any more")
+            for device, capture in captures.items():
+                frame = newest(capture, cv2.CAP_PROP_FRAME_COUNT)
+                if frame is None:
+                    raise TrirailError(f"camera {device} gives no picture any more")
                 grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-                marks.update(_marks(name, grey, shape, turn))
+                for name, its in devices.items():
+                    if its == device:
+                        marks.update(_marks(name, grey, windows.get(name, Window(name)), shape, turn))
             return marks
 
-        yield look
+        yield Source(look, {name: f"camera {device}" for name, device in devices.items()} if windows else None)
 
 
-def _marks(name: str, grey: Any, shape: MarkShape, turn: float) -> dict[str, tuple[float, float]]:
+def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.monotonic) -> Any:
+    """Return a picture whose exposure has begun after the call; of a film the next but one. None where none comes.
+
+    A camera's driver keeps pictures that nobody has read: it hands one of those out at once, and a new one when that
+    comes. The first new one may have been begun before.
+    """
+    film = capture.get(frame_count) > 0
+    for _ in range(0 if film else MOST_KEPT):
+        asked = clock()
+        if not capture.grab() or clock() - asked > AT_ONCE:
+            break
+    if film:
+        capture.grab()
+    read, frame = capture.read()
+    return frame if read else None
+
+
+def _marks(name: str, grey: Any, window: Window, shape: MarkShape, turn: float) -> dict[str, tuple[float, float]]:
     from trirail.alignment.finding import find
 
-    found = find(grey, shape, turn)
-    return {} if found is None else {name: (found.u, found.v)}
+    rows, columns = grey.shape
+    if window.width and (window.u + window.width > columns or window.v + window.height > rows):
+        raise TrirailError(f"the window of {name} is beyond its picture of {columns} × {rows} pixels")
+    bottom, right = (window.v + window.height, window.u + window.width) if window.width else (rows, columns)
+    found = find(grey[window.v : bottom, window.u : right], shape, turn)
+    return {} if found is None else {name: (found.u + window.u, found.v + window.v)}
 
 
 def _opencv() -> Any:

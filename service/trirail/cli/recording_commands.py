@@ -236,7 +236,7 @@ def _print_summary(summed: Summary) -> None:
     if summed.goals:
         _print_goals(summed.goals)
     if summed.alignments:
-        alignment_lines.show(summed.alignments)
+        alignment_lines.show_recorded(summed.alignments)
     for title, colour, incidents in (("faults", "bold red", summed.faults), ("warnings", "yellow", summed.warnings)):
         if incidents:
             terminal.out.print(f"\n[{colour}]{title}[/]")

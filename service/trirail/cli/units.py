@@ -281,6 +281,8 @@ Angles = Annotated[
     tuple[str, ...], Parameter(converter=_angles, consume_multiple=True, negative="", show_default=False)
 ]
 """Angles, as many as there are."""
+PoseWay = Annotated[tuple[float, float, str], _three(LENGTH, ANGLE)]
+"""Of x, y [m] and φ."""
 PoseVelocity = Annotated[tuple[float, float, str], _three(VELOCITY, ANGULAR_VELOCITY)]
 """Of x, y [m/s] and φ."""
 PoseAcceleration = Annotated[tuple[float, float, str], _three(ACCELERATION, ANGULAR_ACCELERATION)]
