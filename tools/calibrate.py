@@ -28,7 +28,7 @@ from trirail.kinematics import correction_fit
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.calibration import Calibration, CalibrationError, identify
 from trirail.kinematics.geometry import LEGS, Geometry, singular_angles
-from trirail.wire.text import number
+from trirail.wire.units import ANGLE, LENGTH, quantity
 from trirail_drivers import files
 
 COLUMNS = ("x", "y", "phi", *LEGS)
@@ -53,25 +53,23 @@ def read(path: Path, *, degrees: bool = False) -> tuple[Array, Array, list[int]]
                 raise CalibrationError(f"line 1: the columns are {', '.join(names)}; wanted are {', '.join(COLUMNS)}")
             for fields in reader:
                 if fields:
-                    rows.append(_numbers(names, fields, reader.line_num))
+                    rows.append(_numbers(names, fields, reader.line_num, "deg" if degrees else "rad"))
                     lines.append(reader.line_num)
     except csv.Error as error:
         raise CalibrationError(f"not a CSV file: {error}") from error
     data = np.array(rows).reshape(-1, len(COLUMNS))
-    if degrees:
-        data[:, 2] = np.radians(data[:, 2])
     return data[:, :3], data[:, 3:], lines
 
 
-def _numbers(names: Sequence[str], fields: Sequence[str], line: int) -> list[float]:
-    """Return the fields of a row in the order of COLUMNS."""
+def _numbers(names: Sequence[str], fields: Sequence[str], line: int, bare: str) -> list[float]:
+    """Return the fields of a row in SI, in the order of COLUMNS; an angle without a unit is in `bare`."""
     if len(fields) != len(names):
         raise CalibrationError(f"line {line}: {len(fields)} fields; wanted are {len(names)}")
     given = dict(zip(names, fields, strict=True))
     values = []
     for name in COLUMNS:
         try:
-            values.append(number(given[name]))
+            values.append(quantity(given[name], ANGLE, bare) if name == "phi" else quantity(given[name], LENGTH))
         except ValueError as error:
             raise CalibrationError(f"line {line}: {name}: {error}") from error
     return values
@@ -179,10 +177,21 @@ def write(text: str, output: Path | None) -> None:
         raise CalibrationError(f"cannot write {output}: {error.strerror}") from error
 
 
+def length(text: str) -> float:
+    """Return a length of the command line [m]. Raises ValueError."""
+    return quantity(text, LENGTH)
+
+
+def angle(text: str) -> float:
+    """Return an angle of the command line [rad]. Raises ValueError."""
+    return quantity(text, ANGLE)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Calibrate; return the exit code."""
     parser = argparse.ArgumentParser(description="Identifies the geometry of a robot as built from measured poses.")
-    parser.add_argument("poses", type=Path, help=f"CSV file with the columns {', '.join(COLUMNS)} [m, rad]")
+    columns = f"CSV file with the columns {', '.join(COLUMNS)} [m, rad], or with units: 12.5um, 3arcsec"
+    parser.add_argument("poses", type=Path, help=columns)
     parser.add_argument("--config", type=Path, default=config.SIM, help="its geometry is where to start (%(default)s)")
     parser.add_argument("--output", type=Path, metavar="FILE", help="where to write the section; else standard output")
     parser.add_argument("--map", action="store_true", help="write the map of what the robot does beside its geometry")
@@ -195,9 +204,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="N",
         help="of the map, 1 to 8",
     )
-    parser.add_argument("--deg", action="store_true", help="phi is in degrees")
-    parser.add_argument("--position-noise", type=float, default=20e-6, metavar="M", help="of x and y [m] (%(default)s)")
-    parser.add_argument("--angle-noise", type=float, default=1e-4, metavar="RAD", help="of phi [rad] (%(default)s)")
+    parser.add_argument("--deg", action="store_true", help="phi is in degrees where it has no unit")
+    parser.add_argument("--position-noise", type=length, default=20e-6, metavar="M", help="of x, y [m] (%(default)s)")
+    parser.add_argument("--angle-noise", type=angle, default=1e-4, metavar="RAD", help="of phi [rad] (%(default)s)")
     try:
         calibrate(parser.parse_args(arguments))
     except TrirailError as error:

@@ -7,15 +7,18 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from decimal import Decimal
+from pathlib import Path
 
 import pytest
+from cyclopts import App, Argument, Token
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from trirail.cli import commands, units
-from trirail.cli.units import ANGLE, DIMENSIONS, LENGTH, Dimension, quantity, written
+from trirail.cli.units import written
 from trirail.wire import text
+from trirail.wire.units import ANGLE, DIMENSIONS, LENGTH, Dimension, quantity
 
 Run = Callable[..., tuple[int, str, str]]
 a_unit = st.sampled_from([(dimension, unit) for dimension in DIMENSIONS for unit in dimension.units])
@@ -231,17 +234,71 @@ def test_half_a_tool_or_half_a_pose_is_wrong_usage(
     assert said in capsys.readouterr().err
 
 
+OF_A_PICTURE = "--turn"
+"""By what angle a mark is turned in a picture: degrees are more than enough."""
+
+
+def arguments(app: App, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Argument]]:
+    """Yield every argument of every command with a name for it."""
+    for name in app:
+        if isinstance(inner := app[name], App) and not name.startswith("-"):
+            yield from arguments(inner, (*path, name))
+            if inner.default_command is not None:
+                for argument in inner.assemble_argument_collection():
+                    yield " ".join((*path, name, argument.name)), argument
+
+
+def test_every_length_and_angle_of_the_command_line_takes_microns_and_arcseconds() -> None:
+    """An argument is one by its converter, or by the unit that its help names: no other is a bare number of these."""
+    taken = set()
+    for name, argument in arguments(commands.app):
+        convert, said = argument.parameter.converter, argument.parameter.help or ""
+        if not callable(convert):
+            meant = re.search(r"\[(m|mm|rad|deg)\b|degree|millimetre", said)
+            assert meant is None or argument.hint is bool or argument.name == OF_A_PICTURE, (name, said)
+            continue
+        for word, other, dimension in (("350um", "0.35mm", LENGTH), ("18arcsec", "0.005deg", ANGLE)):
+            values = []
+            for each in (word, other):
+                tokens = [Token(keyword=None, value=each, source="", index=0)] * (argument.token_count()[0] or 1)
+                with contextlib.suppress(ValueError):
+                    found = convert(argument.hint, tokens)
+                    first = found[0] if isinstance(found, tuple) else found
+                    values.append(quantity(first, ANGLE) if isinstance(first, str) else first)
+            if len(values) == 2:
+                assert values[0] == pytest.approx(values[1], rel=1e-15), name
+                taken.add((name.split()[0], dimension.name))
+    for command in ("goto", "move", "ik"):
+        assert {(command, "a length"), (command, "an angle")} <= taken
+    assert {("sliders", "a length"), ("fk", "a length"), ("workspace", "an angle"), ("align", "a length")} <= taken
+
+
+PAGE = Path(commands.__file__).parents[1] / "panel" / "page" / "going.js"
+
+
+@pytest.mark.parametrize(("name", "dimension"), [("LENGTHS", LENGTH), ("ANGLES", ANGLE)])
+def test_the_page_takes_the_units_of_the_command_line(name: str, dimension: Dimension) -> None:
+    """The same sizes; a bare number and the signs of minutes and seconds of arc are the page's own."""
+    told = re.search(rf"^const {name} = {{ (.*) }};$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert told is not None
+    pairs = re.findall(r"""(?:"([^"]*)"|'(.)'|(\w+)): ([^,]+)""", told[1].replace("'\"'", "'″'").replace('"\'"', "'′'"))
+    sizes = {"".join(names): float(eval(size.replace("Math.PI", "math.pi"))) for *names, size in pairs}
+    assert {"mm", "um", "µm", "μm"} <= set(sizes) or {"deg", "arcsec", "°"} <= set(sizes)
+    for unit in set(sizes) - {"", "′", "″"}:
+        assert sizes[unit] == pytest.approx(float(dimension.units[unit]), rel=1e-12)
+
+
 @given(st.integers(0, 999), st.integers(0, 999), st.sampled_from(["", "-"]), st.sampled_from(["", "mm", " m", "deg"]))
 def test_a_decimal_comma_is_told_with_a_point(whole: int, part: int, sign: str, unit: str) -> None:
     with pytest.raises(ValueError, match=rf": write {sign}{whole}\.{part}, with a point"):
-        units.quantity(f"{sign}{whole},{part}{unit}", units.LENGTH)
+        quantity(f"{sign}{whole},{part}{unit}", LENGTH)
 
 
 @given(st.text("0123456789,;. m-", max_size=8).filter(lambda text: not re.match(r"\s*-?\d+,\d+(?![\d,.])", text)))
 def test_nothing_else_is_taken_for_one(text: str) -> None:
     said = ""
     try:
-        units.quantity(text, units.LENGTH)
+        quantity(text, LENGTH)
     except ValueError as error:
         said = str(error)
     assert "with a point" not in said

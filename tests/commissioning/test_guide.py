@@ -464,5 +464,5 @@ def test_no_rule_is_asked_for_what_was_answered_wrongly(tmp_path: Path) -> None:
     answers = {"What does the rule": ["ten", "1e9", "nan", "0,00 mm"], "Which slider": ["x"]}
     run = Run(tmp_path, person=Beside(only("A"), answers))
     assert run.of("move", "A").verdict == "ok"
-    assert sum("is no number" in line for line in run.person.lines) == 3
+    assert sum("is no length" in line for line in run.person.lines) == 3
     assert sum("is no answer here" in line for line in run.person.lines) == 1

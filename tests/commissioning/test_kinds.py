@@ -10,6 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from trirail.commissioning import kind_step
 from trirail.commissioning.kinds import AMPLE, DISTINCT, NEAR, KindPredicted, KindWay, judge_kind, predicted, way_apart
+from trirail.commissioning.person import Question, length
 from trirail.config import SIM, geometry, load
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
@@ -118,6 +119,13 @@ def test_what_is_neither_kind_is_said() -> None:
     for moved in (-4e-4, 2e-4, 1e-3):
         judged = judge_kind(("3-PRP", "3-PPR"), way, expected, moved, 1e-6)
         assert (judged.verdict, judged.words[1].endswith("it is neither")) == ("wrong", True)
+
+
+@given(st.integers(1, 4999), st.sampled_from((("", 1000), ("mm", 1000), ("um", 1), (" µm", 1), ("μm", 1))))
+def test_somebody_may_answer_in_microns(microns: int, written: tuple[str, int]) -> None:
+    unit, per = written
+    person = Beside(answers={"How far": [f"{microns / per:.3f}{unit}".replace(".", ",")]})
+    assert length(person, lambda: None, Question("How far?")) == pytest.approx(microns * 1e-6, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", ["uvw", "uvw-ppr"])

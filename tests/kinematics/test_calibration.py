@@ -9,6 +9,8 @@ from pathlib import Path
 import calibrate
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from trirail import config
@@ -335,6 +337,20 @@ def test_degrees_and_any_order_of_columns(tmp_path: Path) -> None:
     assert_allclose(read_sliders, sliders, rtol=0.0)
 
 
+@given(st.lists(st.integers(-9999, 9999), min_size=6, max_size=6), st.booleans())
+def test_a_field_of_the_table_may_have_a_unit(
+    tmp_path_factory: pytest.TempPathFactory, values: list[int], deg: bool
+) -> None:
+    length, angle = 1e-6, math.pi / 648_000.0
+    file = tmp_path_factory.mktemp("units") / "poses.csv"
+    units = ["um", " µm", "arcsec", "um", "μm", "um"]
+    fields = [f"{value}{unit}" for value, unit in zip(values, units, strict=True)]
+    file.write_text(f"{HEADER}{','.join(fields)}\n", encoding="utf-8")
+    pose, sliders, _ = calibrate.read(file, degrees=deg)
+    expected = np.multiply(values, [length, length, angle, length, length, length])
+    assert_allclose(np.concatenate([pose[0], sliders[0]]), expected, rtol=1e-15)
+
+
 def test_what_is_open_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     random = np.random.default_rng(17)
     seen = poses(random, 30, (0.1, 0.1, 0.0))
@@ -360,9 +376,9 @@ ROW = "0.01,0.02,0.1,0.03,0.01,0.02\n"
         ("x,y,phi,A,B\n", "line 1: the columns are x, y, phi, A, B; wanted are x, y, phi, A, B, C"),
         ("x,y,phi,A,B,C,D\n", "line 1: the columns are x, y, phi, A, B, C, D; wanted are x, y, phi, A, B, C"),
         ("x,y,phi,A,B,B\n", "line 1: the columns are x, y, phi, A, B, B; wanted are x, y, phi, A, B, C"),
-        (HEADER + ROW + "\n0,0,nan,0,0,0\n", "line 4: phi: 'nan' is no number"),
-        (HEADER + ROW + "0,0,0,0,-inf,0\n", "line 3: B: '-inf' is no number"),
-        (HEADER + "0,0,zero,0,0,0\n", "line 2: phi: 'zero' is no number"),
+        (HEADER + ROW + "\n0,0,nan,0,0,0\n", "line 4: phi: 'nan' is not an angle"),
+        (HEADER + ROW + "0,0,0,0,-inf,0\n", "line 3: B: '-inf' is not a length"),
+        (HEADER + "0,0,zero,0,0,0\n", "line 2: phi: 'zero' is not an angle"),
         (HEADER + "0,0,0,0,0\n", "line 2: 5 fields; wanted are 6"),
         (HEADER + "0,0,0,0,0,0,0\n", "line 2: 7 fields; wanted are 6"),
     ],
@@ -373,7 +389,9 @@ def test_a_wrong_file_is_refused_by_line(
     file = tmp_path / "poses.csv"
     file.write_text(content, encoding="utf-8")
     assert calibrate.main([str(file)]) == 1
-    assert capsys.readouterr() == ("", f"calibrate: {file}: {said}\n")
+    out, told = capsys.readouterr()
+    assert out == ""
+    assert told.startswith(f"calibrate: {file}: {said}")
 
 
 def test_other_errors_are_one_line(measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

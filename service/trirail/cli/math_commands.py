@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from trirail.cli import terminal, units
 from trirail.cli.options import DEFAULT, Flag, Offline
 from trirail.errors import KinematicsError
+from trirail.wire.units import ANGULAR_ACCELERATION, ANGULAR_VELOCITY
 
 if TYPE_CHECKING:
     from trirail.config import Config
@@ -55,8 +56,8 @@ def ik(
 
     config, robot = robot_of(offline)
     pose = np.array([x, y, units.radians(phi, deg)])
-    rates = [*velocity[:2], units.radians(velocity[2], deg, units.ANGULAR_VELOCITY)]
-    changes = [*acceleration[:2], units.radians(acceleration[2], deg, units.ANGULAR_ACCELERATION)]
+    rates = [*velocity[:2], units.radians(velocity[2], deg, ANGULAR_VELOCITY)]
+    changes = [*acceleration[:2], units.radians(acceleration[2], deg, ANGULAR_ACCELERATION)]
     motion = inverse(robot, pose, rates, changes)
     _check_reach(config, robot, pose)
     solved = {name: values.tolist() for name, values in motion._asdict().items()}

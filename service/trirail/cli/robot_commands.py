@@ -22,6 +22,7 @@ from trirail.wire import boundary
 from trirail.wire.goals import Goal
 from trirail.wire.messages import CommandReply
 from trirail.wire.text import check_name, check_new_pose
+from trirail.wire.units import LENGTH, quantity
 from trirail.wire.vocabulary import LONGEST_LEASE, SHORTEST_LEASE, Command, Mode
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def goto(
         with Robot(service.robot, service.connect, tls=service.tls) as robot:
             return _follow(service, robot, robot.move_to_named(x, speed=speed, blend=blend), wait, x)
     try:
-        at, angle = units.quantity(x, units.LENGTH), units.radians(phi, deg)
+        at, angle = quantity(x, LENGTH), units.radians(phi, deg)
     except ValueError as error:
         raise CycloptsError(msg=f"Invalid value for X: {error}") from error
     with Robot(service.robot, service.connect, tls=service.tls) as robot:

@@ -10,7 +10,7 @@ from trirail_drivers.simulated import Carriages
 
 from trirail.commissioning.bench import FOLLOWING
 from trirail.commissioning.moves import DISTANCE
-from trirail.commissioning.person import Person, Question, choose, number
+from trirail.commissioning.person import Person, Question, choose, length
 from trirail.kinematics.arrays import Array
 from trirail.naming import Labels
 
@@ -53,31 +53,31 @@ class Observer:
         if self._read_to is None:
             text = "To how many mm can you read your rule or indicator? (a steel rule 0.5, a dial indicator 0.01)"
             question = Question(text, None if self._simulated is None else "0.01")
-            self._read_to = number(self._person, self._idle, question, 0.0001, 5.0) / 1e3
+            self._read_to = length(self._person, self._idle, question, 1e-7, 5e-3)
         return self._read_to
 
     def reading(self, index: int) -> float:
         """Return what the rule beside a slider reads [m]."""
         rules = self.rules()
         text = f"What does the rule at slider {self._labels[index]} read now, in mm?"
-        return self.number(text, None if rules is None else rules[index])
+        return self.length(text, None if rules is None else rules[index])
 
     def instrument(self) -> float:
         """Return how finely an instrument beside the platform can be read [m]."""
         text = "To how many mm can you read the instrument? (a dial gauge 0.001, a microscope 0.005)"
         question = Question(text, None if self._simulated is None else "0.001")
-        return number(self._person, self._idle, question, 0.00001, 5.0) / 1e3
+        return length(self._person, self._idle, question, 1e-8, 5e-3)
 
     def mark(self, axis: str, simulated: float | None) -> float:
         """Return what an instrument reads along an axis at a mark on the platform [m]."""
         default = None if simulated is None else f"{simulated * 1e3 + 0.0:.4f}"
         question = Question(f"What does the instrument read along {axis} now, in mm?", default)
-        return number(self._person, self._idle, question) / 1e3
+        return length(self._person, self._idle, question)
 
-    def number(self, text: str, simulated: float | None) -> float:
+    def length(self, text: str, simulated: float | None) -> float:
         """Return a length that is asked for in mm [m]."""
         default = None if simulated is None else f"{simulated * 1e3 + 0.0:.2f}"
-        return number(self._person, self._idle, Question(text, default)) / 1e3
+        return length(self._person, self._idle, Question(text, default))
 
     def gone(self, name: str, slider: str, before: float, was: Rules | None, now: Rules | None, verb: str) -> float:
         """Return how far a slider went [m]: its drive's own since the rule read `before`, another one's as is told."""
@@ -87,7 +87,7 @@ class Observer:
         text = (
             f"How far did slider {self._labels[NAMES.index(slider)]} {verb}, in mm, above 0 in its positive direction?"
         )
-        return self.number(text, now[index] - was[index] if now and was else None)
+        return self.length(text, now[index] - was[index] if now and was else None)
 
     def which(self, before: Rules | None, now: Rules | None) -> str | None:
         """Ask which slider has moved, from what rules read before to what they read now."""

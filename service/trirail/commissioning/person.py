@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from trirail.commissioning.judgement import Judged
+from trirail.wire.units import LENGTH, quantity
 
 
 class Quit(Exception):
@@ -49,18 +50,19 @@ def choose(person: Person, idle: Callable[[], object], question: Question, choic
         person.tell(f'  "{answer}" is no answer here; wanted: {told}, or q to leave')
 
 
-def number(
-    person: Person, idle: Callable[[], object], question: Question, low: float = -10_000.0, high: float = 10_000.0
+def length(
+    person: Person, idle: Callable[[], object], question: Question, low: float = -10.0, high: float = 10.0
 ) -> float:
-    """Return the number that is answered; asks until it is one from `low` to `high`. Raises Quit."""
+    """Return the length that is answered [m], a bare number in mm; asks until one is within both [m]. Raises Quit."""
     while True:
         answer = person.ask(question, idle)
         if answer.lower() in ("q", "quit"):
             raise Quit
         try:
-            value = float(answer.replace(",", ".").removesuffix("mm"))
+            value = quantity(answer.replace(",", "."), LENGTH, "mm")
         except ValueError:
             value = float("nan")
         if low <= value <= high:
             return value
-        person.tell(f'  "{answer}" is no number from {low:g} to {high:g}; as in: 12.35 (or q to leave)')
+        between = f"from {low * 1e3:g} to {high * 1e3:g} mm"
+        person.tell(f'  "{answer}" is no length {between}; as in: 12.35, 350um, 0.01in (or q to leave)')
