@@ -59,6 +59,7 @@ $(READY): pyproject.toml
 PICTURES := tools/pictures
 screenshots: $(READY)  ## every picture of the guides anew, from what runs; needs Chromium and the Rerun viewer
 	$(VENV)/bin/python tools/frames_picture.py
+	$(VENV)/bin/python tools/stages_picture.py
 	$(VENV)/bin/python tools/panel_picture.py
 	$(VENV)/bin/trirail workspace --plot $(PICTURES)/workspace.png
 	rm -f $(PICTURES)/demo.rrd
