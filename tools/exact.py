@@ -28,7 +28,7 @@ def travels(
     held: Sequence[float],
     cross_angle: float,
     turns: bool,
-    pose: Sequence[float],
+    pose: Sequence[float | Decimal],
 ) -> tuple[Decimal, Decimal]:
     """Return where slider and cross slide are with the platform at a pose [m].
 
