@@ -187,6 +187,10 @@ class Page:
     def close(self) -> None:
         self._pipe.call("Target.closeTarget", targetId=self._target)
 
+    def freeze(self, *, over: bool = False) -> None:
+        """Freeze the tab as the browser does with those that are not looked at, or let it go on."""
+        self._call("Page.setWebLifecycleState", state="active" if over else "frozen")
+
     def signal_renderers(self, number: signal.Signals) -> None:
         """Send a signal to the processes in which this browser's pages run: SIGSTOP freezes them."""
         for process in self._pipe.call("SystemInfo.getProcessInfo")["processInfo"]:

@@ -58,6 +58,7 @@ class FakeRobot:
         self.moved_to: list[tuple[Triple, str | None, str]] = []
         self.followed: list[tuple[TrajectoryPoint, ...]] = []
         self.connected = ["ann", "bob"]
+        self.warnings: tuple[str, ...] = ()
         self.forced: list[bool] = []
         self.named = {"park": (0.0, 0.05, 0.0)}
         self.gone_to: list[str] = []
@@ -248,6 +249,7 @@ class FakeRobot:
             loop=LOOP,
             settled=True,
             lease=self.holder,
+            warnings=self.warnings,
         )
 
     def _advance(self) -> None:

@@ -145,6 +145,57 @@ def test_a_tab_that_is_gone_while_a_button_is_held_moves_nothing(
 
 @pytest.mark.viewer
 @needs_chromium
+@pytest.mark.parametrize("gone", ["cancelled", "frozen by the browser", "frozen"])
+def test_a_finger_that_is_lost_on_a_touch_screen_moves_nothing(
+    service: Service, robot: Robot, tmp_path: Path, panel: str, gone: str
+) -> None:
+    with chromium("chromium", tmp_path, ["--disable-gpu"]) as browser:
+        page = opened(browser, panel)
+        page.resize(390, 844, phone=True)
+        page.touch(RIGHT)
+        moving(robot)
+        if gone == "cancelled":
+            page.end_touch("touchCancel")
+        elif gone == "frozen":
+            page.signal_renderers(signal.SIGSTOP)
+        else:
+            page.freeze()
+        assert standing(robot).pose[0] < FAR
+        if gone == "frozen":
+            page.signal_renderers(signal.SIGCONT)
+        elif gone != "cancelled":
+            page.freeze(over=True)
+        still(robot)
+
+
+@pytest.mark.viewer
+@needs_chromium
+def test_a_file_is_followed_by_who_holds_the_lease_and_the_session_is_listed(
+    service: Service, robot: Robot, browser: Page, panel: str
+) -> None:
+    page = opened(browser, panel)
+    page.click("[data-command=acquire]")
+    page.until("document.querySelector('#lease').textContent.includes('since')")
+    page.click("[data-view=following]")
+    page.choose_file("#file", "line.csv", "t,x,y,phi\n0,0,0,0\n1,0.01,0,0\n")
+    page.until("!document.querySelector('#file-start').disabled")
+    page.click("#file-start")
+    until(robot, lambda state: state.settled and abs(state.pose[0]) < 1e-5)
+    page.click("#follow")
+    page.until("!document.querySelector('#file-progress').hidden")
+    until(robot, lambda state: state.settled and abs(state.pose[0] - 0.01) < 1e-5)
+    page.until("document.querySelector('#file-progress').hidden")
+    page.click("[data-command=release]")
+    page.until("document.querySelector('#lease').textContent.startsWith('Nobody')")
+    page.until(f"document.querySelector('#people').textContent.includes({robot.user!r})")
+    page.click("[data-view=sessions]")
+    page.until("document.querySelector('#sessions a[download]')")
+    assert "running" in page.text("#sessions")
+    page.close()
+
+
+@pytest.mark.viewer
+@needs_chromium
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_panel_that_is_gone_while_a_button_is_held_moves_nothing(
     service: Service, robot: Robot, browser: Page, number: signal.Signals

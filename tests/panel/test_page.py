@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.viewer, needs_chromium]
 
 WITHIN = 20.0
 SHOWN = "document.body.dataset.contact === 'yes'"
-SIZES = {"desk": (1280, 800, False), "phone": (375, 667, True)}
+SIZES = {"desk": (1280, 800, False), "phone": (390, 844, True), "small phone": (375, 667, True)}
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +159,19 @@ def test_a_frozen_tab_moves_nothing(enabled: Page, robot: FakeRobot) -> None:
         enabled.signal_renderers(signal.SIGCONT)
     enabled.let_go()
     assert len({goal.id for goal in robot.sent}) == 1
+
+
+def test_a_tab_that_the_browser_freezes_moves_nothing(enabled: Page, robot: FakeRobot) -> None:
+    """As it does on phones, where another program is looked at."""
+    enabled.resize(390, 844, phone=True)
+    enabled.touch("[data-axis=x][data-sign='1']")
+    moves(robot)
+    enabled.freeze()
+    stands(robot)
+    asked = len(robot.sent)
+    enabled.freeze(over=True)
+    enabled.evaluate("new Promise((done) => setTimeout(done, 300))")  # the finger is still down
+    assert len(robot.sent) == asked
 
 
 def test_a_tab_that_is_closed_lets_go(browser: Page, enabled: Page, panel: Panel, robot: FakeRobot) -> None:

@@ -60,7 +60,7 @@ export class Commands {
     const powered = POWERED.includes(mode) && Boolean(robot?.permissions.includes("goal"));
     for (const button of document.querySelectorAll(".hold, #poses button, #go")) button.disabled = !powered;
     byId("file-start").disabled = byId("follow").disabled = !powered || !path;
-    byId("override").disabled = !mode;
+    byId("override").disabled = byId("here").disabled = !mode;
     return powered;
   }
 

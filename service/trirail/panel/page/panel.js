@@ -38,7 +38,7 @@ const jogging = new Jogging(send, now, answer);
 const going = new Going(send, now, answer);
 const following = new Following(send, now, allow, answer);
 const naming = new Naming(send, allow, answer);
-const sessions = new Sessions();
+const sessions = new Sessions(now);
 
 // ------------------------------------------------------------------ to the server
 

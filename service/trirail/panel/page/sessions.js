@@ -6,7 +6,9 @@ const HEADS = ["began", "lasted", "goals", "faults", "files"];
 const byId = (id) => document.getElementById(id);
 
 export class Sessions {
-  constructor() {
+  // `now()` has the robot's state.
+  constructor(now) {
+    this.now = now;
     this.told = null;
     onLanguage(() => this.#show());
   }
@@ -24,14 +26,16 @@ export class Sessions {
   #show() {
     if (this.told === null) return byId("sessions").replaceChildren();
     const { folder, here, sessions } = this.told;
+    const warnings = (this.now().state?.warnings ?? []).map((words) => cell("p", quoted(words))); // as that nothing is recorded
+    for (const each of warnings) each.className = "warning";
     if (!here || !sessions.length)
-      return byId("sessions").replaceChildren(say(here ? "sessions.none" : "sessions.elsewhere"), " ", quoted(folder));
+      return byId("sessions").replaceChildren(...warnings, say(here ? "sessions.none" : "sessions.elsewhere"), " ", quoted(folder));
     const table = document.createElement("table");
     const head = table.createTHead().insertRow();
     for (const name of HEADS) head.append(cell("th", say(`sessions.${name}`)));
     const body = table.createTBody();
     for (const each of sessions) row(body.insertRow(), each);
-    byId("sessions").replaceChildren(table);
+    byId("sessions").replaceChildren(...warnings, table);
   }
 }
 
