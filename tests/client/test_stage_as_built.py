@@ -200,6 +200,8 @@ def test_play_is_no_matter_where_the_table_always_comes_from_the_same_side(seed:
     targets = stage.look()
     x, y, phi = rng.uniform(-1.0, 1.0, 3) * (5e-4, 5e-4, 4e-3)
     stage.part = part_at(PART, (float(x), float(y), float(phi)))
+    for pose in ((-1e-3, -1e-3, -1e-2), (0.0, 0.0, 0.0)):
+        stage.go(StageMotion(pose))  # as whoever brings the part: from the other side
     found = stage.drive(align(Task(calibration, targets, tolerance=2e-6, angle=5e-5, approach=beyond)))
     assert found.reached
     assert len(found.corrections) == 1

@@ -37,6 +37,7 @@ __all__ = [
     "calibration_again",
     "calibration_by_moves",
     "look_only",
+    "mean_look",
     "moves_for",
 ]
 
@@ -45,6 +46,9 @@ MOVES: tuple[Triple, ...] = tuple(
     for x, y, turn in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 )
 """The moves of a calibration where none are given: 1 mm and 1°, each both ways, from where it begins."""
+NO_WAY: Triple = (0.0, 0.0, 0.0)
+CENTRE: Pair = (0.0, 0.0)
+"""Of the platform, in its own frame."""
 TOLERANCE, ANGLE = 1e-6, math.radians(5.0 / 3600.0)
 """How far a mark may be from where it should be [m], and by what angle a part may be turned [rad]: 1 µm, 5 arcsec."""
 CORRECTIONS = 3
@@ -84,11 +88,14 @@ def moves_for(lens: Lens, by: float, turn: float) -> tuple[Triple, ...]:
 def align(task: Task) -> Conversation:
     """Measure, correct, measure again, until the part lies right, or no correction is left, or the error grows.
 
-    Raises AlignmentError where a look does not tell how the part lies, before anything is moved because of it.
+    With an approach the table comes from that side before the first look too. Raises AlignmentError where a look does
+    not tell how the part lies, before anything is moved because of it.
     """
     measurements: list[Measurement] = []
     corrections: list[AlignmentCorrection] = []
     confirmed = task.calibration.confirmed
+    if task.approach is not None:
+        yield StageMotion(NO_WAY, CENTRE, task.approach)
     while True:
         sight, found = yield from _measure(task, "alignment")
         measurements.append(measured := _measurement(sight, found))
@@ -130,14 +137,17 @@ def calibration_by_moves(
 ) -> Generator[Wish, Sighting, CameraCalibration]:
     """Look where the robot stands and after each move from there, return there, and calibrate.
 
-    Raises AlignmentError where the looks do not tell it.
+    With an `approach` it comes to where it stands from that side before. Raises AlignmentError where the looks do not
+    tell it.
     """
-    first = yield from _look(looks)
+    if approach is not None:
+        yield StageMotion(NO_WAY, CENTRE, approach)
+    first = yield from mean_look(looks)
     sights = [first]
     yield LookReport("calibration", first)
     for move in moves:
         yield StageMotion(_sum(first.pose, move), approach=approach)
-        sights.append((yield from _look(looks)))
+        sights.append((yield from mean_look(looks)))
         yield LookReport("calibration", sights[-1])
     yield StageMotion(first.pose, approach=approach)
     try:
@@ -158,7 +168,7 @@ def calibration_again(kept: CameraCalibration, looks: int = 1) -> Generator[Wish
     return (yield from calibration_by_moves(moves, views, view.lens, view.centre, looks))
 
 
-def _look(pictures: int) -> Generator[Wish, Sighting, Sighting]:
+def mean_look(pictures: int) -> Generator[Wish, Sighting, Sighting]:
     """Return the mean of several pictures, for each mark over those that show it."""
     taken = []
     for _ in range(pictures):
@@ -180,7 +190,7 @@ def _look(pictures: int) -> Generator[Wish, Sighting, Sighting]:
 def _measure(
     task: Task, purpose: Literal["alignment", "check"]
 ) -> Generator[Wish, Sighting, tuple[Sighting, Misplacement]]:
-    sight = yield from _look(task.looks)
+    sight = yield from mean_look(task.looks)
     try:
         return sight, misplacement(task.calibration, sight.marks, task.targets, task.distance)
     except AlignmentError as error:

@@ -66,8 +66,9 @@ def calibrate(
     speed
         Fraction of full speed, above 0 and up to 1.
     """
-    from trirail.alignment.procedure import moves_for
+    from trirail.alignment.procedure import mean_look, moves_for
     from trirail.client import calibration_file
+    from trirail.client.alignment import drive
     from trirail.client.client import Robot
 
     if lens == "radial" and centre is None:
@@ -77,7 +78,7 @@ def calibrate(
     moves = moves_for(lens, by, units.radians(angle, False))
     with source.opened() as (look, known), Robot(service.robot, service.connect, tls=service.tls) as robot:
         found = robot.calibrate_camera(
-            _telling(look, service, len(moves) + 1),
+            _telling(look, service, looks * (len(moves) + 1)),
             moves,
             views=dict.fromkeys(look(), "camera") if one_camera else known,
             lens=lens,
@@ -87,7 +88,7 @@ def calibrate(
             wait=wait,
             speed=speed,
         )
-        targets = dict(look())
+        targets = dict(drive(robot, look, mean_look(looks), speed, wait).marks)
     calibration_file.write(file, service.robot, found, targets)
     if service.json:
         terminal.json({"file": str(file), "targets": targets, "calibration": msgspec.to_builtins(found)})
@@ -176,9 +177,9 @@ def check(
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
-    """Look once, say how the part lies, and move nothing; with --moves also whether the cameras stand as they did.
+    """Look once, say how the part lies, and move nothing; with --moves instead whether the cameras stand as they did.
 
-    Exit 1 where a camera was shifted or turned.
+    Exit 1 where a camera has been shifted or turned.
 
     Parameters
     ----------
@@ -202,20 +203,23 @@ def check(
 
     kept = _kept(file, service)
     task = Task(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=looks)
-    changes = []
     with source.opened() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
         if moves:
             now = drive(robot, look, calibration_again(kept.calibration, looks), speed, wait)
             changes = view_changes(kept.calibration, now)
-            if not service.json:
-                alignment_lines.show_changes(changes)
-        found = drive(robot, look, look_only(task), 1.0, 0.0)
+        else:
+            found = drive(robot, look, look_only(task), speed, wait)
+    if moves:
+        if service.json:
+            terminal.json({"views": [msgspec.to_builtins(each) | {"changed": each.is_changed} for each in changes]})
+        else:
+            alignment_lines.show_changes(changes)
+        return 1 if any(each.is_changed for each in changes) else 0
     if service.json:
-        told = [msgspec.to_builtins(each) | {"changed": each.is_changed} for each in changes]
-        terminal.json(msgspec.to_builtins(found) | ({"views": told} if moves else {}))
+        terminal.json(msgspec.to_builtins(found))
     else:
         terminal.say(alignment_lines.measured(found))
-    return 1 if any(each.is_changed for each in changes) else 0
+    return 0
 
 
 def _approach(way: tuple[float, float, str]) -> tuple[float, float, float] | None:

@@ -62,7 +62,10 @@ def program(command: str) -> Iterator[Source]:
     Raises TrirailError where it cannot be run, ends, or prints something else.
     """
     try:
-        process = subprocess.Popen(shlex.split(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        # In a group of its own: Ctrl-C is for this program, which ends that one.
+        process = subprocess.Popen(
+            shlex.split(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0
+        )
         stdin, stdout = cast(IO[str], process.stdin), cast(IO[str], process.stdout)
     except (OSError, ValueError) as error:
         raise TrirailError(f"cannot run {command!r}: {error}; it is to print one line of JSON for each look") from error
