@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import msgspec
 from cyclopts import App
 
-from trirail.cli import alignment_lines, mark_source, terminal, units
+from trirail.cli import alignment_lines, terminal, units
 from trirail.cli.mark_options import MarkSource
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
 
 if TYPE_CHECKING:
+    from trirail.alignment.procedure import Sighting, Wish
     from trirail.client.calibration_file import CalibrationFile
 
 app = App(name="align", help="Lay a part right by marks in cameras: calibrate once, then run for each part.")
 FILE = Path("camera.json")
+T = TypeVar("T")
 PROGRAM = MarkSource()
 
 
@@ -41,7 +44,7 @@ def calibrate(
     """Find how the cameras show the table, by six moves of the stage, and keep it with the marks as they lie now.
 
     The robot is enabled, and its marks in the pictures, also after the moves. The file's targets are where the marks
-    were seen at the beginning: lay a part right for it, or edit them.
+    are when it has gone back: lay a part right for it, or edit them.
 
     Parameters
     ----------
@@ -66,7 +69,7 @@ def calibrate(
     speed
         Fraction of full speed, above 0 and up to 1.
     """
-    from trirail.alignment.procedure import mean_look, moves_for
+    from trirail.alignment.procedure import calibration_by_moves, mean_look, moves_for
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
     from trirail.client.client import Robot
@@ -77,17 +80,9 @@ def calibrate(
         )
     moves = moves_for(lens, by, units.radians(angle, False))
     with source.opened() as (look, known), Robot(service.robot, service.connect, tls=service.tls) as robot:
-        found = robot.calibrate_camera(
-            _telling(look, service, looks * (len(moves) + 1)),
-            moves,
-            views=dict.fromkeys(look(), "camera") if one_camera else known,
-            lens=lens,
-            centre=centre or (0.0, 0.0),
-            looks=looks,
-            approach=_approach(approach),
-            wait=wait,
-            speed=speed,
-        )
+        views = dict.fromkeys(look(), "camera") if one_camera else known
+        wishes = calibration_by_moves(moves, views, lens, centre or (0.0, 0.0), looks, _approach(approach))
+        found = drive(robot, look, _told(wishes, service, len(moves) + 1), speed, wait)
         targets = dict(drive(robot, look, mean_look(looks), speed, wait).marks)
     calibration_file.write(file, service.robot, found, targets)
     if service.json:
@@ -136,24 +131,24 @@ def run(
     speed
         Fraction of full speed, above 0 and up to 1.
     """
+    from trirail.alignment.procedure import Task, align
     from trirail.client import calibration_file
+    from trirail.client.alignment import drive
     from trirail.client.client import Robot
 
     kept = _kept(file, service)
+    task = Task(
+        kept.calibration,
+        kept.targets,
+        tolerance,
+        units.radians(angle, False),
+        corrections,
+        distance_ppm * 1e-6,
+        looks,
+        _approach(approach),
+    )
     with source.opened() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
-        found = robot.align(
-            _telling(look, service, None),
-            kept.targets,
-            kept.calibration,
-            tolerance=tolerance,
-            angle=units.radians(angle, False),
-            corrections=corrections,
-            distance=distance_ppm * 1e-6,
-            looks=looks,
-            approach=_approach(approach),
-            wait=wait,
-            speed=speed,
-        )
+        found = drive(robot, look, _told(align(task), service), speed, wait)
     if found.confirmed != kept.calibration.confirmed:
         known = msgspec.structs.replace(kept.calibration, confirmed=found.confirmed)
         calibration_file.write(file, kept.robot, known, kept.targets, kept.made)
@@ -205,7 +200,8 @@ def check(
     task = Task(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=looks)
     with source.opened() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
         if moves:
-            now = drive(robot, look, calibration_again(kept.calibration, looks), speed, wait)
+            again = calibration_again(kept.calibration, looks)
+            now = drive(robot, look, _told(again, service, len(kept.calibration.poses)), speed, wait)
             changes = view_changes(kept.calibration, now)
         else:
             found = drive(robot, look, look_only(task), speed, wait)
@@ -236,18 +232,8 @@ def _kept(file: Path, service: Service) -> CalibrationFile:
     return kept
 
 
-def _telling(look: mark_source.Look, service: Service, total: int | None) -> mark_source.Look:
-    """Return the look that also tells a person which one it is."""
-    taken = 0
-
-    def told() -> dict[str, tuple[float, float]]:
-        nonlocal taken
-        taken += 1
-        seen = dict(look())
-        if not service.json:
-            of = "" if total is None else f" of {total}"
-            marks = ", ".join(f"{name} ({u:.2f}, {v:.2f})" for name, (u, v) in seen.items()) or "no marks"
-            terminal.say(f"look {taken}{of}: {marks}")
-        return seen
-
-    return told
+def _told(
+    wishes: Generator[Wish, Sighting, T], service: Service, looks: int | None = None
+) -> Generator[Wish, Sighting, T]:
+    """Return what asks for the same, and tells a person of each look, where no program reads."""
+    return wishes if service.json else alignment_lines.told(wishes, looks)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from trirail.cli import terminal
 
 if TYPE_CHECKING:
     from trirail.alignment.calibration import CameraCalibration
     from trirail.alignment.changes import ViewChange
-    from trirail.alignment.procedure import Alignment, Measurement
+    from trirail.alignment.procedure import Alignment, Measurement, Sighting, Wish
+    from trirail.alignment.wishes import LookReport
     from trirail.analysis.summary import AlignmentSummary
 
+T = TypeVar("T")
 ARCSECONDS = 3600.0 * 180.0 / math.pi
 ENDED_WELL = ("reached", "calibrated", "checked")
 
@@ -58,6 +60,29 @@ def show_changes(changes: Iterable[ViewChange]) -> None:
         )
 
 
+def told(wishes: Generator[Wish, Sighting, T], looks: int | None) -> Generator[Wish, Sighting, T]:
+    """Wish for the same, and print each look as it comes; `looks` is how many there will be, where that is known."""
+    from trirail.alignment.wishes import LookReport
+
+    number = 0
+    try:
+        wish = next(wishes)
+        while True:
+            if isinstance(wish, LookReport) and wish.sighting is not None:
+                number += 1
+                of = "" if looks is None else f" of {looks}"
+                terminal.say(f"look {number}{of}: {_what(wish, wish.sighting)}")
+            wish = wishes.send((yield wish))
+    except StopIteration as end:
+        return end.value  # type: ignore[no-any-return]
+
+
+def _what(report: LookReport, seen: Sighting) -> str:
+    if report.measurement is None:
+        return ", ".join(f"{name} ({u:.2f}, {v:.2f})" for name, (u, v) in seen.marks.items()) or "no marks"
+    return measured(report.measurement) + ("; corrects it" if report.correction is not None else "")
+
+
 def measured(found: Measurement) -> str:
     """Return how a part lies, in a line."""
     x, y = found.shift
@@ -68,9 +93,7 @@ def measured(found: Measurement) -> str:
 
 
 def show_alignment(found: Alignment) -> None:
-    """Print each look of an alignment, and how it ended."""
-    for measurement in found.measurements:
-        terminal.say(measured(measurement))
+    """Print how an alignment ended."""
     reasons = {
         "reached": "the part lies right",
         "corrections": "no correction is left: raise --corrections or --tolerance, or look at backlash and noise",
