@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from trirail_drivers.interface import Triple
 
@@ -98,7 +99,7 @@ def run(file: Path, recording: Path, parts: int = PARTS, seed: int = 0) -> int:
         sinks: list[rr.FileSink | rr.GrpcSink] = [rr.FileSink(pictures)]
         if config.telemetry.live_port:
             sinks.append(rr.GrpcSink(f"rerun+http://127.0.0.1:{config.telemetry.live_port}/proxy"))
-        stream.set_sinks(*sinks)
+        stream.set_sinks(*sinks, default_blueprint=_layout())
         with Robot(config.robot.name, config.zenoh.listen[0], user="demo") as robot, robot.records(stage.take):
             robot.enable()
             cameras = DrawnCameras(stage, stream, seed)
@@ -108,6 +109,21 @@ def run(file: Path, recording: Path, parts: int = PARTS, seed: int = 0) -> int:
     out.print(f"[bold]recording[/]  {plain(str(recording))}", soft_wrap=True)
     out.print(f"[bold]pictures[/]   {plain(str(pictures))}: look at them with trirail view", soft_wrap=True)
     return 0 if len(results) == parts and all(result.reached for result in results) else 1
+
+
+def _layout() -> rrb.Blueprint:
+    """Return both cameras side by side, beside them what is left of each part."""
+    cameras = [rrb.Spatial2DView(origin=f"/cameras/{name}", name=name) for name in VIEWS]
+    told = rrb.Vertical(
+        rrb.TimeSeriesView(origin="/residual/worst_um", name="A mark has to go  [µm]"),
+        rrb.TimeSeriesView(origin="/residual/turn_urad", name="The part has to turn  [µrad]"),
+        rrb.TextLogView(origin="/alignments", name="Parts"),
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(*cameras, told, column_shares=[3, 3, 2]),
+        rrb.TimePanel(state="collapsed", timeline="time", play_state="Following"),
+        collapse_panels=True,
+    )
 
 
 def _parts(robot: Robot, cameras: DrawnCameras, stream: rr.RecordingStream, parts: int, seed: int) -> list[Alignment]:

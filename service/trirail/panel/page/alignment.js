@@ -3,6 +3,7 @@
 import { onLanguage, quoted, say } from "./words.js";
 
 const LOOKS = 5; // columns, the newest
+const KEPT = 50; // so many looks of one alignment
 const WELL = ["reached", "calibrated", "checked"];
 
 export class Alignment {
@@ -21,7 +22,7 @@ export class Alignment {
     this.newest = [seq, time];
     const first = this.looks[0];
     if (first && (first.id !== look.id || first.purpose !== look.purpose)) this.looks = [];
-    this.looks.push(look);
+    this.looks = [...this.looks, look].slice(-KEPT);
     [this.user, this.time] = [user, time];
     this.show();
   }
