@@ -65,7 +65,7 @@ def _device(text: str) -> tuple[str, str]:
     return name, device
 
 
-def _window(text: str) -> tuple[str, mark_source.SearchWindow]:
+def _window(text: str) -> tuple[str, mark_source.MarkWindow]:
     name, equals, rest = text.partition("=")
     picture, _, numbers = rest.rpartition(":")
     try:
@@ -75,4 +75,4 @@ def _window(text: str) -> tuple[str, mark_source.SearchWindow]:
     except ValueError:
         right = "MARK=U,V,WIDTH,HEIGHT is wanted, whole pixels from the corner above on the left, as left=0,0,640,960"
         raise TrirailError(f"--window {text}: {right}") from None
-    return name, mark_source.SearchWindow(picture or name, u, v, width, height)
+    return name, mark_source.MarkWindow(picture or name, u, v, width, height)

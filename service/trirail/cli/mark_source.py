@@ -34,7 +34,7 @@ AT_ONCE, MOST_KEPT = 0.002, 16
 """A picture that comes sooner was waiting [s]; so many may wait."""
 
 
-class SearchWindow(NamedTuple):
+class MarkWindow(NamedTuple):
     """Where in which picture a mark is [pixel]; anywhere without a width."""
 
     picture: str
@@ -44,7 +44,7 @@ class SearchWindow(NamedTuple):
     height: int = 0
 
 
-NO_WINDOWS: Mapping[str, SearchWindow] = {}
+NO_WINDOWS: Mapping[str, MarkWindow] = {}
 
 
 class Source(NamedTuple):
@@ -100,7 +100,7 @@ def program(command: str) -> Iterator[Source]:
 
 @contextlib.contextmanager
 def folder(
-    path: Path, shape: MarkShape, turn: float, windows: Mapping[str, SearchWindow] = NO_WINDOWS
+    path: Path, shape: MarkShape, turn: float, windows: Mapping[str, MarkWindow] = NO_WINDOWS
 ) -> Iterator[Source]:
     """Find marks in the newest pictures of a folder: of each mark the picture named after it, as left.png.
 
@@ -123,7 +123,7 @@ def folder(
         pictures = {each.stem: each for each in sorted(path.iterdir()) if each.suffix.lower() in PICTURES}
         if not pictures:
             raise TrirailError(f"{path}: no picture in it; wanted is one for each mark, as left.png")
-        wanted = windows or {name: SearchWindow(name) for name in pictures}
+        wanted = windows or {name: MarkWindow(name) for name in pictures}
         marks: dict[str, tuple[float, float]] = {}
         for name, window in wanted.items():
             if (file := pictures.get(window.picture)) is None:
@@ -142,7 +142,7 @@ def folder(
 
 @contextlib.contextmanager
 def cameras(
-    devices: dict[str, str], shape: MarkShape, turn: float, windows: Mapping[str, SearchWindow] = NO_WINDOWS
+    devices: dict[str, str], shape: MarkShape, turn: float, windows: Mapping[str, MarkWindow] = NO_WINDOWS
 ) -> Iterator[Source]:
     """Open cameras through OpenCV, {mark: device}, a number or an address, and find a mark in a picture of each.
 
@@ -174,7 +174,7 @@ def cameras(
                 grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
                 for name, its in devices.items():
                     if its == device:
-                        marks.update(_marks(name, grey, windows.get(name, SearchWindow(name)), shape, turn))
+                        marks.update(_marks(name, grey, windows.get(name, MarkWindow(name)), shape, turn))
             return marks
 
         yield Source(look, {name: f"camera {device}" for name, device in devices.items()} if windows else None)
@@ -197,7 +197,7 @@ def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.mon
     return frame if read else None
 
 
-def _marks(name: str, grey: Any, window: SearchWindow, shape: MarkShape, turn: float) -> dict[str, tuple[float, float]]:
+def _marks(name: str, grey: Any, window: MarkWindow, shape: MarkShape, turn: float) -> dict[str, tuple[float, float]]:
     from trirail.alignment.finding import find
 
     rows, columns = grey.shape
