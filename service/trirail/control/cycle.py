@@ -8,9 +8,9 @@ goes. Between the two calls of a cycle the control decides what changes modes.
 Arrays: `legs` is Geometry.packed(), `bounds` Bounds.packed, `feedback` (2,) of FEEDBACK, the newest and the one before,
 `written` (5, 3) the setpoints of the cycles before, the newest last [m], `motion` (2, 3, 3) the platform's rows pose,
 velocity, acceleration as they are commanded, in this cycle and in the one before, `sliders` (2, 6, 3) the rows
-lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32 as they are set, and as they are tried, `kept` (2,) of BACKLASH,
-likewise, `found` (2,) what the gate has found, and `record` (1,) of trirail.wire.records.DTYPE. Places of sliders that
-are set or measured have the offset in them by which backlash is taken up.
+position, velocity, acceleration, and those of the cross slides, as they are set, and as they are tried, `kept` (2,) of
+BACKLASH, likewise, `found` (2,) what the gate has found, and `record` (1,) of trirail.wire.records.DTYPE. Places of
+sliders that are set or measured have the offset in them by which backlash is taken up.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class Setpoints:
 
     @property
     def rows(self) -> list[list[float]]:
-        """Rows lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32."""
+        """Rows position, velocity, acceleration of the sliders, then those of the cross slides."""
         return self.sliders[0].tolist()  # type: ignore[no-any-return]  # numpy does not tell of what type its lists are
 
     @property

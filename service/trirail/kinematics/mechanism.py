@@ -61,15 +61,20 @@ def demand(leg: Array, line: SlideLine, cosine: float, sine: float) -> tuple[Vec
 @compiled()
 def move(leg: Array, pose: Vector, velocity: Vector, acceleration: Vector) -> MovingLeg:
     """Solve a leg for the motion of its platform."""
-    closed = close(leg, pose)
-    prp = _turns_second(leg)
-    second, third = (pose[2], closed.passive) if prp else (closed.passive, pose[2])
-    rates, accelerations = joint_motion(leg, (closed.slider, second, third), velocity, acceleration)
-    rate, change = (rates[2], accelerations[2]) if prp else (rates[1], accelerations[1])
-    sliders = closed.slider + rates[0] + accelerations[0]
-    total = sliders + closed.passive + rate + change
+    if _turns_second(leg):  # asked once: what is merged of two mechanisms takes a tenth more time
+        closed = _close_prp3(leg, pose)
+        rates, changes = joint_motion(leg, (closed.slider, pose[2], closed.passive), velocity, acceleration)
+        return _moving(closed, rates[0], changes[0], rates[2], changes[2])
+    closed = _close_ppr3(leg, pose)
+    rates, changes = joint_motion(leg, (closed.slider, closed.passive, pose[2]), velocity, acceleration)
+    return _moving(closed, rates[0], changes[0], rates[1], changes[1])
+
+
+@inlined
+def _moving(closed: ClosedLeg, rate: float, change: float, passive_rate: float, passive_change: float) -> MovingLeg:
+    total = closed.slider + rate + change + closed.passive + passive_rate + passive_change
     regular = abs(closed.delta) > PARALLEL and math.isfinite(total)
-    return MovingLeg(closed, rates[0], accelerations[0], rate, change, regular)
+    return MovingLeg(closed, rate, change, passive_rate, passive_change, regular)
 
 
 @compiled()

@@ -28,7 +28,7 @@ a slider or the platform."""
 
 BOUNDS = np.dtype(
     [
-        ("rows", "f8", (4, 3, 3)),  # of the rows lambda_10, v_10, gamma_10, lambda_32, each slider: low, high, slack
+        ("rows", "f8", (4, 3, 3)),  # of position, velocity, acceleration, cross slide, each leg: low, high, slack
         ("pose", "f8", (3, 2)),  # low and high of x, y, phi
         ("edge", "f8"),  # slack of these
         ("step", "f8", 3),  # how far each slider goes in a cycle at most [m]
@@ -109,7 +109,7 @@ def _jerk(now: Array, before: Array, n: int, period: float) -> float:
 
 @compiled(i8(_BOUNDS, _ROWS, _ROW))
 def check_setpoint(bounds: NDArray[np.void], rows: Array, found: Array) -> int:
-    """Check solved sliders, as many of the rows lambda_10, v_10, gamma_10, lambda_32 as there are [m, s].
+    """Check solved sliders, as many of position, velocity, acceleration, cross slide as there are [m, s].
 
     A value that is not a number is beyond every limit.
     """
@@ -220,7 +220,7 @@ class Bounds:
         return self.violation(check_pose(self.packed, np.array(pose, dtype=np.float64), self.found))
 
     def setpoint(self, rows: ArrayLike) -> Violation | None:
-        """Check solved sliders, as many of the rows lambda_10, v_10, gamma_10, lambda_32 as are given [m, s]."""
+        """Check solved sliders, as many of position, velocity, acceleration, cross slide as given [m, s]."""
         return self.violation(check_setpoint(self.packed, np.array(rows, dtype=np.float64), self.found))
 
     def violation(self, code: int) -> Violation | None:

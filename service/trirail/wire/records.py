@@ -57,7 +57,7 @@ FIELDS: tuple[tuple[str, str, int], ...] = (
     ("commanded_position", "d", 3),  # setpoints written in this cycle, with what takes up backlash [m]
     ("commanded_velocity", "d", 3),  # v_10 [m/s]
     ("commanded_acceleration", "d", 3),  # gamma_10 [m/s²]
-    ("passive_position", "d", 3),  # commanded lambda_32 [m]
+    ("passive_position", "d", 3),  # commanded, of the cross slides [m]
     ("following_error", "d", 3),  # setpoint due at this SYNC less measured position [m]
     ("progress", "d", 1),  # of the running goal, 0 to 1
     ("remaining", "d", 1),  # of the running goal [s]
