@@ -24,7 +24,7 @@ from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.client.stage_as_built import built_otherwise
 from trirail.config import SIM, geometry, load
-from trirail.kinematics.geometry import Geometry, Leg, PprLeg, other_kind
+from trirail.kinematics.geometry import CrossLeg, Geometry, Leg, other_kind
 from trirail.kinematics.robot import forward, inverse
 from trirail_drivers.interface import Triple
 
@@ -170,7 +170,7 @@ def small_angles(robot: Geometry) -> Model:
     middle = inverse(robot, np.zeros(3)).position
     rows = []
     for leg in robot.each:
-        x, y = leg.pivot if isinstance(leg, PprLeg) else cast(Leg, leg).edge_point
+        x, y = leg.pivot if isinstance(leg, CrossLeg) else cast(Leg, leg).edge_point
         c, s = math.cos(leg.rail_angle), math.sin(leg.rail_angle)
         rows.append((c, s, s * x - c * y))
     return lambda pose: np.asarray(middle + np.array(rows) @ pose)

@@ -19,17 +19,17 @@ if TYPE_CHECKING:
     from trirail.client.async_client import AsyncRobot
     from trirail.client.client import Robot
     from trirail.errors import ConfigError, KinematicsError, RefusalCode, RefusedError, ServiceError, TrirailError
-    from trirail.kinematics.geometry import Geometry, Leg, PprLeg
+    from trirail.kinematics.geometry import CrossLeg, Geometry, Leg
     from trirail.kinematics.robot import forward, inverse, jacobians
     from trirail.telemetry.reading import read
 
 __all__ = [
     "AsyncRobot",
     "ConfigError",
+    "CrossLeg",
     "Geometry",
     "KinematicsError",
     "Leg",
-    "PprLeg",
     "RefusalCode",
     "RefusedError",
     "Robot",
@@ -46,7 +46,7 @@ _HOMES = {
     "trirail.client.async_client": ("AsyncRobot",),
     "trirail.client.client": ("Robot",),
     "trirail.errors": ("ConfigError", "KinematicsError", "RefusalCode", "RefusedError", "ServiceError", "TrirailError"),
-    "trirail.kinematics.geometry": ("Geometry", "Leg", "PprLeg"),
+    "trirail.kinematics.geometry": ("Geometry", "Leg", "CrossLeg"),
     "trirail.kinematics.robot": ("forward", "inverse", "jacobians"),
     "trirail.telemetry.reading": ("read",),
 }

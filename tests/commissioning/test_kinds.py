@@ -14,7 +14,7 @@ from trirail.commissioning.person import Question, length
 from trirail.config import SIM, geometry, load
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.geometry import Geometry, Leg, PprLeg, other_kind, travels
+from trirail.kinematics.geometry import CrossLeg, Geometry, Leg, other_kind, travels
 from trirail.kinematics.robot import forward
 
 STAGE = load(SIM.with_name("uvw.toml"))
@@ -25,7 +25,7 @@ FILES = {name: load(SIM.with_name(f"{name}.toml")) for name in ("uvw", "xxy", "u
 @st.composite
 def stages(draw: st.DrawFn) -> Geometry:
     """Three rails along x or y, not all alike, none quite so, nor quite square to what they carry."""
-    kind = draw(st.sampled_from((Leg, PprLeg)))
+    kind = draw(st.sampled_from((Leg, CrossLeg)))
     across = draw(st.integers(0, 2))
     legs = []
     for k in range(3):

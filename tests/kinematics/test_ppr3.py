@@ -10,7 +10,7 @@ from hypothesis import assume, given, reject
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from trirail.errors import KinematicsError
-from trirail.kinematics.geometry import Geometry, Leg, PprLeg, gains, singular_angles, travels
+from trirail.kinematics.geometry import CrossLeg, Geometry, Leg, gains, singular_angles, travels
 from trirail.kinematics.robot import forward, inverse, jacobians
 
 RIGHT = math.pi / 2.0
@@ -19,7 +19,7 @@ P = 0.0575
 
 def stage(*carriages: tuple[float, float, float]) -> Geometry:
     """A stage with its carriages at (x, y) on rails at an angle, cross slides across them."""
-    a, b, c = (PprLeg((x, y), angle, 0.0, (x, y), angle + RIGHT) for x, y, angle in carriages)
+    a, b, c = (CrossLeg((x, y), angle, 0.0, (x, y), angle + RIGHT) for x, y, angle in carriages)
     return Geometry((a, b, c))
 
 
@@ -32,6 +32,14 @@ def of_kind_1(robot: Geometry) -> Geometry:
     return Geometry((legs[0], legs[1], legs[2]))
 
 
+def test_a_cross_slide_is_square_to_its_rail_where_nobody_says_otherwise() -> None:
+    legs = [CrossLeg(leg.anchor, leg.rail_angle, leg.home, leg.pivot) for leg in UVW.legs]
+    assert Geometry(kind="3-PPR", legs=(legs[0], legs[1], legs[2])) == UVW
+    assert UVW.kind == "3-PPR"
+    with pytest.raises(KinematicsError, match=r"kind is '3-PRP', and the legs are those of a 3-PPR robot"):
+        Geometry(kind="3-PRP", legs=UVW.legs)
+
+
 lengths = st.floats(-0.3, 0.3)
 angles = st.floats(-math.pi, math.pi)
 
@@ -42,7 +50,7 @@ def robots(draw: st.DrawFn) -> Geometry:
     for _ in range(3):
         rail, points = draw(angles), st.tuples(lengths, lengths)
         cross = rail + draw(st.sampled_from((-1.0, 1.0))) * draw(st.floats(0.5, 2.6))
-        legs.append(PprLeg(draw(points), rail, draw(lengths), draw(points), cross))
+        legs.append(CrossLeg(draw(points), rail, draw(lengths), draw(points), cross))
     try:
         robot = Geometry((legs[0], legs[1], legs[2]))
     except KinematicsError:
@@ -58,14 +66,14 @@ def regular(robot: Geometry, pose: Any) -> bool:
 poses = st.tuples(lengths, lengths, st.floats(-1.5, 1.5))
 
 
-def truth(leg: PprLeg, pose: tuple[float, float, float]) -> tuple[float, float]:
+def truth(leg: CrossLeg, pose: tuple[float, float, float]) -> tuple[float, float]:
     slider, passive = exact.travels(leg.anchor, leg.rail_angle, leg.home, leg.pivot, leg.cross_angle, False, pose)
     return float(slider), float(passive)
 
 
 @given(robots(), poses)
 def test_positions_are_those_of_60_digits(robot: Geometry, pose: tuple[float, float, float]) -> None:
-    expected = np.array([truth(leg, pose) for leg in robot.legs if isinstance(leg, PprLeg)]).T
+    expected = np.array([truth(leg, pose) for leg in robot.legs if isinstance(leg, CrossLeg)]).T
     motion = inverse(robot, pose)
     assert_allclose(np.array(motion[::3]), expected, rtol=0.0, atol=1e-12)
     assert_allclose(travels(robot, pose), expected, rtol=0.0, atol=1e-12)
@@ -90,7 +98,7 @@ def test_rates_are_derivatives(robot: Geometry, pose: Any, velocity: Any, accele
     h, p, v, a = 1e-4, np.array(pose), np.array(velocity), np.array(acceleration)
     motion = inverse(robot, p, v, a)
     for i, leg in enumerate(robot.legs):
-        assert isinstance(leg, PprLeg)
+        assert isinstance(leg, CrossLeg)
         before, now, after = (np.array(truth(leg, tuple(p + v * t + a * t * t / 2.0))) for t in (-h, 0.0, h))
         rates = motion.velocity[i], motion.passive_velocity[i]
         assert_allclose(rates, (after - before) / (2.0 * h), atol=1e-7)
@@ -159,12 +167,12 @@ def test_the_default_of_a_wafer_aligner() -> None:
 
 def test_what_cannot_be_is_refused() -> None:
     a, b, c = UVW.legs
-    along = PprLeg((0.0, 0.0), 0.3, 0.0, (0.1, 0.0), 0.3 - math.pi)
-    with pytest.raises(KinematicsError, match="leg B: cross_angle is parallel to rail_angle") as refused:
+    along = CrossLeg((0.0, 0.0), 0.3, 0.0, (0.1, 0.0), 0.3 - math.pi)
+    with pytest.raises(KinematicsError, match="leg B: slide_angle is parallel to rail_angle") as refused:
         Geometry((a, along, c))
     assert refused.value.leg == "B"
     with pytest.raises(KinematicsError, match=r"leg C: pivot is .* it must be finite"):
-        Geometry((a, b, PprLeg((0.0, 0.0), 0.3, 0.0, (math.nan, 0.0), 1.0)))
+        Geometry((a, b, CrossLeg((0.0, 0.0), 0.3, 0.0, (math.nan, 0.0), 1.0)))
     with pytest.raises(KinematicsError, match="cannot hold the platform"):
         stage((P, -P, 0.0), (P, P, 0.0), (-P, P, 0.0))  # nothing holds it along y
     with pytest.raises(KinematicsError, match="different mechanisms: 3-PPR, 3-PPR, 3-PRP"):

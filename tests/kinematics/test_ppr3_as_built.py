@@ -10,7 +10,7 @@ from trirail.config import SIM, geometry, load, room
 from trirail.kinematics.calibration import corrected, identify, pose_derivatives
 from trirail.kinematics.correction import Correction
 from trirail.kinematics.correction_fit import fit
-from trirail.kinematics.geometry import Geometry, PprLeg
+from trirail.kinematics.geometry import CrossLeg, Geometry
 from trirail.kinematics.robot import forward, inverse, jacobians
 
 CONFIG = load(SIM.with_name("uvw-ppr.toml"))
@@ -19,7 +19,7 @@ ROOM = room(CONFIG.limits)
 LOW, HIGH = (-0.01, -0.01, -0.0873), (0.01, 0.01, 0.0873)
 NOISE = np.array([0.5e-6, 0.5e-6, 5e-6])
 SMALL = np.array([0.01, 2e-4, 2e-4, 2e-4, 0.01])
-"""Errors of a stage [m, rad], in the order of PprLeg.PARAMETERS."""
+"""Errors of a stage [m, rad], in the order of CrossLeg.PARAMETERS."""
 
 
 def poses(random: np.random.Generator, number: int, share: float = 1.0) -> NDArray[np.float64]:
@@ -42,7 +42,7 @@ def test_data_with_noise_gives_poses_better_than_it_has(seed: int) -> None:
     assert 0.8 < found.misfit < 1.2
     for leg, names, _ in found.open:
         assert leg in "ABC"
-        assert set(names) <= set(PprLeg.PARAMETERS)
+        assert set(names) <= set(CrossLeg.PARAMETERS)
 
 
 @pytest.mark.generated(*range(5))
@@ -94,6 +94,6 @@ def test_a_rail_across_its_cross_slide_is_named_as_open() -> None:
     seen = poses(random, 60)
     found = identify(START, seen, inverse(START, seen).position)
     assert [leg for leg, names, _ in found.open if "rail_angle" in names] == ["A", "B", "C"]
-    errors = found.standard_errors[:, PprLeg.PARAMETERS.index("rail_angle")]
+    errors = found.standard_errors[:, CrossLeg.PARAMETERS.index("rail_angle")]
     assert np.all(np.isinf(errors))
     assert math.isfinite(found.misfit)

@@ -15,7 +15,7 @@ from trirail_drivers.interface import NAMES, Triple
 from trirail.config import as_built
 from trirail.config.as_built import AsBuilt
 from trirail.errors import ConfigError
-from trirail.kinematics.geometry import Geometry, Leg, PprLeg, Room
+from trirail.kinematics.geometry import CrossLeg, Geometry, Leg, Room
 from trirail.kinematics.leg import AnyLeg
 from trirail.naming import Labels
 from trirail.wire.endpoints import endpoint_of, is_local
@@ -25,7 +25,6 @@ Angle = Annotated[float, Meta(ge=-2.0 * math.pi, le=2.0 * math.pi)]
 """[rad]."""
 Jerk = Annotated[float, Meta(ge=1e-3, le=1e6)]
 """[m/s³] or [rad/s³]."""
-RIGHT = math.pi / 2.0
 BASE, PLATFORM = "base", "platform"
 """Frames that every robot has."""
 FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
@@ -55,12 +54,12 @@ class LegTable(Struct, frozen=True, forbid_unknown_fields=True):
     home: Coordinate
     """Where on the rail the slider reads zero, from the anchor along the rail [m]."""
     edge_point: Point | None = None
-    """3-PRP: the platform's point that is at the slider's pin when lambda_32 is zero, in the platform's frame [m]."""
+    """3-PRP: the platform's point that is at the slider's pin when the cross slide reads zero, in its frame [m]."""
     edge_angle: Angle | None = None
     """3-PRP: direction of the platform's edge that slides in the pin, in the platform's frame [rad]."""
     pivot: Point | None = None
     """3-PPR: where the platform turns on the cross slide, in the platform's frame [m]."""
-    cross_angle: Angle | None = None
+    slide_angle: Angle | None = None
     """3-PPR: direction of the cross slide in the base frame [rad]; at right angles to the rail when absent."""
 
 
@@ -71,7 +70,7 @@ class GeometryTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Where the pivot is: on the driven carriage, below a cross slide that turns with the platform (3-PRP, alignment
     stages of kind 1), or on a cross slide that keeps its direction (3-PPR, kind 2)."""
     l0: Annotated[float, Meta(ge=0.001, le=100.0)] | None = None
-    """From the centre to each summit of the fixed triangle [m]; instead of three legs."""
+    """From the centre to where each rail of the paper's symmetric robot begins [m]; instead of three legs."""
     leg: tuple[LegTable, LegTable, LegTable] | None = None
     labels: tuple[Label, Label, Label] = NAMES
     """What people call the sliders A, B, C, as U, V, W: in all that they read. One to four letters and digits."""
@@ -113,7 +112,7 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     position: EachRange
     """Travel of lambda_10 [m]."""
     passive: Range
-    """Travel of what slides without a drive [m]: lambda_32 along the platform's edges, or the cross slides of 3-PPR."""
+    """Travel of the cross slides, which have no drive [m]; of 3-PRP they are the platform's edges."""
     velocity: EachVelocity
     """Greatest rate of each slider [m/s]."""
     acceleration: EachAcceleration
@@ -377,7 +376,7 @@ def _labels(table: GeometryTable) -> Labels:
     return table.labels
 
 
-_OF_KIND = {"3-PRP": ("edge_point", "edge_angle"), "3-PPR": ("pivot", "cross_angle")}
+_OF_KIND = {"3-PRP": ("edge_point", "edge_angle"), "3-PPR": ("pivot", "slide_angle")}
 """The keys of a leg that are one mechanism's alone."""
 _WORDS = {"3-PRP": "the platform's edge turns with it", "3-PPR": "the cross slide keeps its direction"}
 
@@ -397,9 +396,7 @@ def _leg(kind: str, name: str, table: LegTable) -> AnyLeg:
         raise ConfigError(f"geometry: leg {name} has no {missing}, which kind {kind} needs")
     if kind == "3-PRP":
         return Leg(table.anchor, table.rail_angle, table.home, point, angle)
-    return PprLeg(
-        table.anchor, table.rail_angle, table.home, point, table.rail_angle + RIGHT if angle is None else angle
-    )
+    return CrossLeg(table.anchor, table.rail_angle, table.home, point, angle)
 
 
 def corrected_geometry(config: Config) -> Geometry:

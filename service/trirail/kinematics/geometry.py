@@ -18,16 +18,16 @@ from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.correction import Correction
 from trirail.kinematics.leg import LEGS, PARALLEL, AnyLeg, wrapped
-from trirail.kinematics.ppr3.leg import PprLeg
+from trirail.kinematics.ppr3.leg import CrossLeg
 from trirail.kinematics.prp3.leg import Leg
 from trirail.naming import Labels
 
 __all__ = [
     "LEGS",
     "PARALLEL",
+    "CrossLeg",
     "Geometry",
     "Leg",
-    "PprLeg",
     "Room",
     "det_j2",
     "gains",
@@ -41,18 +41,25 @@ __all__ = [
 class Geometry:
     """Three legs A, B, C, and what the robot differs from them by, if that is known.
 
-    KinematicsError if a number is not finite, the legs are of two mechanisms, or the pose (0, 0, 0) is singular.
+    KinematicsError if a number is not finite, the legs are of two mechanisms or of another `kind`, or the pose
+    (0, 0, 0) is singular.
     """
 
     legs: tuple[Any, Any, Any]
-    """Of one mechanism, prp3.leg.Leg or ppr3.leg.PprLeg; who knows the face alone reads `each`."""
+    """Of one mechanism, prp3.leg.Leg or ppr3.leg.CrossLeg; who knows the face alone reads `each`."""
     correction: Correction | None = None
     labels: Labels = field(default=LEGS, compare=False)
     """What people call the sliders."""
+    kind: str = ""
+    """The mechanism, as [geometry] kind names it: 3-PRP or 3-PPR; that of the legs if it is not given."""
     _packed: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         _check(self)
+        kind = self.each[0].KIND
+        if self.kind not in ("", kind):
+            raise KinematicsError(f"kind is {self.kind!r}, and the legs are those of a {kind} robot")
+        object.__setattr__(self, "kind", kind)
         packed = np.stack([leg.packed() for leg in self.legs])
         if self.correction is not None:
             packed = np.concatenate([packed, self.correction.packed().reshape(-1, *packed.shape[1:])])
@@ -93,11 +100,6 @@ class Geometry:
     def each(self) -> tuple[AnyLeg, AnyLeg, AnyLeg]:
         """The legs, as all mechanisms have them."""
         return self.legs
-
-    @property
-    def kind(self) -> str:
-        """The mechanism, as [geometry] kind names it: 3-PRP or 3-PPR."""
-        return self.each[0].KIND
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -174,7 +176,7 @@ def other_kind(geometry: Geometry) -> Geometry:
         x, y = leg.anchor
         along = leg.home + slider
         carriage = x + along * math.cos(leg.rail_angle), y + along * math.sin(leg.rail_angle)
-        kind = PprLeg if isinstance(leg, Leg) else Leg
+        kind = CrossLeg if isinstance(leg, Leg) else Leg
         legs.append(kind(leg.anchor, leg.rail_angle, leg.home, carriage, leg.cross_angle))
     return Geometry(legs=(legs[0], legs[1], legs[2]), labels=geometry.labels)
 

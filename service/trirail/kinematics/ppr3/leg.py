@@ -2,7 +2,7 @@
 
 With u(a) = (cos a, sin a), the platform's centre G and its rotation R(phi), the leg closes the loop
 
-    anchor + (home + lambda_10) u(rail_angle) + lambda_21 u(cross_angle) = G + R(phi) pivot
+    anchor + (home + lambda_10) u(rail_angle) + lambda_21 u(slide_angle) = G + R(phi) pivot
 
 so with n across the cross slide, n . u lambda_10 = n . (G + R(phi) pivot - anchor - home u): linear in G.
 """
@@ -21,21 +21,22 @@ from trirail.kinematics.arrays import Array
 from trirail.kinematics.joints import Joint, serial_leg
 from trirail.kinematics.leg import PARALLEL, THETA_1, Crossing, check_finite, theta
 
-__all__ = ["PprLeg"]
+__all__ = ["CrossLeg"]
 
 
 @dataclass(frozen=True, slots=True)
-class PprLeg:
+class CrossLeg:
     """One leg: a slider on a rail of the base carries a cross slide, on which a pivot of the platform rides.
 
     `anchor` is a point of the rail, `rail_angle` its direction, and the slider reads zero at `home` from the anchor.
-    `pivot` is in the platform's frame, `cross_angle` the direction of the cross slide in the base frame.
+    `pivot` is in the platform's frame, `slide_angle` the direction of the cross slide in the base frame, at right
+    angles to the rail if it is None.
     """
 
     KIND: ClassVar[str] = "3-PPR"
     # To move the anchor is to change `home`, and the zero of lambda_21: it is not sought. Where the cross slide is at
     # right angles to its rail, poses do not tell the rail's angle: it is left open.
-    PARAMETERS: ClassVar[tuple[str, ...]] = ("rail_angle", "home", "pivot in x", "pivot in y", "cross_angle")
+    PARAMETERS: ClassVar[tuple[str, ...]] = ("rail_angle", "home", "pivot in x", "pivot in y", "slide_angle")
     DOUBT: ClassVar[tuple[float, ...]] = (0.05, 0.01, 0.01, 0.01, 0.05)
     CROSS: ClassVar[str] = "cross slide"
 
@@ -43,7 +44,15 @@ class PprLeg:
     rail_angle: float
     home: float
     pivot: tuple[float, float]
-    cross_angle: float
+    slide_angle: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "slide_angle", self.cross_angle)
+
+    @property
+    def cross_angle(self) -> float:
+        """Direction of the cross slide [rad]."""
+        return self.rail_angle + math.pi / 2.0 if self.slide_angle is None else self.slide_angle
 
     @property
     def parallel_angle(self) -> None:
@@ -69,7 +78,7 @@ class PprLeg:
         check_finite(self, name)
         if abs(math.sin(self.cross_angle - self.rail_angle)) <= PARALLEL:
             raise KinematicsError(
-                f"leg {name}: cross_angle is parallel to rail_angle: the cross slide must lead across the rail",
+                f"leg {name}: slide_angle is parallel to rail_angle: the cross slide must lead across the rail",
                 leg=name,
                 value=self.cross_angle,
                 limit=self.rail_angle,
@@ -111,18 +120,18 @@ class PprLeg:
         found: Array = -(self.pivot[0] * np.cos(angle) - self.pivot[1] * np.sin(angle))
         return found
 
-    def corrected(self, corrections: Sequence[float]) -> PprLeg:
+    def corrected(self, corrections: Sequence[float]) -> CrossLeg:
         """Return the leg with corrections to its PARAMETERS."""
-        rail_angle, home, pivot_x, pivot_y, cross_angle = corrections
-        return PprLeg(
+        rail_angle, home, pivot_x, pivot_y, slide_angle = corrections
+        return CrossLeg(
             anchor=self.anchor,
             rail_angle=self.rail_angle + rail_angle,
             home=self.home + home,
             pivot=(self.pivot[0] + pivot_x, self.pivot[1] + pivot_y),
-            cross_angle=self.cross_angle + cross_angle,
+            slide_angle=self.cross_angle + slide_angle,
         )
 
-    def parameter_derivatives(self, first: PprLeg, phi: Array, slider: Array, passive: Array) -> Array:  # noqa: ARG002
+    def parameter_derivatives(self, first: CrossLeg, phi: Array, slider: Array, passive: Array) -> Array:  # noqa: ARG002
         """Return how F changes with corrections: (N, 5).
 
         With n = (sin, -cos)(cross_angle), F = n . (anchor + (home + lambda_10) u(rail_angle) - G - R pivot) = 0.
