@@ -14,7 +14,7 @@ import numpy as np
 from trirail_drivers.interface import Triple
 
 from trirail.errors import ServiceError
-from trirail.kinematics.geometry import Geometry, PprLeg
+from trirail.kinematics.geometry import CrossLeg, Geometry
 from trirail.kinematics.robot import forward
 from trirail.wire.records import unpack
 
@@ -36,7 +36,7 @@ def built_otherwise(robot: Geometry, rng: np.random.Generator, places: float, an
 
     legs: list[Any] = []
     for leg in robot.each:
-        point, turn = ("pivot", "cross_angle") if isinstance(leg, PprLeg) else ("edge_point", "edge_angle")
+        point, turn = ("pivot", "slide_angle") if isinstance(leg, CrossLeg) else ("edge_point", "edge_angle")
         changes = {
             "anchor": near(leg.anchor),
             "rail_angle": angle(leg.rail_angle),
