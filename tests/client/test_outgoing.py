@@ -386,6 +386,8 @@ CLOSED: dict[str, Call] = {
     "send": lambda robot, _: robot.send(lambda name: VelocityGoal(0.0, 0.0, 0.0, id=name)),
     "command": lambda robot, _: robot.command("stop"),
     "info": lambda robot, _: robot.info(),
+    "role": lambda robot, _: robot.role(),
+    "users": lambda robot, _: robot.users(),
     "poses": lambda robot, _: robot.poses(),
     "teach": lambda robot, _: robot.teach("out"),
     "forget": lambda robot, _: robot.forget("out"),
