@@ -66,6 +66,8 @@ screenshots: $(READY)  ## every picture of the guides anew, from what runs; need
 	$(VENV)/bin/trirail demo --record $(PICTURES)/demo.rrd
 	$(VENV)/bin/python tools/screenshot.py $(PICTURES)/demo.rrd $(PICTURES)/demo.png
 	rm $(PICTURES)/demo.rrd
+	folder=$$(mktemp -d) && $(VENV)/bin/python tools/paper.py --output $$folder && cp $$folder/paper.png $(PICTURES) && rm -r $$folder
+	$(VENV)/bin/python tools/picture_stamps.py
 
 clean:  ## remove what the commands above made
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -5,21 +5,33 @@ A service on simulated drives of its own, enabled and moving, its page in Chromi
 
 from __future__ import annotations
 
+import base64
+import json
 import shutil
 import subprocess
 import sys
 import tempfile
 import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.panel.server import Panel
+from websockets.sync.client import connect
 
 OUT = Path(__file__).parent / "pictures" / "panel.png"
 SIZE = (1280, 800)
-SETTLES = 4000
-"""The page is drawn so long after it was opened [ms]."""
+WITHIN = 60.0
+"""The page has to show what is wanted within so long [s]."""
+WANTED = (
+    "document.querySelector('.goal')?.getBoundingClientRect().width && document.querySelector('#people').textContent"
+)
+"""When the picture is taken: all is there, and the robot on its way."""
 TOUR = ((0.03, 0.02, 0.2), (-0.03, 0.02, -0.2), (0.02, -0.03, 0.1), (0.0, 0.0, 0.0))
 
 
@@ -29,28 +41,64 @@ def main() -> None:
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         raise SystemExit("no Chromium here: install it (Debian: apt-get install chromium)")
-    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+    with tempfile.TemporaryDirectory(prefix="trirail-", ignore_cleanup_errors=True) as folder:
         config, locator = own_service.private(Path(folder))
         with own_service.service(config, Path(folder, "shown.rrd")), Robot("demo", locator, user="ann") as robot:
             robot.enable()
-            threading.Thread(target=_tour, args=[robot], daemon=True).start()
-            with Panel(robot, 0) as panel:
-                width, height = SIZE
-                subprocess.run(
-                    [
-                        *(browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"),
-                        *(f"--user-data-dir={folder}/profile", f"--window-size={width},{height}"),
-                        *(f"--timeout={SETTLES}", f"--screenshot={out}", panel.url),
-                    ],
-                    check=True,
-                    capture_output=True,
-                )
+            over = threading.Event()
+            tour = threading.Thread(target=_tour, args=[robot, over])
+            tour.start()
+            try:
+                with Panel(robot, 0) as panel, _page(browser, Path(folder, "profile"), panel.url) as call:
+                    deadline = time.monotonic() + WITHIN
+                    while not call("Runtime.evaluate", expression=f"Boolean({WANTED})")["result"]["value"]:
+                        if time.monotonic() > deadline:
+                            raise SystemExit("the page does not come to show the robot")
+                        time.sleep(0.02)
+                    out.write_bytes(base64.b64decode(call("Page.captureScreenshot", format="png")["data"]))
+            finally:
+                over.set()
+                tour.join()
     print(f"drawn to {out}")
 
 
-def _tour(robot: Robot) -> None:
-    for pose in TOUR * 4:
-        robot.move_to(*pose, speed=0.3).wait(timeout=30.0)
+@contextmanager
+def _page(browser: str, profile: Path, url: str) -> Iterator[Callable[..., dict[str, Any]]]:
+    """Open a page in a browser; yield what calls a method of the DevTools protocol on it."""
+    width, height = SIZE
+    flags = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--remote-debugging-port=0")
+    command = [browser, *flags, f"--user-data-dir={profile}", f"--window-size={width},{height}", url]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        try:
+            told, deadline = profile / "DevToolsActivePort", time.monotonic() + WITHIN
+            while not (told.is_file() and len(lines := told.read_text().splitlines()) == 2):
+                if process.poll() is not None or time.monotonic() > deadline:
+                    raise SystemExit(f"{browser} does not start")
+                time.sleep(0.05)
+            with urllib.request.urlopen(f"http://127.0.0.1:{lines[0]}/json") as answer:
+                address = next(each["webSocketDebuggerUrl"] for each in json.load(answer) if each["type"] == "page")
+            with connect(address, max_size=None) as opened:
+
+                def call(method: str, **parameters: Any) -> dict[str, Any]:
+                    opened.send(json.dumps({"id": 1, "method": method, "params": parameters}))
+                    while "result" not in (said := json.loads(opened.recv(WITHIN))):
+                        if "error" in said:
+                            raise SystemExit(said["error"]["message"])
+                    result: dict[str, Any] = said["result"]
+                    return result
+
+                call(
+                    "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+                )
+                yield call
+        finally:
+            process.terminate()
+
+
+def _tour(robot: Robot, over: threading.Event) -> None:
+    while not over.is_set():
+        for pose in TOUR:
+            robot.move_to(*pose, speed=0.3).wait(timeout=30.0)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,8 @@ from trirail.telemetry.sinks import free_port
 TIMEOUT = 60.0
 SETTLE = 2.0
 """For the views to take in what has been loaded [s]."""
+NOTICED = 5.0
+"""For the viewer's notices to go [s]."""
 TITLE_BAR = 36
 """Height of the strip that the viewer keeps for the window's buttons [pixels]; there is nothing in it."""
 
@@ -42,6 +44,7 @@ def main() -> int:
     with viewer(arguments.recording, width, height) as client:
         if arguments.at is not None:
             client.set_time("t", duration=arguments.at, play_state="paused")
+        time.sleep(NOTICED)
         picture(client).save(arguments.picture)
     return 0
 

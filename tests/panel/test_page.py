@@ -488,8 +488,30 @@ def test_a_service_that_is_silent_is_told_and_comes_back(page: Page, robot: Fake
     page.until("document.querySelector('#mode-name').textContent === 'no contact'")
     assert "old" in page.text("#alarm")
     assert "mm" not in page.text("#pose")
+    moving = (
+        "['.platform', '.sleeve', '.carriage', '.pivot']"
+        ".map((kind) => document.querySelector(kind).getBoundingClientRect().width > 0)"
+    )
+    assert not any(page.evaluate(moving))  # nobody knows where it is
+    assert page.evaluate("document.querySelector('.rail').getBoundingClientRect().width")
     robot.silent.clear()
     page.until(f"{SHOWN} && document.querySelector('#alarm').hidden")
+    assert all(page.evaluate(moving))
+
+
+def test_nothing_is_drawn_where_it_may_not_be_before_there_is_a_state(browser: Page) -> None:
+    robot = FakeRobot()
+    robot.silent.set()
+    with Panel(robot.robot(), 0) as panel:
+        page = browser.another()
+        page.open(panel.url)
+        page.until("document.querySelector('.rail')")
+        assert not page.evaluate("document.querySelector('.platform').getBoundingClientRect().width")
+        page.write("#to-x", "1")
+        page.write("#to-y", "1")
+        page.write("#to-phi", "1")
+        page.until("document.querySelector('#going-says').textContent.includes('nobody knows where the robot is')")
+        page.close()
 
 
 def test_a_server_that_has_ended_is_told(browser: Page) -> None:

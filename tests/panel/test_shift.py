@@ -197,6 +197,33 @@ def test_one_that_is_too_fast_is_refused_or_slowed_where_that_is_wanted(page: Pa
     assert "times slower than asked for" in page.text("#file-says")
 
 
+def test_a_file_is_slowed_and_followed_by_keys_alone(page: Page, robot: FakeRobot) -> None:
+    choose(page, circle(0.05))
+    may(page, "no")
+    page.evaluate("document.querySelector('#stretch').focus()")
+    page.type_key("Enter")
+    may(page, "yes")
+    assert page.evaluate("document.querySelector('#stretch').checked")
+    assert not robot.followed
+    page.type_key("Tab")
+    page.type_key("Tab")
+    assert page.evaluate("document.activeElement.id") == "follow"
+    page.type_key("Enter")
+    wait(lambda: bool(robot.followed), "it follows")
+
+
+@pytest.mark.parametrize("list_", ["language", "along", "tool", "frame"])
+def test_keys_in_a_list_choose_and_move_nothing_but_stop_is_stop(page: Page, robot: FakeRobot, list_: str) -> None:
+    page.evaluate(f"document.querySelector('#{list_}').focus()")
+    before = page.evaluate(f"document.querySelector('#{list_}').selectedIndex")
+    page.type_key("ArrowDown" if before == 0 else "ArrowUp")
+    page.until(f"document.querySelector('#{list_}').selectedIndex !== {before}")
+    assert not robot.sent
+    page.type_key("Space")
+    wait(lambda: "stop" in robot.commands, "a stop")
+    page.evaluate("localStorage.clear()")
+
+
 @pytest.mark.parametrize(
     ("name", "text", "why"),
     [

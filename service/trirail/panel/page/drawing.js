@@ -26,7 +26,7 @@ export class Drawing {
     lines(parts.rails, "rail");
     lines(parts.travel, "travel").forEach((line, k) => { line.style.stroke = colours.sliders[k]; });
     lines(parts.stops, "stop");
-    this.goal = add("g", "");
+    this.goal = add("g", "moving");
     lines(parts.outline, "goal", this.goal);
     this.svg = svg;
     this.chosen = add("g", "");
@@ -34,7 +34,7 @@ export class Drawing {
     lines(parts.arms, "wanted", this.chosen);
     this.route = add("polyline", "");
     this.wanted(null, null);
-    this.platform = add("g", "");
+    this.platform = add("g", "moving");
     lines(parts.outline, "platform", this.platform);
     lines(parts.arms, "arm", this.platform);
     lines(parts.edge_stops, "stop", this.platform);

@@ -18,6 +18,11 @@ export class Following {
     byId("choose-file").addEventListener("click", () => byId("file").click());
     byId("file").addEventListener("change", () => this.#choose(byId("file").files[0]));
     byId("stretch").addEventListener("change", () => this.#check());
+    byId("stretch").addEventListener("keydown", (event) => {
+      if (event.key !== "Enter") return;
+      event.preventDefault(); // Space is STOP, and Enter would follow
+      byId("stretch").click();
+    });
     byId("file-start").addEventListener("click", () => {
       answer(say("answer.asked", { what: say("do.pose") }));
       send({ do: "pose", pose: this.found.line[0] });
