@@ -11,8 +11,13 @@ from trirail_drivers.interface import Triple
 from trirail.client import trajectory
 from trirail.client.outgoing import goal_message
 from trirail.errors import KinematicsError, RefusedError, TrirailError
+from trirail.motion.frames import NamedFrames, rotated
+from trirail.motion.goals import Goals
+from trirail.motion.runs import nominal, of_centre, of_tool, rest
+from trirail.motion.schedule import Schedule
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.goals import TrajectoryGoal
+from trirail.workspace.violations import violations
 
 LOOKS = 40
 """Poses on the way, straight in pose space, that are looked at, its end first."""
@@ -27,10 +32,6 @@ def problem(robot: ShownRobot, start: Triple, end: Triple, tool: str | None, fra
     tool goes straight. Empty where nothing is known to be in the way: positions, passive travel and the singular
     margin are looked at, at LOOKS places; speeds and what the planner finds between them are the service's to judge.
     """
-    from trirail.motion.frames import NamedFrames, rotated
-    from trirail.motion.runs import of_centre, of_tool, rest
-    from trirail.workspace.violations import violations
-
     names = NamedFrames(robot.frames)
     try:
         point, (x, y, angle) = names.tool(tool), names.frame(frame)
@@ -64,10 +65,6 @@ class CheckedPath(Struct, frozen=True, omit_defaults=True):
 
 def checked_path(robot: ShownRobot, name: str, text: str, stretch: bool) -> CheckedPath:
     """Read a trajectory and plan it as the service would from its first point: its whole path is checked."""
-    from trirail.motion.goals import Goals
-    from trirail.motion.runs import nominal, rest
-    from trirail.motion.schedule import Schedule
-
     line: list[Triple] = []
     try:
         points = tuple(trajectory.parse(name, text))
