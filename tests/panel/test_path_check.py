@@ -1,0 +1,63 @@
+"""What the page is told before anything moves: of any pose, and of any file."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.config import SIM, FramesTable, load
+from trirail.motion.runs import of_centre, rest
+from trirail.panel.path_check import CheckedPath, checked_path, problem
+from trirail.telemetry.shown_robot import ShownRobot
+from trirail.workspace.violations import violations
+
+TIP, TABLE = (0.02, 0.03), (0.05, 0.02, 0.3)
+FRAMES = FramesTable(tool={"tip": TIP}, work={"table": TABLE})
+CONFIGURED = ShownRobot.configured(load(SIM))
+ROBOT = ShownRobot(CONFIGURED.name, CONFIGURED.geometry, CONFIGURED.limits, CONFIGURED.rate_hz, FRAMES)
+ZERO = (0.0, 0.0, 0.0)
+place = st.floats(-0.2, 0.2)
+
+
+@given(
+    st.tuples(place, place, st.floats(-1.5, 1.5)), st.sampled_from([None, "tip"]), st.sampled_from(["base", "table"])
+)
+def test_a_pose_that_is_out_of_reach_is_never_called_free(
+    pose: tuple[float, float, float], tool: str | None, frame: str
+) -> None:
+    x, y, angle = TABLE if frame == "table" else ZERO
+    c, s = math.cos(angle), math.sin(angle)
+    of_point = x + c * pose[0] - s * pose[1], y + s * pose[0] + c * pose[1], angle + pose[2]
+    centre = of_centre(rest(of_point), TIP if tool else (0.0, 0.0)).pose
+    why, on_way = problem(ROBOT, ZERO, pose, tool, frame)
+    reached = not violations(ROBOT.geometry, ROBOT.limits, np.array(centre))
+    assert reached or (why and not on_way)
+    assert bool(why) or reached
+    assert problem(ROBOT, ZERO, pose, "no such", frame)[0]
+    assert problem(ROBOT, ZERO, pose, tool, "no such")[0]
+
+
+rows = st.lists(st.lists(st.one_of(st.floats(-2.0, 2.0).map(str), st.text(max_size=5)), max_size=6).map(",".join))
+texts = st.one_of(st.text(), rows.map(lambda lines: "\n".join(["t,x,y,phi", *lines])))
+
+
+@given(st.sampled_from(["a.csv", "a.json", "", "…"]), texts, st.booleans())
+def test_whatever_is_in_a_file_comes_to_an_answer(name: str, text: str, stretch: bool) -> None:
+    found = checked_path(ROBOT, name, text, stretch)
+    assert isinstance(found, CheckedPath)
+    assert found.why or (found.duration > 0.0 and len(found.line) > 2)
+
+
+@given(st.lists(st.tuples(place, place, st.floats(-0.6, 0.6)), min_size=1, max_size=6), st.booleans())
+def test_a_path_that_is_called_free_stays_in_reach(poses: list[tuple[float, float, float]], stretch: bool) -> None:
+    lines = [f"{k},{x},{y},{phi}" for k, (x, y, phi) in enumerate([ZERO, *poses])]
+    found = checked_path(ROBOT, "path.csv", "\n".join(["t,x,y,phi", *lines]), stretch)
+    if found.why:
+        return
+    assert found.line[0] == ZERO
+    assert np.allclose(found.line[-1], poses[-1], atol=1e-9)
+    assert found.slowed == 1.0 or stretch
+    for pose in found.line:
+        assert not violations(ROBOT.geometry, ROBOT.limits, np.array(pose))
