@@ -188,5 +188,5 @@ def test_commands_that_nobody_answers_are_bounded_and_hinder_no_stop(name: str) 
         answered = 0
         while answered < UNDER_WAY:
             said = str(tab.recv(PATIENCE))
-            answered += '"done","to":"stop"' in said or '"accepted","to":"go to park"' in said
+            answered += '"done","to":"stop"' in said or '"accepted","to":"goto"' in said
     assert len(robot.gone_to) == (UNDER_WAY if name == "goto" else 0)

@@ -14,7 +14,7 @@ import numpy as np
 from trirail_drivers.interface import Triple
 
 from trirail.errors import ServiceError
-from trirail.kinematics.geometry import CrossLeg, Geometry
+from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import forward
 from trirail.wire.records import unpack
 
@@ -36,14 +36,10 @@ def built_otherwise(robot: Geometry, rng: np.random.Generator, places: float, an
 
     legs: list[Any] = []
     for leg in robot.each:
-        point, turn = ("pivot", "slide_angle") if isinstance(leg, CrossLeg) else ("edge_point", "edge_angle")
-        changes = {
-            "anchor": near(leg.anchor),
-            "rail_angle": angle(leg.rail_angle),
-            point: near(getattr(leg, point)),
-            turn: angle(getattr(leg, turn)),
-        }
-        legs.append(dataclasses.replace(cast(Any, leg), **changes))
+        values = {field.name: getattr(leg, field.name) for field in dataclasses.fields(cast(Any, leg))}
+        points = {name: near(value) for name, value in values.items() if isinstance(value, tuple)}
+        turns = {name: angle(value) for name, value in values.items() if name.endswith("angle")}
+        legs.append(dataclasses.replace(cast(Any, leg), **points, **turns))
     return dataclasses.replace(robot, legs=tuple(legs))
 
 
