@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 import trirail
-from chromium import Page, chromium, needs_chromium
+from chromium import Page, needs_chromium
 from panel.fake_robot import FakeRobot
 from trirail.panel.server import LANGUAGES, Panel
 from trirail.wire.vocabulary import Command, Mode, Role
@@ -52,12 +51,6 @@ def test_every_word_is_used_and_every_one_used_is_there() -> None:
 
 
 # ---------------------------------------------------------------------- in a browser
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with chromium("chromium", tmp_path_factory.mktemp("profile"), ["--disable-gpu"]) as page:
-        yield page
 
 
 @pytest.fixture

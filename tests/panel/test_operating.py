@@ -69,12 +69,6 @@ def still(robot: Robot, cycles: int = 500) -> None:
 # ---------------------------------------------------------------------- the page
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with chromium("chromium", tmp_path_factory.mktemp("profile"), ["--disable-gpu"]) as page:
-        yield page
-
-
 @contextmanager
 def served(service: Service) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """Run `trirail panel`; yield the page's address and the process."""

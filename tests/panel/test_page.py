@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from chromium import Page, chromium, needs_chromium
+from chromium import Page, needs_chromium
 from panel.fake_robot import FakeRobot
 from trirail.client.held_jog import TIMEOUT
 from trirail.errors import RefusalCode, RefusedError
@@ -20,12 +20,6 @@ pytestmark = [pytest.mark.viewer, needs_chromium]
 WITHIN = 20.0
 SHOWN = "document.body.dataset.contact === 'yes'"
 SIZES = {"desk": (1280, 800, False), "phone": (390, 844, True), "small phone": (375, 667, True)}
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with chromium("chromium", tmp_path_factory.mktemp("profile"), ["--disable-gpu"]) as page:
-        yield page
 
 
 @pytest.fixture

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
-from chromium import Page, chromium, needs_chromium
+from chromium import Page, needs_chromium
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
@@ -84,12 +83,6 @@ def test_what_a_role_may_not_reaches_no_robot(
 
 
 # ---------------------------------------------------------------------- the page
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with chromium("chromium", tmp_path_factory.mktemp("profile"), ["--disable-gpu"]) as page:
-        yield page
 
 
 @pytest.mark.viewer

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from chromium import Page, chromium, needs_chromium
+from chromium import Page, needs_chromium
 from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
@@ -27,12 +27,6 @@ pytestmark = [pytest.mark.viewer, needs_chromium]
 TIP, TABLE = (0.02, 0.03), (0.05, 0.02, 0.3)
 FRAMES = {"tool": {"tip": TIP}, "work": {"table": TABLE}}
 SHOWN = "document.body.dataset.contact === 'yes'"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with chromium("chromium", tmp_path_factory.mktemp("profile"), ["--disable-gpu"]) as page:
-        yield page
 
 
 @pytest.fixture
