@@ -58,7 +58,7 @@ class Happening(NamedTuple):
 
 
 class Session:
-    """A loop, what is around it, and everything that it has said; one turn of it is a cycle."""
+    """A loop, what is around it, and everything that it has said."""
 
     begins_ns = 100_000_000_000
 
@@ -161,9 +161,11 @@ class Session:
         for number in range(cycles):
             for what in script.get(number, ()):
                 what.does(self)
-            before = self.loop.control.cycles
+            before, turns = self.loop.control.cycles, 0
             while self.loop.control.cycles == before:
                 self.loop.turn(self.ticker)
+                turns += 1
+            assert turns <= 2, "before a tick it is heard once who calls"
             while self.gateway.receive() is not None:
                 pass
             while (packet := self.recorder.receive()) is not None:
@@ -483,6 +485,25 @@ def test_a_jog_that_nobody_renews_ends_also_where_its_time_is_over_within_a_cycl
     one, other = both_ways(CONFIG, tmp_path, lambda: happens, 400)
     assert one.loop.control.state.mode is Mode.HOLDING
     _compare(one.heard, other.heard)
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_who_stays_at_the_door_unheard_keeps_no_tick_waiting(quiet: bool, tmp_path: Path) -> None:
+    """What a frozen gateway has left is not taken, and it stays there."""
+
+    def freeze(session: Session) -> None:
+        session.beats = False
+
+    def leave(session: Session) -> None:
+        session.ask(CommandRequest(1, "ann", Command.ENABLE))
+
+    session = Session(CONFIGS["cia402"], tmp_path, "unix", quiet=quiet)
+    try:
+        session.run({20: [Happening(freeze)], 600: [Happening(leave)]}, 700)
+        assert session.loop.control.cycles >= 700
+        assert session.loop.control.state.mode is Mode.DISABLED, "nobody has taken it"
+    finally:
+        session.close()
 
 
 def _compare(heard: list[object], heard_of_python: list[object]) -> None:
