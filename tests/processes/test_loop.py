@@ -280,7 +280,7 @@ def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) 
     shell.gateway.close()
     shell.cycles(2)
     shell.loop.ending = True
-    shell.cycles(2)
+    shell.cycles(20)  # a batch of records: what was given goes with it
     said = [decode_answer(packet[1:]) for packet in shell.received(shell.recorder) if packet[0] == Kind.MESSAGE]
     given = [answer for answer in said if isinstance(answer, ControlInput)]
     assert [type(what.given) for what in given] == [CommandRequest, DrivesFault, Disturbance, Disturbance]

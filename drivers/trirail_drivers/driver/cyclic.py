@@ -95,7 +95,8 @@ class Lender(Protocol):
     def lend(self) -> Cyclic | None:
         """Between two cycles: the tables of a cycle, where all that drives need is to have it run by these.
 
-        None where there is more to do. As long as they are lent, nothing else is called.
+        None where there is more to do. As long as they are lent, nothing is called but orders as `disable` or
+        `quick_stop`, and then `take_back` before the next cycle.
         """
 
     def take_back(self, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:

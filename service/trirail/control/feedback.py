@@ -56,6 +56,12 @@ class Measured:
         self.room = np.zeros((2, 3))
 
     @property
+    def position(self) -> Triple:
+        """Newest positions of the sliders [m]; while cycles are quiet the feedback has older ones."""
+        x, y, z = self.numbers["position"][0].tolist()
+        return x, y, z
+
+    @property
     def pose(self) -> Triple:
         """The newest pose to which measured sliders belonged."""
         return self._recorded("pose")

@@ -54,7 +54,7 @@ class Setpoints:
 
     def start(self) -> None:
         """Begin where the sliders are."""
-        self.sliders[0, 0] = self._measured.feedback.position
+        self.sliders[0, 0] = self._measured.position
 
     def solve(self, schedule: Schedule, run: Run | None) -> int:
         """Move the commanded motion on, by the run under way, and solve the sliders by the paper's recursion.
@@ -105,7 +105,7 @@ class Setpoints:
 
     def check_rest(self) -> None:
         """Refuse to enable while a setpoint is on its way to where its slider is."""
-        places = self._measured.feedback.position
+        places = self._measured.position
         for name, setpoint, position in zip(self._bounds.labels, self.rows[0], places, strict=True):
             if not abs(setpoint - position) <= self.step:
                 raise RefusedError(
@@ -115,7 +115,7 @@ class Setpoints:
 
     def check_start(self) -> None:
         """Refuse to begin where the robot stands outside what it may do."""
-        position = self._measured.feedback.position
+        position = self._measured.position
         pose = self._measured.pose_of(position)
         self._motion[:] = 0.0
         self._motion[0] = pose or math.nan

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 from trirail_drivers.interface import DriveGroup
 
@@ -24,6 +25,15 @@ _OUTCOMES: dict[ModeEvent, Outcome] = {
     ModeEvent.FAULT: "faulted",
 }
 """How a goal ends on an event after which it is not under way; else it is stopped."""
+_ORDERS: dict[Action, Callable[[DriveGroup], None]] = {
+    Action.POWER_UP: lambda drives: drives.enable(),
+    Action.POWER_DOWN: lambda drives: drives.disable(),
+    Action.QUICK_STOP: lambda drives: drives.quick_stop(),
+    Action.CLEAR: lambda drives: drives.reset(),
+    Action.HOME: lambda drives: drives.home(),
+    Action.STOP_HOMING: lambda drives: drives.stop_homing(),
+}
+"""What of it the drives are told; all else is for the motion."""
 _GO_ON = (
     ModeEvent.GOAL,
     ModeEvent.STANDSTILL,
@@ -65,6 +75,8 @@ class Transitions:
         """The first reason, since the last reset."""
         self.entered = 0
         """In which cycle the mode was entered."""
+        self.orders = 0
+        """How many orders the drives have been given."""
 
     def check(self, event: ModeEvent) -> Step:
         """Return what an event would do now. Raises RefusedError where it makes no sense in this mode."""
@@ -121,15 +133,11 @@ class Transitions:
             self._goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason)
 
     def _act(self, decided: Step) -> None:
+        if (order := _ORDERS.get(decided.action)) is not None:
+            self.orders += 1
+            order(self._drives)
         match decided.action:
-            case Action.POWER_UP:
-                self._drives.enable()
-            case Action.POWER_DOWN:
-                self._drives.disable()
-            case Action.QUICK_STOP:
-                self._drives.quick_stop()
             case Action.CLEAR:
-                self._drives.reset()
                 self.fault = None
             case Action.BRAKE if decided.state.paused:
                 self._planner.run_at(0.0)
@@ -138,7 +146,3 @@ class Transitions:
                 self._planner.run_at(0.0)
             case Action.RESUME:
                 self._planner.run_at(self._planner.override)
-            case Action.HOME:
-                self._drives.home()
-            case Action.STOP_HOMING:
-                self._drives.stop_homing()

@@ -20,6 +20,24 @@ class Tick(NamedTuple):
     """Ticks skipped since the one before."""
 
 
+class Overruns:
+    """Ticks that were missed, of which so many are `allowed` in a row."""
+
+    def __init__(self, allowed: int) -> None:
+        self.allowed = allowed
+        self.all = 0
+        """Since the start."""
+        self.in_a_row = 0
+        """Before the newest tick and, where ticks were missed before that as well, before those."""
+
+    def too_many(self, missed: int) -> int:
+        """Count those that were missed before a tick; return how many that are in a row, if more than are allowed."""
+        self.all += missed
+        in_a_row = self.in_a_row + missed if missed else 0
+        self.in_a_row = in_a_row if in_a_row <= self.allowed else 0
+        return in_a_row if in_a_row > self.allowed else 0
+
+
 def sleep_until(deadline_ns: int) -> None:
     """Sleep to an absolute time of the monotonic clock."""
     remaining = deadline_ns - time.monotonic_ns()

@@ -19,7 +19,7 @@ from trirail.control.control import Control, Given
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import warm_up
 from trirail.processes import realtime
-from trirail.processes.clock import Tick, Ticker
+from trirail.processes.clock import Overruns, Tick, Ticker
 from trirail.processes.heartbeats import Haste, Heartbeats, Watch
 from trirail.processes.planner_port import PlannerLink
 from trirail.processes.ports import Ports
@@ -68,15 +68,13 @@ class Loop:
         self._planner = PlannerLink(ports.planner)
         self._period = config.period
         self._period_ns = round(config.period * 1e9)
-        self._max_overruns = config.watchdogs.max_overruns
 
         self.control = Control(config, drives, self._planner)
         self._reports = Reports(config, self.control, drives, ports.gateway, ports.recorder, capture, lacking)
         self.ending = False
         """Set from outside to make the loop stop the robot, disable the drives and return."""
         self._ending_since: int | None = None
-        self._overruns = 0
-        self._late_streak = 0
+        self._overruns = Overruns(config.watchdogs.max_overruns)
         self._heart = heartbeats.of("loop")
         self._haste = Haste(heartbeats)
         self._gateway_timeout = config.watchdogs.gateway_timeout
@@ -120,7 +118,7 @@ class Loop:
         Or only the last, where somebody calls while the next tick is waited for: once before each tick.
         """
         quiet, newest = self._quiet, None
-        disturbed = self.ending or self._late_streak or self._gateway_frozen or not self._planner.idle
+        disturbed = self.ending or self._gateway_frozen or not self._planner.idle
         if quiet is not None and not disturbed:
             newest = quiet.run(ticker, self._overruns, listens=not self._listened)
         elif quiet is not None:
@@ -134,7 +132,7 @@ class Loop:
         elif newest.reached is Reached.SYNCED:
             self._marked_ns = newest.marked_ns
             self._parts_ns[Part.SYNC], self._parts_ns[Part.RECORD] = newest.sync_ns, newest.record_ns
-            self._go_on(Tick(newest.deadline_ns, newest.lateness_ns, 0))
+            self._go_on(Tick(newest.deadline_ns, newest.lateness_ns, newest.missed))
         elif quiet is not None:
             self._listened = self._never_listens
             if newest.reached is Reached.CALLED:
@@ -163,7 +161,7 @@ class Loop:
         self._handle_urgent(self._watch(tick, feedback.fault), now_ns)
         self._mark(Part.MODE)
         self.control.execute(feedback, self._mark)
-        self._reports.record(tick, self._overruns, self._parts_ns)
+        self._reports.record(tick, self._overruns.all, self._parts_ns)
         self._reports.pass_on()
         self.control.conclude()
         self._decide(tick.deadline_ns + self._period_ns)
@@ -218,15 +216,8 @@ class Loop:
         if fault is not self._fault:
             self._fault = fault
             self._reports.note(tick.deadline_ns + tick.lateness_ns, DrivesFault(fault.message if fault else None))
-        if tick.missed:
-            self._overruns += tick.missed
-            self._late_streak += tick.missed
-            if self._late_streak > self._max_overruns:
-                text = f"{self._late_streak} ticks missed in a row: the machine is too busy"
-                self._late_streak = 0
-                yield Disturbance(ModeEvent.LATE.name, text)
-        else:
-            self._late_streak = 0
+        if in_a_row := self._overruns.too_many(tick.missed):
+            yield Disturbance(ModeEvent.LATE.name, f"{in_a_row} ticks missed in a row: the machine is too busy")
         if (lost := self._gateway_lost()) is not None:
             yield Disturbance(ModeEvent.GATEWAY_LOST.name, lost)
         if self.ending and self._ending_since is None:

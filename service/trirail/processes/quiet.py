@@ -76,7 +76,10 @@ STATE = np.dtype(
         ("cycle", "<i8"),
         ("until", "<i8"),  # the last cycle that may be run
         ("due", "<i8"),  # the cycle behind which something is to be decided
-        ("overruns", "<i8"),
+        ("overruns", "<i8"),  # ticks that have been missed
+        ("in_a_row", "<i8"),  # those before the newest, and how many may be
+        ("allowed", "<i8"),
+        ("missed", "<i8"),  # those before the newest tick
         ("parts_ns", "<i4", len(Part)),
         ("mode", "u1"),  # as in a record
         ("source", "u1"),  # FOLLOW, HOLD or COMMAND
@@ -224,7 +227,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         now, s.listens = _now_ns(state, moment), s.period_ns > SPARE_NS
         s.marked_ns, s.arrived, s.sent, s.error, s.called = now, 0, 0, 0, 0
         s.lateness_ns = now - s.deadline_ns
-        if s.lateness_ns >= s.period_ns:
+        s.missed = max(0, s.lateness_ns // s.period_ns)
+        if s.missed and s.in_a_row + s.missed > s.allowed:
             return Reached.WAITED
         _copy(kept, 1, 0)
         t = now / 1e9
@@ -238,6 +242,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         ):
             _copy(kept, 0, 1)
             return Reached.WAITED
+        s.deadline_ns, s.lateness_ns = s.deadline_ns + s.missed * s.period_ns, s.lateness_ns - s.missed * s.period_ns
         s.synced, s.arrived = t, 0
         begun, due = _send(bus, begin, starts, times), t >= times[0].beat_due
         first, number = times[0].next_beat, times[0].beats
@@ -306,6 +311,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         _mark(state, moment, Part.WRITE)
 
         s.cycle += 1
+        s.overruns += s.missed
+        s.in_a_row = s.in_a_row + s.missed if s.missed else 0
         row.cycle, row.deadline_ns, row.lateness_ns, row.overruns = s.cycle, s.deadline_ns, s.lateness_ns, s.overruns
         row.parts_ns[:] = s.parts_ns
         row.mode = s.mode

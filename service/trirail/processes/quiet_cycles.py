@@ -12,7 +12,7 @@ from trirail_drivers.driver.cyclic import Cyclic, Lender
 from trirail.control.control import Calm, Control
 from trirail.motion.paths import Path, constant
 from trirail.processes import quiet
-from trirail.processes.clock import Ticker
+from trirail.processes.clock import Overruns, Ticker
 from trirail.processes.heartbeats import HASTE, PROCESSES, Haste, Heartbeats, Watch
 from trirail.processes.quiet import Reached
 from trirail.processes.reports import Reports
@@ -36,6 +36,8 @@ class Newest(NamedTuple):
     reached: Reached
     deadline_ns: int
     lateness_ns: int
+    missed: int
+    """Ticks skipped before it, not counted yet."""
     marked_ns: int
     """When its newest part ended."""
     sync_ns: int
@@ -73,6 +75,10 @@ class QuietCycles:
         self._moment = np.zeros(2, np.int64)
         self._doors = doors
         self._lent: Cyclic | None = None
+        self._orders = 0
+        """How many orders the drives had been given when they lent it."""
+        self._decided = False
+        """Whether anything has been decided since the newest cycle."""
         self._calm: Calm | None = None
         self._nothing = np.zeros(1)
         self._rooms: list[NDArray[Any]] = []
@@ -85,32 +91,35 @@ class QuietCycles:
         state["fastest"], state["limit"], state["step"] = measured.fastest, measured.limit, setpoints.step
         state["gateway_place"], state["gateway_patience"] = PROCESSES.index("gateway"), watch.patience
 
-    def run(self, ticker: Ticker, overruns: int, *, listens: bool) -> Newest | None:
+    def run(self, ticker: Ticker, overruns: Overruns, *, listens: bool) -> Newest | None:
         """Run cycles until something happens; return how far the newest has come, None where none was begun.
 
         `listens`: who calls while the first tick is waited for is heard before it. At the end of a batch the next call
         goes on, if nothing has been said meanwhile.
         """
         control, state = self._control, self._state[0]
-        if not (self._reports.idle and self._gateway.calm and (self._lent is not None or self._borrow())):
+        if not (self._reports.idle and self._gateway.calm and self._goes_on()):
             self.leave()
             return None
         lent, calm, watch = self._lent, self._calm, self._watch
         assert lent is not None
         assert calm is not None
-        state["injected_ns"], state["overruns"], state["deadline_ns"] = ticker.come(), overruns, ticker.deadline_ns
+        state["injected_ns"], state["deadline_ns"] = ticker.come(), ticker.deadline_ns
+        state["overruns"], state["in_a_row"], state["allowed"] = overruns.all, overruns.in_a_row, overruns.allowed
         state["until"] = control.cycles + (1 if state["injected_ns"] >= 0 else _MOST)
         state["batched"] = self._reports.batched
         state["gateway_seen"], state["gateway_turns"], state["haste"] = watch.seen, watch.turns, self._haste.seen
         state["listens"] = listens
         reached = Reached(self._call(lent, calm))
         left = dict(zip(_NAMES, state.item(), strict=True))  # one by one, from the array, it would take longer
+        overruns.all, overruns.in_a_row = left["overruns"], left["in_a_row"]
         watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
         self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
         self.cycles += left["cycle"] - control.cycles
         decides = bool(left["called"]) and reached not in (Reached.SYNCED, Reached.CALLED)
         called = decides or reached is Reached.CALLED
-        if called or reached is not Reached.DONE:
+        self._decided = self._decided or called
+        if reached not in (Reached.DONE, Reached.CALLED):
             synced = left["synced"] if reached is Reached.SYNCED else None
             self.leave(left["arrived"], synced=synced, error=max(left["error"], 0))
         control.go_on(left["cycle"], left["time"], left["found"] if decides else None)
@@ -118,7 +127,8 @@ class QuietCycles:
             self._drives.send_on(left["sent"])
         parts = left["parts_ns"]
         took = int(parts[Part.SYNC]), int(parts[Part.RECORD])
-        return Newest(reached, left["deadline_ns"], left["lateness_ns"], left["marked_ns"], *took, called)
+        tick = left["deadline_ns"], left["lateness_ns"], left["missed"]
+        return Newest(reached, *tick, left["marked_ns"], *took, called)
 
     def leave(self, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
         """Give back to the drives what they have lent, as of trirail_drivers.driver.cyclic.Lender.take_back."""
@@ -126,14 +136,23 @@ class QuietCycles:
             self._control.measured.feedback = self._drives.take_back(arrived, synced=synced, error=error)
             self._lent = None
 
-    def _borrow(self) -> bool:
-        """Have the drives lend their tables, where nothing is to be done but what these hold."""
-        self._calm = self._control.calm()
+    def _goes_on(self) -> bool:
+        """Whether nothing is to be done but what tables hold: those that are lent, if nothing was decided since.
+
+        They stay lent as long as nothing is decided but how the robot moves.
+        """
+        if self._lent is not None and not self._decided:
+            return True
+        self._calm, orders = self._control.calm(), self._control.modes.orders
         if self._calm is None or self._calm.until <= self._control.cycles:
             return False
-        self._lent = self._drives.lend()
+        if orders != self._orders:
+            self.leave()
+        if self._lent is None:
+            self._lent, self._orders = self._drives.lend(), orders
         if self._lent is not None:
             self._take(self._calm)
+            self._decided = False
         return self._lent is not None
 
     def add(self, part: Part) -> None:

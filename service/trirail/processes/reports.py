@@ -24,6 +24,9 @@ from trirail.wire.vocabulary import MODES
 
 BATCHES_PER_SECOND = 50
 ANSWERS_A_CYCLE = 8
+INPUTS_KEPT = 8
+"""So much of what the control was given may wait for the next batch of records; the recorder has no use for it before.
+"""
 EVENTS_KEPT = 1000
 """Events kept for a gateway that comes anew: the one before may have died with some that it had not published."""
 
@@ -96,8 +99,8 @@ class Reports:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing waits to be passed on but records."""
-        return not (self._given or self._answers or self._told < self._events)
+        """Whether nothing waits to be passed on but what goes with a batch."""
+        return not (self._answers or self._told < self._events)
 
     @property
     def batch(self) -> NDArray[np.uint8]:
@@ -105,17 +108,18 @@ class Reports:
         return np.frombuffer(self._batch, np.uint8)[1:].reshape(-1, SIZE)
 
     def pass_on(self) -> None:
-        """Pass on what was given to the control, what has happened and what is answered, if anything.
+        """Pass on what has happened and what is answered, if anything, and what the control was given before that.
 
         An event belongs to the first cycle that it shows in: that under way or, behind its end, the next.
         """
-        if self._control.ledger.answers or self._control.ledger.notices or self._given:
+        if self._control.ledger.answers or self._control.ledger.notices or len(self._given) > INPUTS_KEPT:
             self._publish()
         if self._answers:
             self._send_answers()
 
     def flush(self) -> None:
         """Send the batch, take new peers, and what was kept for them."""
+        self._send_given()
         if self.batched:
             batch = self._batch[: 1 + self.batched * SIZE]
             self.batched = 0
@@ -172,9 +176,7 @@ class Reports:
     def _publish(self) -> None:
         """Answer requests, number what has happened, and pass on what the control was given."""
         control, ledger = self._control, self._control.ledger
-        for given in self._given:
-            self._recorder.send(message(given))
-        self._given.clear()
+        self._send_given()
         for notice in ledger.notices:
             self._events += 1
             cycle = control.modes.cycle
@@ -187,6 +189,12 @@ class Reports:
         self._send_events()
         self._answers.extend(map(message, ledger.answers))
         ledger.answers.clear()
+
+    def _send_given(self) -> None:
+        """Tell the recorder what the control was given."""
+        for given in self._given:
+            self._recorder.send(message(given))
+        self._given.clear()
 
     def _publish_status(self) -> None:
         """Tell what records do not say, where that has changed."""

@@ -24,7 +24,7 @@ _poll: Any = types.ExternalFunction("poll", i4(types.intp, u8, i4))
 _ppoll: Any = types.ExternalFunction("ppoll", i4(types.intp, u8, types.intp, types.intp))
 
 DOORS = i4[:, ::1]
-SPARE_NS: Final = 600_000
+SPARE_NS: Final = 500_000
 """What comes later before a deadline is heard behind that cycle's setpoints: so long Python may take for it [ns]."""
 _MONOTONIC: Final = 1
 _ABSOLUTE: Final = 1
