@@ -11,6 +11,7 @@ import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -358,7 +359,7 @@ def moves() -> dict[int, list[Happening]]:
         ),
     ]
     for request in requests:
-        happens[request.ticket] = [Happening(lambda session, request=request: session.ask(request))]  # type: ignore[misc]
+        happens[request.ticket] = [Happening(partial(Session.ask, request=request))]
     return happens
 
 
@@ -504,6 +505,31 @@ def test_who_stays_at_the_door_unheard_keeps_no_tick_waiting(quiet: bool, tmp_pa
         assert session.loop.control.state.mode is Mode.DISABLED, "nobody has taken it"
     finally:
         session.close()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_who_enables_while_sliders_are_pushed_by_hand_is_answered_alike(seed: int, tmp_path: Path) -> None:
+    """It depends on where the sliders are now, and whether they stand."""
+
+    def pushes() -> dict[int, list[Happening]]:
+        chance, happens = random.Random(seed), dict[int, list[Happening]]()
+        for ticket in range(1, 8):
+            begin, by = 60 * ticket, chance.choice((1e-5, 3e-4, 1e-3, 0.01))
+            slider, command = chance.randrange(3), chance.choice((Command.ENABLE, Command.ENABLE, Command.DISABLE))
+            request = CommandRequest(ticket, "ann", command)
+            for number in range(begin, begin + 20):
+                happens.setdefault(number, []).append(Happening(partial(_push, slider=slider, by=by)))
+            asked = begin + chance.randrange(25)
+            happens.setdefault(asked, []).append(Happening(partial(Session.ask, request=request)))
+        return happens
+
+    one, other = both_ways(CONFIGS["cia402"], tmp_path, pushes, 600)
+    assert one.loop.quiet_cycles > 100
+    _compare(one.heard, other.heard)
+
+
+def _push(session: Session, slider: int, by: float) -> None:
+    session.drives.faults.carriages.push(slider, by)
 
 
 def _compare(heard: list[object], heard_of_python: list[object]) -> None:
