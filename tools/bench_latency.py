@@ -137,8 +137,8 @@ def _each(goals: int, robot: Robot, heard: Listener, chance: random.Random, meas
 
 def _at_rest(robot: Robot, heard: Listener, chance: random.Random) -> float | None:
     """A small goal from standstill, and its end."""
-    time.sleep(chance.uniform(0.02, 0.04))  # at any phase of the cycle
     heard.setpoints()
+    time.sleep(chance.uniform(0.02, 0.04))  # at any phase of the cycle, and setpoints of before are there
     put = time.time()
     goal = robot.move_to(x=-END + chance.uniform(0.0, 0.004), y=chance.uniform(-0.004, 0.004), phi=0.0)
     time.sleep(WITHIN)
