@@ -75,7 +75,7 @@ class Listener:
         return [t for t, one, _ in self._taken() if one == identifier]
 
     def _taken(self) -> Iterator[tuple[float, int, bytes]]:
-        for chunk in self._capture.take():
+        for chunk in self._capture.drain():
             for t, frame in CAPTURED.iter_unpack(chunk):
                 identifier, _, data = CAN_FRAME.unpack(frame)
                 yield t, identifier, data

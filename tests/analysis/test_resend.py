@@ -107,7 +107,7 @@ def test_the_goal_that_set_the_robot_in_motion_and_why_it_ended_are_told_in_fiel
     assert (ended.outcome, ended.message) == ("stopped", "stop by ann")
     heard = _Heard(cast("Robot", None))
     for event in events:
-        heard._take(event)
+        heard._on_event(event)
     assert heard.began == {name: begins}
 
 

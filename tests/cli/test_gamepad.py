@@ -51,7 +51,7 @@ class Hand:
 
     def feel(self, *events: Event) -> None:
         for event in events:
-            self.pad.take(event, self.operator.now)
+            self.pad.apply(event, self.operator.now)
         pendant.follow(self.operator.pendant, self.pad, self.operator.now)
         self.operator.pendant.tick(self.operator.now)
 
@@ -156,7 +156,7 @@ def test_whatever_comes_nothing_moves_without_a_shoulder_button_and_nothing_fast
     pad = Gamepad(RANGES)
     held: set[int] = set()
     for event in said:
-        pad.take(event, 1.0)
+        pad.apply(event, 1.0)
         if event.type == EventType.KEY and event.code in (Button.TL, Button.TR):
             (held.add if event.value else held.discard)(event.code)
         if (event.type, event.code) == (EventType.SYN, Code.SYN_DROPPED):
@@ -283,8 +283,8 @@ def test_the_codes_are_the_kernel_s() -> None:
 def test_events_of_evdev_are_taken() -> None:
     event = pytest.importorskip("evdev").InputEvent
     pad = Gamepad(RANGES)
-    pad.take(event(0, 0, EventType.KEY, Button.TL, 1), 1.0)
-    pad.take(event(0, 0, EventType.ABS, Code.X, FULL), 1.0)
+    pad.apply(event(0, 0, EventType.KEY, Button.TL, 1), 1.0)
+    pad.apply(event(0, 0, EventType.ABS, Code.X, FULL), 1.0)
     assert pad.direction(1.0) == pytest.approx((1.0, 0.0, 0.0), abs=1e-4)
 
 
@@ -299,7 +299,7 @@ def test_a_gamepad_of_the_kernel_s_is_found_read_and_missed() -> None:
             made.write(*said)
         made.syn()
         assert select.select([pad], [], [], 10.0)[0]
-        pad.take(1.0)
+        pad.poll(1.0)
         assert pad.gamepad.direction(1.0) == pytest.approx((1.0, 0.0, 0.0), abs=1e-4)
         made.close()
         with pytest.raises(ServiceError, match="is gone"):
@@ -308,4 +308,4 @@ def test_a_gamepad_of_the_kernel_s_is_found_read_and_missed() -> None:
 
 def read_on(pad: Pad) -> None:
     while select.select([pad], [], [], 10.0)[0]:
-        pad.take(2.0)
+        pad.poll(2.0)

@@ -77,7 +77,7 @@ def test_what_is_commanded_is_what_everybody_elses_mathematics_says(
         run.seams.append(Seam(seam, path))
     run.time = time
     schedule = Schedule(rest(start), PERIOD)
-    schedule.take(deque([run]))
+    schedule.replace_runs(deque([run]))
     measured = Measured(LEGS, PERIOD, STEP)
     measured.start(Feedback((0.0, 0.0, 0.0), ON, None))
     setpoints = Setpoints(LEGS, boundless(), measured, STEP)
@@ -113,7 +113,7 @@ def test_a_motion_stands_on_its_way_where_its_law_does(rate: float, change: floa
     law.pieces[0, 0, :3] = 0.5, rate, change / 2.0
     run = Run(LEGS, path, law, target)
     schedule = Schedule(rest((0.0, 0.0, 0.0)), PERIOD)
-    schedule.take(deque([run]))
+    schedule.replace_runs(deque([run]))
     setpoints = Setpoints(LEGS, boundless(), Measured(LEGS, PERIOD, STEP), STEP)
     found = setpoints.solve(schedule, schedule.begin_cycle())
     assert setpoints.refusal(found) is None
@@ -138,7 +138,7 @@ def test_what_the_gate_refuses_leaves_the_setpoints_as_they_are(
     pieces = np.zeros((1, 3, 6))
     pieces[0, :, 0], pieces[0, :, 1] = start, terms
     law = Path(np.array([0.0, FOR_EVER]), np.array([[[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]]]))
-    schedule.take(deque([Run(LEGS, Path(np.array([0.0, 1.0]), pieces), law, 1.0)]))
+    schedule.replace_runs(deque([Run(LEGS, Path(np.array([0.0, 1.0]), pieces), law, 1.0)]))
     refused = setpoints.refusal(setpoints.solve(schedule, schedule.begin_cycle()))
     assert refused is not None
     assert "jerk" in refused
@@ -153,11 +153,11 @@ def test_the_measured_pose_is_forwards_to_the_last_bit(
     a, b, c = inverse(ROBOT, place).position.tolist()
     measured = Measured(LEGS, PERIOD, STEP)
     measured.start(Feedback((a, b, c), ON, None))
-    measured.take(Feedback((a, b, c), ON, None))
+    measured.update(Feedback((a, b, c), ON, None))
     assert bits(measured.pose) == bits(forward(ROBOT, (a, b, c)))
     moved = (a + shares[0] * STEP, b + shares[1] * STEP, c + shares[2] * STEP)
     before = measured.pose
-    measured.take(Feedback(moved, ON, None))
+    measured.update(Feedback(moved, ON, None))
     try:
         assert bits(measured.pose) == bits(forward(ROBOT, moved, near=before))
     except KinematicsError:

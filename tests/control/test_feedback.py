@@ -21,7 +21,7 @@ Triple = tuple[float, float, float]
 def standing(position: Triple) -> Measured:
     measured = Measured(ROBOT.packed(), PERIOD, STEP)
     measured.start(Feedback(position, ON, None))
-    measured.take(Feedback(position, ON, None))
+    measured.update(Feedback(position, ON, None))
     return measured
 
 
@@ -38,7 +38,7 @@ def test_only_a_slider_that_goes_twice_as_far_as_one_can_has_jumped(place: Tripl
     measured = standing((a, b, c))
     before = measured.pose
     moved = (a + shares[0] * STEP, b + shares[1] * STEP, c + shares[2] * STEP)
-    measured.take(Feedback(moved, ON, None))
+    measured.update(Feedback(moved, ON, None))
     assert measured.jumps == tuple(abs(share) > 2.0 for share in shares)
     if any(measured.jumps):
         assert measured.pose == before
@@ -52,7 +52,7 @@ def test_the_first_cycle_is_no_jump_wherever_the_robot_stands(place: Triple) -> 
     a, b, c = inverse(ROBOT, place).position.tolist()
     measured = Measured(ROBOT.packed(), PERIOD, STEP)
     measured.start(Feedback((a, b, c), ON, None))
-    measured.take(Feedback((a, b, c), ON, None))
+    measured.update(Feedback((a, b, c), ON, None))
     assert measured.jumps == (False, False, False)
     assert measured.velocity == measured.following_error == (0.0, 0.0, 0.0)
     assert measured.pose == pytest.approx(place, abs=1e-9)
@@ -80,9 +80,9 @@ def test_following_error_is_to_the_setpoint_that_was_due_at_the_sync_of_the_posi
     measured = standing(first)
     for setpoint in written:
         measured.record["commanded_position"] = setpoint
-        measured.take(Feedback(first, ON, None))
+        measured.update(Feedback(first, ON, None))
     measured.record["commanded_position"] = last = (0.004, 0.005, -0.006)
-    measured.take(Feedback(position, ON, None, age=age, follows=follows))
+    measured.update(Feedback(position, ON, None, age=age, follows=follows))
     due = [first] * 6 + written + [last]
     expected = [due[-2 - age[n]][n] - position[n] if follows[n] else 0.0 for n in range(3)]
     assert measured.following_error == pytest.approx(expected, abs=1e-15)
@@ -98,18 +98,18 @@ def test_a_following_error_is_beyond_its_limit_when_it_is_more(index: int, sign:
         position = [0.0, 0.0, 0.0]
         position[index] = -sign * error
         a, b, c = position
-        assert measured.take(Feedback((a, b, c), ON, None)) == beyond
+        assert measured.update(Feedback((a, b, c), ON, None)) == beyond
         assert measured.following_error[index] == sign * error
 
 
 def test_sliders_that_belong_to_no_pose_leave_the_pose_as_it_was() -> None:
     measured = Measured(ROBOT.packed(), PERIOD, 10.0)  # none jumps
     measured.start(Feedback((0.0, 0.0, 0.0), ON, None))
-    measured.take(Feedback((0.01, 0.0, 0.0), ON, None))
+    measured.update(Feedback((0.01, 0.0, 0.0), ON, None))
     before = measured.pose
     nowhere = (1.0, 1.0, 1.0)
     assert measured.pose_of(nowhere) is None
-    measured.take(Feedback(nowhere, ON, None))
+    measured.update(Feedback(nowhere, ON, None))
     assert not any(measured.jumps)
     assert measured.pose == before
 
@@ -132,7 +132,7 @@ def test_the_record_has_what_each_drive_said(
     homing: bool,
 ) -> None:
     measured = standing((0.0, 0.0, 0.0))
-    measured.take(Feedback((1e-4, 2e-4, 3e-4), state, None, age=age, follows=follows, homed=homed, homing=homing))
+    measured.update(Feedback((1e-4, 2e-4, 3e-4), state, None, age=age, follows=follows, homed=homed, homing=homing))
     record = measured.record[0]
     assert record["position"].tolist() == [1e-4, 2e-4, 3e-4]
     assert tuple(record["drive_state"].tolist()) == state
@@ -149,5 +149,5 @@ def test_a_robot_is_powered_while_any_drive_can_move_its_slider(index: int) -> N
     for state in PowerState:
         states = [PowerState.SWITCH_ON_DISABLED] * 3
         states[index] = state
-        measured.take(Feedback((0.0, 0.0, 0.0), (states[0], states[1], states[2]), None))
+        measured.update(Feedback((0.0, 0.0, 0.0), (states[0], states[1], states[2]), None))
         assert measured.powered == (state in can_move)

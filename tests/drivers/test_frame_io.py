@@ -118,7 +118,7 @@ def test_a_capture_has_every_frame_with_its_time(kind: str, way: str) -> None:
             far.send(identifier, data)
         arriving(frames, len(KINDS))
     ended = time.time()
-    noted = [line for chunk in capture.take() for line in CAPTURED.iter_unpack(chunk)]
+    noted = [line for chunk in capture.drain() for line in CAPTURED.iter_unpack(chunk)]
     # Linux turns stamping on a moment after it is asked to: until then a frame has the time at which it is read.
     assert all(began <= t <= ended for t, _ in noted)
     seen = [CAN_FRAME.unpack(frame) for _, frame in noted]
@@ -133,7 +133,7 @@ def test_a_captured_frame_has_the_time_of_its_arrival() -> None:
         while time.time() - arrived_by < 0.01:
             os.sched_yield()
         assert frames.receive() is not None
-    ((t, _),) = (line for chunk in capture.take() for line in CAPTURED.iter_unpack(chunk))
+    ((t, _),) = (line for chunk in capture.drain() for line in CAPTURED.iter_unpack(chunk))
     assert t <= arrived_by
 
 

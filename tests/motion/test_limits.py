@@ -516,5 +516,5 @@ def test_a_position_jumps_beyond_twice_what_a_slider_can_do_in_a_cycle(drive: in
         here = Feedback((0.0, 0.0, 0.0), (PowerState.SWITCH_ON_DISABLED,) * 3, None)
         measured.start(here)
         a, b, c = np.eye(3)[drive] * share * 2.0 * step
-        measured.take(Feedback((a, b, c), here.state, None))
+        measured.update(Feedback((a, b, c), here.state, None))
         assert measured.jumps == tuple(jumps and n == drive for n in range(3))

@@ -34,7 +34,7 @@ def of_many_pieces(seconds: float) -> Path:
 
 def begun(*runs: Run, cycles: int = 0) -> Schedule:
     schedule = Schedule(rest(HERE), PERIOD)
-    schedule.take(deque(runs))
+    schedule.replace_runs(deque(runs))
     for _ in range(cycles):
         schedule.advance()
     return schedule

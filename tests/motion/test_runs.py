@@ -278,7 +278,7 @@ def test_a_schedule_goes_from_run_to_run_and_tells_how_long_it_takes() -> None:
     assert schedule.advance() == 0
     assert (schedule.remaining, schedule.last) == (0.0, None)
     first, second = run_of(way(LINE[0])), run_of(way(LINE[1], LINE[0]), 0.5)
-    schedule.take(deque([first, second]))
+    schedule.replace_runs(deque([first, second]))
     assert schedule.last is second
     assert schedule.remaining == pytest.approx(first.ends + second.ends)
     first_ends = math.ceil(first.ends / PERIOD)
@@ -303,7 +303,7 @@ def test_a_motion_that_was_looked_ahead_for_takes_over_where_it_begins(wait: int
     for _ in range(5):
         schedule.advance()
     under_way, _ = chain()
-    schedule.take(deque([under_way]))
+    schedule.replace_runs(deque([under_way]))
     for _ in range(100):
         schedule.advance()
     ahead = schedule.ahead(wait)
@@ -315,7 +315,7 @@ def test_a_motion_that_was_looked_ahead_for_takes_over_where_it_begins(wait: int
         schedule.advance()
     assert schedule.commanded == ahead.commanded  # to the last bit
     later = run_of(way(LINE[2], state.pose))
-    schedule.take(deque([later]))
+    schedule.replace_runs(deque([later]))
     assert schedule.last is later
     assert schedule.remaining == pytest.approx(later.ends)
     looked = schedule.ahead(50)
@@ -336,7 +336,7 @@ def test_whatever_changes_the_motion_under_way_makes_it_another_version() -> Non
         seen.append(schedule.version)
         return seen[-1] > seen[-2]
 
-    schedule.take(deque([under_way, run_of(way(LINE[1]))]))
+    schedule.replace_runs(deque([under_way, run_of(way(LINE[1]))]))
     assert another()
     for _ in range(20):
         schedule.advance()
@@ -355,6 +355,6 @@ def test_whatever_changes_the_motion_under_way_makes_it_another_version() -> Non
 def test_a_schedule_tells_of_each_goal_that_ends_on_the_way() -> None:
     schedule = Schedule(rest(HERE), PERIOD)
     run, seams = chain()
-    schedule.take(deque([run]))
+    schedule.replace_runs(deque([run]))
     passed = [cycle for cycle in range(round(run.ends / PERIOD)) if schedule.advance()]
     assert passed == pytest.approx([seam / PERIOD for seam in seams], abs=1.0)

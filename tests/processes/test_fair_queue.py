@@ -25,7 +25,7 @@ def test_each_users_own_are_in_order_and_nobody_waits_for_more_than_one_of_each_
             queue.put(act, (act, put[act]))
             put[act] += 1
         elif len(queue):
-            user, number = queue.take(next(iter(queue.users)))
+            user, number = queue.pop(next(iter(queue.users)))
             taken[user].append(number)
             for other, before in waited.items():
                 before[user] += other != user
@@ -47,9 +47,9 @@ def test_a_user_is_served_alone_and_everything_is_changed_in_its_place() -> None
         queue.put("ab"[number % 2], number)
     queue.change(lambda number: number + 10)
     assert queue.first("b") == 11
-    assert queue.take("b") == 11
+    assert queue.pop("b") == 11
     assert list(queue.users) == ["a", "b"]
-    assert [queue.take(user) for user in "aab"] == [10, 12, 13]
-    for nothing in (queue.take, queue.first):
+    assert [queue.pop(user) for user in "aab"] == [10, 12, 13]
+    for nothing in (queue.pop, queue.first):
         with pytest.raises(KeyError):
             nothing("a")

@@ -278,7 +278,7 @@ def test_an_asker_that_takes_no_answer_holds_up_nobody_else(rig: Rig, tmp_path: 
 
     def serve() -> None:
         while not over.wait(0.001):
-            for incoming in gateway._inbox.take(1000):
+            for incoming in gateway._inbox.next_messages(1000):
                 gateway._handle(incoming)
 
     serving = threading.Thread(target=serve)

@@ -71,7 +71,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
         def serve() -> None:
             while not over.wait(0.001):
-                for incoming in gateway._inbox.take(100):
+                for incoming in gateway._inbox.next_messages(100):
                     gateway._handle(incoming)
                 gateway._poses.measure(STANDING)
                 gateway._poses.settle()

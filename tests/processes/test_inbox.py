@@ -54,9 +54,9 @@ def keep(inbox: Inbox, kind: str, payload: bytes = b"", user: str = "ann", name:
 def test_messages_are_taken_in_their_order(inbox: Inbox) -> None:
     for number in range(10):
         keep(inbox, "goal", bytes([number]))
-    assert [incoming.payload for incoming in inbox.take(4)] == [bytes([n]) for n in range(4)]
-    assert [incoming.payload for incoming in inbox.take(100)] == [bytes([n]) for n in range(4, 10)]
-    assert list(inbox.take(100)) == []
+    assert [incoming.payload for incoming in inbox.next_messages(4)] == [bytes([n]) for n in range(4)]
+    assert [incoming.payload for incoming in inbox.next_messages(100)] == [bytes([n]) for n in range(4, 10)]
+    assert list(inbox.next_messages(100)) == []
 
 
 def test_a_flood_of_goals_is_refused_and_keeps_no_command_out(inbox: Inbox, refused: list[Incoming]) -> None:
@@ -65,7 +65,7 @@ def test_a_flood_of_goals_is_refused_and_keeps_no_command_out(inbox: Inbox, refu
     assert len(refused) == 5
     keep(inbox, "cmd", name="enable")
     assert len(refused) == 5
-    *_, last = inbox.take(9)
+    *_, last = inbox.next_messages(9)
     assert last.kind == "cmd"  # the ninth user's turn
 
 
@@ -75,7 +75,7 @@ def test_the_flood_of_one_leaves_room_for_the_others(inbox: Inbox, refused: list
     assert [incoming.user for incoming in refused] == ["eve"] * 5
     keep(inbox, "goal")
     assert len(refused) == 5
-    assert [incoming.user for incoming in inbox.take(3)] == ["eve", "ann", "eve"]
+    assert [incoming.user for incoming in inbox.next_messages(3)] == ["eve", "ann", "eve"]
 
 
 @pytest.mark.parametrize("name", Command)
@@ -84,7 +84,7 @@ def test_what_stops_the_robot_for_everybody_comes_first(inbox: Inbox, name: Comm
         keep(inbox, kind, user="eve", name="enable" * (kind == "cmd"))
     keep(inbox, "cmd", name=name)
     overtakes = name in ("stop", "quick_stop", "disable")
-    taken = list(inbox.take(3))
+    taken = list(inbox.next_messages(3))
     assert (taken[0].user == "ann") == overtakes
     assert sorted(incoming.number for incoming in taken) == [1, 2, 3]
     assert max(taken, key=lambda incoming: incoming.number).user == "ann"
@@ -94,37 +94,37 @@ def test_what_stops_the_robot_for_everybody_comes_first(inbox: Inbox, name: Comm
 def test_a_stop_comes_first_whatever_it_holds(inbox: Inbox, content: bytes) -> None:
     keep(inbox, "goal", b"{}")
     keep(inbox, "cmd", content, name="stop")
-    assert [incoming.kind for incoming in inbox.take(2)] == ["cmd", "goal"]
+    assert [incoming.kind for incoming in inbox.next_messages(2)] == ["cmd", "goal"]
 
 
 def test_who_sends_more_than_his_pace_waits_and_nobody_else(inbox: Inbox, clock: Clock) -> None:
     for _ in range(BURST + 10):
         keep(inbox, "goal", user="eve")
-    assert len(list(inbox.take(10_000))) == BURST
+    assert len(list(inbox.next_messages(10_000))) == BURST
     assert not readable(inbox)
     assert 0.0 < inbox.due() <= 1.0 / RATE
     keep(inbox, "goal")
     assert readable(inbox)
-    assert [incoming.user for incoming in inbox.take(10)] == ["ann"]
+    assert [incoming.user for incoming in inbox.next_messages(10)] == ["ann"]
     keep(inbox, "cmd", user="eve", name="stop")  # a stop of hers has its own
-    assert [incoming.kind for incoming in inbox.take(10)] == ["cmd"]
+    assert [incoming.kind for incoming in inbox.next_messages(10)] == ["cmd"]
     for _ in range(10):
-        assert list(inbox.take(10)) == []
+        assert list(inbox.next_messages(10)) == []
         clock.now += inbox.due() + 1e-9
-        assert [incoming.user for incoming in inbox.take(10)] == ["eve"]
+        assert [incoming.user for incoming in inbox.next_messages(10)] == ["eve"]
     assert inbox.due() == math.inf
     clock.now += BURST / RATE
     for _ in range(BURST + 1):
         keep(inbox, "goal", user="eve")
-    assert len(list(inbox.take(10_000))) == BURST
+    assert len(list(inbox.next_messages(10_000))) == BURST
 
 
 def test_what_is_more_than_was_taken_stays_readable(inbox: Inbox) -> None:
     for _ in range(3):
         keep(inbox, "goal")
-    assert len(list(inbox.take(2))) == 2
+    assert len(list(inbox.next_messages(2))) == 2
     assert readable(inbox)
-    assert len(list(inbox.take(2))) == 1
+    assert len(list(inbox.next_messages(2))) == 1
     assert not readable(inbox)
 
 
@@ -140,7 +140,7 @@ def test_what_waits_is_bounded_in_bytes(inbox: Inbox, refused: list[Incoming]) -
         keep(inbox, "goal", bytes(MAX_MESSAGE))
     assert len(refused) == 3
     assert all(incoming.payload == b"" for incoming in refused)
-    taken = list(inbox.take(1000))
+    taken = list(inbox.next_messages(1000))
     assert sum(len(incoming.payload) for incoming in taken) == MAX_UNREAD
     keep(inbox, "goal", bytes(MAX_MESSAGE))
     assert len(refused) == 3
@@ -148,5 +148,5 @@ def test_what_waits_is_bounded_in_bytes(inbox: Inbox, refused: list[Incoming]) -
 
 def test_what_is_too_large_is_not_kept_but_its_size_is(inbox: Inbox) -> None:
     keep(inbox, "goal", bytes(MAX_MESSAGE + 1))
-    (incoming,) = inbox.take(10)
+    (incoming,) = inbox.next_messages(10)
     assert (incoming.size, incoming.payload) == (MAX_MESSAGE + 1, b"")

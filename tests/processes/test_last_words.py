@@ -34,8 +34,8 @@ def test_the_goal_under_way_is_faulted(silent: float, said: str) -> None:
     clock = Clock()
     words = LastWords(0.001, clock)
     words.heard()
-    words.take(ended(7, "before"))
-    words.take(ControlInput(1, 3, 0, request("g-1")))
+    words.follow(ended(7, "before"))
+    words.follow(ControlInput(1, 3, 0, request("g-1")))
     clock.now += silent
     reason = f"{said}: the drives stop by their own watchdogs"
     assert words.reason == reason
@@ -59,8 +59,8 @@ def test_a_slow_loop_is_not_taken_for_frozen() -> None:
 def test_nothing_is_added_to_an_end_as_it_should_be() -> None:
     words = LastWords(0.001)
     words.heard()
-    words.take(request("g-1"))
-    words.take(Farewell())
+    words.follow(request("g-1"))
+    words.follow(Farewell())
     assert (words.reason, words.events(1)) == ("", [])
 
 
@@ -87,10 +87,10 @@ def test_every_goal_ends_once(history: list[tuple[str, str]]) -> None:
     over: set[str] = set()
     for what, name in history:
         if what == "ended":
-            words.take(ended(1, name))
+            words.follow(ended(1, name))
             over.add(name)
         else:
-            words.take(request(name) if what == "asked" else Status(name, 1.0, None))
+            words.follow(request(name) if what == "asked" else Status(name, 1.0, None))
             begun.add(name)
     said = [event.id for event in words.events(1) if event.outcome]
     assert sorted(filter(None, said)) == sorted(begun - over)

@@ -31,7 +31,7 @@ class Asked:
 
     def take(self, look: AlignmentLook, key: str = "trirail/demo/alignment/ann") -> AlignmentLook:
         content = boundary.encode(look)
-        return self.looks.take(Incoming("alignment", key, len(content), content, "", None, time.monotonic_ns()))
+        return self.looks.forward(Incoming("alignment", key, len(content), content, "", None, time.monotonic_ns()))
 
 
 @given(looks)

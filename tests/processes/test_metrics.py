@@ -136,9 +136,9 @@ def exposed(service: ServiceMeasured | None, recorder: RecorderMeasured | None) 
     """What Prometheus reads."""
     measured = Measurements()
     if service is not None:
-        measured.take("gateway", service)
+        measured.store("gateway", service)
     if recorder is not None:
-        measured.take("recorder", recorder)
+        measured.store("recorder", recorder)
     registry = CollectorRegistry(auto_describe=False)
     registry.register(ServiceMetrics("demo", "0.1", health()[0], measured))
     return generate_latest(registry).decode()

@@ -68,7 +68,7 @@ class Asked:
 
     def ask(self, kind: Kind, name: str, content: bytes = b"") -> None:
         key = f"trirail/demo/{kind}/ann/{name}"
-        self.poses.take(Incoming(kind, key, len(content), content, "", None, time.monotonic_ns()))
+        self.poses.edit(Incoming(kind, key, len(content), content, "", None, time.monotonic_ns()))
 
     def teach(self, name: str, at: np.void | None = None) -> None:
         self.ask("teach", name)

@@ -150,7 +150,7 @@ class Session:
 
     def captured(self) -> list[bytes]:
         """The frames that were noted down."""
-        return [frame for chunk in self.ends.capture.take() for _, frame in CAPTURED.iter_unpack(chunk)]
+        return [frame for chunk in self.ends.capture.drain() for _, frame in CAPTURED.iter_unpack(chunk)]
 
     def ask(self, request: Request) -> None:
         """Send a request; a stop with haste, as the gateway does."""

@@ -118,7 +118,7 @@ class Played:
         self._gateway._inbox._keep(incoming._replace(id=copy, at_door=self.answers[number].append))
 
     def _read(self, at_most: int) -> None:
-        for incoming in self._gateway._inbox.take(at_most):
+        for incoming in self._gateway._inbox.next_messages(at_most):
             self._gateway._handle(incoming)
             while self._packets:
                 self._gateway._hear(self._packets.pop(0), lambda: None)

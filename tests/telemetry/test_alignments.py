@@ -56,7 +56,7 @@ def test_residuals_are_of_each_mark_before_and_after(tmp_path: Path) -> None:
 def test_the_live_view_has_a_curve_for_each_mark_and_a_table_of_the_newest_looks() -> None:
     shown = ShownAlignment()
     for number in range(1, MOST_LOOKS + 4):
-        chunks = shown.take(told(number, look(number, 1e-4 / number)), look(number, 1e-4 / number))
+        chunks = shown.drawing_of(told(number, look(number, 1e-4 / number)), look(number, 1e-4 / number))
     paths = {chunk.entity_path for chunk in chunks}
     assert {path for path in paths if path.startswith(RESIDUALS)} == {f"{RESIDUALS}/left", f"{RESIDUALS}/a\\/b\\ \\#"}
     (table,) = (chunk for chunk in chunks if chunk.entity_path not in {p for p in paths if p.startswith(RESIDUALS)})

@@ -27,7 +27,7 @@ class Capture:
         if len(self._frames) < KEPT * CAPTURED.size:
             self._frames += CAPTURED.pack(t, frame)
 
-    def take(self) -> Iterator[bytes]:
+    def drain(self) -> Iterator[bytes]:
         """Hand over what has been noted, in chunks of at most CHUNK frames."""
         frames, self._frames = self._frames, bytearray()
         for start in range(0, len(frames), CHUNK * CAPTURED.size):

@@ -84,7 +84,7 @@ class UnixBus(can.BusABC):
             for descriptor, _ in self._epoll.poll(timeout):
                 peer = self._peers.get(descriptor)
                 if peer is not None:
-                    self._take(peer)
+                    self._read_frame(peer)
                 elif self._listener is not None:
                     self._add(self._listener.accept()[0])
         return (self._arrived.popleft() if self._arrived else None), False
@@ -109,7 +109,7 @@ class UnixBus(can.BusABC):
         self._peers[peer.fileno()] = peer
         self._epoll.register(peer, select.EPOLLIN)
 
-    def _take(self, peer: socket.socket) -> None:
+    def _read_frame(self, peer: socket.socket) -> None:
         """Read one frame, or the end, of a peer."""
         try:
             packet = peer.recv(CAN_FRAME.size)

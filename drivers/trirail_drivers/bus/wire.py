@@ -124,7 +124,7 @@ class Wire:
                 received = self._frames.receive()
                 if received is None:
                     return
-                self._take(*received, now)
+                self._dispatch(*received, now)
         except (can.CanError, OSError) as error:
             self.fail(DriveFault("", "bus", 0, f"CAN bus: cannot receive: {error}"))
 
@@ -132,9 +132,9 @@ class Wire:
         """Wait for a frame, at most so long [s], and take it in; not for the cycle. Raises can.CanError, OSError."""
         received = self._frames.receive(seconds)
         if received is not None:
-            self._take(*received, clock())
+            self._dispatch(*received, clock())
 
-    def _take(self, identifier: int, data: bytearray, now: float) -> None:
+    def _dispatch(self, identifier: int, data: bytearray, now: float) -> None:
         """Give one frame to who listens to it."""
         if identifier & ERROR:
             self._take_error(canerrors.report(identifier & EXTENDED_BITS, data))

@@ -135,7 +135,7 @@ class Odrive(Driver[OdriveAxis]):
         """
         if self._setpoints.stopping:
             return
-        if (axis := self._setpoints.take(position, velocity)) is not None:
+        if (axis := self._setpoints.set_next(position, velocity)) is not None:
             number = self._axes.index(axis)
             self._refuse_setpoint(axis, position[number], velocity[number])
             return

@@ -51,7 +51,7 @@ class SetpointSender:
         for axis in self._axes:
             axis.sent = axis.sent_rate = axis.in_force = math.nan
 
-    def take(self, position: Triple, velocity: Triple) -> OdriveAxis | None:
+    def set_next(self, position: Triple, velocity: Triple) -> OdriveAxis | None:
         """Take what is to be sent at the next SYNC; the axis whose message cannot hold it, if there is one."""
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             if not _is_sendable(axis, metres, rate):

@@ -208,13 +208,13 @@ class _Words:
     def next_is(self, *words: str) -> bool:
         return bool(self.left) and self.left[0] in words
 
-    def take(self, after: str, wants: str, example: str) -> str:
+    def next_word(self, after: str, wants: str, example: str) -> str:
         if not self.left:
             raise FaultSyntaxError(f"after {after} comes {wants}, as in: {example}")
         return self.left.pop(0)
 
     def value(self, after: str, wants: str, example: str, read: Callable[[str], float]) -> float:
-        word = self.take(after, wants, example)
+        word = self.next_word(after, wants, example)
         try:
             return read(word)
         except ValueError:
@@ -265,10 +265,10 @@ def _chance(word: str) -> float:
 
 def _condition(words: _Words) -> Condition:
     example = "when B moving A silent"
-    drive = words.take("when", "A, B, C or any", example)
+    drive = words.next_word("when", "A, B, C or any", example)
     if drive not in (*NAMES, "any"):
         raise FaultSyntaxError(f"when {drive}: after when comes A, B, C or any, as in: {example}")
-    state = words.take(f"when {drive}", ", ".join(CONDITIONS), example)
+    state = words.next_word(f"when {drive}", ", ".join(CONDITIONS), example)
     if state not in CONDITIONS:
         raise FaultSyntaxError(_unknown("condition", state, CONDITIONS))
     return Condition(None if drive == "any" else NAMES.index(drive), state)

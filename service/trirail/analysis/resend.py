@@ -99,11 +99,11 @@ class _Heard:
     def _listen(self) -> None:
         while not self._over.is_set():
             for event in self._robot.events(timeout=0.5):
-                self._take(event)
+                self._on_event(event)
                 if self._over.is_set():
                     return
 
-    def _take(self, event: Event) -> None:
+    def _on_event(self, event: Event) -> None:
         if event.goal is not None:
             self.began[event.goal] = event.cycle
 

@@ -170,4 +170,4 @@ def _stay() -> None:
     out.print("Live view: trirail view, or in the browser: trirail view --web")
     out.print("Ctrl-C ends it.")
     with Signals() as ends:
-        ends.take()
+        ends.first()

@@ -84,7 +84,7 @@ class Gamepad:
         self.keys: list[str] = []
         """What has been pressed beside it, as keys of the pendant's: a space, + or -."""
 
-    def take(self, event: PadEvent, now: float) -> None:
+    def apply(self, event: PadEvent, now: float) -> None:
         """Take in an event."""
         self._heard = now
         match event.type, event.code:
@@ -149,11 +149,11 @@ class Pad:
         """For select and its like."""
         return int(self._device.fileno())
 
-    def take(self, now: float) -> None:
+    def poll(self, now: float) -> None:
         """Take in what it says. Raises ServiceError where it is gone."""
         try:
             for event in self._device.read():
-                self.gamepad.take(event, now)
+                self.gamepad.apply(event, now)
         except BlockingIOError:
             return
         except OSError as error:

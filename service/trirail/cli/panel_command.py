@@ -44,5 +44,5 @@ def panel(
 
             webbrowser.open(served.url)
         with Signals() as ends:
-            ends.take()
+            ends.first()
     return 0

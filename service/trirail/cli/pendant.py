@@ -165,7 +165,7 @@ def _serve(pendant: Pendant, newest: _Newest, live: Live, pad: Pad | None) -> No
         ready, _, _ = select.select([descriptor, *([pad] if pad else [])], [], [], REPEAT / 5.0)
         now = time.monotonic()
         if pad is not None:
-            pad.take(now)
+            pad.poll(now)
         if now - last > STALLED:  # stopped and continued: what waits in the terminal is from before
             pendant.let_go()
             termios.tcflush(descriptor, termios.TCIFLUSH)

@@ -63,7 +63,7 @@ class Fleet:
         self._members: dict[str, Member] = {}
         self._lock = threading.Lock()
         self._session = zenoh_session.open_client(connect, credentials_for(robot, connect, tls))
-        callback = zenoh.handlers.Callback(self._take, indirect=False)
+        callback = zenoh.handlers.Callback(self._on_summary, indirect=False)
         self._subscriber = self._session.declare_subscriber(zenoh_session.key("*", "summary"), callback)
 
     def __enter__(self) -> Fleet:
@@ -78,7 +78,7 @@ class Fleet:
         with self._lock:
             return sorted(self._members.values(), key=lambda member: (member.need(now), member.robot))
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _on_summary(self, sample: zenoh.Sample) -> None:
         _, robot, *_ = str(sample.key_expr).split("/")
         try:
             summary = boundary.decode(sample.payload.to_bytes(), RobotSummary, "not a summary", str(sample.encoding))

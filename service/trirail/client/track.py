@@ -56,7 +56,7 @@ class FollowedTarget(Generic[Handle]):
         if error is not None:
             raise error
 
-    def _take(self, answer: GoalReply | TrirailError) -> None:
+    def _on_answer(self, answer: GoalReply | TrirailError) -> None:
         with self._lock:
             if isinstance(answer, TrirailError):
                 self._error = answer
@@ -102,9 +102,9 @@ class Track(FollowedTarget[GoalHandle]):
         goal = self._goal_of(pose, velocity, clocks.time() if time is None else time)
         if self._goal is None:
             self._goal = self._begin(lambda _: goal, self.id)
-            self._take(self._goal.reply)
+            self._on_answer(self._goal.reply)
         else:
-            self._post(goal, self._take)
+            self._post(goal, self._on_answer)
 
     def close(self) -> None:
         """Brake on the path, if the robot still follows; return when it stands."""

@@ -48,7 +48,7 @@ class Commands:
         self._can_home = any(drive.homing is not None for drive in config.drives.each)
         self._settle_cycles = max(3, round(SETTLE / config.period))
 
-    def take(self, request: CommandRequest) -> None:
+    def carry_out(self, request: CommandRequest) -> None:
         """Begin to carry out a command. Raises RefusedError where that may not be."""
         if not request.name.everybodys:
             self._lease.check(request.user)

@@ -193,7 +193,7 @@ class Control:
     def observe(self, feedback: Feedback) -> None:
         """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
         before = self.measured.feedback
-        behind = self.measured.take(feedback, self._stands)
+        behind = self.measured.update(feedback, self._stands)
         self._tell_warnings(feedback)
         mode = self.state.mode
         if feedback.fault is not None:
@@ -300,9 +300,9 @@ class Control:
         """Take a request: a command at once, a goal behind those before it."""
         try:
             if isinstance(request, GoalRequest):
-                self.goal_queue.take(request, now_ns, self.modes.cycle)
+                self.goal_queue.enqueue(request, now_ns, self.modes.cycle)
             elif isinstance(request, CommandRequest):
-                self._commands.take(request)
+                self._commands.carry_out(request)
             elif isinstance(request, PoseChanged):
                 self.ledger.tell("pose", "info", request.message, user=request.user)
             elif isinstance(request, Looked):

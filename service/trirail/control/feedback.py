@@ -98,7 +98,7 @@ class Measured:
         self.numbers[1] = self.numbers[0]
         self.written[:] = self.record["commanded_position"] = feedback.position
 
-    def take(self, feedback: Feedback, stands: bool = False) -> int:
+    def update(self, feedback: Feedback, stands: bool = False) -> int:
         """Take the feedback of the next cycle; return 0, or 1 + i if slider i's following error is beyond its limit.
 
         `stands` tells whether the motion that was commanded until now does.

@@ -77,7 +77,7 @@ class GoalQueue:
             return cycle
         return min(math.floor(expiring) + 1 if math.isfinite(expiring) else math.inf, cycle + self._planner.due)
 
-    def take(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
+    def enqueue(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
         """Take a goal before a cycle, at a time of the monotonic clock; it waits for its user's turn.
 
         A renewal that comes often takes the place of the one before it that still waits.

@@ -130,7 +130,7 @@ class PlanRequests:
         """Take a motion and stop it, on a schedule that nobody runs: what runs for the first time is slow."""
         nowhere = Schedule(rest(STILL), self._period)
         path = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
-        nowhere.take(deque([unpack_run(self._legs, pack_run(Run(self._legs, path, constant(1.0), 1.0)))]))
+        nowhere.replace_runs(deque([unpack_run(self._legs, pack_run(Run(self._legs, path, constant(1.0), 1.0)))]))
         RateChange(self._scaling, nowhere, 0.0, self._period).step()
 
     def plan(self, goal: Goal, blend: float | None = None) -> None:
@@ -182,7 +182,7 @@ class PlanRequests:
             if self._change is None or self._change.made or self._change.tried >= ROUND:
                 self._ask(self._goal)
             return None
-        return self._take(self._answer) if self._answer is not None else None
+        return self._apply(self._answer) if self._answer is not None else None
 
     # ------------------------------------------------------------------ inside
 
@@ -222,7 +222,7 @@ class PlanRequests:
             return max(lead, SLACK * self._took)
         return max(lead, self._took + 1) if goal.frequent else lead
 
-    def _take(self, answer: PlanAnswer) -> AcceptedPlan | None:
+    def _apply(self, answer: PlanAnswer) -> AcceptedPlan | None:
         """Carry out what the planner has decided, once its time has come; ask anew where it does not fit any more."""
         if isinstance(answer, NotPlanned):
             raise answer.error()
@@ -245,7 +245,7 @@ class PlanRequests:
         if planned.first not in (None, schedule.cycle) or not self._continues(runs):
             self._asked = None
             return None
-        schedule.take(runs)
+        schedule.replace_runs(runs)
         self._change, self._greatest_rate = None, self._goal.greatest_rate if self._goal else math.inf
         if run.target != min(self.override, self._greatest_rate):
             self.run_at(self.override)

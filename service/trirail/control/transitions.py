@@ -106,7 +106,7 @@ class Transitions:
             begun = goal.id if goal is not None else None
             self._ledger.tell("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode, goal=begun)
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
-            self._schedule.take(deque())
+            self._schedule.replace_runs(deque())
             self._setpoints.tell_progress(0.0, 0.0)
             self._planner.leave_rate()
 

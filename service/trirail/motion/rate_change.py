@@ -72,7 +72,7 @@ class RateChange:
             self._look_for_greatest(run)
             return False
         if len(schedule.runs) > 1:
-            self._take(run, constant(self._possible))
+            self._change_law(run, constant(self._possible))
             return True
         if run.arrived or self._is_over(run):
             return True
@@ -134,7 +134,7 @@ class RateChange:
                 self._go_on_trying()
                 return
         if not candidate.ahead and candidate.begins == cycle:
-            self._take(run, candidate.law)
+            self._change_law(run, candidate.law)
 
     def _go_on_trying(self) -> None:
         self._candidate, self._share = None, (self._share + 1) % len(SHARES)
@@ -162,7 +162,7 @@ class RateChange:
         self._share = -1  # slower changes would be no sooner: begin with the quickest again
         return False
 
-    def _take(self, run: Run, law: Path) -> None:
+    def _change_law(self, run: Run, law: Path) -> None:
         self._schedule.change_law(run, law, self._possible)
         self.made = True
         seen = self._schedule.version, len(self._schedule.runs)

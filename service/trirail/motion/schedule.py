@@ -56,7 +56,7 @@ class Schedule:
         *stops, run = self.runs
         return run.progress, run.remaining + sum(stop.ends - stop.time for stop in stops)
 
-    def take(self, runs: deque[Run]) -> None:
+    def replace_runs(self, runs: deque[Run]) -> None:
         """Go on with other runs; they begin with the motion that is commanded now."""
         self.runs = runs
         self.version += 1

@@ -44,7 +44,7 @@ class Feed:
         self.told: dict[str, bytes] = {}
         """What a tab is told once, and again where it changes, as JSON: the robot, before anything can be drawn, and
         the names of its poses; who is connected."""
-        self._take(robot.info())
+        self._learn_robot(robot.info())
         self.told["poses"] = self._ask_poses()
         self.state: bytes | None = None
         """The newest state, as JSON with its stamp; None where the service is silent."""
@@ -109,10 +109,10 @@ class Feed:
         with contextlib.suppress(TrirailError):  # the old description stands until it answers
             told = self._robot.info()
             with self.changed:
-                self._take(told)
+                self._learn_robot(told)
                 self.told["poses"] = poses
 
-    def _take(self, told: Info) -> None:
+    def _learn_robot(self, told: Info) -> None:
         """Take in what robot it is, and what may be done. Raises ServiceError where it is of another version."""
         self._shown = shown(told)
         self.recordings = told.recordings

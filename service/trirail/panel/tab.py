@@ -51,7 +51,7 @@ class Tab:
         try:
             with contextlib.suppress(ConnectionClosed):  # a tab that is killed, or says too much, is gone like another
                 for text in self._socket:
-                    self._take(text)
+                    self._on_message(text)
         finally:
             self._jog.close()
             self._poses.close()
@@ -61,7 +61,7 @@ class Tab:
                 self._feed.changed.notify_all()
             self._orders.close()
 
-    def _take(self, text: str | bytes) -> None:
+    def _on_message(self, text: str | bytes) -> None:
         try:
             said: FromPage = decoded(text, FromPage)
         except msgspec.MsgspecError as error:

@@ -32,8 +32,8 @@ class WaitingGoal(NamedTuple):
 class Backlog:
     """Goals by user, each user's in the order in which they came, bounded in number and in bytes; users take turns.
 
-    Each goal leaves it exactly once, by `take`: one that is withdrawn keeps its place, and the loop tells of its end in
-    its turn.
+    Each goal leaves it exactly once, by `drop_first`: one that is withdrawn keeps its place, and the loop tells of
+    its end in its turn.
     """
 
     def __init__(self) -> None:
@@ -75,9 +75,9 @@ class Backlog:
             request = structs.replace(request, withdrawn=reason)
         return WaitingGoal(incoming, request)
 
-    def take(self, user: str) -> None:
+    def drop_first(self, user: str) -> None:
         """Let go of the user's first: the loop has it."""
-        self._bytes -= self._goals.take(user).incoming.size
+        self._bytes -= self._goals.pop(user).incoming.size
 
     def withdraw(self, goal_id: str, reason: str) -> bool:
         """Withdraw the goal of an id; whether there is one."""

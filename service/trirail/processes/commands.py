@@ -38,7 +38,7 @@ class CommandReader:
         self._of_unread: set[int] = set()
         """Tickets of stops of one goal before which others had come that were not read yet: that goal for one."""
 
-    def take(self, incoming: Incoming) -> None:
+    def read(self, incoming: Incoming) -> None:
         """Have a command carried out, unless it is a copy of one that is, or was. Raises RefusedError for none."""
         user, called = boundary.names(incoming.key, self._prefix, ("user", "command"))
         try:

@@ -41,7 +41,7 @@ class FairQueue(Generic[T]):
         """Return the user's first; KeyError where there is none."""
         return self._of[user][0]
 
-    def take(self, user: str) -> T:
+    def pop(self, user: str) -> T:
         """Take the first of a user, who goes behind the others; KeyError where there is none."""
         waiting = self._of.pop(user)
         item = waiting.popleft()

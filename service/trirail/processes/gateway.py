@@ -119,7 +119,7 @@ class Gateway:
             while not self._ending:
                 self._beat()
                 poll.poll(math.ceil(min(BEAT_EVERY, self._inbox.due()) * 1e3))
-                for incoming in self._inbox.take(AT_ONCE):
+                for incoming in self._inbox.next_messages(AT_ONCE):
                     self._beat()
                     self._handle(incoming)
                 while (packet := self._link.receive()) is not None:
@@ -170,11 +170,11 @@ class Gateway:
             elif incoming.kind == "poses":
                 self._replies.send(incoming, self._poses.table())
             elif incoming.kind in ("teach", "forget"):
-                self._poses.take(incoming)
+                self._poses.edit(incoming)
             elif incoming.kind == "alignment":
-                self._replies.send(incoming, self._looks.take(incoming))
+                self._replies.send(incoming, self._looks.forward(incoming))
             else:
-                self._commands.take(incoming)
+                self._commands.read(incoming)
         except RefusedError as refusal:
             self._refusals.refuse(incoming, refusal)
         except Closed:
@@ -202,7 +202,7 @@ class Gateway:
                 self._publish(content)
                 return
             answer = decode_answer(content)
-            self._take(answer)
+            self._on_answer(answer)
         except Closed:
             raise
         except Exception as error:  # noqa: BLE001 - it would come again after every restart
@@ -213,8 +213,8 @@ class Gateway:
             self._inbox.declare()
             ready()
 
-    def _take(self, answer: Answer) -> None:
-        self._last_words.take(answer)
+    def _on_answer(self, answer: Answer) -> None:
+        self._last_words.follow(answer)
         match answer:
             case Happened(event):
                 self._happened(event)

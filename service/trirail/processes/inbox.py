@@ -91,7 +91,7 @@ class Inbox:
             self._session.liveliness().declare_token(key("alive")),
         ]
 
-    def take(self, at_most: int) -> Iterator[Incoming]:
+    def next_messages(self, at_most: int) -> Iterator[Incoming]:
         """Take what may be read now, user by user in turn, stops first; if that is more, it stays readable."""
         for _ in range(at_most):
             with self._lock:
@@ -118,7 +118,7 @@ class Inbox:
         user = next((user for user in self._stops.users if not _wait(self._stops_pace, user, now)), None)
         if user is not None:
             self._stops_pace.count(user, now)
-            stop, *alike = stops = self._stops.take(user)
+            stop, *alike = stops = self._stops.pop(user)
             if self._newest.get(user) is stops:
                 del self._newest[user]
             self._bytes -= len(stop.payload)
@@ -126,7 +126,7 @@ class Inbox:
         user = next((user for user in self._readable() if not _wait(self._others_pace, user, now)), None)
         if user is not None:
             self._others_pace.count(user, now)
-            incoming = self._others.take(user)
+            incoming = self._others.pop(user)
             self._bytes -= len(incoming.payload)
             return incoming
         return None

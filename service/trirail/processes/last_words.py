@@ -35,7 +35,7 @@ class LastWords:
         self._heard = self._clock()
         self._greeted = True
 
-    def take(self, said: Answer | GoalRequest) -> None:
+    def follow(self, said: Answer | GoalRequest) -> None:
         """Take what the loop says, or a goal that it is given."""
         match said:
             case ControlInput(given=GoalRequest() as request) | (GoalRequest() as request):

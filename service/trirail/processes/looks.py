@@ -28,7 +28,7 @@ class Looks:
         self._clock = clock
         self._pace = Pace(BURST, RATE)
 
-    def take(self, incoming: Incoming) -> AlignmentLook:
+    def forward(self, incoming: Incoming) -> AlignmentLook:
         """Pass a look on, and return it. Raises RefusedError."""
         (user,) = boundary.names(incoming.key, self._prefix, ("user",))
         sent: AlignmentLook = incoming.content(AlignmentLook, "not a look of an alignment")

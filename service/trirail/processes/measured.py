@@ -102,7 +102,7 @@ class Measurements:
         self.service: ServiceMeasured | None = None
         self.recorder: RecorderMeasured | None = None
 
-    def take(self, process: str, measured: ServiceMeasured | RecorderMeasured) -> None:
+    def store(self, process: str, measured: ServiceMeasured | RecorderMeasured) -> None:
         """Keep what a process told."""
         if isinstance(measured, ServiceMeasured):
             self.service = measured

@@ -40,9 +40,9 @@ class Monitor:
         """Look at all processes, in every turn of the supervisor's."""
         self.health.look(processes)
 
-    def take(self, process: str, content: dict[str, Any]) -> None:
+    def store(self, process: str, content: dict[str, Any]) -> None:
         """Take what a process has measured."""
-        self.measured.take(process, converted(content, KINDS[process]))
+        self.measured.store(process, converted(content, KINDS[process]))
 
     def end(self, processes: Mapping[str, Running]) -> None:
         """Look for the last time: the service is ending."""

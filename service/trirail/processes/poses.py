@@ -122,7 +122,7 @@ class Poses:
             return goal
         return pose_in_place_of(goal, *pose)
 
-    def take(self, incoming: Incoming) -> None:
+    def edit(self, incoming: Incoming) -> None:
         """Take a query on …/teach or …/forget. Raises RefusedError."""
         kind = incoming.kind
         user, name = boundary.names(incoming.key, zenoh_session.key(self._robot, kind), ("user", "pose"))

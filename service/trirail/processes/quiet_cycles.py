@@ -151,7 +151,7 @@ class QuietCycles:
         if self._lent is None:
             self._lent, self._orders = self._drives.lend(), orders
         if self._lent is not None:
-            self._take(self._calm)
+            self._write_state(self._calm)
             self._decided = False
         return self._lent is not None
 
@@ -161,7 +161,7 @@ class QuietCycles:
         passed = max(0, time.perf_counter_ns() - int(self._state[0]["marked_ns"]))
         parts[part] = min(int(parts[part]) + passed, LONGEST)
 
-    def _take(self, calm: Calm) -> None:
+    def _write_state(self, calm: Calm) -> None:
         """Write what cycles come to into the state."""
         state, run = self._state[0], calm.run
         state["source"] = quiet.FOLLOW if calm.follows else quiet.HOLD if run is None else quiet.COMMAND

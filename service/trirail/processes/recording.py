@@ -70,7 +70,7 @@ class Intake:
 
         self._box = BlackBox(config.loop.rate_hz, box, self._warn)
 
-    def take(self, packet: bytes) -> None:
+    def on_packet(self, packet: bytes) -> None:
         """Take a packet."""
         self._last_words.heard()
         content = packet[1:]
@@ -102,7 +102,7 @@ class Intake:
 
     def _hear(self, said: Answer) -> None:
         recorder, box = self.recorder, self._box
-        self._last_words.take(said)
+        self._last_words.follow(said)
         match said:
             case Happened(event):
                 recorder.event(event)
@@ -165,7 +165,7 @@ def main(
             poll.poll(500)
             time.sleep(GATHER)
             while (packet := link.receive()) is not None:
-                intake.take(packet)
+                intake.on_packet(packet)
                 heart.beat()
             intake.save()
             if config.telemetry.metrics_port and time.monotonic() >= told + TOLD_EVERY:

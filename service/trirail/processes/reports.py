@@ -126,7 +126,7 @@ class Reports:
             self._gateway.send(batch)
             self._recorder.send(batch)
         if self._capture is not None and self._recorder.connected:
-            for frames in self._capture.take():
+            for frames in self._capture.drain():
                 self._recorder.send(bytes((Kind.FRAMES,)) + frames)
         self._measure_bus_load()
         self.accept_peers()

@@ -100,9 +100,9 @@ class Requests:
                 incoming, request = self.backlog.first(user)
                 if not self._link.send(message(request)):
                     return
-                self.backlog.take(user)
+                self.backlog.drop_first(user)
                 self._ahead[request.ticket] = user
-                self._last_words.take(request)
+                self._last_words.follow(request)
                 self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
 
     # ------------------------------------------------------------------ commands

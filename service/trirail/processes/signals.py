@@ -23,7 +23,7 @@ class Signals:
         self._wakeup = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
         return self
 
-    def take(self) -> signal.Signals:
+    def first(self) -> signal.Signals:
         """Return the signal that came first; wait for one."""
         return signal.Signals(self.reader.recv(1)[0])
 

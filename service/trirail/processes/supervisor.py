@@ -152,7 +152,7 @@ class Supervisor:
             for child in sorted(heard, key=lambda child: child is not self._children.get("loop")):
                 if child is None:
                     ending = progress.interrupted if not self._up else "stopping the robot and disabling the drives"
-                    self._say(f"{signals.take().name}: {ending}", "info")
+                    self._say(f"{signals.first().name}: {ending}", "info")
                     self._ending = True
                 elif not child.listen() and not self._ending:
                     self._on_end(child)
@@ -269,7 +269,7 @@ class Supervisor:
         while child.happened:
             self._tell(child.happened.pop(0))
         while child.measured:
-            self._monitor.take(child.name, child.measured.pop(0))
+            self._monitor.store(child.name, child.measured.pop(0))
 
     def _forget(self, child: ChildProcess) -> None:
         while child.listen():

@@ -27,7 +27,7 @@ class ShownAlignment:
     def __init__(self) -> None:
         self._looks: list[AlignmentLook] = []
 
-    def take(self, event: Event, look: AlignmentLook) -> list[Chunk]:
+    def drawing_of(self, event: Event, look: AlignmentLook) -> list[Chunk]:
         """Take a look, and return what is drawn of it."""
         if self._looks and (self._looks[0].id, self._looks[0].purpose) != (look.id, look.purpose):
             self._looks.clear()

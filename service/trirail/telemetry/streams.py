@@ -116,7 +116,7 @@ class Streams:
         """Take an event."""
         self._entries.append(journal.said(event))
         if event.alignment is not None:
-            self._waiting += self._alignment.take(event, event.alignment)
+            self._waiting += self._alignment.drawing_of(event, event.alignment)
 
     def given(self, what: ControlInput) -> None:
         """Take what the control was given."""
