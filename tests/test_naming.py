@@ -74,7 +74,7 @@ def test_nothing_that_people_read_of_a_stage_has_the_letter_of_a_slider(stage: s
     config = load(SIM.parent / f"{stage}.toml")
     labels, limits = config.geometry.labels, config.limits
     told = info(config)
-    robot = ShownRobot.told(msgspec.convert(msgspec.to_builtins(told), type(told)))
+    robot = ShownRobot.of_info(msgspec.convert(msgspec.to_builtins(told), type(told)))
     said = [str(each) for each in violations(robot.geometry, limits, (0.02, 0.02, 0.02))]
     bounds = Bounds(limits, config.period, labels=robot.geometry.labels)
     for number, label in enumerate(labels):

@@ -110,7 +110,7 @@ class DriveGroup(Protocol):
         is not heard."""
 
     @property
-    def told(self) -> tuple[DriveFault | None, ...]:
+    def reported_faults(self) -> tuple[DriveFault | None, ...]:
         """Of each drive the first fault that it has told of by itself since the last reset, whichever came first."""
 
     def configure(self, period: float, fastest: float | None = None) -> None:

@@ -43,7 +43,7 @@ class Beside:
         self._answers = answers or {}
         self._title = ""
 
-    def tell(self, line: str) -> None:
+    def show(self, line: str) -> None:
         self.lines.append(line)
         if title := re.match(r"\d+/\d+  (.*)", line):
             self._title = title[1]

@@ -30,7 +30,7 @@ class PerfectDrives:
     bus_load = 0.0
     missing_protections: tuple[MissingProtection, ...] = ()
     traffic = 0
-    told: tuple[DriveFault | None, ...] = (None, None, None)
+    reported_faults: tuple[DriveFault | None, ...] = (None, None, None)
 
     def __init__(self, position: Triple = STILL) -> None:
         self._state = OFF

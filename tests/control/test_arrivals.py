@@ -79,7 +79,7 @@ class Sliders:
     bus_load = 0.0
     traffic = 0
     missing_protections: tuple[MissingProtection, ...] = ()
-    told: tuple[DriveFault | None, ...] = (None, None, None)
+    reported_faults: tuple[DriveFault | None, ...] = (None, None, None)
 
     def __init__(self, chance: random.Random) -> None:
         self._chance = chance

@@ -60,7 +60,7 @@ class Meddler:
         """Cycles to each answer, the last one for all that follow."""
         self.change: Callable[[PlanAnswer], Sequence[Said]] = lambda answer: [answer]
 
-    def ask(self, request: PlanRequest) -> None:
+    def request_plan(self, request: PlanRequest) -> None:
         delay = self.delays.pop(0) if len(self.delays) > 1 else (self.delays or [1])[0]
         self.asked.append(request)
         for answer in self.change(self.planner.plan(request)):
@@ -390,7 +390,7 @@ class Silent(Rig):
         if how == "frozen":
             self.planner.delay = 10**9
         elif how == "killed":
-            self.planner.ask = lambda request: None  # type: ignore[method-assign]
+            self.planner.request_plan = lambda request: None  # type: ignore[method-assign]
         elif how == "late":
             self.planner.delay = 40
 

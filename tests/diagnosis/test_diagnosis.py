@@ -18,7 +18,7 @@ from trirail.cli import rail_drawing
 from trirail.config import SIM, Config, everything, load, overlap
 from trirail.config.checks import rules
 from trirail.config.explained import Place, leaves, repaired
-from trirail.diagnosis import Check, diagnose, stops, told
+from trirail.diagnosis import Check, diagnose, failed_checks, stops
 from trirail.diagnosis.configured import JUDGEMENTS
 from trirail.errors import TrirailError
 from trirail_drivers.errors import LONGEST
@@ -61,7 +61,7 @@ def times(value: float, factor: float) -> float:
 def told_of(path: Path) -> list[Check]:
     """Each mistake of a file, and each check of it that can do without what is impossible."""
     found = everything(path)
-    return told(path, found.mistakes) + diagnose(found.config, [mistake.key for mistake in found.mistakes])
+    return failed_checks(path, found.mistakes) + diagnose(found.config, [mistake.key for mistake in found.mistakes])
 
 
 def wrong(path: Path) -> list[Check]:

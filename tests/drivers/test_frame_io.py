@@ -156,7 +156,7 @@ class Listener:
     def take(self, data: bytearray, now: float) -> None:
         self.heard.append(bytes(data))
 
-    def tell(self, cause: str, code: int, text: str) -> None:
+    def note_fault(self, cause: str, code: int, text: str) -> None:
         raise AssertionError(text)
 
 

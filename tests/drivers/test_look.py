@@ -65,7 +65,7 @@ class Rig(DriverRig[SimulatedDrive, Cia402]):
     def look(self) -> str:
         """Why a look refuses drive A; "" where it does not."""
         scales = tuple(scale_of(name, drive) for name, drive in zip("ABC", self.config.each, strict=True))
-        found = setup.look(self.bus, self.config, scales, STEP, self.clock, FASTEST)[0]
+        found = setup.survey(self.bus, self.config, scales, STEP, self.clock, FASTEST)[0]
         return str(found) if isinstance(found, DriveError) else found.refused
 
     def set_up(self) -> str:

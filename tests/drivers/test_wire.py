@@ -32,7 +32,7 @@ class Listener:
         struct.Struct("<i").unpack(data)
         self.heard.append((bytes(data), now))
 
-    def tell(self, cause: str, code: int, text: str) -> None:
+    def note_fault(self, cause: str, code: int, text: str) -> None:
         self.told.append((cause, code, text))
 
 

@@ -51,7 +51,7 @@ class Crowd:
         self.links = {f"at {number}": name for number in range(links)}
         self.descriptors = descriptors
         self.now += LOOK_EVERY
-        self.crowding.look()
+        self.crowding.poll()
         return self.crowding.warnings()
 
 
@@ -85,5 +85,5 @@ def test_who_shows_no_certificate_is_told_of_and_not_ended(crowd: Crowd) -> None
 def test_it_is_not_looked_more_often_than_is_said(crowd: Crowd) -> None:
     crowd.look(90)
     crowd.links = {}
-    crowd.crowding.look()
+    crowd.crowding.poll()
     assert crowd.crowding.use.sessions == 90

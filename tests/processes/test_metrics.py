@@ -70,7 +70,7 @@ class Told:
 
     def newest(self) -> ServiceMeasured:
         self.now += 1.0
-        self.meter.tell(self._states.newest, InUse(3, 512, 40, 1024), ())
+        self.meter.publish(self._states.newest, InUse(3, 512, 40, 1024), ())
         return self.measured[-1]
 
 
@@ -178,7 +178,7 @@ def test_a_frozen_process_is_told_by_its_name(name: str) -> None:
             if each != name or turn < 50:
                 hearts.of(each).beat()
         now[0] += TURN
-        looked.look(ALL_UP)
+        looked.poll(ALL_UP)
         frozen_for = (turn - 49) * TURN
         if frozen_for <= 0.0:
             assert not any(looked.troubles().values())
@@ -190,20 +190,20 @@ def test_a_frozen_process_is_told_by_its_name(name: str) -> None:
 @pytest.mark.parametrize("name", PROCESSES)
 def test_a_process_that_is_dead_or_starting_is_told_at_once(name: str) -> None:
     looked, _, _ = health()
-    looked.look(ALL_UP | {name: NOT_RUNNING})
+    looked.poll(ALL_UP | {name: NOT_RUNNING})
     assert looked.troubles()[name] == "not running"
-    looked.look(ALL_UP | {name: Running(2, ready=False, restarts=1)})
+    looked.poll(ALL_UP | {name: Running(2, ready=False, restarts=1)})
     assert looked.troubles()[name] == "starting"
-    looked.look(ALL_UP)
+    looked.poll(ALL_UP)
     assert not any(looked.troubles().values())
 
 
 def test_a_supervisor_that_is_held_up_or_ending_is_told() -> None:
     looked, _, now = health()
-    looked.look(ALL_UP)
+    looked.poll(ALL_UP)
     now[0] += SILENT + 0.1
     assert looked.troubles()["supervisor"] == "no sign of life"
-    looked.look(ALL_UP)
+    looked.poll(ALL_UP)
     assert not looked.troubles()["supervisor"]
     looked.end()
     assert looked.troubles()["supervisor"] == "the service is ending"
@@ -239,12 +239,12 @@ def test_health_is_red_until_all_are_up_and_says_which(local: tuple[str, Health]
     status, body = get(f"{url}/healthz")
     assert status == 503
     assert json.loads(body)["processes"]["loop"] == "starting"
-    looked.look(ALL_UP)
+    looked.poll(ALL_UP)
     assert get(f"{url}/healthz") == (
         200,
         json.dumps(json.loads(get(f"{url}/healthz")[1]), separators=(",", ":")) + "\n",
     )
-    looked.look(ALL_UP | {"planner": NOT_RUNNING})
+    looked.poll(ALL_UP | {"planner": NOT_RUNNING})
     status, body = get(f"{url}/healthz")
     assert (status, json.loads(body)) == (
         503,
@@ -289,7 +289,7 @@ def beyond(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path
     """A robot with certificates, whose metrics are listened for on every address."""
     folder = tmp_path_factory.mktemp("keys")
     config, server, looked = served(tls_config(folder), metrics_address="0.0.0.0")
-    looked.look(ALL_UP)
+    looked.poll(ALL_UP)
     with server:
         yield f"https://127.0.0.1:{config.telemetry.metrics_port}", folder
 

@@ -148,7 +148,7 @@ def test_poses_whose_file_goes_are_neither_silently_kept_nor_lost(acts: list[str
                 asked.now += LOOK_EVERY
                 before = [said for said in asked.told if isinstance(said, Remark)]
                 was_told = bool(asked.poses.warnings())
-                asked.poses.look()
+                asked.poses.poll()
                 told = [said for said in asked.told if isinstance(said, Remark)][len(before) :]
                 assert len(told) == (gone and not was_told)
                 assert bool(asked.poses.warnings()) is gone

@@ -34,7 +34,7 @@ class Net:
         """Let time pass, look every second, and let what is asked be answered."""
         for _ in range(round(seconds)):
             self.clock.now += 1.0
-            self.links.look()
+            self.links.poll()
             self.links._asking.submit(lambda: None).result()
 
 
@@ -79,7 +79,7 @@ def test_nobody_waits_for_the_answer_why_there_is_none() -> None:
     net.links._why_not = lambda _: str(answered.wait() and "")
     for _ in range(20):
         net.clock.now += 1.0
-        net.links.look()
+        net.links.poll()
     assert net.told == []
     answered.set()
     net.wait(2)
@@ -96,7 +96,7 @@ def test_whatever_answers_there_ends_nothing() -> None:
 
 def test_without_routers_nothing_is_looked_at() -> None:
     links = RouterLinks([], lambda: pytest.fail("looked"), lambda _: "", lambda _: None)
-    links.look()
+    links.poll()
     assert links.warnings() == ()
 
 
@@ -105,9 +105,9 @@ def test_the_gateway_has_the_loop_tell_of_it_and_warns(rig: Rig) -> None:
     assert gateway.warnings() == ()
     gateway._routers._routers, net = Net().links._routers, gateway._routers
     net._why_not, net._routers[0].ask_at = lambda _: "connection refused", 0.0
-    net.look()
+    net.poll()
     net._asking.submit(lambda: None).result()
     net._due = 0.0
-    net.look()
+    net.poll()
     assert link.sent == [Remark("warning", DOWN)]
     assert gateway.warnings() == (DOWN,)

@@ -211,7 +211,7 @@ def test_limits_of_the_following_error_come_into_view_with_it(scene: Scene) -> N
 
 def test_a_robot_is_the_same_by_its_configuration_and_by_its_services_words() -> None:
     answered = msgspec.json.decode(msgspec.json.encode(info(CONFIG)), type=Info)
-    told, configured = ShownRobot.told(answered), ShownRobot.configured(CONFIG)
+    told, configured = ShownRobot.of_info(answered), ShownRobot.configured(CONFIG)
     assert (told.name, told.limits, told.rate_hz) == (configured.name, configured.limits, configured.rate_hz)
     assert told.geometry.legs == configured.geometry.legs
 
@@ -219,7 +219,7 @@ def test_a_robot_is_the_same_by_its_configuration_and_by_its_services_words() ->
 def test_tools_and_work_frames_are_drawn_with_their_names_as_a_service_tells_them() -> None:
     frames = FramesTable(tool={"camera": (0.03, -0.02)}, work={"part": (0.05, 0.01, math.pi / 2.0)})
     told = msgspec.json.decode(msgspec.json.encode(info(msgspec.structs.replace(CONFIG, frames=frames))), type=Info)
-    drawn = dict(Scene(ShownRobot.told(told), WALL_OFFSET_NS).still())
+    drawn = dict(Scene(ShownRobot.of_info(told), WALL_OFFSET_NS).still())
     tools, part = drawn["/robot/platform/tools"], drawn["/robot/frames/part"]
     assert isinstance(tools, rr.Points2D)
     assert isinstance(part, rr.LineStrips2D)

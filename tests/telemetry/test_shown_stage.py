@@ -13,6 +13,6 @@ def test_the_geometry_goes_over_the_wire(name: str) -> None:
     config = load(SIM.with_name(f"{name}.toml"))
     told = msgspec.json.decode(msgspec.json.encode(info(config)), type=Info)
     assert told.mechanism == config.geometry.kind
-    shown = ShownRobot.told(told)
+    shown = ShownRobot.of_info(told)
     assert shown.geometry == geometry(config.geometry)
     assert shown.limits == config.limits

@@ -11,7 +11,7 @@ from trirail.alignment.procedure import AlignmentEnd
 from trirail.errors import AlignmentFault, RefusedError
 from trirail.wire import boundary
 from trirail.wire.looks import WELL, AlignmentLook, LookEnd, SeenMark
-from trirail.wire.packets import Happened, Looked, decode_answer, decode_request, message, told
+from trirail.wire.packets import Happened, Looked, decode_answer, decode_request, event_packet, message
 from trirail.wire.sizes import MAX_MESSAGE, MAX_PACKET
 from wire.looks import LARGEST, looks
 from wire.looks import told as event
@@ -23,13 +23,13 @@ def test_a_look_is_read_as_it_was_said_and_goes_between_the_processes(look: Alig
         assert boundary.decode(boundary.encode(look, encoding), AlignmentLook, "no look", encoding) == look
     request = Looked("ann", "info", "so it looked", look)
     assert decode_request(message(request)[1:]) == request
-    assert decode_answer(told(event(1, look))[1:]) == Happened(event(1, look))
+    assert decode_answer(event_packet(event(1, look))[1:]) == Happened(event(1, look))
 
 
 def test_the_largest_fits_into_a_message_and_a_packet() -> None:
     assert len(boundary.encode(LARGEST)) <= MAX_MESSAGE
     assert len(message(Looked("u" * 64, "warning", "w" * 4000, LARGEST))) <= MAX_PACKET
-    assert decode_answer(told(event(1, LARGEST))[1:]) == Happened(event(1, LARGEST))
+    assert decode_answer(event_packet(event(1, LARGEST))[1:]) == Happened(event(1, LARGEST))
 
 
 ONE = {"id": "a", "purpose": "check", "number": 1}

@@ -74,10 +74,10 @@ def test_an_event_is_told_whole_up_to_the_size_of_a_packet() -> None:
     """And what does not fit is cut, in each of its words: nobody is told less than to whom it belongs."""
     room = MAX_PACKET - len(packets.message(Happened(an_event("x" * 60_000)))) + 60_000
     whole = an_event("x" * room)
-    packet = packets.told(whole)
+    packet = packets.event_packet(whole)
     assert len(packet) == MAX_PACKET
     assert packets.decode_answer(packet[1:]) == Happened(whole)
-    cut = packets.decode_answer(packets.told(an_event("x" * (room + 1)))[1:])
+    cut = packets.decode_answer(packets.event_packet(an_event("x" * (room + 1)))[1:])
     assert isinstance(cut, Happened)
     assert cut.event.message == f"{'x' * 1000}… ({room + 1} characters)"
     assert structs.replace(cut.event, message="") == an_event("")
@@ -86,7 +86,7 @@ def test_an_event_is_told_whole_up_to_the_size_of_a_packet() -> None:
 def test_whatever_is_long_in_an_event_is_cut() -> None:
     long = "x" * MAX_PACKET
     event = Event(1, 0.5, 500, 1.0, "goal", "info", long, id=long, reason=long, goal=long, user=long)
-    packet = packets.told(event)
+    packet = packets.event_packet(event)
     assert len(packet) <= MAX_PACKET
     told = packets.decode_answer(packet[1:])
     assert isinstance(told, Happened)

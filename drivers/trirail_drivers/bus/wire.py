@@ -28,7 +28,7 @@ Handler = Callable[[bytearray, float], None]
 class Listener(Protocol):
     """Whose frame it is."""
 
-    def tell(self, cause: str, code: int, text: str) -> None:
+    def note_fault(self, cause: str, code: int, text: str) -> None:
         """Keep what is wrong with it."""
 
 
@@ -147,7 +147,7 @@ class Wire:
         try:
             handler(data, now)
         except struct.error:
-            listener.tell("frame", 0, f"frame {identifier:03X} has wrong length {len(data)}")
+            listener.note_fault("frame", 0, f"frame {identifier:03X} has wrong length {len(data)}")
 
     def _take_error(self, report: canerrors.Report) -> None:
         if report.gravity is canerrors.Gravity.FAULT:

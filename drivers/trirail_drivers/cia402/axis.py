@@ -7,7 +7,7 @@ from typing import Any
 
 from trirail_drivers.cia402 import frames, ways
 from trirail_drivers.cia402.codes import words
-from trirail_drivers.cia402.second_node import AnswersAfter, AnswersPerSync, told
+from trirail_drivers.cia402.second_node import AnswersAfter, AnswersPerSync, warning
 from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives
@@ -177,7 +177,7 @@ class Cia402Axis(Axis):
         """6061h: 0 is none yet, and no other will do."""
         self.mode.shown = mode == self.way.mode
         if not self.mode.shown and mode:
-            self.tell("state", 0, f"shows mode {mode} (object 6061), with power; wanted {self.way.mode}")
+            self.note_fault("state", 0, f"shows mode {mode} (object 6061), with power; wanted {self.way.mode}")
 
     def request(self) -> bytes:
         """What it is to be asked for by SDO: its statusword, the mode that it shows, or both in turn."""
@@ -202,7 +202,7 @@ class Cia402Axis(Axis):
         self.seen_clear |= ~statusword
         state = frames.power_state(statusword)
         if state is None:
-            self.tell("state", 0, f"statusword {statusword:04X} is that of no CiA 402 state")
+            self.note_fault("state", 0, f"statusword {statusword:04X} is that of no CiA 402 state")
             return
         if state is PowerState.OPERATION_ENABLED:
             self.powered_up = True
@@ -219,11 +219,11 @@ class Cia402Axis(Axis):
         """
         mistaken = self._answers_after.of_another(came=self.came)
         if self._answers_per_sync.from_two_nodes():
-            self.tell("frame", 0, told(self.node, "each SYNC has two positions"))
+            self.note_fault("frame", 0, warning(self.node, "each SYNC has two positions"))
         if mistaken is not None:
             self._restarted = self.left_operational = self.mute = False
             by = "one has booted, or is not operational, and the other goes on"
-            self.event = self.made("frame", 0, told(self.node, by))
+            self.event = self.made("frame", 0, warning(self.node, by))
         return mistaken
 
     @property
@@ -239,7 +239,7 @@ class Cia402Axis(Axis):
             self.error_code = 0
             return
         self.error_code = code
-        self.tell("emcy", code, f"emergency {words(code, f', error register 0x{register:02X}')}")
+        self.note_fault("emcy", code, f"emergency {words(code, f', error register 0x{register:02X}')}")
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
         """Heartbeat, answer to node guarding or boot-up: the drive lives, and should be operational."""
@@ -259,7 +259,7 @@ class Cia402Axis(Axis):
             self._answers_after.begin(self.event)
         elif self._operational:  # before that, it is a heartbeat from before the drive was started
             self.leave_operational()
-            self.tell("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
+            self.note_fault("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
             self._answers_after.begin(self.event)
         self.mute = self.left_operational and state != frames.OPERATIONAL
 

@@ -167,13 +167,13 @@ async def _variables(remote: Remote) -> list[ODVariable]:
         members = [item] if isinstance(item, ODVariable) else list(item.subindices.values())
         found |= {(index, each.subindex): each for each in members}
         if isinstance(item, ODArray) and 1 in item.subindices and is_parameter(item.subindices[1]):
-            for subindex in range(1, (await remote.look(index) or 0) + 1):
+            for subindex in range(1, (await remote.peek(index) or 0) + 1):
                 found.setdefault((index, subindex), item[subindex])
     return [found[key] for key in sorted(found)]
 
 
 async def _origin(remote: Remote, drive: Drive) -> Origin:
-    vendor, product, revision, serial = [await remote.look(0x1018, subindex) for subindex in range(1, 5)]
+    vendor, product, revision, serial = [await remote.peek(0x1018, subindex) for subindex in range(1, 5)]
     return Origin(
         axis=remote.name,
         node=drive.node,

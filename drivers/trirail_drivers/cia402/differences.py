@@ -44,7 +44,7 @@ class Differences:
         if not await self.remote.has(*key):
             self.lack(key, "it has no such object")
             return None
-        found = await self.remote.look(*key)
+        found = await self.remote.peek(*key)
         if found is not None and same(index, subindex, found, value):
             return value
         refusal: SdoRefused | None = None
@@ -66,7 +66,7 @@ class Differences:
 
     async def is_given(self, key: Key, value: int) -> bool:
         """See that an object holds a value; return whether the drive lets it have that."""
-        found = await self.remote.look(*key)
+        found = await self.remote.peek(*key)
         if found is None or not same(*key, found, value):
             try:
                 await self.remote.write(*key, value)
@@ -110,9 +110,9 @@ class Differences:
         if used.need is Need.PROTECTION:
             self.lacking[name] = reason
         else:
-            self.tell(f"{title(key)}, for {used.purpose}: {reason}; instead: {used.without}")
+            self.add_note(f"{title(key)}, for {used.purpose}: {reason}; instead: {used.without}")
 
-    def tell(self, text: str) -> None:
+    def add_note(self, text: str) -> None:
         """Note what is done otherwise."""
         if text not in self.notes:
             self.notes.append(text)
@@ -121,5 +121,5 @@ class Differences:
         """Why the drive is refused: it lacks a protection that the configuration does not name. Tells of the others."""
         refused, told = judged(self.remote.name, self.lacking, accepted, PROTECTIONS)
         for text in told:
-            self.tell(text)
+            self.add_note(text)
         return refused

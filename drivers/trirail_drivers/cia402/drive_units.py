@@ -50,7 +50,7 @@ def _per_metre(unit: Unit | None, counts: float, revolutions: float | None) -> f
 async def _revolutions(remote: Remote, config: Drive, counts: float) -> float | None:
     """Revolutions per metre, as configured or as the drive's own objects have it."""
     derived, source = None, ""
-    told = await remote.look(0x60A8)
+    told = await remote.peek(0x60A8)
     unit = position_unit(told) if told is not None else None
     if unit is not None and unit.of is Of.METRES:
         _agree(
@@ -84,7 +84,7 @@ def _agree(name: str, key: str, configured: float, told: float, source: str) -> 
 
 
 async def _ratio(remote: Remote, index: int) -> float | None:
-    above, below = await remote.look(index, 1), await remote.look(index, 2)
+    above, below = await remote.peek(index, 1), await remote.peek(index, 2)
     return above / below if above and below else None
 
 
@@ -101,7 +101,7 @@ async def _unit(
     remote, key = drive.remote, _KEYS[index]
     text = config.velocity_unit if index == 0x60A9 else config.acceleration_unit
     configured = written(f"drives.{remote.name}.{key}", text, 1 if index == 0x60A9 else 2) if text is not None else None
-    code = await remote.look(index)
+    code = await remote.peek(index)
     told = decoded(code) if code else None
     source = f"{index:04X} = {code:08X}h" if told is not None and code is not None else f"{_FACTORS[index]:04X}"
     if told is None:
@@ -140,7 +140,7 @@ async def _in_counts(drive: Differences, index: int, told: Unit) -> Unit:
     """Set the unit to counts, where nobody says what the drive's own is of a metre."""
     wanted = Unit(Of.COUNTS, 1.0, "counts/s" if index == 0x60A9 else "counts/s2")
     code, remote = _IN_COUNTS[index], drive.remote
-    drive.note((index, 0), await remote.look(index), code, "its unit, for nobody says its revolutions per metre")
+    drive.note((index, 0), await remote.peek(index), code, "its unit, for nobody says its revolutions per metre")
     try:
         await remote.write(index, 0, code)
         if (await remote.becomes((index, 0), lambda held: held == code))[0] == code:

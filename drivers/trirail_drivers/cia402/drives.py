@@ -69,7 +69,7 @@ class Cia402(Driver[Cia402Axis]):
         self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
         guarded = (axis.node for axis in self._axes if axis.way.guarded)
         self._beats += [Frame(frames.HEARTBEAT + node, b"\0", remote=True) for node in guarded]
-        self._tell([made for made, _ in done], means)
+        self._warn_of_setup([made for made, _ in done], means)
 
     def _listen(self, axis: Cia402Axis) -> None:
         listen, way = self._wire.listen, axis.way
@@ -128,7 +128,7 @@ class Cia402(Driver[Cia402Axis]):
             if fault is not None:
                 self._wire.fail(fault)
         for axis in self._axes:
-            self._ask(axis, now)
+            self._poll_by_sdo(axis, now)
         return self._feedback()
 
     def _feedback(self) -> Feedback:
@@ -278,7 +278,7 @@ class Cia402(Driver[Cia402Axis]):
         for axis in self._axes:
             self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
 
-    def _ask(self, axis: Cia402Axis, now: float) -> None:
+    def _poll_by_sdo(self, axis: Cia402Axis, now: float) -> None:
         """Ask for what no PDO tells, without waiting: one request at a time."""
         if axis.sdo_asked is not None:
             return

@@ -48,8 +48,8 @@ async def give_watchdogs(drive: Differences, drives: Drives, period: int, node: 
 async def _watch_master(drive: Differences, master: int, period: int) -> None:
     """Let the drive watch the master's heartbeat, in an entry of 1016h in which it does not watch another node."""
     remote, wanted = drive.remote, master << 16 | period
-    entries = range(1, 1 + min(await remote.look(0x1016) or 1, MOST_WATCHED))
-    held = {entry: await remote.look(0x1016, entry) or 0 for entry in entries}
+    entries = range(1, 1 + min(await remote.peek(0x1016) or 1, MOST_WATCHED))
+    held = {entry: await remote.peek(0x1016, entry) or 0 for entry in entries}
     own = [entry for entry, value in held.items() if value >> 16 & 0x7F == master]
     free = [entry for entry, value in held.items() if not (value >> 16 & 0x7F and value & 0xFFFF)]
     for entry in dict.fromkeys((*own, *free)):  # CiA 301: no two entries have one node
@@ -63,8 +63,8 @@ async def _give_guarding(drive: Differences, period: int, node: int) -> bool:
     remote = drive.remote
     if not (await remote.has(0x100C) and await remote.has(0x100D)):
         return False
-    found = await remote.look(0x100C), await remote.look(0x100D)
-    heartbeats = await remote.look(0x1017)
+    found = await remote.peek(0x100C), await remote.peek(0x100D)
+    heartbeats = await remote.peek(0x1017)
     if heartbeats:
         await drive.give(0x1017, 0, 0)  # CiA 301: a node has heartbeats or is guarded, not both
     unset = 0 in found
@@ -79,7 +79,7 @@ async def _give_guarding(drive: Differences, period: int, node: int) -> bool:
         answers = await _answers(drive, node)  # some, as lely-core, answer only once it is set
         if not answers:
             await _set_guarding(drive, *found)
-    drive.tell(
+    drive.add_note(
         "has no heartbeat consumer (1016): node guarding instead"
         if answers
         else "object 100C:00 (Guard time) is there, but the drive answers no guarding"
@@ -111,17 +111,19 @@ async def _answers(drive: Differences, node: int) -> bool:
 async def _emergency(drive: Differences, drives: Drives, node: int) -> int:
     """The identifier of the drive's EMCY: the predefined one, or what it keeps instead."""
     remote, usual = drive.remote, frames.EMCY + node
-    found = await remote.look(0x1014)
+    found = await remote.peek(0x1014)
     if found is not None and found & _EMCY_BITS != usual and not await drive.is_given((0x1014, 0), usual):
         others = {frames.EMCY + other.node for other in drives.each} | {frames.SYNC}
         kept = shown(0x1014, 0, found)
         if found & INVALID:
-            drive.tell(f"{title((0x1014, 0))} stays {kept}: its EMCY is switched off, and its statusword alone tells")
+            drive.add_note(
+                f"{title((0x1014, 0))} stays {kept}: its EMCY is switched off, and its statusword alone tells"
+            )
         elif found & 0x7FF in others:
             drive.lack((0x1014, 0), f"it keeps {kept}")
         else:
-            drive.tell(f"{title((0x1014, 0))} stays {kept}: its EMCY is heard there")
+            drive.add_note(f"{title((0x1014, 0))} stays {kept}: its EMCY is heard there")
             usual = found & 0x7FF
-    if await remote.look(0x1015):
+    if await remote.peek(0x1015):
         await drive.give(0x1015, 0, 0)
     return usual

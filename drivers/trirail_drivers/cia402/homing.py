@@ -141,7 +141,7 @@ class HomingSequence:
         yield from self._change_mode(axis, HOMING)
         axis.follows = False
         # The newest statusword may be from before, and its bits mean other things in other modes.
-        yield from self._ask(axis, _READ, _STATUSWORD)
+        yield from self._sdo(axis, _READ, _STATUSWORD)
         axis.seen_clear = ~axis.statusword
         if not self._stopping:
             axis.mode_bits = frames.HOMING_START
@@ -178,15 +178,15 @@ class HomingSequence:
         axis.held = None
 
     def _change_mode(self, axis: Cia402Axis, mode: int) -> Steps:
-        yield from self._ask(axis, _WRITE_BYTE, _MODE, mode)
+        yield from self._sdo(axis, _WRITE_BYTE, _MODE, mode)
         deadline = self._now + self._sdo_timeout
-        while (found := (yield from self._ask(axis, _READ, _MODE_DISPLAY))[4]) != mode:
+        while (found := (yield from self._sdo(axis, _READ, _MODE_DISPLAY))[4]) != mode:
             if found == 0 and not axis.mode.shown and axis.state is not PowerState.OPERATION_ENABLED:
                 return  # it shows its mode with power
             if self._now >= deadline:
                 raise HomingFailedError(f"object 6061:00 (Modes of operation display): wanted {mode}, found {found}")
 
-    def _ask(self, axis: Cia402Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
+    def _sdo(self, axis: Cia402Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
         """One SDO, without waiting: the cycle goes on, and a later one has the answer."""
         axis.sdo_answer, axis.sdo_asked = None, index.to_bytes(2, "little")
         self._send(Frame(frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value]))))

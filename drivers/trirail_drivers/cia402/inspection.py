@@ -36,11 +36,11 @@ def inspect(
         done = setup.configure(bus, drives, scales, period, clock, fastest)
         for drive in drives.each:
             bus.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node).message())
-        return [_told(made) for made, _ in done]
-    ends = setup.look(bus, drives, scales, period, clock, fastest)
+        return [_as_json(made) for made, _ in done]
+    ends = setup.survey(bus, drives, scales, period, clock, fastest)
     looked = [end for end in ends if not isinstance(end, DriveError)]
     found = [
-        {"name": name, "node": drive.node, "refused": str(end)} if isinstance(end, DriveError) else _told(end)
+        {"name": name, "node": drive.node, "refused": str(end)} if isinstance(end, DriveError) else _as_json(end)
         for name, drive, end in zip(NAMES, drives.each, ends, strict=True)
     ]
     try:
@@ -69,7 +69,7 @@ def inputs(bus: can.BusABC, drives: Drives, clock: Clock) -> Callable[[str], int
     return read
 
 
-def _told(made: SetUp) -> dict[str, Any]:
+def _as_json(made: SetUp) -> dict[str, Any]:
     who = made.identity
     return {
         "name": made.name,

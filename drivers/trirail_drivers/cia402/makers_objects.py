@@ -54,13 +54,13 @@ async def give_makers_objects(drive: Differences, writes: tuple[ObjectWrite, ...
         key = each.object, each.sub
         remote.describe(key, each.bits // 8, signed=each.signed)
         where = f"drives.{remote.name}.write: object {named(key)}"
-        if why := address(key, remote.name_of(key), await remote.look(0x1018, 1)):
+        if why := address(key, remote.name_of(key), await remote.peek(0x1018, 1)):
             raise DriveError(f"{where} {why}")
         if not await remote.has(*key):
             raise DriveError(f"{where}: the drive has no such object")
         if (bits := await remote.bits(*key)) != each.bits:
             raise DriveError(f'{where} has {bits} bits, and type = "{each.type}"')
-        found = await remote.look(*key)
+        found = await remote.peek(*key)
         if found != each.value:
             await remote.write(*key, each.value)
             drive.note(key, found, each.value, each.why)

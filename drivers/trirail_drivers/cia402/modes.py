@@ -21,7 +21,7 @@ async def choose_modes(remote: Remote, *, homes: bool) -> tuple[int, ...]:
     Of 6502h bit n - 1 stands for mode n; where a drive lacks that, both are to be tried. DriveError where it has
     neither, or is to home and cannot.
     """
-    modes = await remote.look(0x6502)
+    modes = await remote.peek(0x6502)
     if modes is not None and homes and not modes >> (HOMING - 1) & 1:
         raise DriveError(
             f"drive {remote.name}: object 6502:00 (supported drive modes) is {modes:08X}, without homing mode; "
@@ -67,7 +67,9 @@ async def give_mode(drive: Differences, modes: tuple[int, ...]) -> tuple[int, bo
     chosen = untold or modes[0]
     if len(modes) > 1:
         await _write(drive, chosen)
-    drive.tell(f"{title(MODE_DISPLAY)} is 0: until it shows mode {chosen}, with power, the drive is held where it is")
+    drive.add_note(
+        f"{title(MODE_DISPLAY)} is 0: until it shows mode {chosen}, with power, the drive is held where it is"
+    )
     return chosen, False
 
 
@@ -83,8 +85,8 @@ async def _shown_once_given(drive: Differences, mode: int) -> tuple[int, float]:
 
 async def _write(drive: Differences, mode: int) -> None:
     remote = drive.remote
-    if await remote.look(*MODE) != mode or await remote.look(*MODE_DISPLAY) != mode:
-        drive.note(MODE, await remote.look(*MODE), mode)
+    if await remote.peek(*MODE) != mode or await remote.peek(*MODE_DISPLAY) != mode:
+        drive.note(MODE, await remote.peek(*MODE), mode)
         await remote.write(*MODE, mode)
 
 

@@ -135,9 +135,9 @@ async def bring(one: OneDrive, remote: Remote) -> SetUp:
         FOLLOWING_BIT not in drive.accept_without,
         shown,
     )
-    vendor, product, revision, serial = [await remote.look(0x1018, subindex) for subindex in range(1, 5)]
-    device_type = await remote.look(0x1000) or 0
-    identity = Identity(device_type, vendor, product, revision, serial, await remote.look(0x6502))
+    vendor, product, revision, serial = [await remote.peek(0x1018, subindex) for subindex in range(1, 5)]
+    device_type = await remote.peek(0x1000) or 0
+    identity = Identity(device_type, vendor, product, revision, serial, await remote.peek(0x6502))
     refused = differences.refusal(drive.accept_without)
     return SetUp(
         remote.name,

@@ -109,14 +109,14 @@ class Pdos:
             found = FeedbackPdo(pdo.identifier, pdo.entries or ())
         if found.has_status:
             if not timed:
-                self._drive.tell(
+                self._drive.add_note(
                     f"{title((0x1800, 5))}: it has none to count on; its statusword comes with the position"
                 )
             return found, None, False
         status = await self._status()
         polled = status is None or not await self._timer()
         if polled:
-            self._drive.tell(f"its statusword is also asked for by SDO, every {frames.POLL_PERIOD:g} s")
+            self._drive.add_note(f"its statusword is also asked for by SDO, every {frames.POLL_PERIOD:g} s")
         return found, status, polled
 
     async def switch_off_others(self) -> None:
@@ -129,7 +129,7 @@ class Pdos:
                 try:
                     await self._remote.write(index, 1, pdo.cob_id | INVALID)
                 except SdoRefused:
-                    self._drive.tell(f"PDO {index:04X} cannot be switched off, so it stays on, unused")
+                    self._drive.add_note(f"PDO {index:04X} cannot be switched off, so it stays on, unused")
                 else:
                     self._drive.note((index, 1), pdo.cob_id, pdo.cob_id | INVALID, "a PDO that is not used")
 
@@ -169,7 +169,7 @@ class Pdos:
         if not await remote.has(index, subindex) or await remote.bits(index, subindex) != bits:
             return False
         if sending:
-            return await remote.look(index, subindex) is not None
+            return await remote.peek(index, subindex) is not None
         return await remote.may_be_written(index, subindex)
 
     async def _try_to_map(
@@ -209,7 +209,7 @@ class Pdos:
                 await write(index + 0x200, 0, len(entries))
                 await self._drive.confirm((index + 0x200, 0), len(entries))
         except SdoRefused as refusal:
-            self._drive.tell(f"PDO {index:04X} cannot be mapped as wanted: {str(refusal).partition(': ')[2]}")
+            self._drive.add_note(f"PDO {index:04X} cannot be mapped as wanted: {str(refusal).partition(': ')[2]}")
             if not fixed and found.valid and found.cob_id is not None:
                 await write(index, 1, found.cob_id)
             return None
@@ -239,7 +239,7 @@ class Pdos:
 
     async def _parameter(self, index: int, subindex: int, value: int) -> tuple[int, int] | None:
         """A communication parameter that the drive has and that is to change."""
-        if not await self._remote.has(index, subindex) or await self._remote.look(index, subindex) == value:
+        if not await self._remote.has(index, subindex) or await self._remote.peek(index, subindex) == value:
             return None
         return subindex, value
 
@@ -252,7 +252,7 @@ class Pdos:
         timer: tuple[int, int] | None,
         inhibit: tuple[int, int] | None,
     ) -> None:
-        note, look = self._drive.note, self._remote.look
+        note, look = self._drive.note, self._remote.peek
         if not found.valid or found.identifier != cob_id & _IDENTIFIER:
             note((found.at, 1), found.cob_id, cob_id, "the PDO's identifier")
         if found.kind != kind:
@@ -284,7 +284,7 @@ class Pdos:
             if index not in self._used and pdo.valid and pdo.entries:
                 if fits(pdo.entries) and await self._has_kind(pdo, kind):
                     self._used.add(index)
-                    self._drive.tell(f"PDO {index:04X} is used as it is mapped, for {name}")
+                    self._drive.add_note(f"PDO {index:04X} is used as it is mapped, for {name}")
                     return pdo
                 but = ""
                 if fits(pdo.entries):
@@ -324,13 +324,13 @@ class Pdos:
 
     async def _timer(self) -> bool:
         """Whether the drive repeats its statusword by itself."""
-        return await self._remote.look(TPDO, 5) == round(1000 * frames.STATUS_PERIOD)
+        return await self._remote.peek(TPDO, 5) == round(1000 * frames.STATUS_PERIOD)
 
     async def _can_be_prompt(self, index: int) -> bool:
         """Whether the inhibit time is 0, or can be set to it: else a statusword may come late."""
-        if not await self._remote.has(index, 3) or await self._remote.look(index, 3) == 0:
+        if not await self._remote.has(index, 3) or await self._remote.peek(index, 3) == 0:
             return True
-        cob_id = await self._remote.look(index, 1) or 0
+        cob_id = await self._remote.peek(index, 1) or 0
         try:
             await self._remote.write(index, 1, cob_id | INVALID)
             await self._remote.becomes((index, 1), lambda held: bool(held & INVALID))
@@ -361,7 +361,7 @@ class Pdos:
         return [index for index in sorted(named) if await self._remote.has(index, 1)]
 
     async def _pdo(self, index: int) -> PdoParameters:
-        look = self._remote.look
+        look = self._remote.peek
         number = await look(index + 0x200)
         entries = None if number is None else [await look(index + 0x200, n + 1) for n in range(min(number, 64))]
         # Some have a number of entries that are all empty.

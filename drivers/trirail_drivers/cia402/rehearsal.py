@@ -23,9 +23,9 @@ class Rehearsal(Remote):
         self._read, self._missing, self._writable = remote._read, remote._missing, remote._writable
         self._written: dict[Key, bytes] = {}
 
-    async def look(self, index: int, subindex: int = 0) -> int | None:
+    async def peek(self, index: int, subindex: int = 0) -> int | None:
         """Value of an object, as it would be; None where the drive has none to tell."""
-        found = await super().look(index, subindex)
+        found = await super().peek(index, subindex)
         return found if found is None else self._would_be((index, subindex), found)
 
     async def read(self, index: int, subindex: int = 0) -> int:
@@ -49,7 +49,7 @@ class Rehearsal(Remote):
         seconds: float | None = None,  # noqa: ARG002
     ) -> tuple[int | None, float]:
         """What an object would hold at once."""
-        return await self.look(*key), 0.0
+        return await self.peek(*key), 0.0
 
     def _would_be(self, key: Key, found: int) -> int:
         data = self._written.get(key)

@@ -70,12 +70,12 @@ class Remote:
         """Say how many bytes an object has that no standard knows, and whether it has a sign."""
         self._described[key] = size, signed
 
-    async def look(self, index: int, subindex: int = 0) -> int | None:
+    async def peek(self, index: int, subindex: int = 0) -> int | None:
         """Value of an object; None where the drive has none to tell: it lacks the object, or cannot read it."""
         key = index, subindex
         if key not in self._read and key not in self._missing:
             try:
-                with self._told("read", key):
+                with self._as_drive_error("read", key):
                     self._read[key] = await self.client.upload(index, subindex)
             except SdoRefused as refusal:
                 if refusal.code in NO_SUCH_OBJECT:
@@ -87,7 +87,7 @@ class Remote:
 
     async def has(self, index: int, subindex: int = 0) -> bool:
         """Whether the drive has an object."""
-        await self.look(index, subindex)
+        await self.peek(index, subindex)
         return (index, subindex) not in self._missing
 
     async def read(self, index: int, subindex: int = 0) -> int:
@@ -97,7 +97,7 @@ class Remote:
 
     async def content(self, key: Key) -> bytes:
         """Bytes of an object, as they are now; SdoRefused where the drive has none to tell."""
-        with self._told("read", key):
+        with self._as_drive_error("read", key):
             data = self._read[key] = await self.client.upload(*key)
         return self._own(key, data)
 
@@ -109,7 +109,7 @@ class Remote:
     async def put(self, key: Key, data: bytes, value: str) -> None:
         """Give an object these bytes, a `value` for people; SdoRefused where the drive does not take them."""
         self._read.pop(key, None)
-        with self._told(f"write {value} to", key):
+        with self._as_drive_error(f"write {value} to", key):
             await self.client.download(*key, data)
 
     async def may_be_written(self, index: int, subindex: int = 0) -> bool:
@@ -130,7 +130,7 @@ class Remote:
         What else it says is no such word, as that it takes no segments.
         """
         try:
-            with self._told(attempt, key):
+            with self._as_drive_error(attempt, key):
                 await self.client.try_download(*key, size)
         except SdoRefused as refusal:
             read = len(self._read.get(key) or b"") == size  # then the length is right
@@ -140,7 +140,7 @@ class Remote:
     async def bits(self, index: int, subindex: int = 0) -> int:
         """How long an object is: as it was read, else by the drive's EDS, else by the standards."""
         key = index, subindex
-        await self.look(index, subindex)
+        await self.peek(index, subindex)
         known = self._read.get(key)
         return 8 * (self._size(key) if known is None else len(self._own(key, known)))
 
@@ -166,7 +166,7 @@ class Remote:
 
         async def read() -> int | None:
             self._read.pop(key, None)
-            return await self.look(*key)
+            return await self.peek(*key)
 
         def so_or_untold(found: int | None) -> bool:
             return found is None or so(found)
@@ -208,7 +208,7 @@ class Remote:
         return f"object {key[0]:04X}:{key[1]:02X} ({self.name_of(key)})"
 
     @contextmanager
-    def _told(self, attempt: str, key: Key) -> Iterator[None]:
+    def _as_drive_error(self, attempt: str, key: Key) -> Iterator[None]:
         """Turn what canopen and the bus raise into the one tree of errors."""
         called = self._called(key)
         try:

@@ -39,7 +39,7 @@ class TwoNodesError(SdoCommunicationError):
     """Requests are answered twice."""
 
     def __init__(self, node: int) -> None:
-        super().__init__(second_node.told(node, "both answer"))
+        super().__init__(second_node.warning(node, "both answer"))
 
 
 class NoAnswerError(SdoCommunicationError):

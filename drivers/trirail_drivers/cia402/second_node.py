@@ -23,7 +23,7 @@ ANSWERS_AFTER: Final = 3
 one have ended, but for one that was on its way."""
 
 
-def told(node: int, by: str) -> str:
+def warning(node: int, by: str) -> str:
     """What people are to know of it."""
     return f"a second node with id {node} on the bus: {by}; give each its own node id"
 

@@ -74,15 +74,15 @@ PLAIN_SYNC: Final = (
 
 async def _give_plain(drive: Differences, key: Key, wanted: int, bits: int) -> None:
     remote = drive.remote
-    found = await remote.look(*key)
+    found = await remote.peek(*key)
     if found is None or found & bits == wanted:
         return
-    if key == (0x1019, 0) and await remote.look(0x1006):
+    if key == (0x1019, 0) and await remote.peek(0x1006):
         with suppress(SdoRefused):
             await remote.write(0x1006, 0, 0)  # CiA 301: the counter changes only while the period is 0
             await remote.becomes((0x1006, 0), lambda held: held == 0)
     await drive.give(*key, wanted)
-    if (await remote.look(*key) or 0) & bits != wanted:
+    if (await remote.peek(*key) or 0) & bits != wanted:
         raise DriveError(
             f"drive {remote.name}: {title(key)} is {shown(*key, found)} and stays; wanted {shown(*key, wanted)}"
         )
@@ -93,15 +93,15 @@ async def _give_interpolation(drive: Differences, periods: list[tuple[int, int]]
     if not (await remote.has(0x60C2, 1) and await remote.has(0x60C2, 2)):
         drive.lack((0x60C2, 1), "it has no such object")
         return
-    held = await remote.look(0x60C2, 1), await remote.look(0x60C2, 2)
+    held = await remote.peek(0x60C2, 1), await remote.peek(0x60C2, 2)
     if held in periods:
         return
     refusal: SdoRefused | ConfigurationRefused | None = None
     for value, exponent in periods:
         try:
-            if await remote.look(0x60C2, 2) != exponent:
+            if await remote.peek(0x60C2, 2) != exponent:
                 await _write(drive, (0x60C2, 2), exponent)
-            if await remote.look(0x60C2, 1) != value:
+            if await remote.peek(0x60C2, 1) != value:
                 await _write(drive, (0x60C2, 1), value)
         except (SdoRefused, ConfigurationRefused) as error:
             refusal = error
@@ -121,7 +121,7 @@ def _rate_that_it_holds(value: int | None, exponent: int | None) -> str:
 
 
 async def _write(drive: Differences, key: tuple[int, int], value: int) -> None:
-    found = await drive.remote.look(*key)
+    found = await drive.remote.peek(*key)
     await drive.remote.write(*key, value)
     drive.note(key, found, value)
     await drive.confirm(key, value)

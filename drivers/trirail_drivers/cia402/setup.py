@@ -53,7 +53,7 @@ def configure(
     return tuple((made, each) for made, each in zip(done, starts, strict=True) if isinstance(each, Start))
 
 
-def look(
+def survey(
     bus: can.BusABC,
     drives: Drives,
     scales: tuple[Scale, ...],

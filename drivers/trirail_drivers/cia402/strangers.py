@@ -42,14 +42,14 @@ class Strangers:
         for identifier in {axis.way.setpoints.identifier, axis.way.controlword} - {None}:
             self._wire.listen(identifier or 0, self, self._sends(f"sends drive {axis.name} PDOs ({identifier:03X})"))
 
-    def tell(self, cause: str, code: int, text: str) -> None:
+    def note_fault(self, cause: str, code: int, text: str) -> None:
         """A frame of a stranger's that is malformed is a stranger's all the same."""
         self._wire.fail(DriveFault("", "bus", code, f"CAN bus: another master is on it: {text} ({cause})"))
 
     def _sends(self, text: str) -> Handler:
-        return lambda data, now: self._told(text)  # noqa: ARG005  one signature for all
+        return lambda data, now: self._warn(text)  # noqa: ARG005  one signature for all
 
-    def _told(self, text: str) -> None:
+    def _warn(self, text: str) -> None:
         self._wire.fail(DriveFault("", "bus", 0, f"CAN bus: another master is on it: it {text}; only one may be"))
 
     def _on_nmt(self, data: bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
@@ -63,11 +63,11 @@ class Strangers:
                 axis.stopped = command == _STOPS
         name = _COMMANDS.get(command, f"{command:02X}h")
         whom = "all nodes" if node == 0 else f"drive {meant[0].name}"
-        self._told(f'commands {whom} by NMT "{name}"')
+        self._warn(f'commands {whom} by NMT "{name}"')
 
     def _on_heartbeat(self, data: bytearray, now: float) -> None:  # noqa: ARG002
         frames.NMT_STATE.unpack(data)
-        self._told(f"has this service's node id {self._master_node}")
+        self._warn(f"has this service's node id {self._master_node}")
 
 
 class NoOtherMaster(can.BusABC):

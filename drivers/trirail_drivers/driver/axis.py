@@ -53,7 +53,7 @@ class Axis(Answers):
         """What of its cyclic traffic went wrong."""
         return Counts(self.late, self.lost, self.setpoints_late, self.setpoints_lost)
 
-    def tell(self, cause: str, code: int, text: str) -> None:
+    def note_fault(self, cause: str, code: int, text: str) -> None:
         """Keep the first event since faults were last reset."""
         if self.event is None:
             self.event = self.made(cause, code, text)

@@ -15,7 +15,7 @@ from trirail_drivers.bus import load
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.cyclic import Cyclic
-from trirail_drivers.driver.refusals import SetUpDrive, told
+from trirail_drivers.driver.refusals import SetUpDrive, lines_by_drive
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection
 
@@ -59,9 +59,9 @@ class Driver(ABC, Generic[AnyAxis]):
         """By what that was asked for."""
         self._closed = False
 
-    def _tell(self, made: Sequence[SetUpDrive], means: Callable[[str], str]) -> None:
+    def _warn_of_setup(self, made: Sequence[SetUpDrive], means: Callable[[str], str]) -> None:
         """Warn of what is done otherwise, and keep which protections drives do without; `means` words one."""
-        for line in told((each.name, each.notes) for each in made):
+        for line in lines_by_drive((each.name, each.notes) for each in made):
             self._wire.warn(line)
         self.missing_protections = tuple(
             MissingProtection(each.name, name, means(name)) for each in made for name in each.lacking
@@ -73,7 +73,7 @@ class Driver(ABC, Generic[AnyAxis]):
         return self._wire.traffic + int(self._tables.times[0]["traffic"])
 
     @property
-    def told(self) -> tuple[DriveFault | None, ...]:
+    def reported_faults(self) -> tuple[DriveFault | None, ...]:
         """Of each drive the first fault that it has told of by itself since the last reset, whichever came first."""
         return tuple(axis.event for axis in self._axes)
 

@@ -74,7 +74,7 @@ def raise_all(errors: Sequence[DriveError]) -> None:
         raise DriveError("; ".join(shortened(text, LONGEST // len(told) - 2) for text in told))
 
 
-def told(notes: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+def lines_by_drive(notes: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     """What people should know of drives, by name, a line each: what is so of several is said once."""
     names: dict[str, list[str]] = {}
     for name, lines in notes:

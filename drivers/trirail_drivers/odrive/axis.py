@@ -38,7 +38,7 @@ class OdriveAxis(Axis):
         """Axis state of the newest heartbeat."""
         self.errors = 0
         """Active errors, and why it was disarmed."""
-        self.told = False
+        self.reported = False
         """It has answered what its errors are."""
         self.version: Version | None = None
         """Of its hardware and firmware, once it told."""
@@ -56,7 +56,7 @@ class OdriveAxis(Axis):
     def rests(self, wanted: AxisState | None) -> bool:
         """Whether nothing is to be done for it, nor found out, as long as its frames say nothing new."""
         in_state = wanted is not None and self.requested is wanted and self.state == wanted and self.obeys
-        well = self.told and not self.errors and self.event is None and self.reset_until == -math.inf
+        well = self.reported and not self.errors and self.event is None and self.reset_until == -math.inf
         follows = self.powered_up or wanted is AxisState.IDLE
         return in_state and well and follows and self.missed == 0 and math.isfinite(self.position)
 
@@ -100,12 +100,12 @@ class OdriveAxis(Axis):
         if math.isfinite(turns):
             self.position = self.scale.metres(turns)
         else:
-            self.tell("frame", 0, f"position estimate is {turns}: has its encoder been calibrated?")
+            self.note_fault("frame", 0, f"position estimate is {turns}: has its encoder been calibrated?")
 
     def on_errors(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """Get_Error: active errors and disarm reason."""
         active, reason = frames.ERRORS.unpack(data)
-        self.told = True
+        self.reported = True
         self._take_errors(active | reason)
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
@@ -122,7 +122,7 @@ class OdriveAxis(Axis):
         elif self.requested is AxisState.CLOSED_LOOP_CONTROL and self.obeys and not self.powered_up:
             self._watch_refusal()
 
-    def ask(self, state: AxisState) -> None:
+    def note_request(self, state: AxisState) -> None:
         """Note that the drive was asked for a state."""
         self.requested = state
         self._beats = 0
@@ -202,4 +202,4 @@ class OdriveAxis(Axis):
             result = ProcedureResult(self._result).name.lower().replace("_", " ")
         except ValueError:
             result = f"procedure result {self._result}"
-        self.tell("state", 0, f"refuses closed loop control: {result}")
+        self.note_fault("state", 0, f"refuses closed loop control: {result}")

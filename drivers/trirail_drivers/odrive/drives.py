@@ -69,7 +69,7 @@ class Odrive(Driver[OdriveAxis]):
         """
         self._set_period(period, frames.TRAFFIC)
         self._setpoints.period = period
-        self._tell(setup.configure(self._wire, self._axes, self._drives, period, self._clock), means)
+        self._warn_of_setup(setup.configure(self._wire, self._axes, self._drives, period, self._clock), means)
 
     def sync(self) -> None:
         """Send the setpoints written since the last cycle, which are in force on arrival; ask for the positions.
@@ -272,7 +272,7 @@ class Odrive(Driver[OdriveAxis]):
                 if not self._wire.send(frames.command(axis.node, frames.SET_CONTROLLER_MODE, mode)):
                     return
             if self._wire.send(frames.command(axis.node, frames.SET_AXIS_STATE, frames.AXIS_STATE.pack(wanted))):
-                axis.ask(wanted)
+                axis.note_request(wanted)
 
     def _wanted(self, axis: OdriveAxis) -> AxisState | None:
         """The state that a drive should be in now; None leaves it as it is."""

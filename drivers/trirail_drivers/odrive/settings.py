@@ -34,13 +34,15 @@ def read(wire: Wire, axes: Sequence[OdriveAxis], drives: Drives, clock: Clock) -
     found: list[dict[str, float]] = [{} for _ in axes]
     for path in SETTINGS:
         asked = [(axis, table[path]) for axis, table in zip(axes, tables, strict=True) if table and path in table]
-        _ask(wire, asked, path, drives.sdo_timeout, clock)
+        _read_each(wire, asked, path, drives.sdo_timeout, clock)
         for axis, endpoint in asked:
             found[axes.index(axis)][path] = _value(axis, endpoint, path)
     return [None if table is None else each for table, each in zip(tables, found, strict=True)]
 
 
-def _ask(wire: Wire, asked: Sequence[tuple[OdriveAxis, Endpoint]], path: str, timeout: float, clock: Clock) -> None:
+def _read_each(
+    wire: Wire, asked: Sequence[tuple[OdriveAxis, Endpoint]], path: str, timeout: float, clock: Clock
+) -> None:
     """Ask each drive for an endpoint, until all have answered."""
     wanted = {axis.name: endpoint.id for axis, endpoint in asked}
     missing = [axis for axis, _ in asked]

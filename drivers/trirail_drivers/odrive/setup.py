@@ -62,7 +62,7 @@ def configure(
     """
     for axis in axes:
         send(wire, frames.command(axis.node, frames.SET_AXIS_STATE, frames.AXIS_STATE.pack(AxisState.IDLE)))
-        axis.ask(AxisState.IDLE)
+        axis.note_request(AxisState.IDLE)
         axis.sync_sent()
         for number in (frames.GET_VERSION, frames.GET_ERROR, frames.GET_ENCODER_ESTIMATES):
             send(wire, frames.request(axis.node, number))
@@ -103,7 +103,7 @@ def _missing(axis: OdriveAxis) -> str:
     """What the drive has not answered yet, or ""."""
     if axis.version is None:
         return "Get_Version"
-    if not axis.told:
+    if not axis.reported:
         return "Get_Error"
     return "Get_Encoder_Estimates" if axis.age else ""
 

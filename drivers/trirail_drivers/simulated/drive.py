@@ -181,7 +181,7 @@ class SimulatedDrive(Device):
 
     def _move(self, step: float, feed_forward: float) -> None:
         if self.state not in _POWERED:
-            self._profile.tell(self.servo)
+            self._profile.update_actual(self.servo)
             return
         if self._follows_command:
             self.servo.follow(self._profile.setpoint, feed_forward, step)
@@ -229,7 +229,7 @@ class SimulatedDrive(Device):
 
     def _publish(self) -> None:
         """Bring the actual values and the statusword up to date."""
-        self._profile.tell(self.servo)
+        self._profile.update_actual(self.servo)
         status = STATUS[self.state] | _VOLTAGE_ENABLED | _REMOTE
         if self._follows_command:
             status |= _FOLLOWS_COMMAND

@@ -39,7 +39,7 @@ class Emergencies:
         self._active.add((code, detail))
         self._update_register()
         self._remember(detail << 16 | code)
-        self._tell(code, detail)
+        self._emit(code, detail)
 
     def _remember(self, error: int) -> None:
         """The newest error stands first; a device without 1003h forgets it."""
@@ -57,7 +57,7 @@ class Emergencies:
         self._active.remove((code, detail))
         self._update_register()
         if not self._active:
-            self._tell(0, 0)
+            self._emit(0, 0)
 
     def forget(self, but: int) -> None:
         """After a reset: no error but the one with code `but`, and nothing told of it."""
@@ -77,7 +77,7 @@ class Emergencies:
         for code, _ in self._active:
             self._register.value |= _register_bits(code)
 
-    def _tell(self, code: int, detail: int) -> None:
+    def _emit(self, code: int, detail: int) -> None:
         emergency = _EMERGENCY.pack(code, self._register.value, detail)
         if self._muted:
             self._held_back = emergency

@@ -90,7 +90,7 @@ class SimulatedOdrive:
         """Its state as CiA 402 has it."""
         if self._armed:
             return PowerState.OPERATION_ENABLED
-        return PowerState.FAULT if self._told else PowerState.SWITCH_ON_DISABLED
+        return PowerState.FAULT if self._error_bits else PowerState.SWITCH_ON_DISABLED
 
     @property
     def emergencies(self) -> None:
@@ -162,7 +162,7 @@ class SimulatedOdrive:
         return self.axis_state is AxisState.CLOSED_LOOP_CONTROL
 
     @property
-    def _told(self) -> int:
+    def _error_bits(self) -> int:
         return self.errors | self.disarm_reason
 
     def _move(self, step: float) -> None:
@@ -173,7 +173,7 @@ class SimulatedOdrive:
 
     def _answer(self, command: int) -> None:
         if command == frames.HEARTBEAT:
-            data = frames.BEAT.pack(self._told, self.axis_state, self.result, 0)
+            data = frames.BEAT.pack(self._error_bits, self.axis_state, self.result, 0)
         elif command == frames.GET_VERSION:
             data = frames.VERSION.pack(2, *self.version.hardware, *self.version.firmware, self.version.unreleased)
         elif command == frames.GET_ERROR:

@@ -134,7 +134,7 @@ class Profile:
         acceleration = self._homing_acceleration.value * self.units.acceleration
         return self._homing_method.value, fast, slow, acceleration, round(self._home_offset.value * self.units.position)
 
-    def tell(self, servo: Servo) -> None:
+    def update_actual(self, servo: Servo) -> None:
         """Bring the actual values up to date."""
         units = self.units
         self._position.store(servo.position / units.position)

@@ -65,9 +65,9 @@ class FactorGroup:
         self.position = self._position()
         _, velocity, acceleration = (entry.value for entry in self._codes)
         by_factor, of_factor = self._ratio(0x6096), self._ratio(0x6097)
-        told = self._told(velocity, 1) or (self.position / by_factor if by_factor else None)
+        told = self._unit(velocity, 1) or (self.position / by_factor if by_factor else None)
         self.velocity = told or self._mechanics.velocity
-        told = self._told(acceleration, 2) or (self.velocity / of_factor if of_factor else None)
+        told = self._unit(acceleration, 2) or (self.velocity / of_factor if of_factor else None)
         self.acceleration = told or self._mechanics.acceleration
 
     def _written(self, _entry: ObjectEntry, _old: int) -> None:
@@ -75,7 +75,7 @@ class FactorGroup:
 
     def _position(self) -> float:
         code = self._codes[0].value
-        if code != self._code_at_power_on and (size := self._told(code, 0)):
+        if code != self._code_at_power_on and (size := self._unit(code, 0)):
             return size
         return self._counts_per_unit() / self._at_power_on
 
@@ -89,7 +89,7 @@ class FactorGroup:
         numerator, divisor = (entry.value for entry in self._ratios[index])
         return numerator / divisor if numerator > 0 and divisor > 0 else None
 
-    def _told(self, code: int, power: int) -> float | None:
+    def _unit(self, code: int, power: int) -> float | None:
         """The size of a unit by CiA 303-2 [counts, per second to a power]; None where it tells none known here."""
         size = self._decoded(code, power)
         return size if size is not None and math.isfinite(size) else None

@@ -198,7 +198,7 @@ class _RecordedPlanner:
         self._planner = MotionPlanner(config)
         self._planned: dict[int, PlanAnswer] = {}
 
-    def ask(self, request: PlanRequest) -> None:
+    def request_plan(self, request: PlanRequest) -> None:
         """See trirail.control.plan_requests.PlannerPort."""
         self._planned[request.number] = self._planner.plan(request)
 
@@ -242,7 +242,7 @@ class _Recorded:
         return self._said[max(0, self._row - 1)]._replace(fault=self._fault)
 
     @property
-    def told(self) -> tuple[DriveFault | None, ...]:
+    def reported_faults(self) -> tuple[DriveFault | None, ...]:
         """Return that no drive has told of a fault: what was wrong is told by `read`."""
         return None, None, None
 

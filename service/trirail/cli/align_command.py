@@ -82,7 +82,7 @@ def calibrate(
     with source.opened() as (look, known), Robot(service.robot, service.connect, tls=service.tls) as robot:
         views = dict.fromkeys(look(), "camera") if one_camera else known
         wishes = calibration_by_moves(moves, views, lens, centre or (0.0, 0.0), looks, _approach(approach))
-        found = drive(robot, look, _told(wishes, service, len(moves) + 1), speed, wait)
+        found = drive(robot, look, _printed(wishes, service, len(moves) + 1), speed, wait)
         targets = dict(drive(robot, look, mean_look(looks), speed, wait).marks)
     calibration_file.write(file, service.robot, found, targets)
     if service.json:
@@ -148,7 +148,7 @@ def run(
         _approach(approach),
     )
     with source.opened() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
-        found = drive(robot, look, _told(align(task), service), speed, wait)
+        found = drive(robot, look, _printed(align(task), service), speed, wait)
     if found.confirmed != kept.calibration.confirmed:
         known = msgspec.structs.replace(kept.calibration, confirmed=found.confirmed)
         calibration_file.write(file, kept.robot, known, kept.targets, kept.made)
@@ -201,7 +201,7 @@ def check(
     with source.opened() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
         if moves:
             again = calibration_again(kept.calibration, looks)
-            now = drive(robot, look, _told(again, service, len(kept.calibration.poses)), speed, wait)
+            now = drive(robot, look, _printed(again, service, len(kept.calibration.poses)), speed, wait)
             changes = view_changes(kept.calibration, now)
         else:
             found = drive(robot, look, look_only(task), speed, wait)
@@ -232,8 +232,8 @@ def _kept(file: Path, service: Service) -> CalibrationFile:
     return kept
 
 
-def _told(
+def _printed(
     wishes: Generator[Wish, Sighting, T], service: Service, looks: int | None = None
 ) -> Generator[Wish, Sighting, T]:
     """Return what asks for the same, and tells a person of each look, where no program reads."""
-    return wishes if service.json else alignment_lines.told(wishes, looks)
+    return wishes if service.json else alignment_lines.printed(wishes, looks)

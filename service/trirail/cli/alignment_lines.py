@@ -60,7 +60,7 @@ def show_changes(changes: Iterable[ViewChange]) -> None:
         )
 
 
-def told(wishes: Generator[Wish, Sighting, T], looks: int | None) -> Generator[Wish, Sighting, T]:
+def printed(wishes: Generator[Wish, Sighting, T], looks: int | None) -> Generator[Wish, Sighting, T]:
     """Wish for the same, and print each look as it comes; `looks` is how many there will be, where that is known."""
     from trirail.alignment.wishes import LookReport
 

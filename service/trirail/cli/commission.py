@@ -84,7 +84,7 @@ def commission(
                 guide.run()
             guide.write(out)
         finally:
-            person.tell(f"Report: {keeper.path} (for people: {keeper.text.name})")
+            person.show(f"Report: {keeper.path} (for people: {keeper.text.name})")
     if json:
         terminal.json(reports.content(made))
     return 0 if made.ok else 1
@@ -120,7 +120,7 @@ class Console:
         self._open = sys.stdin is not None and not sys.stdin.closed
         self._echoes = not (self._open and sys.stdin.isatty())
 
-    def tell(self, line: str) -> None:
+    def show(self, line: str) -> None:
         """Print a line."""
         self._shown.print(terminal.plain(line), soft_wrap=True)
 

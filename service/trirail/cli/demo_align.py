@@ -57,7 +57,7 @@ class DrawnCameras:
         self._stage, self._stream = stage, stream
         self._rng = np.random.default_rng(seed)
 
-    def look(self) -> dict[str, Pair]:
+    def take_pictures(self) -> dict[str, Pair]:
         """Take a picture with each, find the disc in it, and show both."""
         marks: dict[str, Pair] = {}
         now = time.monotonic()
@@ -130,8 +130,8 @@ def _parts(robot: Robot, cameras: DrawnCameras, stream: rr.RecordingStream, part
     moves = [(BY, 0, 0), (-BY, 0, 0), (0, BY, 0), (0, -BY, 0), (0, 0, TURN), (0, 0, -TURN)]
     robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
     time.sleep(WAIT)
-    calibration = robot.calibrate_camera(cameras.look, moves, looks=4, wait=WAIT)
-    cameras.targets = cameras.look()
+    calibration = robot.calibrate_camera(cameras.take_pictures, moves, looks=4, wait=WAIT)
+    cameras.targets = cameras.take_pictures()
     out.print(f"calibrated in {counted(len(moves), 'move')}: residual {calibration.noise:.3f} pixel")
     rng, results = np.random.default_rng(seed), []
     for number in range(parts):
@@ -140,7 +140,7 @@ def _parts(robot: Robot, cameras: DrawnCameras, stream: rr.RecordingStream, part
         x, y = rng.uniform(-OFF, OFF, 2).tolist()
         error = x, y, float(rng.uniform(-TURNED, TURNED))
         cameras.part = _placed(error)
-        result = robot.align(cameras.look, cameras.targets, calibration, looks=4, wait=WAIT)
+        result = robot.align(cameras.take_pictures, cameras.targets, calibration, looks=4, wait=WAIT)
         left = [f"{1e6 * each.worst:.2f}" for each in result.measurements]
         made = counted(len(result.corrections), "correction")
         line = f"part {number + 1}: {' → '.join(left)} µm, {made}: {result.why}"

@@ -12,7 +12,7 @@ from trirail.cli.doctor_cycle import cycle
 from trirail.cli.doctor_network import metrics, network, routers
 from trirail.cli.machine import Machine
 from trirail.config import Config, Findings, as_built, overlap
-from trirail.diagnosis import Check, diagnose, told
+from trirail.diagnosis import Check, diagnose, failed_checks
 
 RELIABLE_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "riscv_clocksource")
 """Clock sources that are read without leaving the processor, or its virtual machine."""
@@ -35,7 +35,7 @@ def whole(path: Path, found: Findings, read: Callable[[Config], Machine]) -> lis
     It is not called where what it needs to know is impossible.
     """
     wrong = [mistake.key for mistake in found.mistakes]
-    checks = told(path, found.mistakes)
+    checks = failed_checks(path, found.mistakes)
     if overlap(READS, wrong):
         checks += diagnose(found.config, wrong)
     else:
@@ -125,5 +125,5 @@ def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
 def corrected(config: Config) -> list[Check]:
     """What as-built errors are corrected by: nobody should have to guess that it is on."""
     section = config.correction
-    words = as_built.told(section.map, section.as_built, section.backlash)
+    words = as_built.summary(section.map, section.as_built, section.backlash)
     return [] if words is None else [Check("correction", "ok", units.correction(words, config.geometry.labels))]

@@ -126,7 +126,9 @@ def compare(
         two, heading = end, f"drive {name}"
     found = parameter_file.compare(one, two)
     if json:
-        terminal.json({"ok": not found, "one": str(file), "other": heading, "differences": [_told(e) for e in found]})
+        terminal.json(
+            {"ok": not found, "one": str(file), "other": heading, "differences": [_as_json(e) for e in found]}
+        )
         return 1 if found else 0
     for field in ("vendor", "product", "revision", "serial"):
         mine, theirs = getattr(one.origin, field), getattr(two.origin, field)
@@ -179,7 +181,7 @@ def restore(
     with open_bus(settings.can, settings.drives) as bus:
         done = protocol.restore(bus, settings.drives, time.monotonic, name, saved, replace=replace, store=store)
     if json:
-        left = [_told(each.different) | {"why": each.why, "meant": each.meant} for each in done.left]
+        left = [_as_json(each.different) | {"why": each.why, "meant": each.meant} for each in done.left]
         written = [_named(key) for key in done.written]
         said = {"ok": done.ok, "drive": name, "written": written, "left": left, "stored": done.stored}
         terminal.json(said | ({"not_stored": done.not_stored} if done.not_stored else {}))
@@ -236,7 +238,7 @@ def _table(one: str, other: str, rows: Iterable[tuple[Different, str]]) -> None:
     terminal.out.print(table)
 
 
-def _told(each: Different) -> dict[str, Any]:
+def _as_json(each: Different) -> dict[str, Any]:
     one, other = (None if held is None else held.value for held in (each.one, each.other))
     return {"object": _named(each.key), "name": each.name, "one": one, "other": other}
 

@@ -89,7 +89,7 @@ class RemoteRobot:
         self._subscribe(info.robot)
         self._first_records = self._first(info)
         offset_ns = time.time_ns() - int(unpack(self._first_records)[-1]["deadline_ns"])
-        self.streams = Streams(ShownRobot.told(info), name, offset_ns, root)
+        self.streams = Streams(ShownRobot.of_info(info), name, offset_ns, root)
         self._thread = threading.Thread(target=self._run, name=f"records of {info.robot}", daemon=True)
 
     def draw(self, relay: Relay) -> None:

@@ -165,7 +165,7 @@ class AsyncRobot:
     align = _conversation(Robot.align)
 
     async def _report_look(self, look: bytes) -> None:
-        await self._connection.ask(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)
+        await self._connection.fetch(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)
 
     def jog(self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2) -> AsyncJog:
         """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
@@ -197,11 +197,11 @@ class AsyncRobot:
         renews = goal_id in self._goals  # a jog: what it has is not forgotten or stopped for one renewal's sake
         goal = self._goals.setdefault(goal_id, AsyncGoalHandle(goal_id, self.command))
         try:
-            goal.reply = await self._connection.ask(("goal", self.user), GoalReply, content)
+            goal.reply = await self._connection.fetch(("goal", self.user), GoalReply, content)
         except asyncio.CancelledError:
             if not renews:
                 self._goals.pop(goal_id, None)
-                self._connection.tell(("cmd", self.user, Command.STOP), msgspec.json.encode(Stop(goal_id)))
+                self._connection.query_unanswered(("cmd", self.user, Command.STOP), msgspec.json.encode(Stop(goal_id)))
             raise
         except (RefusedError, ServiceError):
             self._goals.pop(goal_id, None)
@@ -214,7 +214,7 @@ class AsyncRobot:
         if name in STOPS:
             return await self._connection.stop(self.user, name, payload, REPLY_WITHIN)
         within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
-        return await self._connection.ask(("cmd", self.user, name), CommandReply, payload, within)
+        return await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within)
 
     def lease(self, *, force: bool = False, timeout: float = 1.0) -> AsyncLease:
         """Have the robot for oneself while the context lasts, as Robot.lease does.
@@ -230,11 +230,11 @@ class AsyncRobot:
 
     async def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""
-        return await self._connection.ask(("info",), Info)
+        return await self._connection.fetch(("info",), Info)
 
     async def role(self) -> Role | None:
         """Ask what this user may, as Robot.role does."""
-        role = (await self._connection.ask(("role", self.user), RoleReply)).role
+        role = (await self._connection.fetch(("role", self.user), RoleReply)).role
         return None if role is None else Role(role)
 
     async def users(self) -> list[str]:
@@ -243,15 +243,15 @@ class AsyncRobot:
 
     async def poses(self) -> dict[str, NamedPose]:
         """Ask for the named poses, as Robot.poses does."""
-        return {pose.name: pose for pose in (await self._connection.ask(("poses",), NamedPoses)).poses}
+        return {pose.name: pose for pose in (await self._connection.fetch(("poses",), NamedPoses)).poses}
 
     async def teach(self, name: str) -> NamedPose:
         """Keep where the robot is measured to stand as the pose of a name, as Robot.teach does."""
-        return await self._connection.ask(("teach", self.user, check_new_pose(name)), NamedPose)
+        return await self._connection.fetch(("teach", self.user, check_new_pose(name)), NamedPose)
 
     async def forget(self, name: str) -> NamedPose:
         """Remove a taught pose, as Robot.forget does."""
-        return await self._connection.ask(("forget", self.user, check_name(name, "pose")), NamedPose)
+        return await self._connection.fetch(("forget", self.user, check_name(name, "pose")), NamedPose)
 
     async def state(self, timeout: float = 2.0) -> State:
         """Return the next state that is published. Raises ServiceError if none comes within `timeout` seconds."""

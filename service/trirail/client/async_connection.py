@@ -55,7 +55,7 @@ class AsyncConnection:
         """Return the users who have a session to this robot, by name."""
         return await asyncio.get_running_loop().run_in_executor(None, self._connection.users)
 
-    async def ask(
+    async def fetch(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes | None = None, within: float = REPLY_WITHIN
     ) -> T:
         """Query the key of these parts, as Connection.ask does."""
@@ -95,7 +95,7 @@ class AsyncConnection:
         """Query the key of these parts, and have what comes of it taken in the event loop, as Connection.post does."""
         self._connection.post(parts, kind, payload, self._hand_over(take))
 
-    def tell(self, parts: tuple[str, ...], payload: bytes | None) -> None:
+    def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
         """Query the key of these parts, and wait for no answer."""
         self._connection.session.get(
             **self._connection.query(parts, payload, REPLY_WITHIN),
@@ -107,7 +107,7 @@ class AsyncConnection:
         reply = None
         if user := self._connection.to_be_asked_for_role(*parts):
             with contextlib.suppress(ServiceError, RefusedError):
-                reply = await self.ask(("role", user), RoleReply, within=ROLE_WITHIN)
+                reply = await self.fetch(("role", user), RoleReply, within=ROLE_WITHIN)
         return self._connection.why_nobody(parts, reply)
 
     async def states(self, timeout: float | None) -> AsyncGenerator[State]:

@@ -309,7 +309,7 @@ class Robot:
         with self._goals_lock:
             goal = self._goals.setdefault(goal_id, goal)
         try:
-            reply = self._connection.ask(("goal", self.user), GoalReply, content)
+            reply = self._connection.fetch(("goal", self.user), GoalReply, content)
         except (RefusedError, ServiceError):
             with self._goals_lock:
                 self._goals.pop(goal_id, None)
@@ -386,7 +386,7 @@ class Robot:
 
     def _report_look(self, look: bytes) -> None:
         """Tell the service of a look of an alignment: a trirail.wire.looks.AlignmentLook as JSON."""
-        self._connection.ask(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)
+        self._connection.fetch(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)
 
     def _arrive(self, make: Callable[[str], Goal]) -> None:
         """Send a goal and wait until it is done. Raises RefusedError where it ends otherwise."""
@@ -459,15 +459,15 @@ class Robot:
         if name in STOPS:
             return self._connection.stop(self.user, name, payload, REPLY_WITHIN)
         within = HOME_WITHIN if name == Command.HOME else REPLY_WITHIN
-        return self._connection.ask(("cmd", self.user, name), CommandReply, payload, within)
+        return self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within)
 
     def info(self) -> Info:
         """Ask for geometry, limits, rates and versions."""
-        return self._connection.ask(("info",), Info)
+        return self._connection.fetch(("info",), Info)
 
     def role(self) -> Role | None:
         """Ask what this user may; None where he may nothing. Where nobody is asked for a certificate: all."""
-        role = self._connection.ask(("role", self.user), RoleReply).role
+        role = self._connection.fetch(("role", self.user), RoleReply).role
         return None if role is None else Role(role)
 
     def users(self) -> list[str]:
@@ -476,7 +476,7 @@ class Robot:
 
     def poses(self) -> dict[str, NamedPose]:
         """Ask for the named poses: those of the configuration, and those that were taught."""
-        return {pose.name: pose for pose in self._connection.ask(("poses",), NamedPoses).poses}
+        return {pose.name: pose for pose in self._connection.fetch(("poses",), NamedPoses).poses}
 
     def teach(self, name: str) -> NamedPose:
         """Keep where the robot is measured to stand, with power or without, as the pose of a name; return that pose.
@@ -484,11 +484,11 @@ class Robot:
         The service keeps it for good: when this returns it is on its disk. A taught pose of that name is replaced.
         Raises RefusedError where the robot moves, is in fault or has not been homed, and for names of [poses].
         """
-        return self._connection.ask(("teach", self.user, check_new_pose(name)), NamedPose)
+        return self._connection.fetch(("teach", self.user, check_new_pose(name)), NamedPose)
 
     def forget(self, name: str) -> NamedPose:
         """Remove a taught pose; return what it was. Raises RefusedError where none of that name was taught."""
-        return self._connection.ask(("forget", self.user, check_name(name, "pose")), NamedPose)
+        return self._connection.fetch(("forget", self.user, check_name(name, "pose")), NamedPose)
 
     # ------------------------------------------------------------------ what the service tells
 

@@ -66,7 +66,7 @@ class Connection:
 
     # ------------------------------------------------------------------ asking
 
-    def ask(
+    def fetch(
         self,
         parts: tuple[str, ...],
         kind: type[T],
@@ -177,7 +177,7 @@ class Connection:
         """
         user = self.to_be_asked_for_role(*parts)
         try:
-            reply = self.ask(("role", user), RoleReply, within=ROLE_WITHIN) if user else None
+            reply = self.fetch(("role", user), RoleReply, within=ROLE_WITHIN) if user else None
         except (ServiceError, RefusedError):
             reply = None
         return self.why_nobody(parts, reply)

@@ -46,7 +46,7 @@ class LookReports:
         self._number = max(1, self._number + (report.sighting is not None))
         self._last = report
         try:
-            return None if self._lost else msgspec.json.encode(self._look(report))
+            return None if self._lost else msgspec.json.encode(self._message(report))
         except (ValueError, TypeError) as error:
             self.lost(error)
             return None
@@ -64,7 +64,7 @@ class LookReports:
             words = f"this alignment is not in the service's recording: {error}"
             warnings.warn(words, UnrecordedAlignmentWarning, stacklevel=4)
 
-    def _look(self, report: LookReport) -> AlignmentLook:
+    def _message(self, report: LookReport) -> AlignmentLook:
         sighting, measured = report.sighting, report.measurement
         return AlignmentLook(
             id=self.id,

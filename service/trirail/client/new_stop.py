@@ -30,7 +30,7 @@ class NewStop:
         self._came: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
         at_door = stop.at_door(connect, credentials, self._came.put)
         self._outcomes = Outcomes(1 if at_door is None else 2)
-        self.opening = threading.Thread(target=self._ask, args=(stop, connect, credentials), daemon=True)
+        self.opening = threading.Thread(target=self._query, args=(stop, connect, credentials), daemon=True)
         """Has a session of its own while it lives. Zenoh cannot be told to give up opening one."""
         self.opening.start()
 
@@ -40,11 +40,11 @@ class NewStop:
             pass
         return reply
 
-    def _ask(self, stop: StopOrder, connect: str, credentials: Credentials | None) -> None:
+    def _query(self, stop: StopOrder, connect: str, credentials: Credentials | None) -> None:
         try:
             connection = Connection(stop.robot, connect, credentials)
             try:
-                self._came.put(connection.ask(stop.parts, CommandReply, stop.content, stop.within, stop.id))
+                self._came.put(connection.fetch(stop.parts, CommandReply, stop.content, stop.within, stop.id))
             finally:
                 connection.close()
         except TrirailError as error:

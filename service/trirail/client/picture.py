@@ -33,7 +33,7 @@ def line(name: str, state: State) -> str:
 
 def html(info: Info, state: State) -> str:
     """Return the same with a drawing of rails, sliders and platform: that commanded is pale."""
-    robot = ShownRobot.told(info)
+    robot = ShownRobot.of_info(info)
     mode = palette.code(next(colour for mode, colour in palette.MODES.items() if str(mode) == state.mode))
     goal = f" to <b>{escape(state.goal.id)}</b>" if state.goal is not None else ""
     faults = "".join(f"<br/><b>{escape(fault)}</b>" for fault in state.faults)

@@ -122,13 +122,13 @@ class StopCall:
 
     def _run(self) -> None:
         try:
-            self._take(self._ask())
+            self._take(self._query_until_answered())
         except TrirailError as error:
             self._take(error)
         except Exception as error:  # noqa: BLE001 - whoever waits gets an outcome, whatever it is
             self._take(NoDoorError(f"cannot ask at {self._address}: {error!r}"))
 
-    def _ask(self) -> CommandReply:
+    def _query_until_answered(self) -> CommandReply:
         """Ask until there is an answer. Raises RefusedError where that is a no, ServiceError where none comes."""
         secured = tls.client(self._credentials) if self._address.secured and self._credentials is not None else None
         why: OSError | None = None

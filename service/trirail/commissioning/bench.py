@@ -215,7 +215,7 @@ class Bench:
             # Another drive, which missed the heartbeat too, was heard first, and the driver has stopped them all.
             for _ in range(round(LAST_WORDS / self.period)):
                 self._listen()
-        own = self._drives.told[index]
+        own = self._drives.reported_faults[index]
         self._stop()
         if fault is None:
             return Silence(after, NAMES[index], str(state))

@@ -174,31 +174,31 @@ class Guide:
         made = plan(self._steps, self._config)
         self._keeper.report.plan = tuple((step.name, step.drive) for step in made)
         if self._keeper.report.simulated:
-            self._person.tell(
+            self._person.show(
                 "Simulated drives: in brackets stands what a person beside them would answer; Enter takes it."
             )
         at = 0
         while at < len(made):
             step = made[at]
-            self._person.tell("")
-            self._person.tell(f"{at + 1}/{len(made)}  {step.title}")
+            self._person.show("")
+            self._person.show(f"{at + 1}/{len(made)}  {step.title}")
             if lacks := self._lacks(step):
                 self._keep(step, Judged("skipped", (lacks,)))
                 at += 1
                 continue
-            self._person.tell(f"  {step.what}")
+            self._person.show(f"  {step.what}")
             if step.name == "setup":
                 for line in self._steps.session.changes_of_set_up():
-                    self._person.tell(f"  {line}")
+                    self._person.show(f"  {line}")
             at = self._done(step, at)
 
     def write(self, out: Path | None) -> Path | None:
         """Write the configuration with what was found, to `out` or a free name beside it; None where nothing was."""
         latest = self._keeper.report.latest.values()
         changes, conflict = merged([entry.changes for entry in latest], self._config.drives)
-        self._person.tell("")
+        self._person.show("")
         if conflict:
-            self._person.tell(f"Node ids: {conflict}.")
+            self._person.show(f"Node ids: {conflict}.")
         written = None
         if changes:
             written = out or configuration.free_name(self._path)
@@ -208,12 +208,12 @@ class Guide:
             if written.parent.resolve() != self._path.parent.resolve():
                 text = configuration.with_whole_paths(text, self._path.parent)
             configuration.write(written, text)
-            self._person.tell("The configuration with what was found:")
+            self._person.show("The configuration with what was found:")
             for key, value in changes.items():
-                self._person.tell(f"  {key} = {value:g}")
-            self._person.tell(f"is {written}; yours is as it was. Begin again with it: trirail commission {written}")
+                self._person.show(f"  {key} = {value:g}")
+            self._person.show(f"is {written}; yours is as it was. Begin again with it: trirail commission {written}")
         else:
-            self._person.tell("Nothing in the configuration is to be changed by what was found.")
+            self._person.show("Nothing in the configuration is to be changed by what was found.")
         self._keeper.conclude(changes, written)
         return written
 

@@ -48,7 +48,7 @@ class KindStep:
         if expected.apart < DISTINCT * read_to:
             return judge_kind(kinds, way, expected, None, read_to), self._measured(expected, None, read_to)
         axis, line = AXES[way.axis], AXES[way.along]
-        self._person.tell(
+        self._person.show(
             f"  It turns by {math.degrees(way.turn):+.2f}° and goes {way.distance * 1e3:+.2f} mm along {line}. Let the "
             f"instrument read a mark, pin or ball on the platform, within {NEAR * 1e3:g} mm of its centre, along {axis}"
             f", its numbers rising towards +{axis}. The edge of a turned table will not do."

@@ -71,7 +71,7 @@ def opened(
             rules = bus.faults.carriages
         else:
             for lack in realtime.acquire(config.loop):
-                person.tell(f"without {lack}")
+                person.show(f"without {lack}")
 
         def make_bench() -> Bench:
             nonlocal driver

@@ -24,7 +24,7 @@ class Question(NamedTuple):
 class Person(Protocol):
     """Who answers. Raises Quit where there are no answers left."""
 
-    def tell(self, line: str) -> None:
+    def show(self, line: str) -> None:
         """Show a line."""
 
     def judged(self, judged: Judged) -> None:
@@ -47,7 +47,7 @@ def choose(person: Person, idle: Callable[[], object], question: Question, choic
         if found:
             return found[0]
         told = ", ".join(f"{choice} ({means})" for choice, means in choices.items())
-        person.tell(f'  "{answer}" is no answer here; wanted: {told}, or q to leave')
+        person.show(f'  "{answer}" is no answer here; wanted: {told}, or q to leave')
 
 
 def length(
@@ -65,4 +65,4 @@ def length(
         if low <= value <= high:
             return value
         between = f"from {low * 1e3:g} to {high * 1e3:g} mm"
-        person.tell(f'  "{answer}" is no length {between}; as in: 12.35, 350um, 0.01in (or q to leave)')
+        person.show(f'  "{answer}" is no length {between}; as in: 12.35, 350um, 0.01in (or q to leave)')

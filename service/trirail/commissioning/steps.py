@@ -60,7 +60,7 @@ class Steps:
         read_to = self._see.read_to()
         label = self.labelled(name)
         angle = np.degrees(geometry(self._config.geometry).each[index].rail_angle)
-        self._person.tell(
+        self._person.show(
             f"  Put the rule along rail {label}, its numbers rising towards {angle:.0f}° (0° is x, 90° is y)."
         )
         before = self._see.reading(index), bench.position
@@ -77,11 +77,11 @@ class Steps:
         """Have a slider pushed; where the rule and the drives then say that it is."""
         bench = self.session.bench()
         if self._place.rules is None:
-            self._person.tell(f"  {text}")
+            self._person.show(f"  {text}")
         else:
             self._place.rules.push(index, by)
             bench.wait(HOLD / 10.0)
-            self._person.tell(f"  A simulated hand has pushed slider {self._labels[index]} {by * 1e3:+g} mm that way.")
+            self._person.show(f"  A simulated hand has pushed slider {self._labels[index]} {by * 1e3:+g} mm that way.")
         return self._see.reading(index), bench.position
 
     def switches(self, name: str) -> Done:
@@ -104,7 +104,7 @@ class Steps:
             text = f"Press each limit switch and the home switch of {slider} for a second; Enter when that is done"
             choose(self._person, look, Question(text, "done"), {"done": "all were pressed"})
         else:
-            self._person.tell(f"  A simulated hand presses the switches of {slider}.")
+            self._person.show(f"  A simulated hand presses the switches of {slider}.")
             for bits in (*SWITCHES, 0):
                 press(NAMES.index(name), bits)
                 for _ in range(round(2.0 * LOOK / bench.period)):

@@ -118,7 +118,7 @@ def written(found: AsBuilt) -> str:
     )
 
 
-def told(file: str | None, found: AsBuilt | None, backlash: Triple) -> CorrectionTold | None:
+def summary(file: str | None, found: AsBuilt | None, backlash: Triple) -> CorrectionTold | None:
     """Return what people are told of a correction; None where nothing is corrected."""
     if found is None:
         return CorrectionTold("", "", (0.0, 0.0, 0.0), backlash) if any(backlash) else None

@@ -135,7 +135,7 @@ def observe(
 
 
 @compiled()
-def _tell(motion: Array, sliders: Array, progress: float, remaining: float, record: NDArray[np.void]) -> None:
+def _record_command(motion: Array, sliders: Array, progress: float, remaining: float, record: NDArray[np.void]) -> None:
     """Write what is commanded into the record."""
     told = record[0]
     for i in range(3):
@@ -219,7 +219,7 @@ def command(
         refused = BACKWARDS
     progress = max(0.0, min(1.0, (s - begun) / (end - begun))) if end > begun else 1.0
     remaining = max(0.0, arrival - time if target != 0.0 else end - s)
-    _tell(motion, sliders, progress, remaining, record)
+    _record_command(motion, sliders, progress, remaining, record)
     passed = s >= end
     stands = s >= knots[-1] or (target == 0.0 and rate == 0.0 and change == 0.0)
     return PASSED * passed + STANDS * stands + 4 * refused
@@ -238,7 +238,7 @@ def hold(
     """Solve the sliders for a platform that stays as it is; returns as `command`."""
     motion[1] = motion[0]
     refused = _solve(legs, bounds, motion, sliders, kept, found)
-    _tell(motion, sliders, 0.0, 0.0, record)
+    _record_command(motion, sliders, 0.0, 0.0, record)
     return 4 * refused
 
 
@@ -284,4 +284,4 @@ def follow(
             lost = now.drive_state[i] != _ENABLED and abs(position - last) > FAR * step
             sliders[0, 0, i] = position if lost else last + max(-step, min(position - last, step))
         sliders[0, 1, i] = sliders[0, 2, i] = 0.0
-    _tell(motion, sliders, 0.0, 0.0, record)
+    _record_command(motion, sliders, 0.0, 0.0, record)

@@ -19,7 +19,7 @@ class LocalPlanner:
         self._answers: deque[tuple[int, PlanAnswer]] = deque()
         self._turns = 0
 
-    def ask(self, request: PlanRequest) -> None:
+    def request_plan(self, request: PlanRequest) -> None:
         """Plan now, to answer later."""
         self._answers.append((self._turns + self.delay, self._planner.plan(request)))
 

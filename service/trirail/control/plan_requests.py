@@ -48,7 +48,7 @@ ROUNDING = (1e-9, 1e-7, 1e-5)
 class PlannerPort(Protocol):
     """Where the planner can be asked."""
 
-    def ask(self, request: PlanRequest) -> None:
+    def request_plan(self, request: PlanRequest) -> None:
         """Send a request; never waits. What the planner answers is given to the control in a later cycle."""
 
 
@@ -180,7 +180,7 @@ class PlanRequests:
             self._asked = None  # it was asked from a motion that has become another one
         if self._asked is None:
             if self._change is None or self._change.made or self._change.tried >= ROUND:
-                self._ask(self._goal)
+                self._request_plan(self._goal)
             return None
         return self._apply(self._answer) if self._answer is not None else None
 
@@ -191,7 +191,7 @@ class PlanRequests:
         if change is not None and (self._asked is None or change.lowers) and change.step():
             self._change = None
 
-    def _ask(self, goal: Goal) -> None:
+    def _request_plan(self, goal: Goal) -> None:
         """Ask for the goal's motion from the one under way; RefusedError when that has been asked too often."""
         if self._times == len(self._leads):
             text = f"its motion came too late {self._times} times, or the motion under way changed: send the goal again"
@@ -213,7 +213,7 @@ class PlanRequests:
         )
         self._times += 1
         self._since = self._since if self._since is not None else schedule.cycle
-        self._port.ask(self._asked)
+        self._port.request_plan(self._asked)
 
     def _lead(self, goal: Goal) -> int:
         """Return in how many cycles a motion is to begin: of a goal that is renewed often, as the last one came."""

@@ -19,7 +19,7 @@ def diagnose(config: Config, impossible: Sequence[str] = ()) -> list[Check]:
     return [check for each in JUDGEMENTS if not overlap(each.reads, impossible) for check in each.of(config)]
 
 
-def told(path: Path, mistakes: Sequence[Mistake]) -> list[Check]:
+def failed_checks(path: Path, mistakes: Sequence[Mistake]) -> list[Check]:
     """Return each mistake of a file as a check that failed."""
     return [
         Check("configuration", "failure", shortened(f"{path}: {text}"), key=shortened(key)) for key, text in mistakes

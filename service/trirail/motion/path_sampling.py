@@ -86,7 +86,7 @@ class Way(NamedTuple):
 
 
 @compiled()
-def _look(way: Way, time: float, near: Array, motion: Array, sliders: Array) -> bool:
+def _solve_at(way: Way, time: float, near: Array, motion: Array, sliders: Array) -> bool:
     """Write platform and sliders at a time of the law; whether they are within reach."""
     law = law_at(way.law_knots, way.law_pieces, time)
     if platform_at(way.legs, way.knots, way.pieces, way.in_sliders, way.tools, law, near, motion) != 0:
@@ -120,7 +120,7 @@ def _turns(way: Way, last: float, time: float, near: Array, motion: Array, slide
         low, high = last, time
         for _ in range(HALVINGS // 3):
             middle = (low + high) / 2.0
-            if not _look(way, middle, near, motion[2], sliders[2]):
+            if not _solve_at(way, middle, near, motion[2], sliders[2]):
                 return middle
             _, velocity = _quantity(motion[2], sliders[2], i)
             if velocity * leaving > 0.0:
@@ -178,14 +178,14 @@ def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst:
         time = times[k]
         if abs(time - last) < ROUNDING:
             motion[1], sliders[1] = motion[0], sliders[0]
-        elif not _look(way, time, near, motion[1], sliders[1]):
+        elif not _solve_at(way, time, near, motion[1], sliders[1]):
             return last, time
         elif time > last + step and k > 0:
             leaves_at = _turns(way, last, time, near, motion, sliders)
             if not math.isnan(leaves_at):
                 return last, leaves_at
         last = time + step
-        if not _look(way, last, near, motion[0], sliders[0]):
+        if not _solve_at(way, last, near, motion[0], sliders[0]):
             return time, last
         whole = time >= 0.0 and last <= until  # else it is the step from or to a standstill, in which nothing else is
         for i in range(3):
@@ -236,7 +236,7 @@ def survey(
         inside = max(inside, first)
         for _ in range(HALVINGS // 3):
             middle = (inside + leaves_at) / 2.0
-            if _look(way, middle, near, motion, sliders):
+            if _solve_at(way, middle, near, motion, sliders):
                 inside = middle
             else:
                 leaves_at = middle

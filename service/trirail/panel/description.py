@@ -26,7 +26,7 @@ FINE, COARSE = 4, 2
 def shown(info: Info) -> ShownRobot:
     """Return the robot that a service tells of. Raises ServiceError where the service is of another version."""
     try:
-        return ShownRobot.told(info)
+        return ShownRobot.of_info(info)
     except (msgspec.ValidationError, ConfigError) as error:
         raise ServiceError(f"the service is of another version, {info.version}: {error}") from error
 

@@ -16,7 +16,7 @@ class NewestAsked:
         self._thread: threading.Thread | None = None
         self._closed = False
 
-    def ask(self, do: Callable[[], None]) -> None:
+    def submit(self, do: Callable[[], None]) -> None:
         """Have it done; one that still waits is left out for it."""
         with self._changed:
             self._asked = do

@@ -53,7 +53,7 @@ class Orders:
         self._open = False
         self._give_back()
 
-    def ask(self, said: Asked) -> None:
+    def request(self, said: Asked) -> None:
         """Ask the service for what is answered there, and is under way beside all else."""
         robot = self._robot
         match said:
@@ -75,7 +75,7 @@ class Orders:
             case Forget(name):
                 self._begin(lambda: robot.forget(name), "forget", name)
 
-    def tell(self, name: Command) -> None:
+    def command(self, name: Command) -> None:
         """Send a command, unless it is under way already; what stops the robot waits for no other."""
         if name in self._under_way and not name.stops:
             return

@@ -84,13 +84,13 @@ class Tab:
             case Tell(name):
                 if name.stops:
                     self._jog.release()
-                self._orders.tell(name)
+                self._orders.command(name)
             case CheckPose():
-                self._poses.ask(lambda: self._check_pose(said))
+                self._poses.submit(lambda: self._check_pose(said))
             case CheckPath():
-                self._paths.ask(lambda: self._check_path(said))
+                self._paths.submit(lambda: self._check_path(said))
             case _:
-                self._orders.ask(said)
+                self._orders.request(said)
 
     def _check_pose(self, said: CheckPose) -> None:
         why, on_way = self._feed.problem(said.pose, said.tool, said.frame)

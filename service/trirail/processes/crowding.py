@@ -75,7 +75,7 @@ class Crowding:
         """Return what is nearly used up, one line each."""
         return tuple(self._warnings.values())
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Look, when it is time."""
         now = self._clock()
         if now < self._due:

@@ -94,17 +94,17 @@ class Gateway:
         self._replies = Replies(self._robot)
         self._refusals = Refusals(link, self._replies)
         self._inbox = Inbox(opened, self._robot, self._refusals.too_much)
-        self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._tell, self._inbox.wake)
+        self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._send_to_loop, self._inbox.wake)
         self._looks = Looks(self._robot, lambda looked: link.send(message(looked)))
         self._requests = Requests(config, link, guard, self._replies, self._last_words, hurrying)
         self._commands = CommandReader(
             self._robot, self._requests, self._replies, self._states, self._inbox, self._refusals.refuse
         )
         connect = config.zenoh.connect
-        self._routers = RouterLinks(connect, partial(guard.linked, opened), guard.why_not_linked, self._tell)
+        self._routers = RouterLinks(connect, partial(guard.linked, opened), guard.why_not_linked, self._send_to_loop)
         known = {*guard.users, config.zenoh.router or ""}
         self._crowding = Crowding(
-            partial(guard.links, opened), guard.disconnect, known, zenoh_session.SESSIONS, self._tell
+            partial(guard.links, opened), guard.disconnect, known, zenoh_session.SESSIONS, self._send_to_loop
         )
         self._ending = False
         self._publications = Publications(opened, self._robot)
@@ -128,9 +128,9 @@ class Gateway:
                     self._hear(packet, ready)
                 self._requests.send_goals()  # those for which there was no room
                 self._poses.settle()
-                self._poses.look()
-                self._routers.look()
-                self._crowding.look()
+                self._poses.poll()
+                self._routers.poll()
+                self._crowding.poll()
                 self._requests.give_up_late()
                 self._summarize()
                 self._refusals.tell_of_overruns()
@@ -189,7 +189,7 @@ class Gateway:
         sent: Goal = incoming.content(Goal, "not a goal")
         self._requests.goal(incoming, user, self._poses.of_name(sent))
 
-    def _tell(self, what: PoseChanged | Remark) -> None:
+    def _send_to_loop(self, what: PoseChanged | Remark) -> None:
         self._link.send(message(what))
 
     # ------------------------------------------------------------------ loop to Zenoh
@@ -206,7 +206,9 @@ class Gateway:
         except Closed:
             raise
         except Exception as error:  # noqa: BLE001 - it would come again after every restart
-            self._refusals.tell(quoted(f"the gateway could not read what the loop said, please report it: {error!r}"))
+            self._refusals.warn_everyone(
+                quoted(f"the gateway could not read what the loop said, please report it: {error!r}")
+            )
             return
         if isinstance(answer, Welcome):
             self._info = msgspec.structs.replace(self._info, missing_protections=answer.missing_protections)
@@ -238,7 +240,7 @@ class Gateway:
         self._poses.measure(rows[-1])
         if self._meter is not None:
             self._meter.records(rows)
-            self._meter.tell(self._states.newest, self._crowding.use, self._crowding.warnings())
+            self._meter.publish(self._states.newest, self._crowding.use, self._crowding.warnings())
         now = self._heard = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)

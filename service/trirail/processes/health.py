@@ -47,7 +47,7 @@ class Health:
         """What was known of each at the newest look."""
         self._troubles: Mapping[str, str] = dict.fromkeys(PROCESSES, "starting")
 
-    def look(self, processes: Mapping[str, Running]) -> None:
+    def poll(self, processes: Mapping[str, Running]) -> None:
         """Look at all of them, in every turn of the supervisor's."""
         self._troubles = {name: self._trouble(name, running) for name, running in processes.items()}
         self.processes = processes

@@ -35,5 +35,5 @@ def info(config: Config) -> Info:
         takeover=config.control.takeover.value,
         homes=tuple(name for name, drive in zip(NAMES, config.drives.each, strict=True) if drive.homing is not None),
         versions=versions(),
-        correction=as_built.told(config.correction.map, config.correction.as_built, config.correction.backlash),
+        correction=as_built.summary(config.correction.map, config.correction.as_built, config.correction.backlash),
     )

@@ -144,7 +144,7 @@ class Meter:
                 fault = OTHER
             self._faults[fault] = self._faults.get(fault, 0) + 1
 
-    def tell(self, newest: Callable[[], State], use: InUse, warnings: tuple[str, ...]) -> None:
+    def publish(self, newest: Callable[[], State], use: InUse, warnings: tuple[str, ...]) -> None:
         """Tell all of it, where that is due."""
         now = self._clock()
         if now < self._due:

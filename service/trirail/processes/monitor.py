@@ -36,9 +36,9 @@ class Monitor:
     def __exit__(self, *_: object) -> None:
         self._serving.close()
 
-    def look(self, processes: Mapping[str, Running]) -> None:
+    def poll(self, processes: Mapping[str, Running]) -> None:
         """Look at all processes, in every turn of the supervisor's."""
-        self.health.look(processes)
+        self.health.poll(processes)
 
     def store(self, process: str, content: dict[str, Any]) -> None:
         """Take what a process has measured."""
@@ -46,5 +46,5 @@ class Monitor:
 
     def end(self, processes: Mapping[str, Running]) -> None:
         """Look for the last time: the service is ending."""
-        self.health.look(processes)
+        self.health.poll(processes)
         self.health.end()

@@ -27,7 +27,7 @@ class PlannerLink:
         """Whether there is nothing to be said that the planner does not say itself."""
         return self._unsent is None
 
-    def ask(self, request: PlanRequest) -> None:
+    def request_plan(self, request: PlanRequest) -> None:
         """Send a request; what cannot be sent is said in the next cycle."""
         if not self._port.connected:
             self._unsent = "the planner is not there, it is being started again"

@@ -89,7 +89,7 @@ class Poses:
             f"pose {name} is that of [poses]; the taught one is not used: trirail forget {name}" for name in both
         )
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """See whether the file of taught poses is still there, once in a while; have everyone told where it is not."""
         if self._clock() < self._next_look:
             return

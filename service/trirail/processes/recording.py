@@ -117,16 +117,16 @@ class Intake:
             case Welcome():
                 recorder.bus_load(said.bus_load)
                 box.stands("bus_load", said.bus_load)
-                self._tell("info", f"recording to {recorder.path}")
+                self._remark("info", f"recording to {recorder.path}")
                 self._ready({"recording": str(recorder.path), "live": recorder.live_url})
 
     def _warn(self, words: str) -> None:
         """Say it in the service's log, and to everyone."""
         with contextlib.suppress(OSError):  # the log may be on the disk that takes no more
             print(f"trirail: recorder: {words}", file=sys.stderr, flush=True)  # noqa: T201 - the log
-        self._tell("warning", words)
+        self._remark("warning", words)
 
-    def _tell(self, level: Level, words: str) -> None:
+    def _remark(self, level: Level, words: str) -> None:
         """Have the loop tell everyone."""
         self._send(Remark(level, words))
 

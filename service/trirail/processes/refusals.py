@@ -39,15 +39,15 @@ class Refusals:
         """Tell everyone whose messages there was no room for."""
         while self._overruns:
             user = self._overruns.popleft()
-            self.tell(TOO_MUCH, user if is_name(user) else "")
+            self.warn_everyone(TOO_MUCH, user if is_name(user) else "")
 
     def refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
         """Answer what cannot be taken, and tell everyone."""
         text = quoted(str(refusal))
         self._replies.answer(incoming, ErrorReply(refusal.code, text))
-        self.tell(text, incoming.user if is_name(incoming.user) else "")
+        self.warn_everyone(text, incoming.user if is_name(incoming.user) else "")
 
-    def tell(self, text: str, user: str = "") -> None:
+    def warn_everyone(self, text: str, user: str = "") -> None:
         """Have the loop tell everyone, but not too often."""
         now = time.monotonic()
         if now - self._told_since >= 1.0:

@@ -17,7 +17,17 @@ from trirail.control.control import Control
 from trirail.processes.clock import Tick
 from trirail.wire.links import Port
 from trirail.wire.messages import Event
-from trirail.wire.packets import ControlInput, GivenInput, Kind, Remark, Status, Welcome, decode_recorder, message, told
+from trirail.wire.packets import (
+    ControlInput,
+    GivenInput,
+    Kind,
+    Remark,
+    Status,
+    Welcome,
+    decode_recorder,
+    event_packet,
+    message,
+)
 from trirail.wire.records import HEAD, SIZE
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import MODES
@@ -181,7 +191,7 @@ class Reports:
             self._events += 1
             cycle = control.modes.cycle
             event = Event(self._events, cycle * self._period, cycle, time.time(), **notice._asdict())
-            packet = told(event)
+            packet = event_packet(event)
             self._kept.append(packet)
             self._recorder.send(packet)
         ledger.notices.clear()

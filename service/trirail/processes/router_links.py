@@ -54,7 +54,7 @@ class RouterLinks:
         """Return which routers are not reached, and why, one line each."""
         return tuple(router.warning for router in self._routers if router.warning)
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Look whether the links are there, when it is time."""
         now = self._clock()
         if not self._routers or now < self._due:

@@ -232,11 +232,11 @@ class StopDoor:
             caller.heard += heard
             line, ended, _ = caller.heard.partition(b"\n")
             if ended:
-                self._ask(caller, line)
+                self._pass_on(caller, line)
             elif len(caller.heard) > MAX_LINE:
                 raise ConnectionError
 
-    def _ask(self, caller: _Caller, line: bytes) -> None:
+    def _pass_on(self, caller: _Caller, line: bytes) -> None:
         """Pass a request on."""
         answer = partial(self._answer, caller)
         try:

@@ -191,7 +191,7 @@ class Supervisor:
                 child.kill_hung(START_WITHIN)
             elif self._up and child.process.pid is None and now - child.began > FORKS_WITHIN:
                 self._parent.kill_hung(FORKS_WITHIN)
-        self._monitor.look({name: self._running(name) for name in self._names})
+        self._monitor.poll({name: self._running(name) for name in self._names})
         for name, watch in self._watches.items():
             watched = self._children.get(name)
             if watched is not None and watched.process.pid is not None and watch.hangs(watched.process.pid):

@@ -36,7 +36,7 @@ class ShownRobot:
         )
 
     @classmethod
-    def told(cls, info: Info) -> ShownRobot:
+    def of_info(cls, info: Info) -> ShownRobot:
         """Take it from a service's answer. msgspec.ValidationError or ConfigError where that is of another version."""
         each = [_leg(leg) for leg in info.geometry]
         legs = converted({"kind": info.mechanism, "leg": each, "labels": info.labels}, GeometryTable)

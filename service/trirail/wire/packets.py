@@ -229,7 +229,7 @@ def message(content: Request | Answer | RecorderSaid) -> bytes:
     return bytes((Kind.MESSAGE,)) + encode(content)
 
 
-def told(event: Event) -> bytes:
+def event_packet(event: Event) -> bytes:
     """Pack an event so that it fits: it is kept, and a gateway that could not read it would meet it again."""
     packet = message(Happened(event))
     if len(packet) <= MAX_PACKET:
