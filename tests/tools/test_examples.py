@@ -5,6 +5,7 @@ import csv
 import math
 import os
 import pty
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ import nbformat
 import pytest
 from trirail import Robot
 from trirail.client import own_service
+from trirail.panel.server import Panel
 
 EXAMPLES = Path(__file__).parents[2] / "tools/examples"
 WITHIN = 60.0
@@ -52,6 +54,9 @@ def pose(service: Service) -> tuple[float, float, float]:
 def test_each_is_short_begins_with_what_it_does_and_is_run_here() -> None:
     here = Path(__file__).read_text(encoding="utf-8")
     for path in EXAMPLES.glob("*.ipynb"):
+        assert f'"{path.name}"' in here, f"{path.name} is not run by any test"
+    for path in EXAMPLES.glob("*.js"):
+        assert path.read_text(encoding="utf-8").startswith("// "), path.name
         assert f'"{path.name}"' in here, f"{path.name} is not run by any test"
     for path in EXAMPLES.glob("*.py"):
         text = path.read_text(encoding="utf-8")
@@ -220,6 +225,44 @@ def test_zenoh_and_json_alone_are_enough(service: Service) -> None:
     lines = run("plain_zenoh.py", "demo", service.locator)
     assert lines[-1].startswith("done goal")
     assert pose(service) == pytest.approx((0.0, 0.02, -0.1), abs=1e-9)
+
+
+NODE = os.environ | {"NODE_PATH": "/usr/share/nodejs"}
+"""Where Debian has Node's packages."""
+
+
+def _has_node() -> bool:
+    if shutil.which("node") is None:
+        return False
+    program = "globalThis.WebSocket ?? require('ws')"
+    return subprocess.run(["node", "-e", program], env=NODE, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not _has_node(), reason="no Node.js with ws: make ci-packages installs them on Debian")
+@pytest.mark.parametrize(("pose_there", "said", "code"), [(None, "done goal", 0), ("[0.5, 0, 0]", "refused: ", 1)])
+def test_javascript_and_json_alone_are_enough(
+    service: Service, tmp_path: Path, pose_there: str | None, said: str, code: int
+) -> None:
+    program = tmp_path / "move_and_wait.js"
+    text = (EXAMPLES / "move_and_wait.js").read_text(encoding="utf-8")
+    program.write_text(text if pose_there is None else text.replace("[0.01, 0.02, 0.1]", pose_there))
+    with Robot("demo", service.locator) as robot, Panel(robot, 0) as panel:
+        command = ["node", str(program), panel.url]
+        done = subprocess.run(command, env=NODE, capture_output=True, text=True, timeout=WITHIN, check=False)
+    assert done.stdout.startswith(said), done.stdout + done.stderr
+    assert done.returncode == code
+    if code == 0:
+        assert pose(service) == pytest.approx((0.01, 0.02, 0.1), abs=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not _has_node(), reason="no Node.js with ws: make ci-packages installs them on Debian")
+def test_javascript_says_that_nobody_is_there() -> None:
+    command = ["node", str(EXAMPLES / "move_and_wait.js"), "http://127.0.0.1:1/token/"]
+    done = subprocess.run(command, env=NODE, capture_output=True, text=True, timeout=WITHIN, check=False)
+    assert done.returncode == 1
+    assert done.stdout.startswith("no panel at http://127.0.0.1:1/token/")
 
 
 ALIGN = ["align_with_two_cameras.py", "align_with_one_camera.py", "align_with_a_moved_camera.py"]
