@@ -1,0 +1,141 @@
+"""The unit, as it is shipped, under a real systemd: up when it says so, started again, stopped in a controlled way.
+
+That systemd is a user's, with a /run and a control group of its own: it manages nothing else of the machine.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from trirail import Robot
+from trirail.client import own_service
+
+UNIT = Path(__file__).parents[2] / "configs" / "trirail.service"
+UP_WITHIN = 60.0
+BOOT = """\
+mount -t tmpfs tmpfs /run
+mkdir -p /run/systemd/system /run/systemd/inaccessible/dir
+touch /run/systemd/inaccessible/reg
+mount -t cgroup2 cgroup2 /sys/fs/cgroup
+own=/sys/fs/cgroup/trirail-unit.$$
+mkdir $own
+sh -ec "echo \\$\\$ >$own/cgroup.procs; exec unshare --cgroup --mount sh -ec '
+    umount /sys/fs/cgroup
+    mount -t cgroup2 cgroup2 /sys/fs/cgroup
+    exec /lib/systemd/systemd --user --unit=basic.target'" || true
+find $own -depth -type d -exec rmdir {} +
+"""
+"""What the system's own systemd would have made in /run, without which a user's does not begin; and a control group of
+its own, all that it sees: it takes whatever stands in the root of those that it sees into groups of its own, where
+nothing gets a real-time priority."""
+HERE = """\
+[Service]
+ExecStart=
+ExecStart={python} -P -m trirail run {config} --record {recording}
+User=
+WorkingDirectory={folder}
+ReadWritePaths={folder} {checkout}
+ProtectHome=false
+Environment=NUMBA_CACHE_DIR=
+"""
+"""The paths, which who installs the unit sets; here the installation may be at home, and keeps what it has compiled.
+And in a user's systemd nobody is another user."""
+
+
+def _can() -> bool:
+    programs = all(map(shutil.which, ("systemctl", "unshare"))) and Path("/lib/systemd/systemd").exists()
+    return programs and subprocess.run(["unshare", "--mount", "true"], capture_output=True, check=False).returncode == 0
+
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not _can(), reason="needs root, for a /run of its own, and systemd: .ci/packages installs it"),
+]
+
+
+class Systemd:
+    """A manager of one unit."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        units = folder / "units"
+        (units / "trirail.service.d").mkdir(parents=True)
+        shutil.copy(UNIT, units)
+        self.config, self.locator = own_service.private(folder)
+        self.recording = folder / "unit.rrd"
+        here = HERE.format(
+            python=sys.executable, config=self.config, recording=self.recording, folder=folder, checkout=UNIT.parents[1]
+        )
+        (units / "trirail.service.d/here.conf").write_text(here)
+        self._environment = os.environ | {
+            "XDG_RUNTIME_DIR": str(folder),
+            "SYSTEMD_UNIT_PATH": f"{units}:",
+            "XDG_CONFIG_HOME": str(folder / "config"),
+            "XDG_CACHE_HOME": str(folder / "cache"),
+        }
+        self._manager = subprocess.Popen(
+            ["unshare", "--mount", "sh", "-ec", BOOT],
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def ctl(self, *words: str) -> str:
+        """Call systemctl; return what it prints."""
+        command = ["systemctl", "--user", "--no-pager", *words]
+        done = subprocess.run(command, env=self._environment, capture_output=True, text=True, check=False)
+        return done.stdout + done.stderr
+
+    def shows(self, **wanted: str) -> Callable[[], bool]:
+        return lambda: all(f"{name}={value}" in self.shown().split() for name, value in wanted.items())
+
+    def shown(self) -> str:
+        return self.ctl("show", "trirail", "-p", "ActiveState,SubState,Result,NRestarts,MainPID")
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + UP_WITHIN
+        while not condition():
+            assert time.monotonic() < deadline, self.ctl("status", "trirail")
+            time.sleep(0.05)
+
+    def end(self) -> None:
+        self.ctl("exit")  # which ends what it has started
+        self._manager.wait(UP_WITHIN)
+
+
+@pytest.fixture
+def systemd() -> Iterator[Systemd]:
+    with tempfile.TemporaryDirectory(dir="/var/lib", prefix="u") as folder:  # /tmp is the unit's own
+        groups = Path("/proc/self/cgroup").read_text()
+        systemd = Systemd(Path(folder))
+        try:
+            systemd.until(systemd.shows(ActiveState="inactive"))
+            yield systemd
+        finally:
+            systemd.end()
+        assert Path("/proc/self/cgroup").read_text() == groups
+
+
+def test_it_is_up_when_it_says_so_comes_back_disabled_and_stops_in_a_controlled_way(systemd: Systemd) -> None:
+    systemd.ctl("start", "trirail")  # which waits until it is up
+    assert systemd.shows(ActiveState="active", SubState="running")(), systemd.ctl("status", "trirail")
+    with Robot("demo", systemd.locator) as robot:
+        robot.enable()
+        robot.move_to(x=0.01, y=0.0, phi=0.0).wait(timeout=10.0)
+        systemd.ctl("kill", "--signal=KILL", "trirail")
+    systemd.until(systemd.shows(ActiveState="active", NRestarts="1"))
+    with Robot("demo", systemd.locator) as robot:
+        assert robot.state().mode == "disabled"
+        robot.enable()
+        robot.move_to(x=0.02, y=0.0, phi=0.0)
+        systemd.ctl("stop", "trirail")
+    assert systemd.shows(ActiveState="inactive", Result="success")(), systemd.ctl("status", "trirail")
