@@ -24,7 +24,7 @@ from trirail.kinematics.calibration import corrected
 from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Bounds
 from trirail.panel.description import describe
-from trirail.processes.info import info
+from trirail.processes.publications import info
 from trirail.telemetry import curves, provenance, readout
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.shown_robot import ShownRobot

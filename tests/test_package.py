@@ -79,7 +79,6 @@ def test_the_sdist_holds_what_a_checkout_does(dist: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_installed(dist: Path, tmp_path: Path) -> None:
     """In an environment of its own; only the dependencies are those that are here."""
     (wheel,) = dist.glob("*.whl")

@@ -129,7 +129,7 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # who runs the tests ends it
     setproctitle("warm parent of services")  # it looks for where its title is once, with the environment as it was
-    from trirail.cli import commands  # noqa: F401 - what is imported here nobody else has to
+    from trirail.cli import app  # noqa: F401 - what is imported here nobody else has to
     from trirail.processes import compiling, fork_server, supervisor  # noqa: F401 - as above
 
     if not compiling.load():

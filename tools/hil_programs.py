@@ -20,8 +20,8 @@ BUFFER = 8_000_000
 SILENT = 10.0
 """How long a process may give no sign of life in this slow machine [s]: while the others start, its turn comes late."""
 PATIENT = (
-    "from trirail.cli import commands; from trirail.processes import supervisor; "
-    f"supervisor.START_WITHIN = supervisor.END_WITHIN = {WITHIN}; supervisor.SILENT = {SILENT}; commands.main()"
+    "from trirail.cli import app; from trirail.processes import supervisor; "
+    f"supervisor.START_WITHIN = supervisor.END_WITHIN = {WITHIN}; supervisor.SILENT = {SILENT}; app.main()"
 )
 """`trirail`, with more patience: the interpreters alone take a minute to start here, and a black
 box for each fault some seconds to be written."""

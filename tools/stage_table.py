@@ -22,7 +22,7 @@ from typing import NamedTuple
 import exact
 import numpy as np
 from trirail import config
-from trirail.cli.units import numbers
+from trirail.cli.notation import numbers
 from trirail.errors import TrirailError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry

@@ -13,11 +13,11 @@ def main() -> None:
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where it is ignored, as under nohup
     if handled:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from trirail.cli import commands
+    from trirail.cli import app
 
     if handled:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    commands.main()
+    app.main()
 
 
 def _open_standard_streams() -> None:

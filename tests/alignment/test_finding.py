@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.alignment.finding import find
 from trirail.alignment.shapes import MarkKind, MarkShape
@@ -51,6 +51,7 @@ def seen(kind: MarkKind, rng: np.random.Generator, noise: float, dark: bool) -> 
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=40)  # of each kind
 @given(SEEDS, st.booleans())
 def test_to_a_twentieth_of_a_pixel_whatever_blur_turn_size_and_light(kind: MarkKind, seed: int, dark: bool) -> None:
     picture, u, v = seen(kind, np.random.default_rng(seed), 0.0, dark)

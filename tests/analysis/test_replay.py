@@ -25,7 +25,7 @@ from trirail.telemetry import provenance
 from trirail.telemetry.reading import Recording, join, read
 from trirail.wire.goals import VelocityGoal
 from trirail.wire.packets import CommandRequest, Disturbance, DrivesFault, GoalRequest
-from trirail.wire.planning import Extended, NotPlanned, Planned
+from trirail.wire.plan_packets import Extended, NotPlanned, Planned
 
 pytestmark = pytest.mark.slow
 

@@ -21,7 +21,7 @@ import pytest
 from cyclopts import App
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.cli import commands, help_pages, live, terminal, typed, units, view
+from trirail.cli import app, help_pages, live, notation, terminal, typed, view
 from trirail.client import client, connection
 from trirail.client.goal import Result
 from trirail.config import SIM, load
@@ -33,22 +33,7 @@ Run = Callable[..., tuple[int, str, str]]
 NOBODY = "tcp/127.0.0.1:1"
 
 
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Call a command as from a terminal; return its exit code and what it printed."""
-
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["trirail", *words])
-        with pytest.raises(SystemExit) as ended:
-            commands.main()
-        printed = capsys.readouterr()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code, printed.out, printed.err
-
-    return call
-
-
-def pages(app: App = commands.app, *path: str) -> Iterator[tuple[str, App]]:
+def pages(app: App = app.app, *path: str) -> Iterator[tuple[str, App]]:
     """Yield every command with what is typed to call it."""
     for name in app:
         if not name.startswith("-"):
@@ -66,7 +51,7 @@ def test_every_command_is_in_a_group_with_examples_that_can_be_typed() -> None:
             for line in examples:
                 program, command, *words = shlex.split(line)
                 assert (program, command) == ("trirail", name)
-                commands.app.parse_args(units.numbers([command, *words]), exit_on_error=False, print_error=False)
+                app.app.parse_args(notation.numbers([command, *words]), exit_on_error=False, print_error=False)
 
 
 @pytest.mark.parametrize(("name", "page"), list(pages()))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from trirail.cli import commission
-from trirail.cli.commands import app
+from trirail.cli.app import app
 from trirail.commissioning.person import Question, Quit
 from trirail.config import SIM
 from trirail.errors import ConfigError

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from trirail.cli.commands import app
+from trirail.cli.app import app
 from trirail.config import SIM, load, parse
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from trirail.cli.commands import app
+from trirail.cli.app import app
 from trirail.cli.drives_command import UNTRIED
 from trirail.config import SIM
 from trirail_drivers.errors import DriveError, FileError

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from trirail.cli import commands
+from trirail.cli import app
 from trirail.config import SIM
 from trirail_drivers import files
 from trirail_drivers.errors import LONGEST, FileError, TrirailError, shortened
@@ -30,7 +30,7 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     def call(arguments: list[str]) -> str:
         monkeypatch.setattr(sys, "argv", ["trirail", *arguments])
         with pytest.raises(SystemExit) as ended:
-            commands.main()
+            app.main()
         said = capsys.readouterr()
         assert (ended.value.code, said.out) == (1, "")
         assert said.err.startswith("trirail: ")

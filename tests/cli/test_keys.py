@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from conftest import CONFIG
 from cyclopts import CycloptsError
-from trirail.cli import commands, doctor_network, key_folder, probes, terminal
+from trirail.cli import app, doctor_network, key_folder, probes, terminal
 from trirail.cli.key_folder import KeyFolder
 from trirail.config import Tls, Zenoh
 from trirail.errors import ServiceError
@@ -29,7 +29,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def keys(*arguments: str) -> int:
-    return int(commands.app(["keys", *arguments], exit_on_error=False, print_error=False, result_action="return_value"))
+    return int(app.app(["keys", *arguments], exit_on_error=False, print_error=False, result_action="return_value"))
 
 
 def test_robot_and_user_get_what_they_need(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

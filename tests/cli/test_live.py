@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from trirail.cli import live
 from trirail.config import SIM, load
-from trirail.processes.info import info
+from trirail.processes.publications import info
 from trirail.wire.state import Commanded, CorrectionTold, FrameCounts, GoalState, LoopState, Percentiles, Sliders, State
 from trirail.wire.units import ANGLE, LENGTH, VELOCITY, quantity
 from trirail_drivers.interface import NAMES

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 from trirail.cli import fleet_command, terminal
-from trirail.cli.commands import app
+from trirail.cli.app import app
 from trirail.client.fleet import SILENT, Attention, Fleet, Member
 from trirail.wire import zenoh_session
 from trirail.wire.state import RobotSummary

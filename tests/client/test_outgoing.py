@@ -22,7 +22,7 @@ import zenoh
 from conftest import carried
 from cyclopts import App, CycloptsError
 from msgspec import structs
-from trirail.cli.commands import app
+from trirail.cli.app import app
 from trirail.cli.robot_commands import telling
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from trirail.client import picture
 from trirail.config import SIM, geometry, load
 from trirail.kinematics.robot import inverse
-from trirail.processes.info import info
+from trirail.processes.publications import info
 from trirail.wire.state import Commanded, GoalState, Sliders, State
 from trirail.workspace import mechanism
 

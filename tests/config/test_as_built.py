@@ -20,8 +20,8 @@ from trirail.config.as_built import AsBuilt, geometry_of, parse, written
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import PLANNED
-from trirail.motion.planning import revision
-from trirail.processes.info import info
+from trirail.motion.motion_planner import revision
+from trirail.processes.publications import info
 from trirail.telemetry import provenance
 
 PLAIN = geometry(CONFIG.geometry)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from msgspec import Meta, Struct
 from msgspec.structs import fields
 from trirail.config import SIM, Config, geometry, load, metrics_url, parse
-from trirail.config.checks import check
+from trirail.config.impossible import check
 from trirail.config.tables import LegTable
 from trirail.errors import ConfigError
 from trirail.telemetry import provenance

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from trirail.config import Config
 from trirail.control.backlash import TURNS, add_offset, backlash, taking_up
-from trirail.motion.take_up import NO_BACKLASH, SHARE, planned_limits, take_up
+from trirail.motion.backlash_reserve import NO_BACKLASH, SHARE, planned_limits, take_up
 from trirail.wire.goals import SlidersGoal
 from trirail.wire.vocabulary import Mode
 

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from conftest import CONFIG, Rig
 from msgspec.structs import fields
-from trirail.cli.commands import app
+from trirail.cli.app import app
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.config import geometry

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import Config, FramesTable
 from trirail.errors import RefusedError
-from trirail.motion.frames import NamedFrames
-from trirail.motion.goals import meant
+from trirail.motion.goal_planner import meant
+from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode

@@ -16,13 +16,13 @@ from control.test_stop import PROMPT, STEP, braking, confirmed_after, play
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.motion.feasibility import Look
+from trirail.motion.motion_planner import MotionPlanner, revision
 from trirail.motion.paths import Path
-from trirail.motion.planning import MotionPlanner, revision
 from trirail.motion.runs import nominal
 from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, GoalRequest, PlannerLost, Refused
-from trirail.wire.planning import (
+from trirail.wire.plan_packets import (
     MAX_PLANNING,
     Extended,
     PackedPath,

@@ -16,8 +16,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.cli import rail_drawing
 from trirail.config import SIM, Config, everything, load, overlap
-from trirail.config.checks import rules
 from trirail.config.explained import Place, leaves, repaired
+from trirail.config.impossible import rules
 from trirail.diagnosis import Check, diagnose, failed_checks, stops
 from trirail.diagnosis.configured import JUDGEMENTS
 from trirail.errors import TrirailError

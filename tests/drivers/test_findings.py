@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 from drivers.foreign import Habits
 from drivers.test_foreign import PERIOD, Rig
@@ -11,14 +9,6 @@ from trirail_drivers.errors import DriveError
 
 Key = tuple[int, int]
 MASTER = 126
-
-
-@pytest.fixture
-def rigs() -> Iterator[list[Rig]]:
-    made: list[Rig] = []
-    yield made
-    for rig in made:
-        rig.drives.close()
 
 
 def test_a_drive_that_takes_8_ms_only_is_refused_with_the_rate_that_it_has(rigs: list[Rig]) -> None:

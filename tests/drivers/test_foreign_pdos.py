@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 from drivers.foreign import Habits
 from drivers.test_foreign import MAKES, Rig
@@ -11,14 +9,6 @@ from trirail_drivers.errors import DriveError
 
 FIXED = {(0x1600, 0): 0, (0x1601, 0): 1, (0x1601, 1): 0x60FF_0020}
 """No controlword, and a target velocity where setpoints would be."""
-
-
-@pytest.fixture
-def rigs() -> Iterator[list[Rig]]:
-    made: list[Rig] = []
-    yield made
-    for rig in made:
-        rig.drives.close()
 
 
 @pytest.mark.parametrize("name", MAKES)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +21,6 @@ KINDS = {"i8": 0x02, "i16": 0x03, "i32": 0x04, "u8": 0x05, "u16": 0x06, "u32": 0
 """CiA 301 data types."""
 BRAKE = ObjectWrite(object=0x208E, value=0x100, type="u16", why="the brake opens late")
 ROWS = ((0x208E, 0, 6, "rw", 0, False), (0x2090, 1, 4, "rw", 7, False))
-
-
-@pytest.fixture
-def rigs() -> Iterator[list[Rig]]:
-    made: list[Rig] = []
-    yield made
-    for rig in made:
-        rig.drives.close()
 
 
 @settings(max_examples=20)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,14 +51,6 @@ def is_right(path: str, value: float) -> bool:
 def accepting(*names: str) -> Any:
     each = {name: msgspec.structs.replace(getattr(CONFIG, name), accept_without=names) for name in NAMES}
     return msgspec.structs.replace(CONFIG, **each)
-
-
-@pytest.fixture
-def rigs() -> Iterator[list[Rig]]:
-    made: list[Rig] = []
-    yield made
-    for rig in made:
-        rig.drives.close()
 
 
 @settings(max_examples=60)

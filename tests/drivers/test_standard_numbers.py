@@ -15,7 +15,7 @@ import pytest
 from drivers.test_cia402 import PERIOD
 from rigs import Bus, DeviceRig
 from trirail_drivers.cia402 import frames as canopen
-from trirail_drivers.cia402 import homing, sdo, ways
+from trirail_drivers.cia402 import homing, process_data, sdo
 from trirail_drivers.interface import PowerState
 from trirail_drivers.odrive import frames as cansimple
 from trirail_drivers.simulated import Servo, SimulatedDrive, SimulatedOdrive
@@ -192,7 +192,7 @@ def test_every_statusword(word: int) -> None:
 
 def test_modes_of_operation_and_bits_of_objects() -> None:
     # CiA 402-2: 6060h, 6061h, 6041h; statusword bits 10, 12, 13 in homing mode.
-    assert (homing.HOMING, ways.INTERPOLATED_POSITION, ways.CYCLIC_SYNCHRONOUS_POSITION) == (6, 7, 8)
+    assert (homing.HOMING, process_data.INTERPOLATED_POSITION, process_data.CYCLIC_SYNCHRONOUS_POSITION) == (6, 7, 8)
     assert (homing._MODE, homing._MODE_DISPLAY, homing._STATUSWORD) == (0x6060, 0x6061, 0x6041)
     assert (homing._REACHED, homing._ATTAINED, homing._ERROR) == (0x0400, 0x1000, 0x2000)
     # CiA 301, 7.2.4: initiate download of one byte, initiate upload, abort; index, subindex, data.

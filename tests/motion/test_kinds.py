@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import FieldInfo, fields
 from trirail.motion.goal_motion import GoalMotion
-from trirail.motion.goals import MOTIONS
+from trirail.motion.goal_planner import MOTIONS
 from trirail.wire.goal_kind import GoalKind
 from trirail.wire.goals import KINDS
 

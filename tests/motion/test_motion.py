@@ -18,8 +18,8 @@ from trirail.config import Config
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import LEGS
 from trirail.kinematics.robot import forward, inverse
-from trirail.motion.goals import Goals, PlannedMotion
-from trirail.motion.planner import TOO_FAST_IN_MOTION
+from trirail.motion.goal_planner import GoalPlanner, PlannedMotion
+from trirail.motion.path_planner import TOO_FAST_IN_MOTION
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.schedule import Schedule
 from trirail.wire.goals import (
@@ -417,7 +417,6 @@ def meddle(rnd: random.Random, rig: Rig) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 @pytest.mark.generated(20_090_901, 20_090_902, 20_090_903, 20_090_904)
 def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig, seed: int) -> None:
     rnd = random.Random(seed)
@@ -474,10 +473,10 @@ def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
     rig.bus.shutdown()
 
 
-PLAIN_SET_OUT = Goals._set_out
+PLAIN_SET_OUT = GoalPlanner._set_out
 
 
-def only_from_rest(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
+def only_from_rest(goals: GoalPlanner, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
     """Plan from no motion, so that the robot stops first."""
     if not schedule.commanded.at_rest:
         raise TOO_FAST_IN_MOTION
@@ -497,14 +496,14 @@ def test_of_two_ways_the_sooner_is_taken(
     monkeypatch: pytest.MonkeyPatch, config: Config, first: tuple[float, ...], second: tuple[float, ...]
 ) -> None:
     """From the same motion, with lower limits or after a stop: each where the other is not to be had, and then both."""
-    plain_stop_first = Goals._stop_first
+    plain_stop_first = GoalPlanner._stop_first
 
-    def no_stop(goals: Goals, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
+    def no_stop(goals: GoalPlanner, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
         raise TOO_FAST_IN_MOTION
 
     def asked(wait: int, way: str) -> tuple[Rig, Answer]:
-        monkeypatch.setattr(Goals, "_set_out", only_from_rest if way == "stop" else PLAIN_SET_OUT)
-        monkeypatch.setattr(Goals, "_stop_first", no_stop if way == "lower" else plain_stop_first)
+        monkeypatch.setattr(GoalPlanner, "_set_out", only_from_rest if way == "stop" else PLAIN_SET_OUT)
+        monkeypatch.setattr(GoalPlanner, "_stop_first", no_stop if way == "lower" else plain_stop_first)
         rig = Rig(config)
         rig.enable()
         rig.goal("g1", *first)
@@ -539,7 +538,7 @@ def test_a_stop_is_kept_though_the_rate_of_the_goal_to_come_is_thought_about(
     monkeypatch: pytest.MonkeyPatch, later: int
 ) -> None:
     """The robot stops for a goal that is then to run at an override; it is told to stop as that is being looked at."""
-    monkeypatch.setattr(Goals, "_set_out", only_from_rest)
+    monkeypatch.setattr(GoalPlanner, "_set_out", only_from_rest)
     rig = Rig(SLOW)
     rig.enable()
     rig.goal("g1", 0.08, 0.02, 0.3)

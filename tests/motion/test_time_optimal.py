@@ -21,8 +21,8 @@ from trirail.errors import RefusedError
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.feasibility import PLANNED, Checker
 from trirail.motion.limits import Bounds
+from trirail.motion.path_planner import PathPlanner, Plan
 from trirail.motion.paths import Path, value
-from trirail.motion.planner import Plan, Planner
 from trirail.motion.ruckig_call import Kinodynamic
 from trirail.motion.runs import MotionState, rest
 
@@ -53,13 +53,13 @@ class Pair(NamedTuple):
     uniform: Plan
 
 
-def planner_of(sliders: Sequence[float]) -> Planner:
+def planner_of(sliders: Sequence[float]) -> PathPlanner:
     velocity, acceleration, jerk = sliders
     slider = msgspec.structs.replace(CONFIG.limits.slider, velocity=velocity, acceleration=acceleration, jerk=jerk)
     limits = msgspec.structs.replace(CONFIG.limits, slider=slider)
     bounds = Bounds(limits, CONFIG.period)
     checker = Checker(ROBOT, limits, bounds, CONFIG.period)
-    return Planner(ROBOT, limits.platform, limits.slider, bounds, checker, CONFIG.period)
+    return PathPlanner(ROBOT, limits.platform, limits.slider, bounds, checker, CONFIG.period)
 
 
 def to_pose(
@@ -67,14 +67,14 @@ def to_pose(
 ) -> Pair:
     planner = planner_of(sliders)
     plan = planner.to_pose(rest(start), target, speed, own)
-    with patch("trirail.motion.planner.time_optimal", return_value=None):
+    with patch("trirail.motion.path_planner.time_optimal", return_value=None):
         return Pair(plan, planner.to_pose(rest(start), target, speed, own))
 
 
 def to_sliders(sliders: Sequence[float], start: Triple, target: Triple) -> Pair:
     planner = planner_of(sliders)
     plan = planner.to_sliders(rest(start), target)
-    with patch("trirail.motion.planner.time_optimal", return_value=None):
+    with patch("trirail.motion.path_planner.time_optimal", return_value=None):
         return Pair(plan, planner.to_sliders(rest(start), target))
 
 
@@ -201,7 +201,7 @@ def test_a_way_comes_close_to_the_limit_that_is_nearest(sliders: Triple, end: Tr
 def test_what_fits_stays_ruckigs() -> None:
     """To the last bit, whatever the way by which others are made sooner."""
     start, end = (0.0, 0.0, 0.0), (0.03, -0.02, 0.1)
-    with patch("trirail.motion.planner.time_optimal", side_effect=AssertionError):
+    with patch("trirail.motion.path_planner.time_optimal", side_effect=AssertionError):
         plan = planner_of((1.0, 15.0, 400.0)).to_pose(rest(start), end)
     assert plan.slowed == 1.0
 

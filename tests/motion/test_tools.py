@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.robot import forward
-from trirail.motion.goals import Goals
+from trirail.motion.goal_planner import GoalPlanner
 from trirail.motion.limits import EXCESS
 from trirail.motion.packing import pack_path, unpack_path
 from trirail.motion.paths import Path, path_motion
@@ -32,9 +32,9 @@ NANOMETRE = 1e-9
 
 
 @pytest.fixture(scope="module")
-def goals() -> dict[bool, Goals]:
+def goals() -> dict[bool, GoalPlanner]:
     """Planners of the shipped robot, and of one with slow sliders."""
-    return {slow: Goals(ROBOT, config.limits, PERIOD) for slow, config in ((False, CONFIG), (True, SLOW))}
+    return {slow: GoalPlanner(ROBOT, config.limits, PERIOD) for slow, config in ((False, CONFIG), (True, SLOW))}
 
 
 def point(poses: NDArray[np.float64], tool: Tool) -> NDArray[np.float64]:
@@ -49,7 +49,7 @@ def at(pose: Pose, tool: Tool) -> Pose:
     return x, y, pose[2]
 
 
-def planned(goals: Goals, begin: Pose, goal: PoseGoal) -> NDArray[np.float64]:
+def planned(goals: GoalPlanner, begin: Pose, goal: PoseGoal) -> NDArray[np.float64]:
     """The poses of every cycle from rest to a goal, and of some cycles before and after."""
     run = goals.plan(goal, Schedule(rest(begin), PERIOD), 1.0, 3).run
     cycles = range(-3, math.ceil(run.ends / PERIOD) + 3)
@@ -120,7 +120,7 @@ def test_a_path_of_several_tools_is_sent_to_the_last_bit(tools: list[Tool], time
 
 @given(POSES, POSES, TOOLS, st.booleans())
 def test_the_tool_goes_straight_within_its_limits_and_the_centre_within_its_own(
-    goals: dict[bool, Goals], begin: Pose, end: Pose, tool: Tool, slow: bool
+    goals: dict[bool, GoalPlanner], begin: Pose, end: Pose, tool: Tool, slow: bool
 ) -> None:
     poses = planned(goals[slow], begin, PoseGoal(*at(end, tool), tool=tool))
     assert poses[-1] == pytest.approx(end, abs=NANOMETRE)
@@ -134,7 +134,7 @@ def test_the_tool_goes_straight_within_its_limits_and_the_centre_within_its_own(
 @example((0.118839, -0.078274, 0.379732), (0.013187, -0.031977, -0.397632), None, False)
 @example((-0.067277, 0.085107, 0.192926), (-0.071368, 0.098751, 0.100579), None, False)
 def test_from_rest_every_way_is_straight_in_all_three(
-    goals: dict[bool, Goals], begin: Pose, end: Pose, tool: Tool | None, slow: bool
+    goals: dict[bool, GoalPlanner], begin: Pose, end: Pose, tool: Tool | None, slow: bool
 ) -> None:
     """x, y and phi share their time, whichever of them is the slowest in velocity, acceleration and jerk."""
     poses = planned(goals[slow], begin, PoseGoal(*at(end, tool or (0.0, 0.0)), tool=tool))
@@ -147,7 +147,7 @@ def test_from_rest_every_way_is_straight_in_all_three(
 
 @given(POSES, TOOLS, st.floats(-0.4, 0.4), st.booleans())
 def test_a_pure_rotation_leaves_the_tool_where_it_is(
-    goals: dict[bool, Goals], begin: Pose, tool: Tool, phi: float, slow: bool
+    goals: dict[bool, GoalPlanner], begin: Pose, tool: Tool, phi: float, slow: bool
 ) -> None:
     x, y, _ = at(begin, tool)
     try:
@@ -179,7 +179,7 @@ def test_every_setpoint_keeps_the_tool_on_its_line(config: Config, tool: Tool) -
     rig.bus.shutdown()
 
 
-def test_a_far_tool_turns_as_fast_as_the_centre_may_go(goals: dict[bool, Goals]) -> None:
+def test_a_far_tool_turns_as_fast_as_the_centre_may_go(goals: dict[bool, GoalPlanner]) -> None:
     """About a point 0.5 m away the centre's own limit is the nearer one."""
     poses = planned(goals[False], (0.0, 0.0, 0.0), PoseGoal(0.5, 0.0, 0.2, tool=(0.5, 0.0)))
     speed = np.abs(np.diff(poses[:, 1])).max() / PERIOD
@@ -187,7 +187,7 @@ def test_a_far_tool_turns_as_fast_as_the_centre_may_go(goals: dict[bool, Goals])
     assert_platform_within_limits(poses, (0.0, 0.0))
 
 
-def test_own_limits_are_those_of_the_tool(goals: dict[bool, Goals]) -> None:
+def test_own_limits_are_those_of_the_tool(goals: dict[bool, GoalPlanner]) -> None:
     tool, own = (0.1, 0.0), (0.02, 0.02, 0.1)
     limits = OwnLimits(velocity=own, acceleration=(0.5, 0.5, 3.0), jerk=(10.0, 10.0, 75.0))
     goal = PoseGoal(0.15, 0.0, 0.2, tool=tool, limits=limits)
@@ -267,6 +267,6 @@ def test_from_tool_to_tool_in_motion_nothing_jumps(
     rig.bus.shutdown()
 
 
-def test_a_coordinate_that_hardly_moves_bounds_nothing(goals: dict[bool, Goals]) -> None:
+def test_a_coordinate_that_hardly_moves_bounds_nothing(goals: dict[bool, GoalPlanner]) -> None:
     poses = planned(goals[False], (0.0, 0.0, 0.0), PoseGoal(1e-310, 0.05, -1e-200))
     assert poses[-1] == pytest.approx((0.0, 0.05, 0.0), abs=NANOMETRE)

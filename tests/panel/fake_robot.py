@@ -17,7 +17,7 @@ from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse
-from trirail.processes.info import info
+from trirail.processes.publications import info
 from trirail.wire.goals import Goal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import CommandReply, Event
 from trirail.wire.state import (

@@ -225,7 +225,6 @@ def test_two_tabs_both_work_and_either_stops(service: Service, robot: Robot, bro
 
 @pytest.mark.viewer
 @needs_chromium
-@pytest.mark.timeout(300)
 def test_the_page_comes_back_with_the_service(browser: Page, tmp_path: Path) -> None:
     with Service(tmp_path) as first:
         first.wait_up()

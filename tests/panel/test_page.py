@@ -67,6 +67,7 @@ def stands(robot: FakeRobot) -> None:
 # ---------------------------------------------------------------------- the dead man
 
 
+@pytest.mark.alone  # a hand's signs of life have to be in time, through a browser
 def test_the_robot_moves_while_a_button_is_held(enabled: Page, robot: FakeRobot) -> None:
     before = robot.pose[0]
     enabled.press("[data-axis=x][data-sign='1']")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.processes import descriptors
-from trirail.processes.crowding import EACH, LOOK_EVERY, Crowding, surplus
+from trirail.processes.zenoh_links import EACH, LOOK_EVERY, Crowding, surplus
 from trirail.wire.packets import Remark
 
 USERS = frozenset({"ann", "eva", "max"})

@@ -14,10 +14,9 @@ import pytest
 import servers
 from trirail.config import SIM, load
 from trirail.processes import warm_parent
-from trirail.processes.child_process import ChildProcess
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.process import Order
-from trirail.processes.warm_parent import UNTOLD, WarmParent
+from trirail.processes.warm_parent import UNTOLD, ChildProcess, WarmParent
 from trirail.wire import links
 
 SERVER = """

@@ -12,8 +12,7 @@ from contextlib import contextmanager
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.processes.hanging import Effort, HangWatch, effort
-from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.heartbeats import Effort, HangWatch, Heartbeats, effort
 
 TURN = 0.1
 TURNS = st.tuples(st.booleans(), st.sampled_from("RDSTtZ"), st.floats(0.0, TURN))

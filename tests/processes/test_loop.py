@@ -8,7 +8,7 @@ from typing import cast
 
 import pytest
 from conftest import Followers, Rig, alone, what_memory_takes
-from trirail.motion.planning import MotionPlanner
+from trirail.motion.motion_planner import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.loop import REQUESTS_A_CYCLE, Loop
@@ -34,7 +34,7 @@ from trirail.wire.packets import (
     decode_answer,
     message,
 )
-from trirail.wire.planning import MAX_PLANNING, Planned, decode_plan_request, encode
+from trirail.wire.plan_packets import MAX_PLANNING, Planned, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.vocabulary import Command, Mode, Override

@@ -23,7 +23,6 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from trirail.config import SIM, Config
 from trirail.errors import ServiceError
-from trirail.processes.crowding import InUse
 from trirail.processes.health import NOT_RUNNING, SILENT, Health, Running
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
 from trirail.processes.measured import (
@@ -38,7 +37,8 @@ from trirail.processes.measured import (
 from trirail.processes.metrics import ServiceMetrics
 from trirail.processes.metrics_server import MetricsServer
 from trirail.processes.process import MEASURED
-from trirail.processes.state import StateMaker
+from trirail.processes.publications import StateMaker
+from trirail.processes.zenoh_links import InUse
 from trirail.telemetry.sinks import free_port
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.records import DTYPE

@@ -22,7 +22,7 @@ from conftest import CONFIG, carried
 from lockstep import CARRIERS, STEP_NS, Lockstep
 from msgspec import structs
 from trirail.config import Config
-from trirail.motion.planning import MotionPlanner
+from trirail.motion.motion_planner import MotionPlanner
 from trirail.processes.clock import Ticker
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.loop import Loop
@@ -31,7 +31,7 @@ from trirail.wire import links
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrackGoal, VelocityGoal
 from trirail.wire.links import Port
 from trirail.wire.packets import CommandRequest, GoalRequest, Happened, Kind, Request, decode_answer, message
-from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
+from trirail.wire.plan_packets import MAX_PLANNING, decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes import refusals
+from trirail.processes import replies as refusals
 from trirail.processes.incoming import Incoming
-from trirail.processes.refusals import REFUSALS_OF_ALL, REFUSALS_PER_SECOND, Refusals
+from trirail.processes.replies import REFUSALS_OF_ALL, REFUSALS_PER_SECOND, Refusals
 from trirail.wire import packets
 from trirail.wire.messages import ErrorReply
 

@@ -8,7 +8,7 @@ import pytest
 from processes.test_gateway import Rig
 from processes.test_gateway import rig as rig  # noqa: PLC0414 - a fixture
 from rigs import Clock
-from trirail.processes.router_links import ASK_EVERY, PATIENCE, RouterLinks
+from trirail.processes.zenoh_links import ASK_EVERY, PATIENCE, RouterLinks
 from trirail.wire.packets import Remark
 
 HUB = "tls/192.0.2.9:7447"

@@ -17,11 +17,10 @@ from conftest import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.errors import RefusalCode
-from trirail.processes.copies import REMEMBERED, Copies
 from trirail.processes.gateway import Gateway
 from trirail.processes.guard import Guard
 from trirail.processes.inbox import ALIKE
-from trirail.processes.incoming import Incoming
+from trirail.processes.incoming import REMEMBERED, Copies, Incoming
 from trirail.wire import packets, zenoh_session
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused

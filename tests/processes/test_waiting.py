@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from trirail.processes.waiting import SPARE_NS, Doors
+from trirail.processes.clock import SPARE_NS, Doors
 from trirail.wire import links
 from trirail.wire.links import PacketLink, Port
 

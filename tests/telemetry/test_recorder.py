@@ -140,7 +140,6 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["FIFO", "device", "folder"])
-@pytest.mark.timeout(20)
 def test_what_is_no_file_is_not_recorded_to(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a.rrd"
     if kind == "FIFO":

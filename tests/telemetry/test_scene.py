@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 from trirail.config import SIM, FramesTable, LegTable, load
 from trirail.kinematics.geometry import Geometry, Leg
-from trirail.processes.info import info
+from trirail.processes.publications import info
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.scene import Scene
 from trirail.telemetry.shown_robot import ShownRobot

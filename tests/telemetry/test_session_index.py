@@ -18,7 +18,7 @@ import pytest
 from cyclopts import CycloptsError
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from trirail.cli.commands import app
+from trirail.cli.app import app
 from trirail.config import SIM, Config, load
 from trirail.telemetry import contents
 from trirail.telemetry.blackbox import BlackBox

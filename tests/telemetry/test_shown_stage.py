@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 from trirail.config import SIM, geometry, load
-from trirail.processes.info import info
+from trirail.processes.publications import info
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.state import Info
 

@@ -13,8 +13,8 @@ import msgspec
 import pytest
 import trirail
 import trirail_drivers
-from trirail.cli.commands import app
-from trirail.cli.units import numbers
+from trirail.cli.app import app
+from trirail.cli.notation import numbers
 from trirail.config import Config
 from trirail.errors import TrirailError
 from trirail.wire.goals import Goal

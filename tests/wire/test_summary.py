@@ -7,7 +7,7 @@ import numpy as np
 from conftest import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.processes.state import StateMaker
+from trirail.processes.publications import StateMaker
 from trirail.wire.packets import Status
 from trirail.wire.records import DTYPE
 from trirail.wire.sizes import MAX_NAME

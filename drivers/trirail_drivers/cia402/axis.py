@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from trirail_drivers.cia402 import frames, ways
+from trirail_drivers.cia402 import frames, process_data
 from trirail_drivers.cia402.codes import words
-from trirail_drivers.cia402.second_node import AnswersAfter, AnswersPerSync, warning
+from trirail_drivers.cia402.duplicate_node import AnswersAfter, AnswersPerSync, warning
 from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives
@@ -43,7 +43,7 @@ class Cia402Axis(Axis):
 
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
-        self.set_up(ways.usual(node), Units(scale, scale.counts_per_metre, abs(scale.counts_per_metre)))
+        self.set_up(process_data.usual(node), Units(scale, scale.counts_per_metre, abs(scale.counts_per_metre)))
         self.velocity_step, self.velocity_bytes = 1.0, 4
         self.still = max(1.0, abs(scale.counts_per_metre) * STILL)
         self.status_heard = self.stands_since = math.inf
@@ -86,7 +86,7 @@ class Cia402Axis(Axis):
         self._unfollowed_since: float | None = None
         self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfter()
 
-    def set_up(self, way: ways.Exchange, units: Units) -> None:
+    def set_up(self, way: process_data.Exchange, units: Units) -> None:
         """Note what goes by which frames, and in which units."""
         self.way, self.units = way, units
         self.velocity_per_metre = units.velocity_per_metre
@@ -135,11 +135,11 @@ class Cia402Axis(Axis):
         """The frames that say nothing new of it, as rows of trirail_drivers.driver.cyclic.EXPECTED; it has a number."""
         way, word = self.way, frames.STATUSWORD.pack(self.statusword)
         decides = frames.STATUSWORD.pack(_STATE_BITS | (frames.FOLLOWS if way.tells_following else 0))
-        feedback, place = way.feedback, way.feedback.place(ways.STATUSWORD)
+        feedback, place = way.feedback, way.feedback.place(process_data.STATUSWORD)
         data, mask = bytearray(feedback.size), bytearray(feedback.size)
         if place >= 0:
             data[place : place + 2], mask[place : place + 2] = word, decides
-        position, identifier = feedback.place(ways.ACTUAL_POSITION), feedback.identifier
+        position, identifier = feedback.place(process_data.ACTUAL_POSITION), feedback.identifier
         rows = [expected(identifier, number, bytes(data), bytes(mask), position_at=position, status_at=place)]
         if way.status is not None:
             rows.append(expected(way.status, number, word, decides, status_at=0))
@@ -301,7 +301,7 @@ class Cia402Axis(Axis):
         word = frames.controlword(self.state, wanted)
         if word != frames.ENABLE_OPERATION:
             return word
-        interpolates = self.way.mode == ways.INTERPOLATED_POSITION and self.cyclic
+        interpolates = self.way.mode == process_data.INTERPOLATED_POSITION and self.cyclic
         if interpolates and self.state is PowerState.OPERATION_ENABLED:
             word |= frames.INTERPOLATE
         return word | self.mode_bits

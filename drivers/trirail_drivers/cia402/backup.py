@@ -15,10 +15,10 @@ from trirail_drivers.cia402.conversations import side_by_side, until
 from trirail_drivers.cia402.makers_objects import address, owned
 from trirail_drivers.cia402.objects import Key
 from trirail_drivers.cia402.one_drive import HAS_POWER, greet, send
+from trirail_drivers.cia402.other_masters import NoOtherMaster
 from trirail_drivers.cia402.parameter_file import Different, Origin, Saved, compare
 from trirail_drivers.cia402.parameters import BYTES, Parameter, is_parameter, of_kind, parameter
 from trirail_drivers.cia402.sdo import Remote, SdoRefused, reason
-from trirail_drivers.cia402.strangers import NoOtherMaster
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock, PowerState

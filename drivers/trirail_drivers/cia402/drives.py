@@ -15,12 +15,12 @@ import can
 from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packets import packets
-from trirail_drivers.cia402 import frames, setup, ways
+from trirail_drivers.cia402 import frames, process_data, setup
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.cia402.objects import means
 from trirail_drivers.cia402.one_drive import HAS_POWER
-from trirail_drivers.cia402.strangers import Strangers
+from trirail_drivers.cia402.other_masters import OtherMasters
 from trirail_drivers.driver.axis_row import NOWHERE
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
@@ -35,7 +35,7 @@ class Cia402(Driver[Cia402Axis]):
 
     def __init__(self, bus: can.BusABC, bitrate: int, drives: config.Drives, clock: Clock = time.monotonic) -> None:
         super().__init__(bus, bitrate, drives, clock, Cia402Axis)
-        self._strangers = Strangers(self._wire, self._axes, drives.master_node)
+        self._other_masters = OtherMasters(self._wire, self._axes, drives.master_node)
         for axis in self._axes:
             self._listen(axis)
         self._homing = HomingSequence(self._axes, drives, self._wire.send)
@@ -58,7 +58,7 @@ class Cia402(Driver[Cia402Axis]):
         self._set_period(period, frames.TRAFFIC)
         scales = tuple(axis.scale for axis in self._axes)
         done = setup.configure(self._wire.bus, self._drives, scales, period, self._clock, fastest)
-        self._set_period(period, ways.traffic(made.way for made, _ in done))
+        self._set_period(period, process_data.traffic(made.way for made, _ in done))
         for axis, (made, start) in zip(self._axes, done, strict=True):
             axis.set_up(made.way, made.units)
             axis.mode.shown = made.way.mode_shown
@@ -79,7 +79,7 @@ class Cia402(Driver[Cia402Axis]):
         listen(way.emergency, axis, axis.on_emergency)
         listen(frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
         listen(frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
-        self._strangers.listen_to(axis)
+        self._other_masters.listen_to(axis)
 
     def sync(self) -> None:
         """Send SYNC: the drives take up the setpoints written since the last one and sample positions.
@@ -298,7 +298,7 @@ class Cia402(Driver[Cia402Axis]):
             if not (word != axis.controlword or repeat):
                 continue
             if deaf:
-                # PDOs are heard in NMT operational only (CiA 301): what stops it goes both ways.
+                # PDOs are heard in NMT operational only (CiA 301): what stops it goes both process_data.
                 self._send_word_by_sdo(axis, word)
             if self._send_word(axis, word):
                 axis.controlword = word

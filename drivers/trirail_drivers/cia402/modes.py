@@ -5,8 +5,8 @@ from __future__ import annotations
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.homing import HOMING
 from trirail_drivers.cia402.objects import MODE, MODE_DISPLAY, title
+from trirail_drivers.cia402.process_data import CYCLIC_SYNCHRONOUS_POSITION, INTERPOLATED_POSITION, POSITIONS
 from trirail_drivers.cia402.sdo import Remote, SdoRefused
-from trirail_drivers.cia402.ways import CYCLIC_SYNCHRONOUS_POSITION, INTERPOLATED_POSITION, POSITIONS
 from trirail_drivers.errors import ConfigurationRefused, DriveError
 
 _LINEAR = 0

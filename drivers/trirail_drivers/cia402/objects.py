@@ -32,79 +32,57 @@ class Use(NamedTuple):
     purpose: str
     without: str
     """What is so where a drive lacks it."""
-    section: str
-    """Of the standard."""
 
 
 _N, _R, _P = Need.NEEDED, Need.REPLACEABLE, Need.PROTECTION
 
 USES: Final = {
-    "1000": Use(_N, "Device type", "that it is a CiA 402 drive", "refused", "CiA 301, 1000h"),
-    "1001": Use(_R, "Error register", "whether an EMCY is still in force", "EMCY 00xxh alone tells", "CiA 301, 1001h"),
-    "1005": Use(_R, "COB-ID SYNC", "that it hears SYNC 080h", "080h, the predefined one", "CiA 301, 1005h"),
-    "1006": Use(_P, "Communication cycle period", "its watch on SYNC", "it goes on without SYNC", "CiA 301, 1006h"),
-    "1007": Use(
-        _R, "Synchronous window length", "that setpoints count whenever they come", "there is none", "CiA 301, 1007h"
-    ),
-    "100C": Use(_R, "Guard time", "node guarding, for want of 1016", "heartbeats", "CiA 301, 100Ch"),
-    "100D": Use(_R, "Life time factor", "node guarding, for want of 1016", "heartbeats", "CiA 301, 100Dh"),
-    "1014": Use(_R, "COB-ID EMCY", "its EMCY", "080h + node, the predefined one", "CiA 301, 1014h"),
-    "1015": Use(_R, "Inhibit time EMCY", "that an EMCY comes at once", "none is taken to be there", "CiA 301, 1015h"),
-    "1016": Use(
-        _P, "Consumer heartbeat time", "its watch on this service", "node guarding 100Ch, or none", "CiA 301, 1016h"
-    ),
-    "1017": Use(
-        _R, "Producer heartbeat time", "this service's watch on it", "its answers to SYNC alone", "CiA 301, 1017h"
-    ),
-    "1019": Use(_R, "Synchronous counter overflow", "SYNC without a counter", "there is none", "CiA 301, 1019h"),
-    "1029": Use(
-        _R,
-        "Error behaviour",
-        "pre-operational when it hears nobody",
-        "the standard's default is that",
-        "CiA 301, 1029h",
-    ),
-    "1400:05": Use(_R, "Event timer", "that nothing has to come unchanged", "there is none", "CiA 301, 1400h"),
-    "1800:03": Use(_R, "Inhibit time", "that a statusword comes at once", "there is none", "CiA 301, 1800h"),
-    "1800:05": Use(
-        _R, "Event timer", "that statuswords come also unchanged", "beside the position, or polled", "CiA 301, 1800h"
-    ),
-    "6007": Use(_P, "Abort connection option code", "its stop when it hears nobody", "its own way", "CiA 402-2, 6007h"),
-    "603F": Use(_R, "Error code", "why it was in fault at the start", "its EMCY alone tells", "CiA 402-2, 603Fh"),
-    "6040": Use(_N, "Controlword", "power, stop, reset", "refused", "CiA 402-2, 6040h"),
-    "6041": Use(_N, "Statusword", "its state", "refused", "CiA 402-2, 6041h"),
-    "605A": Use(_P, "Quick stop option code", "its quick-stop ramp", "its own way to stop", "CiA 402-2, 605Ah"),
-    "605E": Use(_P, "Fault reaction option code", "the ramp of its faults", "its own way to stop", "CiA 402-2, 605Eh"),
-    "6060": Use(_N, "Modes of operation", "the mode", "refused", "CiA 402-2, 6060h"),
-    "6061": Use(_N, "Modes of operation display", "the mode", "refused", "CiA 402-2, 6061h"),
-    "6064": Use(_N, "Position actual value", "its position", "refused", "CiA 402-2, 6064h"),
-    "6065": Use(
-        _P, "Following error window", "its own watch on its following error", "this service's alone", "CiA 402-2, 6065h"
-    ),
-    "607A": Use(_N, "Target position", "setpoints of mode 8", "refused", "CiA 402-2, 607Ah"),
-    "607C": Use(_R, "Home offset", "that home is at `offset`", "0, the standard's default", "CiA 402-2, 607Ch"),
-    "6085": Use(_P, "Quick stop deceleration", "its quick-stop ramp", "its own ramp", "CiA 402-2, 6085h"),
-    "6098": Use(_N, "Homing method", "homing, where configured", "refused", "CiA 402-2, 6098h"),
-    "6099": Use(_N, "Homing speeds", "homing, where configured", "refused", "CiA 402-2, 6099h"),
-    "609A": Use(_R, "Homing acceleration", "homing, where configured", "its own", "CiA 402-2, 609Ah"),
-    "60B1": Use(
-        _R, "Velocity offset", "the velocity feed-forward", "it follows with a lag of its own", "CiA 402-2, 60B1h"
-    ),
-    "60C0": Use(_R, "Interpolation sub mode select", "linear interpolation", "its own", "CiA 402-2, 60C0h"),
-    "60C1": Use(_N, "Interpolation data record", "setpoints of mode 7", "refused", "CiA 402-2, 60C1h"),
-    "60C2": Use(_R, "Interpolation time period", "its interpolation", "the time from SYNC to SYNC", "CiA 402-2, 60C2h"),
-    "60C4": Use(_R, "Interpolation data configuration", "an empty buffer", "its own", "CiA 402-2, 60C4h"),
-    "6502": Use(_R, "Supported drive modes", "mode 8 or 7", "mode 8 is tried, then 7", "CiA 402-2, 6502h"),
+    "1000": Use(_N, "Device type", "that it is a CiA 402 drive", "refused"),
+    "1001": Use(_R, "Error register", "whether an EMCY is still in force", "EMCY 00xxh alone tells"),
+    "1005": Use(_R, "COB-ID SYNC", "that it hears SYNC 080h", "080h, the predefined one"),
+    "1006": Use(_P, "Communication cycle period", "its watch on SYNC", "it goes on without SYNC"),
+    "1007": Use(_R, "Synchronous window length", "that setpoints count whenever they come", "there is none"),
+    "100C": Use(_R, "Guard time", "node guarding, for want of 1016", "heartbeats"),
+    "100D": Use(_R, "Life time factor", "node guarding, for want of 1016", "heartbeats"),
+    "1014": Use(_R, "COB-ID EMCY", "its EMCY", "080h + node, the predefined one"),
+    "1015": Use(_R, "Inhibit time EMCY", "that an EMCY comes at once", "none is taken to be there"),
+    "1016": Use(_P, "Consumer heartbeat time", "its watch on this service", "node guarding 100Ch, or none"),
+    "1017": Use(_R, "Producer heartbeat time", "this service's watch on it", "its answers to SYNC alone"),
+    "1019": Use(_R, "Synchronous counter overflow", "SYNC without a counter", "there is none"),
+    "1029": Use(_R, "Error behaviour", "pre-operational when it hears nobody", "the standard's default is that"),
+    "1400:05": Use(_R, "Event timer", "that nothing has to come unchanged", "there is none"),
+    "1800:03": Use(_R, "Inhibit time", "that a statusword comes at once", "there is none"),
+    "1800:05": Use(_R, "Event timer", "that statuswords come also unchanged", "beside the position, or polled"),
+    "6007": Use(_P, "Abort connection option code", "its stop when it hears nobody", "its own way"),
+    "603F": Use(_R, "Error code", "why it was in fault at the start", "its EMCY alone tells"),
+    "6040": Use(_N, "Controlword", "power, stop, reset", "refused"),
+    "6041": Use(_N, "Statusword", "its state", "refused"),
+    "605A": Use(_P, "Quick stop option code", "its quick-stop ramp", "its own way to stop"),
+    "605E": Use(_P, "Fault reaction option code", "the ramp of its faults", "its own way to stop"),
+    "6060": Use(_N, "Modes of operation", "the mode", "refused"),
+    "6061": Use(_N, "Modes of operation display", "the mode", "refused"),
+    "6064": Use(_N, "Position actual value", "its position", "refused"),
+    "6065": Use(_P, "Following error window", "its own watch on its following error", "this service's alone"),
+    "607A": Use(_N, "Target position", "setpoints of mode 8", "refused"),
+    "607C": Use(_R, "Home offset", "that home is at `offset`", "0, the standard's default"),
+    "6085": Use(_P, "Quick stop deceleration", "its quick-stop ramp", "its own ramp"),
+    "6098": Use(_N, "Homing method", "homing, where configured", "refused"),
+    "6099": Use(_N, "Homing speeds", "homing, where configured", "refused"),
+    "609A": Use(_R, "Homing acceleration", "homing, where configured", "its own"),
+    "60B1": Use(_R, "Velocity offset", "the velocity feed-forward", "it follows with a lag of its own"),
+    "60C0": Use(_R, "Interpolation sub mode select", "linear interpolation", "its own"),
+    "60C1": Use(_N, "Interpolation data record", "setpoints of mode 7", "refused"),
+    "60C2": Use(_R, "Interpolation time period", "its interpolation", "the time from SYNC to SYNC"),
+    "60C4": Use(_R, "Interpolation data configuration", "an empty buffer", "its own"),
+    "6502": Use(_R, "Supported drive modes", "mode 8 or 7", "mode 8 is tried, then 7"),
 }
-"""By index, or index and subindex. 605B (shutdown) and 605C (disable operation) are not used: power is taken off by
-"disable voltage" and "quick stop", which they do not bear on."""
+"""By index, or index and subindex, of CiA 301 or, from 6000h on, of CiA 402-2. 605B (shutdown) and 605C (disable
+operation) are not used: power is taken off by "disable voltage" and "quick stop", which they do not bear on."""
 
 FOLLOWING_BIT: Final = "6041"
 """What `accept_without` names where bit 12 of the statusword says nothing."""
 PROTECTIONS: Final = {name: used for name, used in USES.items() if used.need is Need.PROTECTION} | {
-    FOLLOWING_BIT: Use(
-        _P, "Bit 12 of the statusword", "saying that it follows setpoints", "that is not looked at", "CiA 402-2, 6041h"
-    )
+    FOLLOWING_BIT: Use(_P, "Bit 12 of the statusword", "saying that it follows setpoints", "that is not looked at")
 }
 """What `accept_without` may name."""
 

@@ -16,11 +16,11 @@ from trirail_drivers.cia402.makers_objects import give_makers_objects
 from trirail_drivers.cia402.modes import choose_modes, give_mode
 from trirail_drivers.cia402.objects import FOLLOWING_BIT
 from trirail_drivers.cia402.pdos import Pdos
+from trirail_drivers.cia402.process_data import Exchange
 from trirail_drivers.cia402.rehearsal import Rehearsal
 from trirail_drivers.cia402.sdo import Remote, RestartedError, SdoRefused
 from trirail_drivers.cia402.settings import give_cycle, give_homing, give_reactions, heartbeat_of
 from trirail_drivers.cia402.units import Units
-from trirail_drivers.cia402.ways import Exchange
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout

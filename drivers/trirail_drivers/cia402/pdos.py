@@ -8,8 +8,7 @@ from typing import Final, NamedTuple
 from trirail_drivers.cia402 import frames
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.objects import title
-from trirail_drivers.cia402.sdo import INVALID, NO_REMOTE_REQUEST, SdoRefused
-from trirail_drivers.cia402.ways import (
+from trirail_drivers.cia402.process_data import (
     ACTUAL_POSITION,
     CONTROLWORD,
     CYCLIC_SYNCHRONOUS_POSITION,
@@ -21,6 +20,7 @@ from trirail_drivers.cia402.ways import (
     fits_feedback,
     fits_setpoints,
 )
+from trirail_drivers.cia402.sdo import INVALID, NO_REMOTE_REQUEST, SdoRefused
 from trirail_drivers.errors import DriveError
 
 RPDO: Final = 0x1400

@@ -10,7 +10,7 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.cia402 import frames, second_node
+from trirail_drivers.cia402 import duplicate_node, frames
 from trirail_drivers.cia402.conversations import Wait
 from trirail_drivers.interface import Clock
 
@@ -39,7 +39,7 @@ class TwoNodesError(SdoCommunicationError):
     """Requests are answered twice."""
 
     def __init__(self, node: int) -> None:
-        super().__init__(second_node.warning(node, "both answer"))
+        super().__init__(duplicate_node.warning(node, "both answer"))
 
 
 class NoAnswerError(SdoCommunicationError):

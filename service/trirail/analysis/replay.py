@@ -25,11 +25,11 @@ from trirail.config import Config
 from trirail.control.control import Control, Given
 from trirail.control.local_planner import LocalPlanner
 from trirail.errors import ServiceError
-from trirail.motion.planning import MotionPlanner, revision
+from trirail.motion.motion_planner import MotionPlanner, revision
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import Recording
 from trirail.wire.packets import ControlInput, DrivesFault, PlannerLost
-from trirail.wire.planning import PlanAnswer, PlanRequest
+from trirail.wire.plan_packets import PlanAnswer, PlanRequest
 from trirail.wire.vocabulary import MODES, Mode
 
 SETPOINTS = ("commanded_position", "commanded_velocity")

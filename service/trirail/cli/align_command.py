@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 import msgspec
 from cyclopts import App
 
-from trirail.cli import alignment_lines, terminal, units
+from trirail.cli import alignment_lines, notation, terminal
 from trirail.cli.mark_options import MarkSource
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
@@ -29,15 +29,15 @@ def calibrate(
     file: Path = FILE,
     /,
     *,
-    by: units.Length = 1e-3,
-    angle: units.Angle = "1deg",
+    by: notation.Length = 1e-3,
+    angle: notation.Angle = "1deg",
     one_camera: Annotated[bool, Flag] = False,
     lens: Literal["affine", "perspective", "radial"] = "affine",
     centre: tuple[float, float] | None = None,
-    approach: units.PoseWay = units.AT_REST,
+    approach: notation.PoseWay = notation.AT_REST,
     looks: int = 1,
     wait: float = 0.0,
-    speed: units.Share = 1.0,
+    speed: notation.Share = 1.0,
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
@@ -78,7 +78,7 @@ def calibrate(
         raise TrirailError(
             "a radial lens wants --centre U V, the pixel on its axis: the middle of the picture for most"
         )
-    moves = moves_for(lens, by, units.radians(angle, False))
+    moves = moves_for(lens, by, notation.radians(angle, False))
     with source.opened() as (look, known), Robot(service.robot, service.connect, tls=service.tls) as robot:
         views = dict.fromkeys(look(), "camera") if one_camera else known
         wishes = calibration_by_moves(moves, views, lens, centre or (0.0, 0.0), looks, _approach(approach))
@@ -97,14 +97,14 @@ def run(
     file: Path = FILE,
     /,
     *,
-    tolerance: units.Length = 1e-6,
-    angle: units.Angle = "24urad",
+    tolerance: notation.Length = 1e-6,
+    angle: notation.Angle = "24urad",
     corrections: int = 3,
     distance_ppm: float = 1000.0,
-    approach: units.PoseWay = units.AT_REST,
+    approach: notation.PoseWay = notation.AT_REST,
     looks: int = 1,
     wait: float = 0.0,
-    speed: units.Share = 1.0,
+    speed: notation.Share = 1.0,
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
@@ -141,7 +141,7 @@ def run(
         kept.calibration,
         kept.targets,
         tolerance,
-        units.radians(angle, False),
+        notation.radians(angle, False),
         corrections,
         distance_ppm * 1e-6,
         looks,
@@ -168,7 +168,7 @@ def check(
     moves: Annotated[bool, Flag] = False,
     looks: int = 1,
     wait: float = 0.0,
-    speed: units.Share = 1.0,
+    speed: notation.Share = 1.0,
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
@@ -219,7 +219,7 @@ def check(
 
 
 def _approach(way: tuple[float, float, str]) -> tuple[float, float, float] | None:
-    x, y, phi = way[0], way[1], units.radians(way[2], False)
+    x, y, phi = way[0], way[1], notation.radians(way[2], False)
     return (x, y, phi) if any((x, y, phi)) else None
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from trirail.cli import units
+from trirail.cli import notation
 from trirail.cli.doctor_can import can_interface
 from trirail.cli.doctor_cycle import cycle
 from trirail.cli.doctor_network import metrics, network, routers
@@ -126,4 +126,4 @@ def corrected(config: Config) -> list[Check]:
     """What as-built errors are corrected by: nobody should have to guess that it is on."""
     section = config.correction
     words = as_built.summary(section.map, section.as_built, section.backlash)
-    return [] if words is None else [Check("correction", "ok", units.correction(words, config.geometry.labels))]
+    return [] if words is None else [Check("correction", "ok", notation.correction(words, config.geometry.labels))]

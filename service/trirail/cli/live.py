@@ -14,7 +14,7 @@ from rich.table import Table
 from trirail_drivers.interface import MissingProtection
 
 from trirail import naming
-from trirail.cli import units
+from trirail.cli import notation
 from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain, say
 from trirail.errors import ServiceError
 from trirail.naming import Labels
@@ -35,7 +35,7 @@ def show(state: State, info: Info) -> None:
     """Print a state, with what as-built errors are corrected by, and what drives do without."""
     grid = table(state, info.robot, info.labels, limits_of(info))
     if info.correction is not None:
-        grid.add_row("corrected", plain(units.correction(info.correction, info.labels)))
+        grid.add_row("corrected", plain(notation.correction(info.correction, info.labels)))
     out.print(grid)
     _missing(info.missing_protections, info.labels)
 
@@ -65,7 +65,7 @@ def _say_once_a_second(robot: Robot) -> None:
             due = time.monotonic() + 1.0
             goal = f"  goal {state.goal.id} {state.goal.progress:.0%}" if state.goal else ""
             faults = "".join(f"  {fault}" for fault in state.faults)
-            say(f"{state.t:.2f} s  {state.mode}  {units.pose(state.pose)}{goal}{faults}")
+            say(f"{state.t:.2f} s  {state.mode}  {notation.pose(state.pose)}{goal}{faults}")
 
 
 def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
@@ -98,13 +98,13 @@ def table(state: State, robot: str, labels: Labels, limits: Limits | None = None
     for fault in state.faults:
         grid.add_row("fault", f"[bold red]{plain(fault)}[/]")
     colour = "yellow" if state.override != 1.0 else "default"
-    grid.add_row("override", f"[{colour}]{units.written(state.override * 100.0, '%', 0)}[/]")
+    grid.add_row("override", f"[{colour}]{notation.written(state.override * 100.0, '%', 0)}[/]")
     if state.lease is not None:
         grid.add_row("lease", f"held by {plain(state.lease)}")
     if state.goal:
         _add_goal(grid, state, state.goal)
-    grid.add_row("measured", units.pose(state.pose, 9))
-    grid.add_row("commanded", units.pose(state.commanded.pose, 9))
+    grid.add_row("measured", notation.pose(state.pose, 9))
+    grid.add_row("commanded", notation.pose(state.commanded.pose, 9))
     _add_sliders(grid, state, labels)
     for words in near_limits(state, limits, labels) if limits else ():
         grid.add_row("[yellow]near[/]", plain(words))
@@ -141,13 +141,13 @@ def _position(name: str, at: float, ends: Sequence[float], unit: str, digits: in
     low, high = ends
     limit = low if at - low < high - at else high
     if abs(limit - at) <= NEAR * (high - low) or not low <= at <= high:
-        yield f"{name} {units.written(at, unit, digits)}, limit {units.written(limit, unit, digits)}"
+        yield f"{name} {notation.written(at, unit, digits)}, limit {notation.written(limit, unit, digits)}"
 
 
 def _rate(name: str, at: float, most: float, unit: str, digits: int) -> Iterator[str]:
     if abs(at) >= (1.0 - NEAR) * most:
         limit = math.copysign(most, at)
-        yield f"{name} {units.written(at, unit, digits)}, limit {units.written(limit, unit, digits)}"
+        yield f"{name} {notation.written(at, unit, digits)}, limit {notation.written(limit, unit, digits)}"
 
 
 def _mode(state: State) -> str:
@@ -159,22 +159,22 @@ def _mode(state: State) -> str:
 
 def _add_goal(grid: Table, state: State, goal: GoalState) -> None:
     if goal.lag is not None:
-        grid.add_row("goal", f"{plain(goal.id)}  follows its target, {units.written(goal.lag, 'm', 6)} behind")
+        grid.add_row("goal", f"{plain(goal.id)}  follows its target, {notation.written(goal.lag, 'm', 6)} behind")
     else:
         grid.add_row("goal", f"{plain(goal.id)}  {goal.progress:.0%}, {left(state, goal)}")
     if goal.target is not None:
-        grid.add_row("  target", units.pose(goal.target, 9))
-        grid.add_row("  to go", units.pose([end - at for end, at in zip(goal.target, state.pose, strict=True)], 9))
+        grid.add_row("  target", notation.pose(goal.target, 9))
+        grid.add_row("  to go", notation.pose([end - at for end, at in zip(goal.target, state.pose, strict=True)], 9))
 
 
 def _add_sliders(grid: Table, state: State, labels: Labels) -> None:
     sliders = state.sliders
     for index, name in enumerate(labels):
         written = (
-            units.written(sliders.position[index], "mm", 3, 9),
-            f"commanded {units.written(state.commanded.position[index], 'mm', 3, 9)}",
-            f"error {units.written(sliders.following_error[index], 'µm', 1, 7)}",
-            units.written(sliders.velocity[index], "mm/s", 2, 8),
+            notation.written(sliders.position[index], "mm", 3, 9),
+            f"commanded {notation.written(state.commanded.position[index], 'mm', 3, 9)}",
+            f"error {notation.written(sliders.following_error[index], 'µm', 1, 7)}",
+            notation.written(sliders.velocity[index], "mm/s", 2, 8),
             sliders.status[index],
         )
         grid.add_row(f"slider {name}", "  ".join(written))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Annotated
 
-from trirail.cli import terminal, units
+from trirail.cli import notation, terminal
 from trirail.cli.options import DEFAULT, Flag, Offline
 from trirail.errors import KinematicsError
 from trirail.wire.units import ANGULAR_ACCELERATION, ANGULAR_VELOCITY
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 def ik(
-    x: units.Length,
-    y: units.Length,
-    phi: units.Angle,
+    x: notation.Length,
+    y: notation.Length,
+    phi: notation.Angle,
     /,
     *,
-    velocity: units.PoseVelocity = units.AT_REST,
-    acceleration: units.PoseAcceleration = units.AT_REST,
+    velocity: notation.PoseVelocity = notation.AT_REST,
+    acceleration: notation.PoseAcceleration = notation.AT_REST,
     deg: Annotated[bool, Flag] = False,
     offline: Offline = DEFAULT,
 ) -> int:
@@ -55,9 +55,9 @@ def ik(
     from trirail.workspace.singularity import conditioning, distance_to_singularity, sensitivity
 
     config, robot = robot_of(offline)
-    pose = np.array([x, y, units.radians(phi, deg)])
-    rates = [*velocity[:2], units.radians(velocity[2], deg, ANGULAR_VELOCITY)]
-    changes = [*acceleration[:2], units.radians(acceleration[2], deg, ANGULAR_ACCELERATION)]
+    pose = np.array([x, y, notation.radians(phi, deg)])
+    rates = [*velocity[:2], notation.radians(velocity[2], deg, ANGULAR_VELOCITY)]
+    changes = [*acceleration[:2], notation.radians(acceleration[2], deg, ANGULAR_ACCELERATION)]
     motion = inverse(robot, pose, rates, changes)
     _check_reach(config, robot, pose)
     solved = {name: values.tolist() for name, values in motion._asdict().items()}
@@ -72,13 +72,15 @@ def ik(
         return 0
     _print_pose(pose)
     _print_joints(robot, solved, sensitivities)
-    terminal.say(f"conditioning {isotropy:.3f} (1 is isotropic), singular {units.written(distance, '°', 2)} away in φ")
+    terminal.say(
+        f"conditioning {isotropy:.3f} (1 is isotropic), singular {notation.written(distance, '°', 2)} away in φ"
+    )
     for warning in warnings:
         terminal.complain(f"warning: the service would refuse this: {warning}")
     return 0
 
 
-def fk(a: units.Length, b: units.Length, c: units.Length, /, *, offline: Offline = DEFAULT) -> int:
+def fk(a: notation.Length, b: notation.Length, c: notation.Length, /, *, offline: Offline = DEFAULT) -> int:
     """Solve the forward kinematics: the pose at which the sliders stand as given.
 
     Sliders beyond their travel, and a pose that the robot cannot reach, are an error.
@@ -134,7 +136,7 @@ def _out_of_reach(found: list[Violation]) -> KinematicsError:
 
 def _print_pose(pose: Array) -> None:
     values = pose.tolist()
-    terminal.say(f"{units.pose(values)} = {units.written(values[2], 'rad', 6)}")
+    terminal.say(f"{notation.pose(values)} = {notation.written(values[2], 'rad', 6)}")
 
 
 def _print_joints(robot: Geometry, solved: dict[str, list[float]], sensitivities: Array) -> None:
@@ -147,8 +149,8 @@ def _print_joints(robot: Geometry, solved: dict[str, list[float]], sensitivities
         ("  velocity", "passive_velocity", 1e3, "mm/s"),
         ("  acceleration", "passive_acceleration", 1.0, "m/s²"),
     ):
-        table.add_row(title, *(units.number(value * scale, 3) for value in solved[name]), unit)
+        table.add_row(title, *(notation.number(value * scale, 3) for value in solved[name]), unit)
     columns = sensitivities.T * [[1.0], [1.0], [1e3 * math.radians(1.0)]]
     for axis, unit, values in zip("xyφ", ("mm/mm", "mm/mm", "mm/°"), columns.tolist(), strict=True):
-        table.add_row(f"slider per {axis}", *(units.number(value, 3) for value in values), unit)
+        table.add_row(f"slider per {axis}", *(notation.number(value, 3) for value in values), unit)
     terminal.out.print(table)

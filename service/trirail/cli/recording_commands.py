@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.text import Text
 
-from trirail.cli import alignment_lines, terminal, units
+from trirail.cli import alignment_lines, notation, terminal
 from trirail.cli.options import Flag
 from trirail.errors import ServiceError, TrirailError
 from trirail.naming import Labels, label
@@ -103,9 +103,9 @@ def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Fl
 def export(
     *file: Recordings,
     out: Path | None = None,
-    begin: Annotated[units.Time | None, Parameter(name="--from")] = None,
-    end: Annotated[units.Time | None, Parameter(name="--to")] = None,
-    every: units.Time | None = None,
+    begin: Annotated[notation.Time | None, Parameter(name="--from")] = None,
+    end: Annotated[notation.Time | None, Parameter(name="--to")] = None,
+    every: notation.Time | None = None,
     columns: str = "",
     goal: str | None = None,
     json: Annotated[bool, Flag] = False,

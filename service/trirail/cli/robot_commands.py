@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import msgspec
 from cyclopts import CycloptsError, Parameter, validators
 
-from trirail.cli import live, terminal, units
+from trirail.cli import live, notation, terminal
 from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
 from trirail.cli.options import poses as poses_of_robot
 from trirail.naming import Labels
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from trirail.client.client import GoalHandle, Robot
     from trirail.wire.messages import Event
 
-Tool = Annotated[units.ToolPoint, Parameter(completer=tools)]
+Tool = Annotated[notation.ToolPoint, Parameter(completer=tools)]
 
 
 NO_END = "the jog has no known end"
@@ -37,13 +37,13 @@ NO_END = "the jog has no known end"
 
 def goto(
     x: Annotated[str, Parameter(completer=poses_of_robot)],
-    y: units.Length | None = None,
-    phi: units.Angle | None = None,
+    y: notation.Length | None = None,
+    phi: notation.Angle | None = None,
     /,
     *,
     wait: Annotated[bool, Flag] = False,
-    speed: units.Share = 1.0,
-    blend: units.Distance | None = None,
+    speed: notation.Share = 1.0,
+    blend: notation.Distance | None = None,
     tool: Tool | None = None,
     frame: Annotated[str, Parameter(completer=frames)] = "base",
     deg: Annotated[bool, Flag] = False,
@@ -77,9 +77,9 @@ def goto(
 
     if y is None or phi is None:
         if y is not None:
-            typed = f"X = {x} and Y = {units.written(y, 'mm', 3)}"
+            typed = f"X = {x} and Y = {notation.written(y, 'mm', 3)}"
             raise CycloptsError(msg=f"goto takes X, Y and PHI: here are {typed}, and PHI is missing, the angle, as 0")
-        if units.is_length(x) or tool is not None or frame != "base":
+        if notation.is_length(x) or tool is not None or frame != "base":
             raise CycloptsError(
                 msg="goto takes X, Y and PHI, or the NAME of a pose, that knows no --tool and no --frame"
             )
@@ -87,22 +87,22 @@ def goto(
         with Robot(service.robot, service.connect, tls=service.tls) as robot:
             return _follow(service, robot, robot.move_to_named(x, speed=speed, blend=blend), wait, x)
     try:
-        at, angle = quantity(x, LENGTH), units.radians(phi, deg)
+        at, angle = quantity(x, LENGTH), notation.radians(phi, deg)
     except ValueError as error:
         raise CycloptsError(msg=f"Invalid value for X: {error}") from error
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         goal = robot.move_to(x=at, y=y, phi=angle, speed=speed, blend=blend, tool=tool, frame=frame)
-        return _follow(service, robot, goal, wait, units.pose((at, y, angle)))
+        return _follow(service, robot, goal, wait, notation.pose((at, y, angle)))
 
 
 def move(
-    dx: units.Length,
-    dy: units.Length,
-    dphi: units.Angle,
+    dx: notation.Length,
+    dy: notation.Length,
+    dphi: notation.Angle,
     /,
     *,
     wait: Annotated[bool, Flag] = False,
-    speed: units.Share = 1.0,
+    speed: notation.Share = 1.0,
     tool: Tool | None = None,
     frame: Annotated[str, Parameter(completer=axes)] = "base",
     measured: Annotated[bool, Flag] = False,
@@ -135,11 +135,11 @@ def move(
     """
     from trirail.client.client import Robot
 
-    angle = units.radians(dphi, deg)
+    angle = notation.radians(dphi, deg)
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         origin: Literal["commanded", "measured"] = "measured" if measured else "commanded"
         goal = robot.move(x=dx, y=dy, phi=angle, speed=speed, tool=tool, frame=frame, origin=origin)
-        return _follow(service, robot, goal, wait, f"by {units.pose((dx, dy, angle))}")
+        return _follow(service, robot, goal, wait, f"by {notation.pose((dx, dy, angle))}")
 
 
 def goal(content: str, /, *, wait: Annotated[bool, Flag] = False, service: Service = HERE) -> int:
@@ -160,13 +160,13 @@ def goal(content: str, /, *, wait: Annotated[bool, Flag] = False, service: Servi
 
 
 def sliders(
-    a: units.Length,
-    b: units.Length,
-    c: units.Length,
+    a: notation.Length,
+    b: notation.Length,
+    c: notation.Length,
     /,
     *,
     wait: Annotated[bool, Flag] = False,
-    speed: units.Share = 1.0,
+    speed: notation.Share = 1.0,
     service: Service = HERE,
 ) -> int:
     """Move the sliders to positions; also the way out of a pose that goto refuses.
@@ -193,12 +193,12 @@ def sliders(
 
 
 def jog(
-    vx: units.Velocity | None = None,
-    vy: units.Velocity | None = None,
-    w: units.AngularVelocity | None = None,
+    vx: notation.Velocity | None = None,
+    vy: notation.Velocity | None = None,
+    w: notation.AngularVelocity | None = None,
     /,
     *,
-    seconds: units.Time | None = None,
+    seconds: notation.Time | None = None,
     gamepad: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
@@ -294,7 +294,7 @@ def teach(name: str, /, *, service: Service = HERE) -> int:
     check_new_pose(name)
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         pose = robot.teach(name)
-    show(service, msgspec.to_builtins(pose), f"{name}: {units.pose((pose.x, pose.y, pose.phi))}")
+    show(service, msgspec.to_builtins(pose), f"{name}: {notation.pose((pose.x, pose.y, pose.phi))}")
     return 0
 
 
@@ -310,7 +310,7 @@ def forget(name: Annotated[str, Parameter(completer=taught_poses)], /, *, servic
 
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         pose = robot.forget(name)
-    show(service, msgspec.to_builtins(pose), f"{name} is removed; it was {units.pose((pose.x, pose.y, pose.phi))}")
+    show(service, msgspec.to_builtins(pose), f"{name} is removed; it was {notation.pose((pose.x, pose.y, pose.phi))}")
     return 0
 
 
@@ -326,13 +326,13 @@ def poses(*, service: Service = HERE) -> int:
     width = max(map(len, found), default=0)
     for name, pose in found.items():
         whose = "taught" if pose.taught else "of [poses]"
-        terminal.say(f"{name:<{width}}   {units.pose((pose.x, pose.y, pose.phi), 9)}   {whose}")
+        terminal.say(f"{name:<{width}}   {notation.pose((pose.x, pose.y, pose.phi), 9)}   {whose}")
     if not found:
         terminal.say("there is none: trirail teach NAME makes one of where the robot stands")
     return 0
 
 
-def override(percent: units.Percent, /, *, service: Service = HERE) -> int:
+def override(percent: notation.Percent, /, *, service: Service = HERE) -> int:
     """Send the one command that takes a number.
 
     Parameters
@@ -352,7 +352,7 @@ WAKE_EVERY = 0.2
 """How often who waits looks for a signal: the kernel may have handed it to another thread, which wakes nobody [s]."""
 
 
-def acquire(*, force: Annotated[bool, Flag] = False, timeout: units.Time = 1.0, service: Service = HERE) -> int:
+def acquire(*, force: Annotated[bool, Flag] = False, timeout: notation.Time = 1.0, service: Service = HERE) -> int:
     """Hold the lease until Ctrl-C or SIGTERM, or until it is lost.
 
     Parameters
@@ -483,7 +483,7 @@ def confirmed(service: Service, name: Command, reply: CommandReply) -> None:
 
 
 def _sliders(labels: Labels, *positions: float) -> str:
-    return "   ".join(f"{name} {units.written(at, 'mm', 3)}" for name, at in zip(labels, positions, strict=True))
+    return "   ".join(f"{name} {notation.written(at, 'mm', 3)}" for name, at in zip(labels, positions, strict=True))
 
 
 def _follow(service: Service, robot: Robot, goal: GoalHandle, wait: bool, title: str) -> int:

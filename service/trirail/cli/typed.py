@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from trirail.cli.units import TOOL
+from trirail.cli.notation import TOOL
 
 OF_THREE: Final = ("goto", "move", "sliders", "jog", "ik", "fk")
 """Commands that take three numbers, or poses of three."""

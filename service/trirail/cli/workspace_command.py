@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from trirail.cli import terminal, units
+from trirail.cli import notation, terminal
 from trirail.cli.math_commands import robot_of
 from trirail.cli.options import DEFAULT, Flag, Offline
 from trirail.errors import TrirailError
@@ -27,7 +27,7 @@ SLICES = 8
 def workspace(
     *,
     plot: Path | None = None,
-    phi: units.Angles = (),
+    phi: notation.Angles = (),
     deg: Annotated[bool, Flag] = False,
     offline: Offline = DEFAULT,
 ) -> int:
@@ -50,7 +50,7 @@ def workspace(
     config, robot = robot_of(offline)
     limits = config.limits
     service, reach = extent(robot, limits, permitted), extent(robot, limits, reachable)
-    angles = [units.radians(angle, deg) for angle in phi] or _round_angles(*service.phi)
+    angles = [notation.radians(angle, deg) for angle in phi] or _round_angles(*service.phi)
     slices = [(angle, permitted(robot, limits, angle), reachable(robot, limits, angle)) for angle in angles]
     at_zero = area(permitted(robot, limits, 0.0)), area(reachable(robot, limits, 0.0))
     if plot:
@@ -118,19 +118,21 @@ def _print_extents(service: Extent, reach: Extent, at_zero: tuple[float, float])
     table.add_row("x", *(_range(each.x, 1e3) for each in both), "mm")
     table.add_row("y", *(_range(each.y, 1e3) for each in both), "mm")
     table.add_row("φ", *(_range(each.phi, math.degrees(1.0)) for each in both), "°")
-    table.add_row("area at φ = 0", *(units.number(each * CM2, 3) for each in at_zero), "cm²")
-    table.add_row("greatest area", *(units.number(each.best_area * CM2, 3) for each in both), "cm²")
-    table.add_row("  at φ =", *(units.number(math.degrees(each.best_phi), 2) for each in both), "°")
-    table.add_row("volume", *(units.number(each.volume * CM2, 3) for each in both), "cm² rad")
+    table.add_row("area at φ = 0", *(notation.number(each * CM2, 3) for each in at_zero), "cm²")
+    table.add_row("greatest area", *(notation.number(each.best_area * CM2, 3) for each in both), "cm²")
+    table.add_row("  at φ =", *(notation.number(math.degrees(each.best_phi), 2) for each in both), "°")
+    table.add_row("volume", *(notation.number(each.volume * CM2, 3) for each in both), "cm² rad")
     terminal.out.print(table)
 
 
 def _print_slices(slices: list[tuple[float, float, float]]) -> None:
     table = terminal.table("slice at φ [°]", "permitted [cm²]", "reached [cm²]")
     for angle, inside, whole in slices:
-        table.add_row(units.number(math.degrees(angle), 2), *(units.number(each * CM2, 3) for each in (inside, whole)))
+        table.add_row(
+            notation.number(math.degrees(angle), 2), *(notation.number(each * CM2, 3) for each in (inside, whole))
+        )
     terminal.out.print(table)
 
 
 def _range(ends: tuple[float, float], scale: float) -> str:
-    return " to ".join(units.number(end * scale, 2) for end in ends)
+    return " to ".join(notation.number(end * scale, 2) for end in ends)

@@ -1,7 +1,7 @@
 """A configuration: its keys (`tables`), how it is read (`loading`) and what is refused (`checks`, `explained`)."""
 
-from trirail.config.checks import check_as_built
 from trirail.config.explained import Mistake, explain, overlap
+from trirail.config.impossible import check_as_built
 from trirail.config.loading import SIM, Findings, everything, load, parse
 from trirail.config.network_checks import check_reach
 from trirail.config.tables import (

@@ -12,8 +12,8 @@ from trirail_drivers.errors import FileError
 from trirail_drivers.interface import NAMES
 
 from trirail.config import as_built
-from trirail.config.checks import check, mistakes
 from trirail.config.explained import Mistake, leaves, repaired
+from trirail.config.impossible import check, mistakes
 from trirail.config.tables import Config, FramesTable, Limits
 from trirail.errors import ConfigError
 from trirail.wire.decoding import prepare

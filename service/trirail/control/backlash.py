@@ -2,10 +2,10 @@
 
 A slider with play stands half its width beside its motor, behind it as the motor last went. So the setpoints are the
 sliders' places plus an offset of half a width to the side to which the slider last went, and what the drives measure,
-less the offset, is where the slider is. From one side to the other the offset goes by trirail.motion.take_up, one way
-at a time: a slider that turns back again meanwhile waits for the end of it, and where it has turned twice goes to the
-other side first, since it may have been left anywhere in its play. Where nobody knows to which side a slider last went,
-as after power-on, the offset is zero.
+less the offset, is where the slider is. From one side to the other the offset goes by trirail.motion.backlash_reserve,
+one way at a time: a slider that turns back again meanwhile waits for the end of it, and where it has turned twice goes
+to the other side first, since it may have been left anywhere in its play. Where nobody knows to which side a slider
+last went, as after power-on, the offset is zero.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
-from trirail.motion.take_up import TakeUp
+from trirail.motion.backlash_reserve import TakeUp
 
 __all__ = ["BACKLASH", "KEPT", "TURNS", "add_offset", "backlash", "due_offset", "keep_offset", "let_go", "taking_up"]
 

@@ -25,11 +25,11 @@ from trirail.control.plan_requests import PlannerPort, PlanRequests
 from trirail.control.setpoints import Setpoints
 from trirail.control.transitions import Transitions
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.frames import NamedFrames
+from trirail.motion.backlash_reserve import take_up
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
-from trirail.motion.take_up import take_up
+from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.messages import FaultDetail, Outcome
 from trirail.wire.packets import (
     CommandRequest,
@@ -42,7 +42,7 @@ from trirail.wire.packets import (
     Remark,
     Request,
 )
-from trirail.wire.planning import PlanAnswer
+from trirail.wire.plan_packets import PlanAnswer
 from trirail.wire.records import Part
 from trirail.wire.vocabulary import FaultCause, Mode
 

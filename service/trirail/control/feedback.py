@@ -11,8 +11,8 @@ from trirail.control.backlash import backlash
 from trirail.control.in_position import Settling
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.robot import forward_into
+from trirail.motion.backlash_reserve import NO_BACKLASH, TakeUp
 from trirail.motion.runs import STILL
-from trirail.motion.take_up import NO_BACKLASH, TakeUp
 from trirail.wire.records import DTYPE
 
 WINDOWS = InPosition()

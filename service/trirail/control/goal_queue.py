@@ -11,10 +11,10 @@ from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger, Withdrawal
 from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.frames import NamedFrames
 from trirail.motion.goal_motion import Place
-from trirail.motion.goals import meant
+from trirail.motion.goal_planner import meant
 from trirail.motion.schedule import Schedule
+from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.goals import Goal
 from trirail.wire.messages import Outcome
 from trirail.wire.packets import GoalRequest

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 
 from trirail.config import Config
-from trirail.motion.planning import MotionPlanner
-from trirail.wire.planning import PlanAnswer, PlanRequest
+from trirail.motion.motion_planner import MotionPlanner
+from trirail.wire.plan_packets import PlanAnswer, PlanRequest
 
 
 class LocalPlanner:

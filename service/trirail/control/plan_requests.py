@@ -16,18 +16,18 @@ from trirail_drivers.interface import Triple
 
 from trirail.config import Config, corrected_geometry
 from trirail.errors import RefusalCode, RefusedError
+from trirail.motion.backlash_reserve import planned_limits
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
+from trirail.motion.motion_planner import revision
 from trirail.motion.packing import pack_run, unpack_law, unpack_path, unpack_run
 from trirail.motion.paths import Path, constant
-from trirail.motion.planning import revision
 from trirail.motion.rate_change import RateChange
 from trirail.motion.runs import STILL, MotionState, Run, nominal, rest
 from trirail.motion.schedule import Schedule
-from trirail.motion.take_up import planned_limits
 from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.goals import Goal
-from trirail.wire.planning import Extended, NotPlanned, PlanAnswer, Planned, PlanRequest
+from trirail.wire.plan_packets import Extended, NotPlanned, PlanAnswer, Planned, PlanRequest
 
 LEADS = (0.003, 0.012, 0.048)
 """How long before it is to begin a motion from motion is asked for, each time that it has to be asked for anew [s]."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import ClassVar, Generic, Literal, TypeVar
 
-from trirail.motion.frames import NamedFrames
-from trirail.motion.planner import Plan, Planner
+from trirail.motion.path_planner import PathPlanner, Plan
 from trirail.motion.runs import MotionState
+from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.goal_kind import GoalKind
 
 G = TypeVar("G", bound=GoalKind)
@@ -22,7 +22,7 @@ class GoalMotion(Generic[G]):
     examples: ClassVar[tuple[GoalKind, ...]] = ()
     """Planned from the middle of the workspace before the first goal comes: what runs for the first time is slow."""
 
-    def __init__(self, planner: Planner) -> None:
+    def __init__(self, planner: PathPlanner) -> None:
         self._planner = planner
 
     @staticmethod

@@ -7,7 +7,7 @@ import numpy as np
 from trirail.kinematics.arrays import Array
 from trirail.motion.paths import Path, falls, sound
 from trirail.motion.runs import Run, Seam
-from trirail.wire.planning import PackedPath, PackedRun
+from trirail.wire.plan_packets import PackedPath, PackedRun
 
 POWERS = 6
 """Coefficients of a piece."""

@@ -17,8 +17,8 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from trirail.errors import RefusedError
 from trirail.kinematics.arrays import Array
 from trirail.motion.feasibility import Look
+from trirail.motion.path_planner import GENTLEST, ROOM, TOO_FAST_IN_MOTION, PathPlanner, Plan
 from trirail.motion.paths import Path, constant
-from trirail.motion.planner import GENTLEST, ROOM, TOO_FAST_IN_MOTION, Plan, Planner
 from trirail.motion.quintic import Point, between
 from trirail.motion.ruckig_call import Kinodynamic, solve_within
 from trirail.motion.runs import STILL, MotionState, cut, from_ruckig, joined, nominal
@@ -51,7 +51,7 @@ class _Aim(NamedTuple):
 class Tracker:
     """Plans to follow moving targets, within the limits of platform and sliders."""
 
-    def __init__(self, planner: Planner) -> None:
+    def __init__(self, planner: PathPlanner) -> None:
         self._planner, self._platform = planner, planner.platform
         self._bounds, self._checker = planner.bounds, planner.checker
         self._ruckig = Ruckig(3)

@@ -11,10 +11,10 @@ from trirail_drivers.interface import Triple
 from trirail.client import trajectory
 from trirail.client.outgoing import goal_message
 from trirail.errors import KinematicsError, RefusedError, TrirailError
-from trirail.motion.frames import NamedFrames, rotated
-from trirail.motion.goals import Goals
+from trirail.motion.goal_planner import GoalPlanner
 from trirail.motion.runs import nominal, of_centre, of_tool, rest
 from trirail.motion.schedule import Schedule
+from trirail.motion.tool_frames import NamedFrames, rotated
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.goals import TrajectoryGoal
 from trirail.workspace.violations import violations
@@ -71,7 +71,7 @@ def checked_path(robot: ShownRobot, name: str, text: str, stretch: bool) -> Chec
         line = [(point.x, point.y, point.phi) for point in points]
         goal, period = TrajectoryGoal(points, stretch=stretch), 1.0 / robot.rate_hz
         goal_message(goal, "checked")  # as the client does
-        planned = Goals(robot.geometry, robot.limits, period).plan(goal, Schedule(rest(line[0]), period), 1.0, 0)
+        planned = GoalPlanner(robot.geometry, robot.limits, period).plan(goal, Schedule(rest(line[0]), period), 1.0, 0)
     except (TrirailError, ValueError) as error:
         return CheckedPath(str(error), line)
     path = planned.run.path

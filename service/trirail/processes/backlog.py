@@ -9,7 +9,7 @@ from typing import NamedTuple
 from msgspec import structs
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.fair_queue import FairQueue
+from trirail.processes.fairness import FairQueue
 from trirail.processes.incoming import Incoming
 from trirail.wire.packets import GoalRequest
 from trirail.wire.sizes import MAX_UNREAD

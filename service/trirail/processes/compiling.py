@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
-from trirail.processes.memory import give_back
+from trirail.processes.realtime import give_back
 from trirail.processes.systemd import notify
 
 LOADED = "trirail.processes.rehearsal"
@@ -82,7 +82,7 @@ def compile_all(begin: Callable[[str], None]) -> None:
 
 
 def _import_rooms() -> None:
-    from trirail.processes import planner, rehearsal  # noqa: F401 - importing compiles
+    from trirail.processes import planner_process, rehearsal  # noqa: F401 - importing compiles
 
 
 def main() -> int:

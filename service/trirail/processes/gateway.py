@@ -17,24 +17,19 @@ import zenoh
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.commands import CommandReader
-from trirail.processes.crowding import Crowding
+from trirail.processes.alignment_looks import Looks
 from trirail.processes.guard import Guard
 from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox
 from trirail.processes.incoming import Incoming
-from trirail.processes.info import info
-from trirail.processes.last_words import LastWords
-from trirail.processes.looks import Looks
+from trirail.processes.loop_death import LoopDeath
 from trirail.processes.measured import Meter
-from trirail.processes.memory import give_back
 from trirail.processes.poses import Poses
-from trirail.processes.publications import Publications
-from trirail.processes.refusals import Refusals
-from trirail.processes.replies import Replies
-from trirail.processes.requests import Requests
-from trirail.processes.router_links import RouterLinks
-from trirail.processes.state import StateMaker
+from trirail.processes.publications import Publications, StateMaker, info
+from trirail.processes.realtime import give_back
+from trirail.processes.replies import Refusals, Replies
+from trirail.processes.requests import CommandReader, Requests
+from trirail.processes.zenoh_links import Crowding, RouterLinks
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Goal
 from trirail.wire.links import Closed, PacketLink
@@ -85,7 +80,7 @@ class Gateway:
         self._link = link
         self._beat = beat
         self._guard = guard
-        self._last_words = LastWords(config.period)
+        self._loop_death = LoopDeath(config.period)
         self._info = info(config)
         self._states = StateMaker(config)
         self._meter = Meter(measured) if config.telemetry.metrics_port else None
@@ -96,7 +91,7 @@ class Gateway:
         self._inbox = Inbox(opened, self._robot, self._refusals.too_much)
         self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._send_to_loop, self._inbox.wake)
         self._looks = Looks(self._robot, lambda looked: link.send(message(looked)))
-        self._requests = Requests(config, link, guard, self._replies, self._last_words, hurrying)
+        self._requests = Requests(config, link, guard, self._replies, self._loop_death, hurrying)
         self._commands = CommandReader(
             self._robot, self._requests, self._replies, self._states, self._inbox, self._refusals.refuse
         )
@@ -124,7 +119,7 @@ class Gateway:
                     self._handle(incoming)
                 while (packet := self._link.receive()) is not None:
                     self._beat()
-                    self._last_words.heard()
+                    self._loop_death.heard()
                     self._hear(packet, ready)
                 self._requests.send_goals()  # those for which there was no room
                 self._poses.settle()
@@ -216,7 +211,7 @@ class Gateway:
             ready()
 
     def _on_answer(self, answer: Answer) -> None:
-        self._last_words.follow(answer)
+        self._loop_death.follow(answer)
         match answer:
             case Happened(event):
                 self._happened(event)
@@ -266,15 +261,15 @@ class Gateway:
         """Hear what the loop said before it ended: that may be its farewell."""
         with contextlib.suppress(Closed):
             while (packet := self._link.receive()) is not None:
-                self._last_words.heard()
+                self._loop_death.heard()
                 with contextlib.suppress(Closed):  # it takes nothing any more
                     self._hear(packet, ready)
 
     def _tell_of_its_end(self) -> None:
         """The loop has gone: where it has died, tell everyone in its place."""
-        for event in self._last_words.events(self._states.cycle):
+        for event in self._loop_death.events(self._states.cycle):
             self._happened(event)
-        if (reason := self._last_words.reason) and self._states.cycle:
+        if (reason := self._loop_death.reason) and self._states.cycle:
             state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason,))
             self._publications.state(state)
 

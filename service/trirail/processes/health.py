@@ -1,4 +1,4 @@
-"""Whether each process does its work: what the supervisor knows of it, and its heartbeats.
+"""Whether each process does its work, and what was measured: what the supervisor keeps for whoever watches.
 
 The supervisor looks once in each of its turns; who asks does so in a thread of its own, so that a supervisor that is
 held up itself, by its output for one, is told as well.
@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Final, NamedTuple
+from contextlib import ExitStack
+from typing import Any, Final, NamedTuple
 
+from trirail.config import Config
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
+from trirail.processes.measured import Measurements, RecorderMeasured, ServiceMeasured
+from trirail.wire.decoding import converted, prepare
 
 SILENT: Final = 3.0
 """A process is told as frozen that has given no sign of life for so long [s]; most have been killed for it by then."""
@@ -70,3 +74,41 @@ class Health:
         if not running.ready:
             return "starting"
         return "no sign of life" if silent else ""
+
+
+KINDS: Final = {"gateway": ServiceMeasured, "recorder": RecorderMeasured}
+"""What each process measures."""
+prepare(*KINDS.values())
+
+
+class Monitor:
+    """Health and measurements; while the context lasts they are served, where [telemetry] metrics_port is given."""
+
+    def __init__(self, config: Config, heartbeats: Heartbeats, turn: float) -> None:
+        self._config = config
+        self.health = Health(heartbeats, config.period, turn)
+        self.measured = Measurements()
+        self._serving = ExitStack()
+
+    def __enter__(self) -> Monitor:
+        if self._config.telemetry.metrics_port:
+            from trirail.processes.metrics_server import MetricsServer
+
+            self._serving.enter_context(MetricsServer(self._config, self.health, self.measured))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._serving.close()
+
+    def poll(self, processes: Mapping[str, Running]) -> None:
+        """Look at all processes, in every turn of the supervisor's."""
+        self.health.poll(processes)
+
+    def store(self, process: str, content: dict[str, Any]) -> None:
+        """Take what a process has measured."""
+        self.measured.store(process, converted(content, KINDS[process]))
+
+    def end(self, processes: Mapping[str, Running]) -> None:
+        """Look for the last time: the service is ending."""
+        self.health.poll(processes)
+        self.health.end()

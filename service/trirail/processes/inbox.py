@@ -12,9 +12,8 @@ from functools import partial
 
 import zenoh
 
-from trirail.processes.fair_queue import FairQueue
+from trirail.processes.fairness import FairQueue, Pace
 from trirail.processes.incoming import Incoming, Kind
-from trirail.processes.pace import Pace
 from trirail.processes.stop_door import Answer
 from trirail.wire import zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_UNREAD

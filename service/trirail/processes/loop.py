@@ -19,14 +19,12 @@ from trirail.control.control import Control, Given
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import warm_up
 from trirail.processes import realtime
-from trirail.processes.clock import Overruns, Tick, Ticker
+from trirail.processes.clock import SPARE_NS, Doors, Overruns, Tick, Ticker
 from trirail.processes.heartbeats import Haste, Heartbeats, Watch
-from trirail.processes.planner_port import PlannerLink
-from trirail.processes.ports import Ports
+from trirail.processes.ports import PlannerLink, Ports
 from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
 from trirail.processes.reports import Reports
-from trirail.processes.waiting import SPARE_NS, Doors
 from trirail.wire.packets import (
     Disturbance,
     DrivesFault,

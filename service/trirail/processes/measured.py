@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from trirail.processes.crowding import InUse
+from trirail.processes.zenoh_links import InUse
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.state import FrameCounts, State
 

@@ -12,9 +12,9 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 from trirail_drivers.interface import NAMES
 
-from trirail.processes.crowding import InUse
 from trirail.processes.health import Health, Running
 from trirail.processes.measured import Histogram, Measurements, ServiceMeasured
+from trirail.processes.zenoh_links import InUse
 from trirail.wire.vocabulary import MODES
 
 PREFIX: Final = "trirail"

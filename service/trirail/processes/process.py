@@ -21,7 +21,7 @@ from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.ports import Ports
 from trirail.wire import links
 from trirail.wire.messages import Event
-from trirail.wire.planning import MAX_PLANNING
+from trirail.wire.plan_packets import MAX_PLANNING
 
 
 class Order(msgspec.Struct, frozen=True):
@@ -96,21 +96,21 @@ def _run(child: Child) -> int:
 
         tell_of_compiling(child.compiling)
     if name == "drives":
-        from trirail.processes import drives
+        from trirail.processes import drives_process
 
-        return drives.main(config, child.runtime, child.ready)
+        return drives_process.main(config, child.runtime, child.ready)
     if name == "loop":
-        from trirail.processes import drives, loop
+        from trirail.processes import drives_process, loop
         from trirail.processes.rehearsal import rehearse
 
         gateway, recorder, planner = (socket.socket(fileno=number) for number in child.sockets)
         ports = Ports(links.Port(gateway), links.Port(recorder), links.Port(planner, MAX_PLANNING))
-        bus = partial(drives.bus, config, child.runtime)
+        bus = partial(drives_process.bus, config, child.runtime)
         return loop.main(config, bus, ports, child.heartbeats, child.ready, rehearse)
     if name == "planner":
-        from trirail.processes import planner as thinking
+        from trirail.processes import planner_process
 
-        return thinking.main(config, child.runtime / name, child.heartbeats.of(name), child.ready)
+        return planner_process.main(config, child.runtime / name, child.heartbeats.of(name), child.ready)
     heart = child.heartbeats.of(name)
     link = links.connect(child.runtime / name)
     if name == "gateway":

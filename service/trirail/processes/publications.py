@@ -1,14 +1,34 @@
-"""What the gateway publishes for one robot: the state, every cycle's records, and events with their past."""
+"""What the gateway publishes and answers for one robot: state, records, events with their past, and its info."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import msgspec
+import numpy as np
 import zenoh
+from numpy.typing import NDArray
+from trirail_drivers.interface import NAMES, PowerState, Triple
 from zenoh.ext import CacheConfig, MissDetectionConfig, RepliesConfig, declare_advanced_publisher
 
+from trirail.config import Config, as_built, geometry
+from trirail.telemetry.provenance import software, versions
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import Event
-from trirail.wire.state import RobotSummary, State
+from trirail.wire.packets import Status, Welcome
+from trirail.wire.state import (
+    Commanded,
+    FrameCounts,
+    GoalState,
+    Info,
+    LoopState,
+    Percentiles,
+    RobotSummary,
+    Sliders,
+    State,
+)
+from trirail.wire.vocabulary import MODES, Mode
 
 EVENTS_KEPT = 1000
 """So many events a client hears that asks for the past."""
@@ -57,3 +77,166 @@ class Publications:
     def event(self, event: Event) -> None:
         """Publish an event; who comes later hears it too."""
         self._event.put(msgspec.json.encode(event))
+
+
+WINDOW = 60.0
+"""Span of the timing statistics [s]."""
+
+_ENABLED = [MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING)]
+_NONE = Percentiles(0.0, 0.0, 0.0, 0.0)
+
+
+class StateMaker:
+    """Keeps the newest record and the timing of the last minute."""
+
+    def __init__(self, config: Config) -> None:
+        self._period = config.period
+        self._rate_hz = config.loop.rate_hz
+        self._lateness = _Recent(round(WINDOW / config.period))
+        self._cycle = _Recent(round(WINDOW / config.period))
+        self._statistics = _NONE, _NONE
+        self._statistics_due = 0
+        self._newest: Any = None
+        self._velocity = self._acceleration = np.zeros(3)
+        self._error_max = np.zeros(3)
+        self._welcome = Welcome((), 0.0, 0.0)
+        self._status = Status(None, 1.0, None)
+
+    def update(self, news: Status | Welcome) -> None:
+        """Take in what the loop says beside its records."""
+        if isinstance(news, Welcome):
+            self._welcome = news
+        else:
+            self._status = news
+
+    def records(self, rows: NDArray[np.void]) -> None:
+        """Take in a batch of records."""
+        newest, before = rows[-1], self._newest
+        if before is not None:
+            # Over a batch and not over a cycle: at 1 kHz a count of the encoder is a large step of velocity.
+            span = (int(newest["cycle"]) - int(before["cycle"])) * self._period
+            velocity = (newest["pose"] - before["pose"]) / span
+            self._acceleration = (velocity - self._velocity) / span
+            self._velocity = velocity
+        self._newest = newest.copy()
+        enabled = rows["following_error"][np.isin(rows["mode"], _ENABLED)]
+        if len(enabled):
+            self._error_max = np.maximum(self._error_max, np.abs(enabled).max(axis=0))
+        self._lateness.extend(rows["lateness_ns"])
+        self._cycle.extend(rows["parts_ns"].sum(axis=1))
+        if newest["cycle"] >= self._statistics_due:
+            self._statistics_due = int(newest["cycle"]) + self._rate_hz
+            self._statistics = self._lateness.percentiles(), self._cycle.percentiles()
+
+    @property
+    def lease(self) -> str | None:
+        """Who holds the lease."""
+        return self._status.lease
+
+    @property
+    def cycle(self) -> int:
+        """Cycle of the newest record; 0 for none."""
+        return 0 if self._newest is None else int(self._newest["cycle"])
+
+    def newest(self, warnings: tuple[str, ...] = ()) -> State:
+        """Make the state of the newest record; with what people should know of how the service is run."""
+        row = self._newest
+        lateness, cycle = self._statistics
+        goal = self._status.goal
+        a, b, c = self._status.counts
+        offset = row["backlash"]  # in what the drives are told and tell, not where the sliders are
+        return State(
+            seq=int(row["cycle"]),
+            t=round(int(row["cycle"]) * self._period, 9),
+            mode=MODES[row["mode"]],
+            pose=_triple(row["pose"]),
+            velocity=_triple(self._velocity),
+            acceleration=_triple(self._acceleration),
+            commanded=Commanded(
+                pose=_triple(row["commanded_pose"]),
+                pose_velocity=_triple(row["commanded_pose_velocity"]),
+                pose_acceleration=_triple(row["commanded_pose_acceleration"]),
+                position=_triple(row["commanded_position"] - offset),
+                velocity=_triple(row["commanded_velocity"]),
+                acceleration=_triple(row["commanded_acceleration"]),
+            ),
+            sliders=Sliders(
+                position=_triple(row["position"] - offset),
+                velocity=_triple(row["velocity"]),
+                following_error=_triple(row["following_error"]),
+                following_error_max=_triple(self._error_max),
+                status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
+                traffic=(FrameCounts(*a), FrameCounts(*b), FrameCounts(*c)),
+            ),
+            goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._status.target, self._status.lag)
+            if goal
+            else None,
+            settled=bool(row["settled"]),
+            override=self._status.override,
+            lease=self._status.lease,
+            faults=(self._status.fault,) if self._status.fault else (),
+            warnings=(*warnings, self._status.unrecorded) if self._status.unrecorded else warnings,
+            loop=LoopState(
+                rate_hz=self._rate_hz,
+                cycles=int(row["cycle"]),
+                overruns=int(row["overruns"]),
+                lateness_us=lateness,
+                cycle_us=cycle,
+                bus_load=self._welcome.bus_load,
+                bus_load_measured=self._status.bus_load,
+                lacking=self._welcome.lacking,
+            ),
+        )
+
+
+class _Recent:
+    """The last so many values [ns]."""
+
+    def __init__(self, size: int) -> None:
+        self._values = np.zeros(size, dtype=np.int64)
+        self._next = 0
+        self._full = False
+
+    def extend(self, values: NDArray[np.int64]) -> None:
+        places = (self._next + np.arange(len(values))) % len(self._values)
+        self._values[places] = values
+        self._full = self._full or self._next + len(values) >= len(self._values)
+        self._next = (self._next + len(values)) % len(self._values)
+
+    def percentiles(self) -> Percentiles:
+        values = self._values if self._full else self._values[: self._next]
+        if not len(values):
+            return _NONE
+        p50, p99, p999, most = (np.percentile(values, (50.0, 99.0, 99.9, 100.0)) / 1000.0).tolist()
+        return Percentiles(round(p50, 1), round(p99, 1), round(p999, 1), round(most, 1))
+
+
+def _triple(values: NDArray[np.float64]) -> Triple:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def info(config: Config) -> Info:
+    """Return what a service of this configuration answers on …/info."""
+    live = config.telemetry.live_port
+    legs: list[dict[str, Any]] = []
+    for name, leg in zip(NAMES, geometry(config.geometry).each, strict=True):
+        legs.append({"name": name} | leg.keys())
+    return Info(
+        robot=config.robot.name,
+        version=software().trirail,
+        geometry=tuple(legs),
+        mechanism=config.geometry.kind,
+        labels=config.geometry.labels,
+        limits=msgspec.to_builtins(config.limits),
+        frames=msgspec.to_builtins(config.frames),
+        rate_hz=config.loop.rate_hz,
+        state_hz=config.telemetry.state_hz,
+        recordings=str(Path(config.telemetry.directory).resolve()),
+        live=f"rerun+http://127.0.0.1:{live}/proxy" if live else "",
+        lease=config.control.lease,
+        takeover=config.control.takeover.value,
+        homes=tuple(name for name, drive in zip(NAMES, config.drives.each, strict=True) if drive.homing is not None),
+        versions=versions(),
+        correction=as_built.summary(config.correction.map, config.correction.as_built, config.correction.backlash),
+    )

@@ -24,6 +24,7 @@ from trirail_drivers.driver.cyclic import MOST_FRAMES
 from trirail.control import cycle
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
+from trirail.processes.clock import DOORS, SPARE_NS, called, now_ns, sleep, wait
 from trirail.processes.exchange import (
     AXES,
     EXPECTATIONS,
@@ -37,7 +38,6 @@ from trirail.processes.exchange import (
 )
 from trirail.processes.heartbeats import HASTE
 from trirail.processes.packet_calls import memcpy, receive_frames, send_frames
-from trirail.processes.waiting import DOORS, SPARE_NS, called, now_ns, sleep, wait
 from trirail.wire.records import LONGEST, Part
 
 __all__ = ["COMMAND", "FOLLOW", "HOLD", "STATE", "Reached", "run"]

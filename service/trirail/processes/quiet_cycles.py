@@ -12,11 +12,10 @@ from trirail_drivers.driver.cyclic import Cyclic, Lender
 from trirail.control.control import Calm, Control
 from trirail.motion.paths import Path, constant
 from trirail.processes import quiet
-from trirail.processes.clock import Overruns, Ticker
+from trirail.processes.clock import Doors, Overruns, Ticker
 from trirail.processes.heartbeats import HASTE, PROCESSES, Haste, Heartbeats, Watch
 from trirail.processes.quiet import Reached
 from trirail.processes.reports import Reports
-from trirail.processes.waiting import Doors
 from trirail.wire.links import Port
 from trirail.wire.records import LONGEST, Part
 from trirail.wire.vocabulary import MODES

@@ -1,4 +1,7 @@
-"""The loop's rights: real-time scheduling, locked memory, its own processor, no garbage collector in its way."""
+"""The loop's rights: real-time scheduling, locked memory, its own processor, no garbage collector in its way.
+
+And for every process: memory is given back that starting has touched and running does not need.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,49 @@ import ctypes
 import gc
 import os
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from setproctitle import setproctitle
 
 from trirail.config import LoopTable
 from trirail.errors import ServiceError
 from trirail.processes.interpreter import title
-from trirail.processes.memory import trim
+
+_MADV_DONTNEED = 4
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_libc.madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+
+
+def trim() -> None:
+    """Collect garbage, and return to the system what is free."""
+    gc.collect()
+    _libc.malloc_trim(0)
+
+
+def give_back() -> None:
+    """Trim, and unmap what of libraries their files have as well.
+
+    Loading a library touches most of it, LLVM's 68 MB for instance; what is needed of it later comes from the page
+    cache again.
+    """
+    trim()
+    for start, end in _clean():
+        _libc.madvise(start, end - start, _MADV_DONTNEED)
+
+
+def _clean() -> Iterator[tuple[int, int]]:
+    """Yield the addresses of each mapping of a library that is only read and has nothing of this process's own."""
+    path, rights, start, end = "", "", 0, 0
+    for line in Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines():
+        first, *rest = line.split()
+        if not first.endswith(":"):
+            start, end = (int(address, 16) for address in first.split("-"))
+            rights, path = rest[0], rest[-1]
+        elif first == "Anonymous:" and rest[0] == "0" and rights[1] == "-" and ".so" in path:
+            yield start, end
+
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
@@ -22,8 +60,6 @@ PLANNER_BELOW = 10
 """By so much is the planner's priority lower than the loop's."""
 DRIVES_BELOW = 5
 """The same of simulated drives: a plan takes longer than a drive has for an answer."""
-
-_libc = ctypes.CDLL(None, use_errno=True)
 
 
 def _call(name: str, *arguments: int) -> None:

@@ -16,9 +16,9 @@ import msgspec
 
 from trirail.config import Config
 from trirail.processes.heartbeats import Heart
-from trirail.processes.last_words import LastWords
+from trirail.processes.loop_death import LoopDeath
 from trirail.processes.measured import TOLD_EVERY, RecorderMeasured
-from trirail.processes.memory import give_back
+from trirail.processes.realtime import give_back
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
@@ -58,7 +58,7 @@ class Intake:
         self._ready = ready
         self._cycle = 0
         self._told_unrecorded = ""
-        self._last_words = LastWords(config.period)
+        self._loop_death = LoopDeath(config.period)
         path = Path(record) if record else None
         directory = Path(config.telemetry.directory)
         index = None if path else SessionIndex(directory)  # where somebody wants one file he finds it by himself
@@ -72,7 +72,7 @@ class Intake:
 
     def on_packet(self, packet: bytes) -> None:
         """Take a packet."""
-        self._last_words.heard()
+        self._loop_death.heard()
         content = packet[1:]
         if packet[0] == Kind.RECORDS:
             self._cycle = last_cycle(content)
@@ -92,7 +92,7 @@ class Intake:
 
     def loop_gone(self) -> None:
         """The loop has gone: where it has died, keep what it can no longer say."""
-        for event in self._last_words.events(self._cycle):
+        for event in self._loop_death.events(self._cycle):
             self._hear(Happened(event))
 
     def close(self) -> None:
@@ -102,7 +102,7 @@ class Intake:
 
     def _hear(self, said: Answer) -> None:
         recorder, box = self.recorder, self._box
-        self._last_words.follow(said)
+        self._loop_death.follow(said)
         match said:
             case Happened(event):
                 recorder.event(event)

@@ -20,7 +20,7 @@ from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.config import Config
-from trirail.motion.planning import MotionPlanner
+from trirail.motion.motion_planner import MotionPlanner
 from trirail.processes.clock import Ticker
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.loop import Loop
@@ -29,7 +29,7 @@ from trirail.wire import links
 from trirail.wire.goals import VelocityGoal
 from trirail.wire.links import PacketLink, Port
 from trirail.wire.packets import CommandRequest, GoalRequest, Request, message
-from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
+from trirail.wire.plan_packets import MAX_PLANNING, decode_plan_request, encode
 from trirail.wire.vocabulary import Command, Mode
 
 WITHIN = 500

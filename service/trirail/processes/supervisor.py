@@ -13,18 +13,15 @@ from typing import Any
 
 from trirail.config import Config
 from trirail.errors import ServiceError
-from trirail.processes.child_process import ChildProcess
 from trirail.processes.compiling import Progress
 from trirail.processes.descriptors import raise_limit
-from trirail.processes.hanging import HangWatch
-from trirail.processes.health import Running
-from trirail.processes.heartbeats import PROCESSES, Heartbeats
-from trirail.processes.memory import give_back
-from trirail.processes.monitor import Monitor
+from trirail.processes.health import Monitor, Running
+from trirail.processes.heartbeats import PROCESSES, HangWatch, Heartbeats
 from trirail.processes.process import Order
+from trirail.processes.realtime import give_back
 from trirail.processes.signals import Signals
 from trirail.processes.systemd import Watchdog, notify
-from trirail.processes.warm_parent import WarmParent
+from trirail.processes.warm_parent import ChildProcess, WarmParent
 from trirail.wire import links
 from trirail.wire.messages import Event, Level
 

@@ -1,4 +1,7 @@
-"""The fork server as the supervisor sees it, and the processes that it has forked."""
+"""The fork server and the processes that it has forked, as the supervisor sees them.
+
+Each says on a pipe when it is ready and what it measures; the pipe's end is its end.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,15 @@ import socket
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from trirail.processes.fork_server import LARGEST, MATHEMATICS, OF_TERMINAL, Ended, Fork, Forked, Inheritance, fork
 from trirail.processes.heartbeats import Heartbeats
-from trirail.processes.process import Order
-from trirail.wire.decoding import decoded, prepare
+from trirail.processes.process import COMPILING, HAPPENED, MEASURED, Order
+from trirail.wire.decoding import converted, decoded, prepare
+from trirail.wire.messages import Event
 
 TELLS_WITHIN = 1.0
 """So long after the end of a child the fork server may take to say how it ended [s]."""
@@ -201,3 +206,53 @@ def how_ended(code: int) -> str:
 def hung(silent: float) -> str:
     """Return how a process ended that had given no sign of life for so long [s], for people."""
     return f"no sign of life for {silent:g} s, so it was killed"
+
+
+class ChildProcess:
+    """A child process, and a pipe on which it says that it is ready and whose end is its end."""
+
+    def __init__(self, parent: WarmParent, name: str, record: str | None) -> None:
+        self.name = name
+        self.began = time.monotonic()
+        self.compiling: list[str] = []
+        self.happened: list[Event] = []
+        self.measured: list[dict[str, Any]] = []
+        self._begun_line = b""
+        self.ready_with: dict[str, Any] | None = None
+        self._hung_for = 0.0
+        self.pipe, write = os.pipe()
+        os.set_blocking(self.pipe, False)
+        self.process = parent.fork(name, record, write)
+        os.close(write)
+
+    def listen(self) -> bool:
+        """Read what the child says; False once it has ended."""
+        try:
+            content = os.read(self.pipe, 65_536)
+        except BlockingIOError:
+            return False
+        *lines, self._begun_line = (self._begun_line + content).split(b"\n")
+        for line in lines:
+            said = msgspec.json.decode(line)
+            if COMPILING in said:
+                self.compiling.append(said[COMPILING])
+            elif HAPPENED in said:
+                self.happened.append(converted(said[HAPPENED], Event))
+            elif MEASURED in said:
+                self.measured.append(said[MEASURED])
+            else:
+                self.ready_with = said
+        return bool(content)
+
+    def kill_hung(self, silent: float) -> None:
+        """Kill it for having given no sign of life for so long [s]; SIGTERM would wait, if it is stopped."""
+        self._hung_for = silent
+        self.process.kill()
+
+    @property
+    def how(self) -> str:
+        """How it ended, for people."""
+        code = self.process.returncode
+        if self._hung_for and code == -signal.SIGKILL:
+            return hung(self._hung_for)
+        return how_ended(code) if code else "another process sent it SIGTERM"

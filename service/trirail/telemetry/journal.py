@@ -29,7 +29,7 @@ from trirail.wire.packets import (
     RefusedRequest,
     Remark,
 )
-from trirail.wire.planning import Extended, NotPlanned, Planned
+from trirail.wire.plan_packets import Extended, NotPlanned, Planned
 
 EVENTS, REQUESTS = "/events", "/requests"
 TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()

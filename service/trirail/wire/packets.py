@@ -13,7 +13,7 @@ from trirail.wire.decoding import converted, decoder, prepare
 from trirail.wire.goals import Goal
 from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import Event, Level
-from trirail.wire.planning import PlanAnswer
+from trirail.wire.plan_packets import PlanAnswer
 from trirail.wire.sizes import MAX_PACKET
 from trirail.wire.vocabulary import Command
 

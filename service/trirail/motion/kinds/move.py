@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from trirail.config import PLATFORM
-from trirail.motion.frames import NamedFrames, rotated
 from trirail.motion.goal_motion import GoalMotion, Place
 from trirail.motion.runs import of_tool, rest
+from trirail.motion.tool_frames import NamedFrames, rotated
 from trirail.wire.kinds.move import MoveGoal
 from trirail.wire.kinds.pose import PoseGoal, pose_in_place_of
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NoReturn
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.frames import NamedFrames
 from trirail.motion.goal_motion import GoalMotion, Place
+from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.kinds.named import NamedGoal
 
 

@@ -6,11 +6,11 @@ from msgspec import structs
 
 from trirail.config import BASE, PLATFORM
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.frames import NamedFrames, rotated
 from trirail.motion.goal_motion import GoalMotion, Place
-from trirail.motion.planner import Plan
+from trirail.motion.path_planner import Plan
 from trirail.motion.ruckig_call import Kinodynamic
 from trirail.motion.runs import NO_TOOL, MotionState
+from trirail.motion.tool_frames import NamedFrames, rotated
 from trirail.wire.goals import PoseGoal
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from trirail.motion.goal_motion import GoalMotion
-from trirail.motion.planner import Plan
+from trirail.motion.path_planner import Plan
 from trirail.motion.runs import MotionState
 from trirail.wire.kinds.sliders import SlidersGoal
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from trirail.motion.goal_motion import GoalMotion
-from trirail.motion.planner import Plan, Planner
+from trirail.motion.path_planner import PathPlanner, Plan
 from trirail.motion.runs import MotionState
 from trirail.motion.tracking import Tracker
 from trirail.wire.kinds.track import TrackGoal
@@ -15,7 +15,7 @@ class TrackMotion(GoalMotion[TrackGoal]):
     kind = TrackGoal
     examples = (TrackGoal(0.0, 0.0, 0.0, (0.01, 0.0, 0.0), 0.0),)
 
-    def __init__(self, planner: Planner) -> None:
+    def __init__(self, planner: PathPlanner) -> None:
         super().__init__(planner)
         self._tracker = Tracker(planner)
 

@@ -17,7 +17,7 @@ FROZEN, CYCLES = 0.5, 3
 """The loop sends records every 20 ms, or in every cycle: silent for so long before its end, it was frozen [s]."""
 
 
-class LastWords:
+class LoopDeath:
     """Follows what the loop says; `events` is what is missing when it has gone."""
 
     def __init__(self, period: float, clock: Callable[[], float] = time.monotonic) -> None:

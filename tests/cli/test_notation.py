@@ -15,29 +15,14 @@ import pytest
 from cyclopts import App, Argument, Token
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from trirail.cli import commands, units
-from trirail.cli.units import written
+from trirail.cli import app, notation
+from trirail.cli.notation import written
 from trirail.wire import text
 from trirail.wire.units import ANGLE, DIMENSIONS, LENGTH, Dimension, quantity
 
 Run = Callable[..., tuple[int, str, str]]
 a_unit = st.sampled_from([(dimension, unit) for dimension in DIMENSIONS for unit in dimension.units])
 a_value = st.floats(-1e3, 1e3)
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Call a command as from a terminal; return its exit code and what it printed."""
-
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["trirail", *words])
-        with pytest.raises(SystemExit) as ended:
-            commands.main()
-        printed = capsys.readouterr()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code, printed.out, printed.err
-
-    return call
 
 
 @given(a_unit, a_value, st.integers(0, 9), st.integers(0, 12))
@@ -53,7 +38,7 @@ def test_what_is_printed_is_taken_again_to_its_digits(
 
 @given(a_value, a_value, st.floats(-math.pi, math.pi))
 def test_a_printed_pose_is_one_that_can_be_typed(x: float, y: float, phi: float) -> None:
-    words = re.fullmatch(r"x(.*mm) {3}y(.*mm) {3}φ(.*°)", units.pose((x, y, phi), 9))
+    words = re.fullmatch(r"x(.*mm) {3}y(.*mm) {3}φ(.*°)", notation.pose((x, y, phi), 9))
     assert words is not None
     assert quantity(words[1], LENGTH) == pytest.approx(x, abs=0.51e-6)
     assert quantity(words[2], LENGTH) == pytest.approx(y, abs=0.51e-6)
@@ -81,14 +66,14 @@ def test_an_inch_is_exact() -> None:
 
 @given(st.decimals("0.001", 1, places=4))
 def test_a_share_is_a_number_or_a_percentage(value: Decimal) -> None:
-    assert units.share(str(value)) == float(value)
-    assert units.share(f"{100 * value}%") == pytest.approx(float(value), rel=1e-15)
+    assert notation.share(str(value)) == float(value)
+    assert notation.share(f"{100 * value}%") == pytest.approx(float(value), rel=1e-15)
 
 
 @given(st.decimals(allow_nan=False, allow_infinity=False).filter(lambda value: not Decimal("0.001") <= value <= 1))
 def test_a_share_is_from_a_thousandth_to_one(value: Decimal) -> None:
     with pytest.raises(ValueError, match=r"0\.001 to 1, or 0\.1% to 100%"):
-        units.share(str(value))
+        notation.share(str(value))
 
 
 def is_quantity(word: str) -> bool:
@@ -204,7 +189,7 @@ def test_what_is_wrong_is_one_line_that_says_what_would_be_right(line: str, said
     ],
 )
 def test_a_tool_is_a_point_or_a_name(line: str, tool: object) -> None:
-    _, bound, _ = commands.app.parse_args(units.numbers(line.split()), exit_on_error=False, print_error=False)
+    _, bound, _ = app.app.parse_args(notation.numbers(line.split()), exit_on_error=False, print_error=False)
     assert bound.arguments.get("tool") == tool
     assert len([word for word in bound.args if word != ""]) == 3
 
@@ -229,7 +214,7 @@ def test_half_a_tool_or_half_a_pose_is_wrong_usage(
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["trirail", *line.split()])
     with pytest.raises(SystemExit) as ended:
-        commands.main()
+        app.main()
     assert ended.value.code == 2
     assert said in capsys.readouterr().err
 
@@ -251,7 +236,7 @@ def arguments(app: App, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Argum
 def test_every_length_and_angle_of_the_command_line_takes_microns_and_arcseconds() -> None:
     """An argument is one by its converter, or by the unit that its help names: no other is a bare number of these."""
     taken = set()
-    for name, argument in arguments(commands.app):
+    for name, argument in arguments(app.app):
         convert, said = argument.parameter.converter, argument.parameter.help or ""
         if not callable(convert):
             meant = re.search(r"\[(m|mm|rad|deg)\b|degree|millimetre", said)
@@ -273,7 +258,7 @@ def test_every_length_and_angle_of_the_command_line_takes_microns_and_arcseconds
     assert {("sliders", "a length"), ("fk", "a length"), ("workspace", "an angle"), ("align", "a length")} <= taken
 
 
-PAGE = Path(commands.__file__).parents[1] / "panel" / "page" / "going.js"
+PAGE = Path(app.__file__).parents[1] / "panel" / "page" / "going.js"
 
 
 @pytest.mark.parametrize(("name", "dimension"), [("LENGTHS", LENGTH), ("ANGLES", ANGLE)])

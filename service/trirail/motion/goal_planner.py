@@ -11,14 +11,14 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry
 from trirail.motion import kinds
 from trirail.motion.feasibility import Checker
-from trirail.motion.frames import NamedFrames
 from trirail.motion.goal_motion import GoalMotion, Place
 from trirail.motion.limits import Bounds
+from trirail.motion.path_planner import TOO_FAST_IN_MOTION, PathPlanner, Plan
 from trirail.motion.paths import HALVINGS, Path, constant
-from trirail.motion.planner import TOO_FAST_IN_MOTION, Plan, Planner
 from trirail.motion.runs import MotionState, Run, nominal, rest, stretched
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import TimeScaling
+from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.goal_kind import import_all
 from trirail.wire.goals import Goal
 
@@ -70,7 +70,7 @@ class Extension(NamedTuple):
     slowed: float
 
 
-class Goals:
+class GoalPlanner:
     """Plans the goals of one robot."""
 
     def __init__(
@@ -80,7 +80,7 @@ class Goals:
         checker = Checker(geometry, limits, bounds, period, beat)
         self._checker = checker
         self._period = period
-        self._planner = Planner(geometry, limits.platform, limits.slider, bounds, checker, period)
+        self._planner = PathPlanner(geometry, limits.platform, limits.slider, bounds, checker, period)
         self._motions = {kind: made(self._planner) for kind, made in MOTIONS.items()}
         self.time_scaling = TimeScaling(geometry, checker, period)
 

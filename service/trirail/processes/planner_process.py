@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from trirail.config import Config
-from trirail.motion.planning import MotionPlanner
+from trirail.motion.motion_planner import MotionPlanner
 from trirail.processes import realtime
 from trirail.processes.heartbeats import BEAT_EVERY, Heart
 from trirail.wire import links
 from trirail.wire.links import Closed
-from trirail.wire.planning import MAX_PLANNING, decode_plan_request, encode
+from trirail.wire.plan_packets import MAX_PLANNING, decode_plan_request, encode
 
 
 def main(config: Config, path: Path, heart: Heart, ready: Callable[[object], None]) -> int:

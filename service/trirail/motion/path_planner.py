@@ -54,7 +54,7 @@ class Plan(NamedTuple):
     """How far a point of the platform is at most from where a track's target has it, at the start [m]."""
 
 
-class Planner:
+class PathPlanner:
     """Makes paths within the platform's limits and the sliders'."""
 
     def __init__(

@@ -8,8 +8,8 @@ import pytest
 from conftest import Rig
 from hypothesis import given
 from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.alignment_looks import BURST, RATE, Looks, in_words
 from trirail.processes.incoming import Incoming
-from trirail.processes.looks import BURST, RATE, Looks, in_words
 from trirail.wire import boundary
 from trirail.wire.looks import WELL, AlignmentLook
 from trirail.wire.packets import Looked

@@ -12,9 +12,9 @@ from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits
 from motion.test_motion import only_from_rest
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker
-from trirail.motion.goals import Extension, Goals
+from trirail.motion.goal_planner import Extension, GoalPlanner
 from trirail.motion.limits import Bounds
-from trirail.motion.planner import Planner
+from trirail.motion.path_planner import PathPlanner
 from trirail.motion.runs import rest
 from trirail.motion.schedule import Schedule
 from trirail.wire.goals import PoseGoal, VelocityGoal
@@ -67,7 +67,7 @@ def test_a_robot_that_stops_first_beyond_a_waiting_goals_seam_is_still_on_its_wa
     monkeypatch: pytest.MonkeyPatch, before: int
 ) -> None:
     """It passes where the goal that waited would have begun: that ends nothing, for the goal it stops for has begun."""
-    monkeypatch.setattr(Goals, "_set_out", only_from_rest)
+    monkeypatch.setattr(GoalPlanner, "_set_out", only_from_rest)
     rig = Rig()
     rig.enable()
     accepted(rig, "q0", PoseGoal(0.05, 0.0, 0.0, blend=0.03))
@@ -90,7 +90,7 @@ def test_a_robot_that_stops_first_beyond_a_waiting_goals_seam_is_still_on_its_wa
 @pytest.mark.parametrize("passed", [0.0, 0.4, 0.999])
 def test_a_goal_follows_from_where_the_path_comes_near_its_end_and_is_ahead(blend: float, passed: float) -> None:
     """Not before it, by more than a hair; nor where the path has been, or will be before the answer comes."""
-    goals, lead = Goals(ROBOT, CONFIG.limits, PERIOD), 3
+    goals, lead = GoalPlanner(ROBOT, CONFIG.limits, PERIOD), 3
     run = goals.plan(PoseGoal(0.02, 0.0, 0.0), Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 1.0, lead).run
     run.time = passed * run.path.duration
     extension = goals.append(PoseGoal(0.02, 0.02, 0.0), run, blend, lead)
@@ -107,7 +107,7 @@ def test_a_goal_follows_from_where_the_path_comes_near_its_end_and_is_ahead(blen
 
 def test_behind_a_goal_at_override_zero_another_one_is_planned_at_full_speed() -> None:
     """At which rate the two will run is not known yet."""
-    goals = Goals(ROBOT, CONFIG.limits, PERIOD)
+    goals = GoalPlanner(ROBOT, CONFIG.limits, PERIOD)
     run = goals.plan(PoseGoal(0.05, 0.0, 0.0), Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 0.0, 3).run
     assert run.target == 0.0
     behind = goals.append(PoseGoal(0.0, 0.0, 0.0), run, 0.0, 3)
@@ -120,7 +120,7 @@ def test_behind_a_goal_at_override_zero_another_one_is_planned_at_full_speed() -
 
 def test_a_jog_holds_its_velocity_for_as_long_as_it_may_last_at_the_greatest_override() -> None:
     """Twice its time-out: time along the path runs at up to twice its rate, and the control ends the jog."""
-    goals = Goals(ROBOT, CONFIG.limits, PERIOD)
+    goals = GoalPlanner(ROBOT, CONFIG.limits, PERIOD)
     jog = VelocityGoal(0.02, 0.0, 0.0, timeout=0.5)
     path = goals.plan(jog, Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 1.0, 3).run.path
     held = np.abs(path.pieces[:, 0, 1] - 0.02) + np.abs(path.pieces[:, 0, 2:]).sum(axis=1) < 1e-9
@@ -134,7 +134,7 @@ CHANGES_AT = 2.0 * ACCELERATION**3 / JERK**2
 
 @pytest.mark.parametrize("distance", [CHANGES_AT, math.nextafter(CHANGES_AT, 1.0), CHANGES_AT + 1e-17])
 def test_where_ruckig_changes_its_profile_the_way_takes_no_more_jerk_and_hardly_longer(distance: float) -> None:
-    goals = Goals(ROBOT, CONFIG.limits, PERIOD)
+    goals = GoalPlanner(ROBOT, CONFIG.limits, PERIOD)
     motion = goals.plan(PoseGoal(distance, 0.0, 0.0), Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 1.0, 3)
     assert np.abs(6.0 * motion.run.path.pieces[:, 0, 3]).max() == pytest.approx(JERK, rel=2e-6)
     assert motion.duration == pytest.approx(4.0 * ACCELERATION / JERK, rel=1e-3)
@@ -151,6 +151,6 @@ def test_how_near_a_pose_is_counts_the_edge_that_is_farthest_from_the_centre(far
     limits, robot = CONFIG.limits, Geometry((a, b, c))
     bounds = Bounds(limits, PERIOD)
     checker = Checker(robot, limits, bounds, PERIOD)
-    planner = Planner(robot, limits.platform, limits.slider, bounds, checker, PERIOD)
+    planner = PathPlanner(robot, limits.platform, limits.slider, bounds, checker, PERIOD)
     reach = max(math.hypot(*leg.edge_point) for leg in robot.legs)
     assert planner.nearness((0.03, 0.04, 0.2), (0.0, 0.0, 0.1)) == pytest.approx(0.05 + 0.1 * reach)

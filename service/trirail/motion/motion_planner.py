@@ -15,12 +15,12 @@ import msgspec
 
 from trirail.config import Config, corrected_geometry
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.goals import MOTIONS, Extension, Goals, PlannedMotion
+from trirail.motion.backlash_reserve import planned_limits
+from trirail.motion.goal_planner import MOTIONS, Extension, GoalPlanner, PlannedMotion
 from trirail.motion.packing import pack_path, pack_run, unpack_run
 from trirail.motion.runs import MotionState
 from trirail.motion.schedule import Schedule
-from trirail.motion.take_up import planned_limits
-from trirail.wire.planning import Extended, NotPlanned, PackedRun, PlanAnswer, Planned, PlanRequest
+from trirail.wire.plan_packets import Extended, NotPlanned, PackedRun, PlanAnswer, Planned, PlanRequest
 
 
 def revision(config: Config) -> int:
@@ -38,7 +38,7 @@ class MotionPlanner:
         self._legs = robot.packed()
         self._period = config.period
         self._revision = revision(config)
-        self._goals = Goals(robot, planned_limits(config.limits, config.correction.backlash), config.period, beat)
+        self._goals = GoalPlanner(robot, planned_limits(config.limits, config.correction.backlash), config.period, beat)
 
     def plan(self, request: PlanRequest) -> PlanAnswer:
         """Return the motion to a goal, or why there is none. Whatever goes wrong is an answer."""

@@ -24,7 +24,7 @@ _STARTS: Final = 0x01
 _STOPS: Final = 0x02
 
 
-class Strangers:
+class OtherMasters:
     """Hears on the bus what other masters send to the drives: NMT commands, SYNC, PDOs, this service's heartbeat."""
 
     def __init__(self, wire: Wire, axes: Sequence[Cia402Axis], master_node: int) -> None:

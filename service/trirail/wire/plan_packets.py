@@ -56,8 +56,8 @@ class PlanRequest(Struct, frozen=True):
     runs: tuple[PackedRun, ...]
     """The motion under way, and what follows it."""
     goal: Goal
-    """As trirail.motion.goals.meant has it: its tools are points, its poses those of the base frame, its times the
-    loop's."""
+    """As trirail.motion.goal_planner.meant has it: its tools are points, its poses those of the base frame, its times
+    the loop's."""
     blend: float | None = None
     """How far from the end of the last run this goal may follow it [m]; None where it preempts the motion."""
 

@@ -24,6 +24,7 @@ from trirail.cli import (
     help_pages,
     keys_command,
     math_commands,
+    notation,
     panel_command,
     recording_commands,
     robot_commands,
@@ -32,7 +33,6 @@ from trirail.cli import (
     stop_commands,
     terminal,
     typed,
-    units,
     workspace_command,
 )
 from trirail.cli.completion import Shell, script
@@ -273,7 +273,7 @@ def main() -> None:
             if signal.getsignal(number) is signal.SIG_DFL:  # not where it is ignored, as under nohup
                 signal.signal(number, _terminated)
         code = app(
-            units.numbers(typed.spread(words)), exit_on_error=False, print_error=False, result_action="return_value"
+            notation.numbers(typed.spread(words)), exit_on_error=False, print_error=False, result_action="return_value"
         )
     except CycloptsError as error:
         terminal.complain(_wrong_usage(error, words))

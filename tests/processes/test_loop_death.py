@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.processes.last_words import LastWords
+from trirail.processes.loop_death import LoopDeath
 from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput, Farewell, GoalRequest, Happened, Status
@@ -32,7 +32,7 @@ def ended(seq: int, goal_id: str) -> Happened:
 )
 def test_the_goal_under_way_is_faulted(silent: float, said: str) -> None:
     clock = Clock()
-    words = LastWords(0.001, clock)
+    words = LoopDeath(0.001, clock)
     words.heard()
     words.follow(ended(7, "before"))
     words.follow(ControlInput(1, 3, 0, request("g-1")))
@@ -50,14 +50,14 @@ def test_the_goal_under_way_is_faulted(silent: float, said: str) -> None:
 
 def test_a_slow_loop_is_not_taken_for_frozen() -> None:
     clock = Clock()
-    words = LastWords(1.0, clock)
+    words = LoopDeath(1.0, clock)
     words.heard()
     clock.now += 1.0
     assert "has died" in words.reason
 
 
 def test_nothing_is_added_to_an_end_as_it_should_be() -> None:
-    words = LastWords(0.001)
+    words = LoopDeath(0.001)
     words.heard()
     words.follow(request("g-1"))
     words.follow(Farewell())
@@ -65,7 +65,7 @@ def test_nothing_is_added_to_an_end_as_it_should_be() -> None:
 
 
 def test_a_loop_that_never_turned_says_by_itself_why() -> None:
-    assert LastWords(0.001).events(0) == []
+    assert LoopDeath(0.001).events(0) == []
 
 
 IDS = st.sampled_from("abcd")
@@ -81,7 +81,7 @@ IDS = st.sampled_from("abcd")
     )
 )
 def test_every_goal_ends_once(history: list[tuple[str, str]]) -> None:
-    words = LastWords(0.001)
+    words = LoopDeath(0.001)
     words.heard()
     begun: set[str] = set()
     over: set[str] = set()
