@@ -139,7 +139,7 @@ def test_a_hundred_calls_at_once_take_no_thread(silent: Silent, locator: str) ->
         assert threading.active_count() <= before + 1  # the one in which this test waits
         for query in queries:
             with query:
-                query.reply(query.key_expr, msgspec.json.encode(CommandReply("enable", "holding")))
+                query.reply(query.key_expr, msgspec.json.encode(CommandReply("enable", "holding", 1)))
         await asyncio.gather(*calls)
 
     run(locator, work)

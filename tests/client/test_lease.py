@@ -27,7 +27,7 @@ class Service:
         self.asked.put((name, content))
         if self.refusal is not None:
             raise self.refusal
-        return CommandReply(name, self.mode)
+        return CommandReply(name, self.mode, 0)
 
     def next(self) -> tuple[Command, bytes]:
         return self.asked.get(timeout=20.0)

@@ -67,7 +67,7 @@ class Taken:
                 self.said.append(content)
                 if isinstance(content, Stop):
                     self._end(content.goal)
-                reply = CommandReply(command, "holding")
+                reply = CommandReply(command, "holding", 1)
             query.reply(query.key_expr, msgspec.json.encode(reply))
 
     def _end(self, goal_id: str | None) -> None:

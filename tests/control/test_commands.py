@@ -70,7 +70,7 @@ def test_a_method_of_a_commands_name_sends_that_and_both_clients_have_it(name: C
 
         def command(self, name: str, content: CommandContent | bytes | None = None) -> CommandReply:
             sent.append(name)
-            return CommandReply(name, "holding")
+            return CommandReply(name, "holding", 1)
 
     assert hasattr(Robot, name) == hasattr(AsyncRobot, name)
     if hasattr(Robot, name):

@@ -169,9 +169,9 @@ def test_each_command_is_answered_once_when_its_verdict_is_there(verdicts: list[
         return verdicts[NAMES.index(name)]
 
     for _ in range(rounds):
-        ledger.settle(verdict, "holding")
+        ledger.settle(verdict, "holding", 1)
     assert ledger.answers == [
-        Refused(n, RefusalCode.FAILED, f"{NAMES[n]} failed: {said}") if said else Confirmed(n, NAMES[n], "holding")
+        Refused(n, RefusalCode.FAILED, f"{NAMES[n]} failed: {said}") if said else Confirmed(n, NAMES[n], "holding", 1)
         for n, said in enumerate(verdicts)
         if said is not None
     ]

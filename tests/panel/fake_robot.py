@@ -172,7 +172,7 @@ class FakeRobot:
             self.mode = {"enable": "holding", "disable": "disabled", "reset": "disabled"}.get(name, self.mode)
             self.faults = () if name == "reset" else self.faults
             self.holder = {"acquire": self.user, "release": None}.get(name, self.holder)
-            return CommandReply(name, self.mode)
+            return CommandReply(name, self.mode, 0)
 
     def stop(self) -> None:
         self.command(Command.STOP)

@@ -140,9 +140,9 @@ def test_many_commands_are_refused_but_never_a_stop(rig: Rig) -> None:
         command(gateway, name)
     passed = [request.name for request in link.sent if isinstance(request, CommandRequest)]
     assert passed == ["resume"] * UNDER_WAY + ["stop", "quick_stop", "disable", "pause"]
-    gateway._hear(packets.message(Confirmed(1, Command.RESUME, "holding")), lambda: None)
+    gateway._hear(packets.message(Confirmed(1, Command.RESUME, "holding", 1)), lambda: None)
     for ticket in (UNDER_WAY + 1, UNDER_WAY + 2, UNDER_WAY + 3, UNDER_WAY + 4):
-        gateway._hear(packets.message(Confirmed(ticket, Command.STOP, "holding")), lambda: None)
+        gateway._hear(packets.message(Confirmed(ticket, Command.STOP, "holding", 1)), lambda: None)
     command(gateway, "reset")
     last = link.sent[-1]
     assert isinstance(last, CommandRequest)

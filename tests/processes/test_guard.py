@@ -47,7 +47,7 @@ class Loop:
         request = packets.decode_request(packet[1:])
         self.asked.append(request)
         if isinstance(request, CommandRequest):
-            self.answers.append(packets.message(Confirmed(request.ticket, request.name, "holding")))
+            self.answers.append(packets.message(Confirmed(request.ticket, request.name, "holding", 1)))
         elif isinstance(request, GoalRequest):
             self.answers.append(packets.message(Accepted(request.ticket, request.id, 1.0, 1.0, False, False)))
         return True

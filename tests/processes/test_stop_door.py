@@ -27,7 +27,7 @@ from trirail.wire.messages import CommandReply
 from trirail.wire.stop_door import MAX_LINE, STOPS, StopRequest, stop_address
 from trirail.wire.vocabulary import Command
 
-DONE = CommandReply("stop", "holding")
+DONE = CommandReply("stop", "holding", 1)
 PLACES = 64
 WITHIN = 10.0
 

@@ -94,7 +94,7 @@ class Played:
             )
             no = Refused(request.ticket, RefusalCode.NO_GOAL, "not under way")
             self._packets.append(
-                packets.message(Confirmed(request.ticket, request.name, "holding") if under_way else no)
+                packets.message(Confirmed(request.ticket, request.name, "holding", 1) if under_way else no)
             )
         else:
             return True
@@ -191,7 +191,7 @@ def test_a_late_copy_stops_nothing_and_has_the_answer_of_the_first(opened: zenoh
         ("bob-2", None),
         ("ann-1", None),
     ]
-    assert played.answers[2] == played.answers[4] == played.answers[6] == [CommandReply("stop", "holding")]
+    assert played.answers[2] == played.answers[4] == played.answers[6] == [CommandReply("stop", "holding", 1)]
 
 
 def test_a_goal_that_was_not_read_when_it_alone_was_stopped_does_not_begin(opened: zenoh.Session) -> None:

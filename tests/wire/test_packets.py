@@ -53,7 +53,7 @@ def test_requests(request_: Request) -> None:
     "answer",
     [
         Accepted(1, "g", 0.5, 1.0, False, True),
-        Confirmed(2, Command.STOP, "holding"),
+        Confirmed(2, Command.STOP, "holding", 1),
         Refused(3, RefusalCode.OUT_OF_WORKSPACE, "no", "A", 0.4, 0.3),
         Happened(Event(1, 0.5, 500, 1.0, "goal", "info", "goal g done", id="g", outcome="done")),
         Status("g", 1.0, None),

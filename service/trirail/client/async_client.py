@@ -254,10 +254,11 @@ class AsyncRobot:
         return await self._connection.fetch(("forget", self.user, check_name(name, "pose")), NamedPose)
 
     async def state(self, timeout: float = 2.0) -> State:
-        """Return the next state that is published. Raises ServiceError if none comes within `timeout` seconds."""
+        """Return the next state that is published, as Robot.state does."""
         async with aclosing(self.states(timeout)) as states:
             async for state in states:
-                return state
+                if not self._connection.overtaken(state):
+                    return state
         raise await self._connection.nobody("state")
 
     def states(self, timeout: float | None = None) -> AsyncGenerator[State]:

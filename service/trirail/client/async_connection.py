@@ -130,6 +130,10 @@ class AsyncConnection:
             async for event in _until_silent(received, timeout):
                 yield event
 
+    def overtaken(self, state: State) -> bool:
+        """Whether a state is of before the newest answer or event that this client has."""
+        return self._connection.overtaken(state)
+
     def subscribe_to_events(self, take: Callable[[Event], None], *, history: bool) -> AbstractContextManager[Any]:
         """Have every event taken in the event loop, with `history` the past too."""
         return self._connection.subscribe_to_events(self._hand_over(take), history=history)

@@ -493,12 +493,14 @@ class Robot:
     # ------------------------------------------------------------------ what the service tells
 
     def state(self, timeout: float = 2.0) -> State:
-        """Return the next state that is published. Raises ServiceError if none comes within `timeout` seconds.
+        """Return the next state that is published; after an answer or an event, none of before that.
 
+        Raises ServiceError if none comes within `timeout` seconds.
         `pose` is measured, from the measured sliders; `commanded` is what the drives were told. SI units and radians.
         """
         for state in self.states(timeout):
-            return state
+            if not self._connection.overtaken(state):
+                return state
         raise self._connection.nobody("state")
 
     def states(self, timeout: float | None = None) -> Iterator[State]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import queue
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
@@ -32,8 +33,12 @@ HERE_WITHIN = 1.0
 """How long the answer may take who is connected [s]."""
 POST_WITHIN = 2.0
 """How long the answer may take to what is posted [s]."""
+OVERTAKEN_WITHIN = 1.0
+"""How long a state may be on its way that an answer or an event has overtaken [s]; a service that was started again
+within it, and counts from one, is heard after it."""
 
 T = TypeVar("T", bound=msgspec.Struct)
+Said = TypeVar("Said")
 
 
 class SilenceError(ServiceError):
@@ -57,6 +62,7 @@ class Connection:
         self.close = weakref.finalize(self, zenoh_session.close, self._opened)
         """End it; calls after the first do nothing."""
         self._reader = SampleReader()
+        self._known = 0, 0.0
         self._here = self._opened.liveliness().declare_token(self._key("here", user)) if user is not None else None
 
     @property
@@ -111,7 +117,7 @@ class Connection:
                 answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
             except RefusedError as error:
                 return ServiceError(f"somebody answered at {self._connect}, but {error}")
-            return answer
+            return self._noted(answer)
         refused = refusal(reply.err.payload.to_bytes() if reply.err is not None else b"")
         if isinstance(refused, RefusedError):
             raise refused
@@ -134,7 +140,7 @@ class Connection:
     @contextlib.contextmanager
     def copies(self, stop: StopOrder, take: Callable[[Outcome], None]) -> Iterator[Outcomes]:
         """Send all copies of a stop, and have what comes of each taken, by whatever thread; until the context ends."""
-        at_door = stop.at_door(self._connect, self._credentials, take)
+        at_door = stop.at_door(self._connect, self._credentials, lambda outcome: take(self._noted(outcome)))
         try:
             query = self.query(stop.parts, stop.content, stop.within) | {"attachment": stop.id}
             self._post(query, CommandReply, take)
@@ -225,6 +231,10 @@ class Connection:
         with self.subscribe_to_states(keep_newest):
             yield from _until_silent(received, timeout)
 
+    def overtaken(self, state: State) -> bool:
+        """Whether a state is of before the newest answer or event that this client has."""
+        return state.seq < self._known[0] and not self._forgets()
+
     def events(self, history: bool, timeout: float | None) -> Iterator[Event]:
         """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
         received: queue.Queue[Event] = queue.Queue()
@@ -240,7 +250,7 @@ class Connection:
         return declare_advanced_subscriber(
             self._session,
             self._key("event"),
-            self._reader.messages(Event, take),
+            self._reader.messages(Event, lambda event: take(self._noted(event))),
             history=HistoryConfig(detect_late_publishers=True) if history else None,
             recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
@@ -264,6 +274,16 @@ class Connection:
         if not self.close.alive:
             raise ServiceError("the connection is closed: open a new one, as Robot(…)")
         return self._opened
+
+    def _noted(self, said: Said) -> Said:
+        """Note from which state on shows what the service has said; return it."""
+        seq = said.seq if isinstance(said, CommandReply) else said.cycle if isinstance(said, Event) else 0
+        if seq and (seq > self._known[0] or self._forgets()):
+            self._known = seq, time.monotonic()
+        return said
+
+    def _forgets(self) -> bool:
+        return time.monotonic() - self._known[1] > OVERTAKEN_WITHIN
 
     def _key(self, *parts: str) -> str:
         return zenoh_session.key(self.robot, *parts)

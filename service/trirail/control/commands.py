@@ -57,7 +57,7 @@ class Commands:
 
     def settle(self) -> None:
         """Answer the commands that are carried out, or cannot be any more."""
-        self._ledger.settle(self._verdict, self._modes.state.mode)
+        self._ledger.settle(self._verdict, self._modes.state.mode, self._modes.cycle + 1)
 
     def end_silent_lease(self) -> None:
         """End a lease that its holder does not renew."""

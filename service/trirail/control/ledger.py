@@ -267,11 +267,12 @@ class Ledger:
         """Whether a command is under way, or something is to be said."""
         return bool(self.answers or self.notices or any(self._commands.values()))
 
-    def settle(self, verdict: Callable[[Command, int], str | None], mode: str) -> None:
+    def settle(self, verdict: Callable[[Command, int], str | None], mode: str, cycle: int) -> None:
         """Answer the commands that are done or never will be.
 
         `verdict`, given a command's name and the cycle it came in, is "" for done, None for not yet, else why not.
-        A command is never done before an earlier one of its name: where that is not, the later ones are not looked at.
+        What is done shows from `cycle` on. A command is never done before an earlier one of its name: where that is
+        not, the later ones are not looked at.
         """
         for name, under_way in self._commands.items():
             while under_way and (why := verdict(name, under_way[0][1])) is not None:
@@ -279,7 +280,7 @@ class Ledger:
                 if why:
                     self.answers.append(Refused(request.ticket, RefusalCode.FAILED, f"{name} failed: {why}"))
                 else:
-                    self.answers.append(Confirmed(request.ticket, name, mode))
+                    self.answers.append(Confirmed(request.ticket, name, mode, cycle))
 
     # ------------------------------------------------------------------ everyone
 

@@ -220,9 +220,9 @@ class Gateway:
             case Accepted(ticket, goal_id, duration, slowed, stops_first, queued, lag):
                 expected = duration if math.isfinite(duration) else None
                 self._requests.answer(ticket, GoalReply(goal_id, expected, slowed, stops_first, queued, lag))
-            case Confirmed(ticket, name, mode):
+            case Confirmed(ticket, name, mode, cycle):
                 self._commands.confirmed(ticket)
-                self._requests.answer(ticket, CommandReply(name, mode))
+                self._requests.answer(ticket, CommandReply(name, mode, cycle))
             case Refused(ticket, code, text, slider, value, limit):
                 error = ErrorReply(code, text, slider, value, limit)
                 self._requests.answer(ticket, self._commands.refused(ticket, error))

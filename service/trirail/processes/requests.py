@@ -217,8 +217,13 @@ class CommandReader:
         unread = ticket in self._of_unread
         self._of_unread.discard(ticket)
         if unread and error.code == RefusalCode.NO_GOAL:
-            return CommandReply(Command.STOP, self._states.newest().mode)
+            return self._stopped()
         return error
+
+    def _stopped(self) -> CommandReply:
+        """Return the answer to a stop of a goal that never came to the loop."""
+        newest = self._states.newest()
+        return CommandReply(Command.STOP, newest.mode, newest.seq)
 
     def confirmed(self, ticket: int) -> None:
         """Note that a command has been carried out."""
@@ -229,7 +234,7 @@ class CommandReader:
         reason = f"{name} by {user}"
         backlog = self._requests.backlog
         if goal is not None and backlog.withdraw(goal, reason):  # before the loop has it
-            self._replies.answer(incoming, CommandReply(Command.STOP, self._states.newest().mode))
+            self._replies.answer(incoming, self._stopped())
             return
         ticket = self._requests.command(incoming, user, name, content)
         if goal is not None and self._inbox.earlier(incoming.number):

@@ -46,6 +46,8 @@ class CommandReply(Struct, frozen=True):
     """Its name."""
     mode: str
     """A trirail.wire.vocabulary.Mode: the robot's, when it had been carried out."""
+    seq: int
+    """Of the first State that shows it."""
     ok: Literal[True] = True
 
 

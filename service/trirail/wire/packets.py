@@ -107,6 +107,8 @@ class Confirmed(Struct, frozen=True, tag=True):
     ticket: int
     name: Command
     mode: str
+    cycle: int
+    """The first whose record shows it."""
 
 
 class Refused(Struct, frozen=True, tag=True):
