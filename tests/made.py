@@ -42,7 +42,7 @@ def records(
     made["lateness_ns"] = random.gamma(4.0, 9e3, n)
     late = random.choice(n, max(1, n // 1500), replace=False)
     made["lateness_ns"][late] += random.integers(60_000, 320_000, len(late))
-    made["parts_ns"] = random.gamma(40.0, 500.0, (n, 7)) * [0.9, 2.2, 0.3, 1.4, 0.8, 1.8, 0.7]
+    made["parts_ns"] = random.gamma(40.0, 500.0, (n, 8)) * [0.9, 2.2, 0.3, 1.4, 0.8, 1.8, 0.7, 0.2]
     made["mode"] = MODES.index(mode)
     made["drive_state"] = PowerState.OPERATION_ENABLED
     made["commanded_pose"] = commanded

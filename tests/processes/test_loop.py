@@ -56,7 +56,7 @@ class Shell:
         self.serves = True
         """Whether the planner answers what it is asked before the next cycle."""
         self.heartbeats = Heartbeats.create()
-        self.loop = Loop(rig.config, rig.driver, self.ports, self.heartbeats)
+        self.loop = Loop(rig.config, rig.driver, self.ports, self.heartbeats, now=lambda: round(rig.now * 1e9))
         self.loop.control.start(rig.control.measured.feedback)
 
     def cycles(self, number: int, missed: int = 0) -> None:

@@ -95,7 +95,7 @@ class Session:
             self._stack.callback(closes.close)
         self.hearts = Heartbeats.create()
         self.motion = MotionPlanner(config)
-        self.loop = Loop(config, driver, ports, self.hearts, quiet=quiet)
+        self.loop = Loop(config, driver, ports, self.hearts, quiet=quiet, now=lambda: self.now_ns)
         self.loop.begin()
         self.ticker = Ticker(round(config.period * 1e9), lambda: self.now_ns, self.sleep)
         self.heard: list[object] = []

@@ -264,8 +264,8 @@ class Ledger:
 
     @property
     def busy(self) -> bool:
-        """Whether a command is under way, or something is to be said."""
-        return bool(self.answers or self.notices or any(self._commands.values()))
+        """Whether a command is under way."""
+        return any(self._commands.values())
 
     def settle(self, verdict: Callable[[Command, int], str | None], mode: str, cycle: int) -> None:
         """Answer the commands that are done or never will be.

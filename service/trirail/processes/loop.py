@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, MutableSequence
 from types import FrameType
 
 from trirail_drivers.bus.capture import Capture
@@ -38,6 +38,8 @@ from trirail.wire.vocabulary import Mode
 
 REQUESTS_A_CYCLE = 4
 """Requests that are taken in one cycle: at 1 kHz more than the gateway can send, so that a stop waits for nothing."""
+SAYING_NS = 150_000
+"""Where less is left before the next tick, what has been decided is said behind that one's setpoints [ns]."""
 LEAST_PATIENCE = 3
 """Cycles for which the gateway may be silent, however few there are a second."""
 PLANNER_WITHIN = 120.0
@@ -59,8 +61,13 @@ class Loop:
         capture: Capture | None = None,
         lacking: tuple[str, ...] = (),
         quiet: bool = True,
+        now: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`quiet`: cycles in which nothing happens are run by the compiled call; else all by Python."""
+        """`quiet`: cycles in which nothing happens are run by the compiled call; else all by Python.
+
+        `now`: the clock of the ticks [ns].
+        """
+        self._now = now
         self._drives = drives
         self._gateway = ports.gateway
         self._planner = PlannerLink(ports.planner)
@@ -83,19 +90,22 @@ class Loop:
         self._never_listens = self._period_ns <= SPARE_NS
         self._listened = self._never_listens
         """Whether nobody else is to be heard before the next tick."""
+        self._unsaid = False
+        """Whether there was no time left to say what has been decided."""
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
             beside = self._reports, heartbeats, ports.gateway, self._doors, self._gateway_watch, self._haste
             self._quiet = QuietCycles(self.control, drives, *beside)
         self._fault: DriveFault | None = None
         self._marked_ns = 0
-        self._parts_ns = [0] * len(Part)
+        self._parts_ns: MutableSequence[int] = [0] * len(Part) if self._quiet is None else self._quiet.parts_ns
 
     def run(self, ticker: Ticker) -> None:
         """Run cycles until told to end and the robot stands without power."""
         self.begin()
         while not self._over():
             self.turn(ticker)
+        self._say()
         self._flush()
 
     def begin(self) -> None:
@@ -118,7 +128,7 @@ class Loop:
         quiet, newest = self._quiet, None
         disturbed = self.ending or self._gateway_frozen or not self._planner.idle
         if quiet is not None and not disturbed:
-            newest = quiet.run(ticker, self._overruns, listens=not self._listened)
+            newest = quiet.run(ticker, self._overruns, listens=not self._listened, once=self._unsaid)
         elif quiet is not None:
             quiet.leave()
         if newest is None and not self._listened and ticker.listen(self._doors):
@@ -129,17 +139,14 @@ class Loop:
             self.cycle(ticker.tick())
         elif newest.reached is Reached.SYNCED:
             self._marked_ns = newest.marked_ns
-            self._parts_ns[Part.SYNC], self._parts_ns[Part.RECORD] = newest.sync_ns, newest.record_ns
             self._go_on(Tick(newest.deadline_ns, newest.lateness_ns, newest.missed))
+        elif newest.reached is Reached.CALLED:
+            self._hear(ticker)
         elif quiet is not None:
             self._listened = self._never_listens
-            if newest.reached is Reached.CALLED:
-                self._hear(ticker)
-            elif newest.called:
-                self._decide(newest.deadline_ns + self._period_ns)
-            if newest.called or self._reports.full:
-                self._flush_full()
-                quiet.add(Part.RECORD)
+            if newest.called or self._unsaid or self._reports.full:
+                self._decide(newest.deadline_ns + self._period_ns, newest.called)
+                quiet.add(Part.DECIDE)
 
     def cycle(self, tick: Tick) -> None:
         """Run one cycle. Nothing in it waits, and nothing that goes wrong in it leaves the robot moving."""
@@ -160,11 +167,11 @@ class Loop:
         self._mark(Part.MODE)
         self.control.execute(feedback, self._mark)
         self._reports.record(tick, self._overruns.all, self._parts_ns)
+        self._mark(Part.RECORD)
         self._reports.pass_on()
         self.control.conclude()
         self._decide(tick.deadline_ns + self._period_ns)
-        self._flush_full()
-        self._mark(Part.RECORD)
+        self._mark(Part.DECIDE)
 
     def _handle_urgent(self, given: Iterable[Request | Disturbance], now_ns: int) -> None:
         """Have what is given its effect in this very cycle: stops, and what has happened."""
@@ -172,9 +179,23 @@ class Loop:
             self._reports.note(now_ns, what, urgent=True)
             self.control.handle(what, now_ns)
 
-    def _decide(self, now_ns: int) -> None:
-        """Decide what comes at the next tick, which is due at that time, by what has been asked for and planned."""
-        self.control.decide(self._noted(now_ns))
+    def _decide(self, next_ns: int, called: bool = True) -> None:
+        """Decide what comes at the next tick, which is due at that time, where somebody has `called`.
+
+        What is to be said of it may wait for the time behind that tick's setpoints, once.
+        """
+        if called:
+            self.control.decide(self._noted(next_ns))
+        if self._unsaid or (called and next_ns - self._now() >= SAYING_NS):
+            self._say()
+        else:
+            self._unsaid = called
+        if self._reports.full:
+            self._flush()
+
+    def _say(self) -> None:
+        """Pass on what has happened and what is answered, and hear the recorder."""
+        self._unsaid = False
         self._reports.listen()
         self._reports.pass_on()
 
@@ -183,8 +204,7 @@ class Loop:
         self._listened = True
         if given := list(self._noted(ticker.deadline_ns + self._period_ns, waiting=True)):
             self.control.decide(given)
-        self._reports.listen()
-        self._reports.pass_on()
+        self._say()
 
     def _noted(self, now_ns: int, *, waiting: bool = False) -> Iterator[Given]:
         """Yield what gateway and planner have sent, and keep it for the recorder."""
@@ -241,10 +261,6 @@ class Loop:
         control = self.control
         stands = control.state.mode in (Mode.DISABLED, Mode.FAULT) and not control.measured.powered
         return stands or (control.cycles - self._ending_since) * self._period > SHUTDOWN
-
-    def _flush_full(self) -> None:
-        if self._reports.full:
-            self._flush()
 
     def _flush(self) -> None:
         """Give a sign of life, pass the batch on, and take new peers."""

@@ -315,6 +315,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         s.in_a_row = s.in_a_row + s.missed if s.missed else 0
         row.cycle, row.deadline_ns, row.lateness_ns, row.overruns = s.cycle, s.deadline_ns, s.lateness_ns, s.overruns
         row.parts_ns[:] = s.parts_ns
+        s.parts_ns[Part.DECIDE] = 0
         row.mode = s.mode
         batch[s.batched] = made
         s.batched += 1

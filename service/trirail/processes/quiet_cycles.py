@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import MutableSequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,10 +40,6 @@ class Newest(NamedTuple):
     """Ticks skipped before it, not counted yet."""
     marked_ns: int
     """When its newest part ended."""
-    sync_ns: int
-    """How long its SYNC took."""
-    record_ns: int
-    """How long the record of the one before it took, and all that was decided with that."""
     called: bool
     """Whether somebody has something to say, or something is to be said."""
 
@@ -85,19 +82,21 @@ class QuietCycles:
         measured, setpoints = control.measured, control.setpoints
         self._made = measured.record.view(np.uint8)
         state = self._state[0]
+        self.parts_ns: MutableSequence[int] = state["parts_ns"]
+        """How long the parts of the newest cycle took, in the room where compiled code writes it."""
         state["period"], state["period_ns"] = control.period, round(control.period * 1e9)
         state["injected_ns"] = -1
         state["fastest"], state["limit"], state["step"] = measured.fastest, measured.limit, setpoints.step
         state["gateway_place"], state["gateway_patience"] = PROCESSES.index("gateway"), watch.patience
 
-    def run(self, ticker: Ticker, overruns: Overruns, *, listens: bool) -> Newest | None:
+    def run(self, ticker: Ticker, overruns: Overruns, *, listens: bool, once: bool) -> Newest | None:
         """Run cycles until something happens; return how far the newest has come, None where none was begun.
 
-        `listens`: who calls while the first tick is waited for is heard before it. At the end of a batch the next call
-        goes on, if nothing has been said meanwhile.
+        `listens`: who calls while the first tick is waited for is heard before it. `once`: one cycle, for something
+        waits to be said behind it. At the end of a batch the next call goes on, if nothing has been said meanwhile.
         """
         control, state = self._control, self._state[0]
-        if not (self._reports.idle and self._gateway.calm and self._goes_on()):
+        if not ((once or self._reports.idle) and self._gateway.calm and self._goes_on()):
             self.leave()
             return None
         lent, calm, watch = self._lent, self._calm, self._watch
@@ -105,7 +104,7 @@ class QuietCycles:
         assert calm is not None
         state["injected_ns"], state["deadline_ns"] = ticker.come(), ticker.deadline_ns
         state["overruns"], state["in_a_row"], state["allowed"] = overruns.all, overruns.in_a_row, overruns.allowed
-        state["until"] = control.cycles + (1 if state["injected_ns"] >= 0 else _MOST)
+        state["until"] = control.cycles + (1 if once or state["injected_ns"] >= 0 else _MOST)
         state["batched"] = self._reports.batched
         state["gateway_seen"], state["gateway_turns"], state["haste"] = watch.seen, watch.turns, self._haste.seen
         state["listens"] = listens
@@ -124,10 +123,8 @@ class QuietCycles:
         control.go_on(left["cycle"], left["time"], left["found"] if decides else None)
         if reached is Reached.WRITTEN:
             self._drives.send_on(left["sent"])
-        parts = left["parts_ns"]
-        took = int(parts[Part.SYNC]), int(parts[Part.RECORD])
         tick = left["deadline_ns"], left["lateness_ns"], left["missed"]
-        return Newest(reached, *tick, left["marked_ns"], *took, called)
+        return Newest(reached, *tick, left["marked_ns"], called)
 
     def leave(self, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
         """Give back to the drives what they have lent, as of trirail_drivers.driver.cyclic.Lender.take_back."""
@@ -156,9 +153,8 @@ class QuietCycles:
 
     def add(self, part: Part) -> None:
         """Count what has passed since the newest cycle into a part of it; none where a simulated time is ahead."""
-        parts = self._state[0]["parts_ns"]
         passed = max(0, time.perf_counter_ns() - int(self._state[0]["marked_ns"]))
-        parts[part] = min(int(parts[part]) + passed, LONGEST)
+        self.parts_ns[part] = min(int(self.parts_ns[part]) + passed, LONGEST)
 
     def _write_state(self, calm: Calm) -> None:
         """Write what cycles come to into the state."""

@@ -68,7 +68,7 @@ class _Rehearsal:
         self._ports = Ports(Port(gateway), Port(recorder), Port(planner, MAX_PLANNING))
         self._heartbeats = Heartbeats.create()
         # What Python does is rehearsed, in each cycle: compiled code has its pages from the first one on.
-        self._loop = Loop(config, self._drives, self._ports, self._heartbeats, quiet=False)
+        self._loop = Loop(config, self._drives, self._ports, self._heartbeats, quiet=False, now=lambda: self._now_ns)
         self._asked = links.connect(folder / "planner", MAX_PLANNING)
         self._planner = MotionPlanner(config)
         self._gateway: PacketLink | None = None

@@ -28,6 +28,8 @@ class Part(IntEnum):
     KINEMATICS = 4
     WRITE = 5
     RECORD = 6
+    DECIDE = 7
+    """What is decided, and passed on, in the time that is left behind the setpoints and the record."""
 
 
 PARTS = tuple(part.name.lower() for part in Part)
@@ -39,7 +41,7 @@ FIELDS: tuple[tuple[str, str, int], ...] = (
     ("deadline_ns", "q", 1),  # when this cycle was due, monotonic clock
     ("lateness_ns", "q", 1),  # how much later it began
     ("overruns", "q", 1),  # ticks missed since the start
-    ("parts_ns", "i", len(Part)),  # time spent in each part; "record" is that of the cycle before
+    ("parts_ns", "i", len(Part)),  # time spent in each part; "record" and "decide" are those of the cycle before
     ("mode", "B", 1),  # index into trirail.wire.vocabulary.MODES
     ("drive_state", "B", 3),  # trirail_drivers.interface.PowerState of A, B, C
     ("age", "B", 3),  # how many SYNCs ago the positions of A, B, C were sampled; 255 for any more
