@@ -27,7 +27,7 @@ from trirail.client.client import Robot
 from trirail.config import SIM, load
 from trirail.errors import TrirailError
 from trirail.processes import bare_loop
-from trirail.wire.records import PARTS, unpack
+from trirail.wire.records import PARTS, Part, unpack
 from trirail.wire.vocabulary import Mode
 
 MOST_FAULTS = 0.2
@@ -100,6 +100,8 @@ def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, An
         "lost_by_the_machine": sum(run["lost_by_the_machine"] for run in found),
         "runs": found,
         "parts": {name: quantiles(parts[:, column]) for column, name in enumerate(PARTS)},
+        "to_setpoints": quantiles(parts[:, : Part.WRITE + 1].sum(axis=1)),
+        "to_record": quantiles(parts[:, : Part.RECORD + 1].sum(axis=1)),
         "cycle": quantiles(parts.sum(axis=1)),
         "lateness": quantiles(np.concatenate([_lateness(each, period_us) for each in batches])),
     }

@@ -21,6 +21,7 @@ import pytest
 from bench_latency import Setpoint
 from bench_rig import QUANTILES, Rig
 from trirail.processes.bare_loop import Cycles
+from trirail.wire.records import PARTS
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +75,10 @@ def test_what_one_users_flood_costs_another_is_measured(rig: Rig) -> None:
 def test_the_loop_is_measured_beside_the_machine(capsys: pytest.CaptureFixture[str]) -> None:
     told = bench_loop.measure(0.6, (1000,), 1)
     (found,) = told["rates"]
-    assert set(found["parts"]) == {"sync", "read", "mode", "motion", "kinematics", "write", "record"}
+    assert set(found["parts"]) == set(PARTS)
     bare = found["bare"]
     assert 0 < bare["answers"] <= 3 * bare["cycles"]
+    assert all(is_spread(found[what]) for what in ("to_setpoints", "to_record"))
     for what in ("cycle", "lateness"):
         assert is_spread(found[what])
         assert found["to_bare"][what] == [a / b for a, b in zip(found[what], bare[what], strict=True)]

@@ -78,23 +78,24 @@ class Doors:
 
     def __init__(self, ports: Sequence[Port]) -> None:
         self._ports = ports
-        self._room = np.zeros((len(ports), 2), np.int32)
+        self.room = np.zeros((len(ports), 2), np.int32)
+        """As poll takes them."""
         self._moment = np.zeros(2, np.int64)
 
-    @property
-    def now(self) -> NDArray[np.int32]:
-        """As poll takes them, with those who are connected now; the same room each time."""
-        for door, port in zip(self._room, self._ports, strict=True):
+    def refresh(self) -> None:
+        """Write those who are connected now into the room."""
+        for door, port in zip(self.room, self._ports, strict=True):
             door[:] = port.fileno(), _POLLIN
-        return self._room
 
     def called(self) -> bool:
         """Whether somebody is at a door."""
-        return bool(called(self.now))
+        self.refresh()
+        return bool(called(self.room))
 
     def wait(self, deadline_ns: int) -> bool:
         """Wait as the function `wait` does."""
-        return bool(wait(deadline_ns, self.now, self._moment))
+        self.refresh()
+        return bool(wait(deadline_ns, self.room, self._moment))
 
 
 class Tick(NamedTuple):

@@ -76,6 +76,8 @@ class QuietCycles:
         self._decided = False
         """Whether anything has been decided since the newest cycle."""
         self._calm: Calm | None = None
+        self._given: tuple[Any, ...] = ()
+        """What the compiled call is given: the same arrays until something else is lent or is to be done."""
         self._nothing = np.zeros(1)
         self._rooms: list[NDArray[Any]] = []
         self._kept = np.zeros((0, 3), np.int64)
@@ -99,16 +101,15 @@ class QuietCycles:
         if not ((once or self._reports.idle) and self._gateway.calm and self._goes_on()):
             self.leave()
             return None
-        lent, calm, watch = self._lent, self._calm, self._watch
-        assert lent is not None
-        assert calm is not None
+        watch = self._watch
         state["injected_ns"], state["deadline_ns"] = ticker.come(), ticker.deadline_ns
         state["overruns"], state["in_a_row"], state["allowed"] = overruns.all, overruns.in_a_row, overruns.allowed
         state["until"] = control.cycles + (1 if once or state["injected_ns"] >= 0 else _MOST)
         state["batched"] = self._reports.batched
         state["gateway_seen"], state["gateway_turns"], state["haste"] = watch.seen, watch.turns, self._haste.seen
         state["listens"] = listens
-        reached = Reached(self._call(lent, calm))
+        self._doors.refresh()
+        reached = Reached(quiet.run(*self._given))
         left = dict(zip(_NAMES, state.item(), strict=True))  # one by one, from the array, it would take longer
         overruns.all, overruns.in_a_row = left["overruns"], left["in_a_row"]
         watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
@@ -148,6 +149,7 @@ class QuietCycles:
             self._lent, self._orders = self._drives.lend(), orders
         if self._lent is not None:
             self._write_state(self._calm)
+            self._given = self._gather(self._lent, self._calm)
             self._decided = False
         return self._lent is not None
 
@@ -170,7 +172,8 @@ class QuietCycles:
         if run is not None:
             state["in_sliders"], state["target"], state["course"] = run.path.in_sliders, run.target, run.course
 
-    def _call(self, lent: Cyclic, calm: Calm) -> int:
+    def _gather(self, lent: Cyclic, calm: Calm) -> tuple[Any, ...]:
+        """Return what the compiled call is to be given."""
         control, run = self._control, calm.run
         measured, setpoints, schedule = control.measured, control.setpoints, control.schedule
         path, law = (run.path, run.law) if run is not None else (_NOWHERE, constant(1.0))
@@ -183,13 +186,13 @@ class QuietCycles:
             )
             self._kept, self._rooms = quiet.copies(kept)
         self._kept[-1, 0] = furthest.ctypes.data
-        given: tuple[Any, ...] = (
+        return (
             *(self._state, self._kept, self._moment, lent.bus),
             *(lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
             *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
             *(lent.expected, lent.axes, lent.times, lent.history),
             *(
-                self._doors.now,
+                self._doors.room,
                 self._hearts,
                 self._reports.batch,
                 measured.legs,
@@ -201,4 +204,3 @@ class QuietCycles:
             *(setpoints.found, measured.numbers, measured.written, measured.jumping, measured.room),
             *(measured.settling.monitored, measured.record, self._made),
         )
-        return quiet.run(*given)
