@@ -7,6 +7,7 @@ import heapq
 import itertools
 import math
 import os
+import signal
 import tempfile
 import traceback
 import tracemalloc
@@ -43,6 +44,7 @@ CONFIG = msgspec.structs.replace(SHIPPED, drives=msgspec.structs.replace(SHIPPED
 _STATE = tempfile.TemporaryDirectory(prefix="trirail-tests-")
 os.environ["STATE_DIRECTORY"] = _STATE.name  # the poses that somebody has taught on this machine are no test's
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what it runs beside it without
 pytest_plugins = ["generated", "parsed_eds"]
 
 

@@ -481,3 +481,16 @@ def test_the_recorder_has_every_answer_with_the_cycle_in_which_it_was_taken(shel
     assert isinstance(goal.given, GoalRequest)
     assert isinstance(planned.given, Planned)
     assert planned.cycle == goal.cycle + 1
+
+
+@pytest.mark.parametrize("words", [b"", b"{}", b"\x93\x01\xff", bytes(range(256))])
+def test_a_gateway_that_says_what_cannot_be_read_is_let_go(shell: Shell, words: bytes) -> None:
+    shell.enabled()
+    shell.gateway.send(bytes((Kind.MESSAGE,)) + words)
+    shell.cycles(3)
+    assert not shell.ports.gateway.connected
+    assert "the gateway is gone: controlled stop" in str(shell.loop.control.state) or shell.loop.control.state.mode in (
+        Mode.HOLDING,
+        Mode.STOPPING,
+    )
+    assert shell.loop.control.fault is None

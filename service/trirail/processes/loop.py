@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, MutableSequence
 from types import FrameType
 
+import msgspec
 from trirail_drivers.bus.capture import Capture
 from trirail_drivers.config import Can
 from trirail_drivers.connection.opening import connect
@@ -38,8 +39,10 @@ from trirail.wire.vocabulary import Mode
 
 REQUESTS_A_CYCLE = 4
 """Requests that are taken in one cycle: at 1 kHz more than the gateway can send, so that a stop waits for nothing."""
+DECIDING_NS = 300_000
+"""Where less is left before the next tick, requests that have been read wait for the time behind its setpoints [ns]."""
 SAYING_NS = 150_000
-"""Where less is left before the next tick, what has been decided is said behind that one's setpoints [ns]."""
+"""Likewise what is to be said of what has been decided."""
 LEAST_PATIENCE = 3
 """Cycles for which the gateway may be silent, however few there are a second."""
 PLANNER_WITHIN = 120.0
@@ -90,6 +93,8 @@ class Loop:
         self._never_listens = self._period_ns <= SPARE_NS
         self._listened = self._never_listens
         """Whether nobody else is to be heard before the next tick."""
+        self._in_hand: list[Request] = []
+        """What has been read, and there was no time left to decide by it."""
         self._unsaid = False
         """Whether there was no time left to say what has been decided."""
         self._quiet: QuietCycles | None = None
@@ -128,7 +133,7 @@ class Loop:
         quiet, newest = self._quiet, None
         disturbed = self.ending or self._gateway_frozen or not self._planner.idle
         if quiet is not None and not disturbed:
-            newest = quiet.run(ticker, self._overruns, listens=not self._listened, once=self._unsaid)
+            newest = quiet.run(ticker, self._overruns, listens=not self._listened, once=self._postponed)
         elif quiet is not None:
             quiet.leave()
         if newest is None and not self._listened and ticker.listen(self._doors):
@@ -144,7 +149,7 @@ class Loop:
             self._hear(ticker)
         elif quiet is not None:
             self._listened = self._never_listens
-            if newest.called or self._unsaid or self._reports.full:
+            if newest.called or self._postponed or self._reports.full:
                 self._decide(newest.deadline_ns + self._period_ns, newest.called)
                 quiet.add(Part.DECIDE)
 
@@ -179,17 +184,26 @@ class Loop:
             self._reports.note(now_ns, what, urgent=True)
             self.control.handle(what, now_ns)
 
+    @property
+    def _postponed(self) -> bool:
+        """Whether there was no time left for all that came behind the newest setpoints."""
+        return self._unsaid or bool(self._in_hand)
+
     def _decide(self, next_ns: int, called: bool = True) -> None:
         """Decide what comes at the next tick, which is due at that time, where somebody has `called`.
 
-        What is to be said of it may wait for the time behind that tick's setpoints, once.
+        What there is no time for before it waits for the time behind its setpoints, once: requests, and what is to be
+        said.
         """
-        if called:
-            self.control.decide(self._noted(next_ns))
-        if self._unsaid or (called and next_ns - self._now() >= SAYING_NS):
+        waited = bool(self._in_hand)
+        if called or waited:
+            self._read()
+            in_time = waited or next_ns - self._now() >= DECIDING_NS
+            self.control.decide(self._noted(next_ns, requests=in_time))
+        if self._unsaid or ((called or waited) and next_ns - self._now() >= SAYING_NS):
             self._say()
         else:
-            self._unsaid = called
+            self._unsaid = called or waited
         if self._reports.full:
             self._flush()
 
@@ -206,9 +220,9 @@ class Loop:
             self.control.decide(given)
         self._say()
 
-    def _noted(self, now_ns: int, *, waiting: bool = False) -> Iterator[Given]:
-        """Yield what gateway and planner have sent, and keep it for the recorder."""
-        for what in itertools.chain(self._requests(), self._planner.answers()):
+    def _noted(self, now_ns: int, *, requests: bool = True, waiting: bool = False) -> Iterator[Given]:
+        """Yield what the planner has sent, and before it the gateway's `requests`; keep it for the recorder."""
+        for what in itertools.chain(self._requests() if requests else (), self._planner.answers()):
             self._reports.note(now_ns, what, waiting=waiting)
             yield what, now_ns
 
@@ -219,15 +233,24 @@ class Loop:
         self._marked_ns = now
 
     def _requests(self) -> Iterator[Request]:
-        """Take what the gateway has sent: as much as comes in a cycle, and no more than a cycle has time for.
+        """Yield what the gateway has sent: as much as comes in a cycle, and no more than a cycle has time for."""
+        self._read()
+        while self._in_hand and not self._gateway_frozen:
+            yield self._in_hand.pop(0)
 
-        Nothing is taken of what a frozen one has left, until it serves again.
+    def _read(self) -> None:
+        """Read what the gateway has sent. Nothing is read of what a frozen one has left, until it serves again.
+
+        One that says what cannot be read has lost its mind: it is let go, and started again.
         """
-        for _ in range(0 if self._gateway_frozen else REQUESTS_A_CYCLE):
+        while len(self._in_hand) < REQUESTS_A_CYCLE and not self._gateway_frozen:
             packet = self._gateway.receive()
             if packet is None:
                 return
-            yield decode_request(memoryview(packet)[1:])
+            try:
+                self._in_hand.append(decode_request(memoryview(packet)[1:]))
+            except msgspec.DecodeError:
+                self._gateway.hang_up()
 
     def _watch(self, tick: Tick, fault: DriveFault | None) -> Iterator[Disturbance]:
         """Count what the ticker missed; yield what has happened: late ticks, a lost gateway, a wish to end."""

@@ -164,9 +164,10 @@ def _send(
         *(_STATE, i8[:, ::1], i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], DOORS, u8[::1], FRAMES),
-        *(cycle.LEGS, cycle.BOUND, cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
+        *(cycle.LEGS, cycle.BOUND),
         *(cycle.MOTION, cycle.SLIDERS, cycle.KEPT, f8[::1], cycle.FEEDBACKS, f8[:, ::1], types.b1[::1], f8[:, ::1]),
         *(cycle.MONITORED, cycle.RECORD, u1[::1]),
+        *(cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
     ),
     releases=True,
 )
@@ -192,12 +193,6 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     batch: NDArray[np.uint8],
     legs: Array,
     bounds: NDArray[np.void],
-    knots: Array,
-    pieces: Array,
-    tools: Array,
-    law_knots: Array,
-    law_pieces: Array,
-    furthest: Array,
     motion: Array,
     sliders: Array,
     backlash: NDArray[np.void],
@@ -209,6 +204,12 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     monitored: NDArray[np.void],
     record: NDArray[np.void],
     made: NDArray[np.uint8],
+    knots: Array,
+    pieces: Array,
+    tools: Array,
+    law_knots: Array,
+    law_pieces: Array,
+    furthest: Array,
 ) -> int:
     """Run cycles; return how far the newest has come: Reached.
 

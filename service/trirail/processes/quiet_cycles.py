@@ -12,6 +12,7 @@ from trirail_drivers.driver.cyclic import Cyclic, Lender
 
 from trirail.control.control import Calm, Control
 from trirail.motion.paths import Path, constant
+from trirail.motion.runs import Run
 from trirail.processes import quiet
 from trirail.processes.clock import Doors, Overruns, Ticker
 from trirail.processes.heartbeats import HASTE, PROCESSES, Haste, Heartbeats, Watch
@@ -26,8 +27,9 @@ _MOST = 1 << 40
 """Cycles that are run at once: more than any batch has."""
 _NEVER = 1 << 62
 """No cycle."""
+_UNMOVED = constant(1.0)
 _NOWHERE = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
-"""A path for compiled code where there is none."""
+"""A law and a path for compiled code where there is no motion."""
 
 
 class Newest(NamedTuple):
@@ -76,8 +78,9 @@ class QuietCycles:
         self._decided = False
         """Whether anything has been decided since the newest cycle."""
         self._calm: Calm | None = None
-        self._given: tuple[Any, ...] = ()
-        """What the compiled call is given: the same arrays until something else is lent or is to be done."""
+        self._tables: tuple[Any, ...] = ()
+        self._motion: tuple[Any, ...] = ()
+        """What the compiled call is given: the same arrays until others are lent, or the robot moves otherwise."""
         self._nothing = np.zeros(1)
         self._rooms: list[NDArray[Any]] = []
         self._kept = np.zeros((0, 3), np.int64)
@@ -109,7 +112,7 @@ class QuietCycles:
         state["gateway_seen"], state["gateway_turns"], state["haste"] = watch.seen, watch.turns, self._haste.seen
         state["listens"] = listens
         self._doors.refresh()
-        reached = Reached(quiet.run(*self._given))
+        reached = Reached(quiet.run(*self._tables, *self._motion))
         left = dict(zip(_NAMES, state.item(), strict=True))  # one by one, from the array, it would take longer
         overruns.all, overruns.in_a_row = left["overruns"], left["in_a_row"]
         watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
@@ -117,7 +120,7 @@ class QuietCycles:
         self.cycles += left["cycle"] - control.cycles
         decides = bool(left["called"]) and reached not in (Reached.SYNCED, Reached.CALLED)
         called = decides or reached is Reached.CALLED
-        self._decided = self._decided or called
+        self._decided = self._decided or called or once
         if reached not in (Reached.DONE, Reached.CALLED):
             synced = left["synced"] if reached is Reached.SYNCED else None
             self.leave(left["arrived"], synced=synced, error=max(left["error"], 0))
@@ -147,9 +150,10 @@ class QuietCycles:
             self.leave()
         if self._lent is None:
             self._lent, self._orders = self._drives.lend(), orders
+            self._tables = self._gather(self._lent) if self._lent is not None else ()
         if self._lent is not None:
             self._write_state(self._calm)
-            self._given = self._gather(self._lent, self._calm)
+            self._motion = self._follow(self._calm.run)
             self._decided = False
         return self._lent is not None
 
@@ -172,12 +176,9 @@ class QuietCycles:
         if run is not None:
             state["in_sliders"], state["target"], state["course"] = run.path.in_sliders, run.target, run.course
 
-    def _gather(self, lent: Cyclic, calm: Calm) -> tuple[Any, ...]:
-        """Return what the compiled call is to be given."""
-        control, run = self._control, calm.run
-        measured, setpoints, schedule = control.measured, control.setpoints, control.schedule
-        path, law = (run.path, run.law) if run is not None else (_NOWHERE, constant(1.0))
-        furthest = run.furthest if run is not None else self._nothing
+    def _gather(self, lent: Cyclic) -> tuple[Any, ...]:
+        """Return what the compiled call is given as long as the drives' tables are lent."""
+        measured, setpoints, schedule = self._control.measured, self._control.setpoints, self._control.schedule
         if not self._rooms:
             kept = (
                 *(measured.numbers, measured.written, measured.backlash, measured.jumping),
@@ -185,22 +186,20 @@ class QuietCycles:
                 *(setpoints.found, lent.axes, lent.times, lent.history, self._nothing),
             )
             self._kept, self._rooms = quiet.copies(kept)
-        self._kept[-1, 0] = furthest.ctypes.data
         return (
             *(self._state, self._kept, self._moment, lent.bus),
             *(lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
             *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
             *(lent.expected, lent.axes, lent.times, lent.history),
-            *(
-                self._doors.room,
-                self._hearts,
-                self._reports.batch,
-                measured.legs,
-                setpoints.bounds,
-                path.knots,
-                path.pieces,
-            ),
-            *(path.tools, law.knots, law.pieces, furthest, schedule.motion, setpoints.sliders, measured.backlash),
-            *(setpoints.found, measured.numbers, measured.written, measured.jumping, measured.room),
+            *(self._doors.room, self._hearts, self._reports.batch, measured.legs, setpoints.bounds),
+            *(schedule.motion, setpoints.sliders, measured.backlash, setpoints.found),
+            *(measured.numbers, measured.written, measured.jumping, measured.room),
             *(measured.settling.monitored, measured.record, self._made),
         )
+
+    def _follow(self, run: Run | None) -> tuple[Any, ...]:
+        """Return what the compiled call is given of a motion."""
+        path, law = (run.path, run.law) if run is not None else (_NOWHERE, _UNMOVED)
+        furthest = run.furthest if run is not None else self._nothing
+        self._kept[-1, 0] = furthest.ctypes.data
+        return path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest
