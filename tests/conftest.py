@@ -31,7 +31,7 @@ from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Command, CommandContent, Mode
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import Feedback, Triple
 from trirail_drivers.protocols import PROTOCOLS
@@ -139,7 +139,9 @@ class Rig:
         given += [(answer, now_ns) for answer in self.planner.answers()]
         control.cycle(self.driver.read, given)
         self.rows.append(control.setpoints.rows)
-        self.seen.append([frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6])
+        self.seen.append(
+            [canopen_frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6]
+        )
         ledger = control.ledger
         self.answers += ledger.answers
         self.notices += ledger.notices

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from alignment.cameras import FOCUS, part_at
-from trirail.alignment.calibration import placed
+from trirail.alignment.camera_calibration import placed
 from trirail.alignment.images import CameraView, Pair, pixels
 from trirail.client import calibration_file, own_service
 from trirail.client.async_client import AsyncRobot

@@ -21,7 +21,7 @@ from trirail.wire.goals import PoseGoal, SlidersGoal, TrajectoryGoal, Trajectory
 from trirail.wire.messages import FaultDetail
 from trirail.wire.packets import Accepted, Answer, Confirmed, GoalRequest, Refused
 from trirail.wire.vocabulary import FaultCause, Mode
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.interface import PowerState
 
 PERIOD = CONFIG.period
@@ -36,9 +36,9 @@ def refusal(answer: Answer) -> Refused:
 def quick_stops(rig: Rig) -> set[int]:
     """Nodes that got the quick stop command (controlword xxxx xxxx xxxx x01x) in the last cycle."""
     return {
-        message.arbitration_id - frames.RPDO1
+        message.arbitration_id - canopen_frames.RPDO1
         for message in rig.sent
-        if message.arbitration_id - frames.RPDO1 in (1, 2, 3) and message.data[0] & 0b110 == 0b010
+        if message.arbitration_id - canopen_frames.RPDO1 in (1, 2, 3) and message.data[0] & 0b110 == 0b010
     }
 
 
@@ -318,7 +318,7 @@ def a_cycle(message: can.Message) -> float:
 
 
 def one_drive_late(message: can.Message) -> float:
-    return 0.4 * PERIOD if message.arbitration_id == frames.TPDO2 + 2 else 0.0
+    return 0.4 * PERIOD if message.arbitration_id == canopen_frames.TPDO2 + 2 else 0.0
 
 
 def as_it_comes(message: can.Message) -> float:
@@ -359,7 +359,7 @@ def test_a_lost_answer_is_no_step_in_error_or_velocity(late: float) -> None:
     lost: list[float] = []
 
     def delay(message: can.Message) -> float:
-        if lost and message.arbitration_id == frames.TPDO2 + 2:
+        if lost and message.arbitration_id == canopen_frames.TPDO2 + 2:
             return lost.pop()
         return late * PERIOD
 
@@ -454,7 +454,7 @@ def test_the_last_gate(rig: Rig, commanded: MotionState, said: str) -> None:
     assert rig.mode is Mode.FAULT
     assert quick_stops(rig) == {1, 2, 3}
     assert said in (rig.control.fault or "")
-    assert not any(message.arbitration_id - frames.RPDO2 in (1, 2, 3) for message in rig.sent)
+    assert not any(message.arbitration_id - canopen_frames.RPDO2 in (1, 2, 3) for message in rig.sent)
     assert np.abs(rig.setpoints()[-1, 0] - sent).max() < 1e-3  # what it would send is where the robot is
 
 

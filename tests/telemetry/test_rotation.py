@@ -371,7 +371,7 @@ def faulted(folder: Path, seconds: float, at: float, after: float) -> tuple[list
     cycle = round(at * 1000)
     box.stands("stands", Standing(None, (0.01, 0.02, 0.1)))
     feed(box, sent[: cycle - 500], time)
-    box.given(goal(cycle - 500))
+    box.control_input(goal(cycle - 500))
     feed(box, sent[cycle - 500 : cycle], time)
     wall = (WALL_NS + cycle * 1_000_000) * 1e-9
     box.event(Event(1, at, cycle, wall, "fault", "error", "drive B: emergency 4310"))

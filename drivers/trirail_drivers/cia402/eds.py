@@ -24,7 +24,7 @@ SERVO: Final = Path(__file__).with_name("servo.eds")
 def load(drive: str, file: Path, node: int) -> ObjectDictionary:
     """The objects of the drive called `drive`; DriveError if the file cannot be used."""
     try:
-        with files.opened(file) as content, io.TextIOWrapper(content, encoding="utf-8", errors="replace") as text:
+        with files.open_regular(file) as content, io.TextIOWrapper(content, encoding="utf-8", errors="replace") as text:
             return canopen.import_od(text, node)
     except (FileError, OSError) as error:
         raise DriveError(f"drive {drive}: cannot read EDS {error}") from error

@@ -39,4 +39,4 @@ def compact_arrays(file: Path) -> dict[int, int]:
 
 def _text(file: Path) -> io.TextIOWrapper:
     # Makers write names in whatever encoding they have; numbers are ASCII in all of them.
-    return io.TextIOWrapper(files.opened(file), encoding="utf-8", errors="replace")
+    return io.TextIOWrapper(files.open_regular(file), encoding="utf-8", errors="replace")
