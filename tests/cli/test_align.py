@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
 from trirail.cli import mark_source
 from trirail.cli.mark_options import MarkSource
-from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
 from trirail_drivers.interface import Triple
@@ -43,14 +41,6 @@ with Robot("demo", sys.argv[1]) as robot:
             seen[name] = pixels(view, placed(place, pose)[None])[0].tolist()
         print(json.dumps(seen), flush=True)
 """
-
-
-@pytest.fixture(scope="module")
-def locator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    folder = tmp_path_factory.mktemp("al")
-    config, locator = own_service.private(folder)
-    with own_service.service(config, folder / "align.rrd"):
-        yield locator
 
 
 def trirail(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:

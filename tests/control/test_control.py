@@ -9,28 +9,24 @@ import can
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Delay, Rig, changed
+from conftest import CONFIG, Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from refusals import refusal
 from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState, rest
 from trirail.wire.goals import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import FaultDetail
-from trirail.wire.packets import Accepted, Answer, Confirmed, GoalRequest, Refused
+from trirail.wire.packets import Accepted, Confirmed, GoalRequest
 from trirail.wire.vocabulary import FaultCause, Mode
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.interface import PowerState
 
 PERIOD = CONFIG.period
 ROBOT = geometry(CONFIG.geometry)
-
-
-def refusal(answer: Answer) -> Refused:
-    assert isinstance(answer, Refused), answer
-    return answer
 
 
 def quick_stops(rig: Rig) -> set[int]:
@@ -307,18 +303,6 @@ def test_goals_in_the_wrong_mode(rig: Rig) -> None:
 
 
 # ---------------------------------------------------------------------- feedback that is on its way
-
-
-def part_of_a_cycle(message: can.Message) -> float:
-    return 0.4 * PERIOD
-
-
-def a_cycle(message: can.Message) -> float:
-    return PERIOD
-
-
-def one_drive_late(message: can.Message) -> float:
-    return 0.4 * PERIOD if message.arbitration_id == canopen_frames.TPDO2 + 2 else 0.0
 
 
 def as_it_comes(message: can.Message) -> float:

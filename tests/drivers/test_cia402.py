@@ -72,21 +72,6 @@ def new() -> Iterator[Rig]:
     rig.drives.close()
 
 
-@pytest.fixture
-def ready(new: Rig) -> Rig:
-    """Drives that are set up, without power."""
-    new.ready()
-    return new
-
-
-@pytest.fixture
-def enabled(ready: Rig) -> Rig:
-    """Drives with power, holding their position."""
-    ready.enable()
-    ready.bus.sent.clear()
-    return ready
-
-
 class TestConfigure:
     def test_drives_hold_what_the_cycle_needs(self, ready: Rig) -> None:
         for device, drive in zip(ready.devices, CONFIG.each, strict=True):
@@ -533,15 +518,6 @@ class TestFaults:
         fault = enabled.cycles(5).fault
         assert fault is not None
         assert fault[:3] == ("A", "emcy", 0x2310)
-
-    def test_silence_is_a_fault_at_the_third_sync(self, ready: Rig) -> None:
-        ready.cycle()
-        ready.devices[1].silent = True
-        assert ready.cycle().fault is None
-        assert ready.cycle().fault is None
-        fault = ready.cycle().fault
-        assert fault is not None
-        assert fault[:3] == ("B", "silent", 0)
 
     def test_prompt_positions_have_no_age_and_lost_ones_leave_none(self, ready: Rig) -> None:
         assert ready.cycle().age == (0, 0, 0)

@@ -13,11 +13,12 @@ import msgspec
 import numpy as np
 import pytest
 from canopen.profiles.p402 import BaseNode402
-from conftest import CONFIG, Delay, Rig, changed
+from conftest import CONFIG, Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
+from refusals import refusal
 from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import inverse
-from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused
+from trirail.wire.packets import Accepted, CommandRequest, Confirmed
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
@@ -56,11 +57,6 @@ def rig() -> Iterator[Rig]:
     made = Rig(incremental())
     yield made
     made.bus.shutdown()
-
-
-def refusal(answer: Answer) -> Refused:
-    assert isinstance(answer, Refused), answer
-    return answer
 
 
 def true_positions(rig: Rig) -> list[float]:
@@ -143,18 +139,6 @@ def test_only_what_is_not_absolute_is_homed() -> None:
 
 
 # ---------------------------------------------------------------------- how it gets there
-
-
-def part_of_a_cycle(message: can.Message) -> float:
-    return 0.4 * PERIOD
-
-
-def a_cycle(message: can.Message) -> float:
-    return PERIOD
-
-
-def one_drive_late(message: can.Message) -> float:
-    return 0.4 * PERIOD if message.arbitration_id == canopen_frames.TPDO2 + 2 else 0.0
 
 
 @pytest.mark.core

@@ -99,21 +99,6 @@ def new() -> Iterator[Rig]:
     rig.drives.close()
 
 
-@pytest.fixture
-def ready(new: Rig) -> Rig:
-    """Drives that were found, without power."""
-    new.ready()
-    return new
-
-
-@pytest.fixture
-def enabled(ready: Rig) -> Rig:
-    """Drives with power, holding their position."""
-    ready.enable()
-    ready.bus.sent.clear()
-    return ready
-
-
 IDLE = (cansimple.SET_AXIS_STATE, AxisState.IDLE)
 MODE = (cansimple.SET_CONTROLLER_MODE, cansimple.POSITION_CONTROL)
 CLOSED_LOOP = (cansimple.SET_AXIS_STATE, AxisState.CLOSED_LOOP_CONTROL)
@@ -364,15 +349,6 @@ class TestStop:
 
 
 class TestFaults:
-    def test_silence_at_the_third_cycle(self, ready: Rig) -> None:
-        ready.cycle()
-        ready.devices[1].silent = True
-        assert ready.cycle().fault is None
-        assert ready.cycle().fault is None
-        fault = ready.cycle().fault
-        assert fault is not None
-        assert fault[:3] == ("B", "silent", 0)
-
     def test_lost_heartbeat(self, ready: Rig) -> None:
         ready.cycle()
         ready.devices[0]._due["heartbeat"] = math.inf

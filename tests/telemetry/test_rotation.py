@@ -20,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
+from telemetry.test_recorder import configured
 from trirail.config import SIM, Config, load, parse
 from trirail.processes import loop
 from trirail.processes.recording import GATHER
@@ -56,11 +57,6 @@ class Time:
 
     def wall(self) -> int:
         return WALL_NS + self.ns - made.MONOTONIC_NS
-
-
-def configured(**telemetry: Any) -> Config:
-    config = load(SIM)
-    return msgspec.structs.replace(config, telemetry=msgspec.structs.replace(config.telemetry, **telemetry))
 
 
 def recorder(directory: Path, time: Time, config: Config, **more: Any) -> Recorder:
