@@ -13,7 +13,7 @@ from trirail.cli.key_folder import AUTHORITY_KEY, KeyFolder
 from trirail.config import Config, Tls, Zenoh
 from trirail.telemetry.sinks import free_port
 from trirail.wire.certificates import Pair, authority, issue
-from trirail.wire.stop_door import stop_address
+from trirail.wire.stop_protocol import stop_address
 from trirail.wire.vocabulary import Role
 
 ROLES = {"eva": Role.VIEWER, "ann": Role.OPERATOR, "max": Role.MAINTAINER}

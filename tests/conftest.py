@@ -12,6 +12,7 @@ import tempfile
 import traceback
 import tracemalloc
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from typing import cast
 
@@ -31,7 +32,7 @@ from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Command, CommandContent, Mode
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import Feedback, Triple
 from trirail_drivers.protocols import PROTOCOLS
@@ -77,6 +78,18 @@ def delay_answers(bus: can.BusABC, delay: Delay, clock: Callable[[], float]) -> 
     bus.recv = recv  # type: ignore[method-assign]
 
 
+def part_of_a_cycle(message: can.Message) -> float:
+    return 0.4 * CONFIG.period
+
+
+def a_cycle(message: can.Message) -> float:
+    return CONFIG.period
+
+
+def one_drive_late(message: can.Message) -> float:
+    return 0.4 * CONFIG.period if message.arbitration_id == canopen_frames.TPDO2 + 2 else 0.0
+
+
 FRAMES = 25
 """How deep a stack is looked into for who has allocated."""
 
@@ -87,10 +100,51 @@ def carried(name: str, rate: float | None = None) -> CommandContent:
     return content(*(1.0 if rate is None else 100.0 * rate for field in fields(content) if field.required))
 
 
-class Rig:
+class Cycles(ABC):
+    """Runs cycles of a control, and keeps what it said."""
+
+    control: Control
+
+    def __init__(self) -> None:
+        self.answers: list[Answer] = []
+        self.notices: list[Notice] = []
+
+    @abstractmethod
+    def cycle(self, request: Request | None = None) -> None:
+        """Run one cycle, with a request or without."""
+
+    @property
+    def mode(self) -> Mode:
+        """The robot's mode."""
+        return self.control.state.mode
+
+    def keep_what_was_said(self) -> None:
+        """Move answers and notices from the control's ledger to here."""
+        ledger = self.control.ledger
+        self.answers += ledger.answers
+        self.notices += ledger.notices
+        ledger.answers.clear()
+        ledger.notices.clear()
+
+    def cycles(self, number: int) -> None:
+        """Run so many cycles."""
+        for _ in range(number):
+            self.cycle()
+
+    def until(self, condition: Callable[[], bool], within: int = 5000) -> int:
+        """Run cycles until something holds; return how many."""
+        for number in range(within):
+            if condition():
+                return number
+            self.cycle()
+        raise AssertionError(f"not within {within} cycles; the mode is {self.mode}")
+
+
+class Rig(Cycles):
     """Runs cycles of control, driver and drives, and keeps what was said and every frame that was sent."""
 
     def __init__(self, config: Config = CONFIG, delay: Delay | None = None) -> None:
+        super().__init__()
         self.config = config
         self.now = 100.0
         self.bus = simulated_bus(config.can, config.drives, lambda: self.now)
@@ -106,8 +160,6 @@ class Rig:
         self.control = Control(config, self.driver, self.planner)
         self.driver.sync()
         self.control.start(self.driver.read())
-        self.answers: list[Answer] = []
-        self.notices: list[Notice] = []
         self.rows: list[list[list[float]]] = []
         self.seen: list[list[tuple[int, int]]] = []
         self._tickets = itertools.count(1)
@@ -119,10 +171,6 @@ class Rig:
     @property
     def drives(self) -> tuple[SimulatedDrive, ...]:
         return cast(tuple[SimulatedDrive, ...], self.bus.drives)  # tests with another protocol take rig.bus.drives
-
-    @property
-    def mode(self) -> Mode:
-        return self.control.state.mode
 
     def holds(self) -> bool:
         """Whether the robot stands and is ready for a goal."""
@@ -139,24 +187,10 @@ class Rig:
         given += [(answer, now_ns) for answer in self.planner.answers()]
         control.cycle(self.driver.read, given)
         self.rows.append(control.setpoints.rows)
-        self.seen.append([frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6])
-        ledger = control.ledger
-        self.answers += ledger.answers
-        self.notices += ledger.notices
-        ledger.answers.clear()
-        ledger.notices.clear()
-
-    def cycles(self, number: int) -> None:
-        for _ in range(number):
-            self.cycle()
-
-    def until(self, condition: Callable[[], bool], within: int = 5000) -> int:
-        """Run cycles until something holds; return how many."""
-        for number in range(within):
-            if condition():
-                return number
-            self.cycle()
-        raise AssertionError(f"not within {within} cycles; the mode is {self.mode}")
+        self.seen.append(
+            [canopen_frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6]
+        )
+        self.keep_what_was_said()
 
     def command(self, name: str, value: float | None = None) -> Answer:
         """Send a command and run until it is answered."""
@@ -312,3 +346,14 @@ def rig() -> Iterator[Rig]:
     made = Rig()
     yield made
     made.bus.shutdown()  # not driver.close, which waits for standstill by a clock that stands
+
+
+@pytest.fixture(scope="module")
+def locator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Where a service on simulated drives is, one for all tests of a module."""
+    from trirail.client import own_service
+
+    folder = tmp_path_factory.mktemp("service")
+    config, locator = own_service.private(folder)
+    with own_service.service(config, folder / "session.rrd"):
+        yield locator

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.packets import Answer, Refused
 
 
 @contextlib.contextmanager
@@ -15,3 +16,9 @@ def refused_as(code: RefusalCode) -> Iterator[pytest.ExceptionInfo[RefusedError]
     with pytest.raises(RefusedError) as caught:
         yield caught
     assert caught.value.code is code, caught.value
+
+
+def refusal(answer: Answer) -> Refused:
+    """Return an answer that is one."""
+    assert isinstance(answer, Refused), answer
+    return answer

@@ -18,7 +18,7 @@ from trirail.cli import live
 from trirail.config import Config, geometry, load, parse
 from trirail.config.loading import SIM
 from trirail.config.tables import GeometryTable
-from trirail.diagnosis.bench import JUDGEMENTS
+from trirail.diagnosis.dial_gauge import JUDGEMENTS
 from trirail.errors import ConfigError, KinematicsError
 from trirail.kinematics.calibration import corrected
 from trirail.kinematics.robot import inverse

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from trirail.alignment.calibration import placed
+from trirail.alignment.camera_calibration import placed
 from trirail.alignment.images import CameraView, Pair, pixels
 from trirail.alignment.procedure import LOOK, Sighting, StageMotion, Task, Wish, align, calibration_by_moves
 from trirail.alignment.rigid import Floats, rigid_error, turned

@@ -19,7 +19,7 @@ import numpy as np
 from can.interfaces.socketcan import SocketcanBus
 from trirail_drivers.bus.frame_io import FrameIO, PythonCanFrames, SocketFrames
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.cia402 import frames as layout
+from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.interface import NAMES
 
 AIM = 10.0
@@ -48,7 +48,7 @@ class Listener:
     def __init__(self) -> None:
         self.heard = 0
 
-    def take(self, data: bytearray) -> None:
+    def decode(self, data: bytearray) -> None:
         """Decode a position."""
         layout.POSITION.unpack(data)
         self.heard += 1
@@ -88,7 +88,7 @@ def _cycle(
     listener = Listener()
     began = time.perf_counter()
     while (received := frames.receive()) is not None:
-        listener.take(received[1])
+        listener.decode(received[1])
     for frame in setpoints:
         frame.fill(layout.SETPOINT, 123_456, -7890)
         frames.send(frame)

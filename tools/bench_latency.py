@@ -22,7 +22,7 @@ from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED
 from trirail_drivers.bus.capture import Capture
 from trirail_drivers.bus.frame_io import SocketFrames
 from trirail_drivers.bus.unixbus import UnixBus
-from trirail_drivers.cia402 import frames as layout
+from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.interface import NAMES
 
 SETPOINTS = {layout.RPDO2 + node for node in range(1, 1 + len(NAMES))}

@@ -20,7 +20,7 @@ import numpy as np
 from bench_latency import listener
 from bench_rig import QUANTILES, configured, drives, quantiles, rig, without_pause
 from trirail_drivers.bus.unixbus import UnixBus
-from trirail_drivers.cia402 import frames as layout
+from trirail_drivers.cia402 import canopen_frames as layout
 
 RATE = 1000
 PRIORITY = 80

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from can import CanutilsLogReader
 from trirail.config import Config
-from trirail_drivers.cia402 import frames as layout
+from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.config import Drive
 from trirail_drivers.interface import NAMES
 

@@ -25,7 +25,7 @@ from trirail.telemetry.reading import Recording, read
 from trirail.telemetry.sinks import HOST, free_port
 from trirail.wire.state import State
 from trirail_drivers.bus.unixbus import UnixBus
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 20.0
@@ -224,7 +224,9 @@ class Rig:
         with self._lock:
             begin = len(self._heard)
         request = struct.pack("<BHB4x", 0x40, index, 0)
-        self._bus.send(can.Message(arbitration_id=frames.SDO_REQUEST + node, data=request, is_extended_id=False))
+        self._bus.send(
+            can.Message(arbitration_id=canopen_frames.SDO_REQUEST + node, data=request, is_extended_id=False)
+        )
 
         def answers() -> list[int]:
             with self._lock:
@@ -232,7 +234,8 @@ class Rig:
             return [
                 int.from_bytes(m.data[4:8], "little", signed=True)
                 for m in new
-                if m.arbitration_id == frames.SDO_ANSWER + node and int.from_bytes(m.data[1:3], "little") == index
+                if m.arbitration_id == canopen_frames.SDO_ANSWER + node
+                and int.from_bytes(m.data[1:3], "little") == index
             ]
 
         wait_for(lambda: bool(answers()), f"drive {node} answers")
@@ -269,12 +272,15 @@ class Rig:
         with self._lock:
             heard = list(self._heard)
         for message in heard:
-            if message.arbitration_id == frames.RPDO1 + node:
-                before, told = told, frames.CONTROLWORD.unpack(message.data[:2])[0] & frames.ENABLE_OPERATION
-                if told == frames.ENABLE_OPERATION != before:
+            if message.arbitration_id == canopen_frames.RPDO1 + node:
+                before, told = (
+                    told,
+                    canopen_frames.CONTROLWORD.unpack(message.data[:2])[0] & canopen_frames.ENABLE_OPERATION,
+                )
+                if told == canopen_frames.ENABLE_OPERATION != before:
                     runs.append([])
-            elif message.arbitration_id == frames.RPDO2 + node and told == frames.ENABLE_OPERATION:
-                runs[-1].append(frames.SETPOINT.unpack(message.data)[0] / self.counts)
+            elif message.arbitration_id == canopen_frames.RPDO2 + node and told == canopen_frames.ENABLE_OPERATION:
+                runs[-1].append(canopen_frames.SETPOINT.unpack(message.data)[0] / self.counts)
         return [np.array(run) for run in runs]
 
 

@@ -22,10 +22,10 @@ class Bound(NamedTuple):
 INTRODUCTION = """\
 ## Where a limit or time-out stands
 
-What the robot may do is in `[limits]`; what is asked of the drives, and by whom it is watched where they watch
-themselves, in `[drives]`; what the service watches, in `[watchdogs]`. What depends on no robot is fixed.
-A following error is bounded twice on purpose: by the drives, which go on watching when the service is dead, and by the
-service, which stops all three at once and whose limit should be the lower one.
+What the robot may do is in `[limits]`, what the drives do and watch in `[drives]`, what the
+service watches in `[watchdogs]`. What depends on no robot is fixed: a value, with its name in the
+code. A following error is bounded twice: by the service, which stops all three at once at the lower
+limit, and by the drives, which go on watching when the service is dead.
 """
 
 BOUNDS = (
@@ -78,18 +78,22 @@ BOUNDS = (
 
 def table(known: set[str]) -> str:
     """Return the table. `known` are the keys of the configuration; KeyError for a place that is not there."""
-    own = "each one its own, `timeout`"
-    rows = [f"| {what} | {', '.join(_said(place, known) for place in places) or own} | {beyond} |"
-            for what, places, beyond in BOUNDS]  # fmt: skip
+    rows = [f"| {what} | {_said(places, known)} | {beyond} |" for what, places, beyond in BOUNDS]
     return "\n".join([INTRODUCTION, "| what is bounded | where | beyond it |", "|---|---|---|", *rows]) + "\n"
 
 
-def _said(place: str, known: set[str]) -> str:
-    module, _, constant = place.partition(":")
-    if constant:
-        name, unit = constant.split(" ")
-        return f"fixed: {vars(importlib.import_module(module))[name]:g} {unit}, `{name}` in `{module}`"
-    if place not in known:
-        raise KeyError(place)
-    section, _, key = place.rpartition(".")
-    return f"`[{section}] {key}`"
+def _said(places: tuple[str, ...], known: set[str]) -> str:
+    """Say places; a section that is that of the place before is not said again."""
+    said, last = [], ""
+    for place in places:
+        module, _, constant = place.partition(":")
+        section, _, key = place.rpartition(".")
+        if constant:
+            name, unit = constant.split(" ")
+            said.append(f"{vars(importlib.import_module(module))[name]:g} {unit} (`{name}`)")
+        elif place not in known:
+            raise KeyError(place)
+        else:
+            said.append(f"`{key}`" if section == last else f"`[{section}] {key}`")
+            last = section
+    return ", ".join(said) or "its own `timeout`"

@@ -29,23 +29,23 @@ FILE = Path(__file__).parents[1] / "configs/README.md"
 HEAD = """\
 # Configurations
 
-One TOML file is one robot. It is strict: an unknown key, a wrong type or an impossible value is refused with the file,
-the key, the value and what is allowed; nothing falls back silently. SI units and radians throughout.
+One TOML file is one robot. It is strict: an unknown key, a wrong type or an impossible value is
+refused with the file, the key, the value and what is allowed. SI units and radians throughout.
 
 {files}
 
 ```sh
 trirail config                              # the list above, wherever trirail is installed
 trirail config copy socketcan robot.toml    # one to start from
-trirail config show robot.toml              # every key as it will be used, and how it differs from sim.toml
+trirail config show robot.toml              # every key as it will be used, and what differs from sim.toml
 trirail doctor robot.toml                   # this machine, its rights, the CAN interface and the bus load for it
 ```
 
-Alignment stages, UVW and XXY: [which one have I got?](stages.md)
-How to bring a real robot up with one: [drivers/README.md](../drivers/README.md).
-A key is added in `service/trirail/config/tables.py` or, for bus and drives, in `drivers/trirail_drivers/config.py`,
-with a docstring that gives meaning and unit. What follows is made from there by `tools/config_reference.py`; a test
-holds the two together.
+Alignment stages, UVW and XXY: [which one have I got?](stages.md) A real robot, step by step:
+[drivers/README.md](../drivers/README.md#bring-up-a-drive).
+
+What follows is made by `tools/config_reference.py` from `service/trirail/config/tables.py` and
+`drivers/trirail_drivers/config.py`: a key's docstring is its row.
 """
 
 

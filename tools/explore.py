@@ -65,7 +65,7 @@ class Summary(NamedTuple):
         tried = sum(count > 0 for count in self.examples.values())
         return f"{self.examples.total():,} examples of {tried} of {self.tests} tests, {len(self.findings)} findings"
 
-    def told(self) -> Iterator[str]:
+    def lines(self) -> Iterator[str]:
         """Yield it line by line, for people."""
         for test, count in sorted(self.examples.items()):
             yield f"{count:10,}  {test}"
@@ -175,7 +175,7 @@ def main() -> int:
         told = {"seed": seed, "tests": found.tests, "examples": found.examples, "findings": found.findings}
         print(json.dumps(told | {"interrupted": trouble is not None}))
     else:
-        print("\n".join(found.told()) + f"; --seed {seed}" + ("; interrupted" if trouble is not None else ""))
+        print("\n".join(found.lines()) + f"; --seed {seed}" + ("; interrupted" if trouble is not None else ""))
     return 130 if trouble is not None else int(bool(found.findings))
 
 

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from trirail.config import SIM, load
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse
-from trirail.workspace import mechanism
-from trirail.workspace.mechanism import Mechanism, Points
+from trirail.workspace import part_positions
+from trirail.workspace.part_positions import Points, RobotParts
 
 FILE = Path(__file__).parent / "pictures/frames.png"
 INK, GREY, RAIL, PLATFORM, BASE, SLIDER = "#1f2933", "#7b8794", "#d3d9e0", "#f0772b", "#2166ac", "#1b7f4d"
@@ -33,7 +33,7 @@ def draw(file: Path) -> None:
     """Draw the robot at its centre and moved, in millimetres, with all that is counted."""
     limits = load(SIM).limits.slider
     robot = Geometry.symmetric(0.3)
-    parts = Mechanism.of(robot, limits)
+    parts = RobotParts.of(robot, limits)
     figure = Figure(figsize=(12.0, 5.9), dpi=150, layout="constrained")
     centre, moved = figure.subplots(1, 2, sharex=True, sharey=True)
     x, y, phi = MOVED
@@ -50,15 +50,15 @@ def draw(file: Path) -> None:
     figure.savefig(file)
 
 
-def _robot(panel: Axes, robot: Geometry, parts: Mechanism, pose: tuple[float, float, float]) -> None:
+def _robot(panel: Axes, robot: Geometry, parts: RobotParts, pose: tuple[float, float, float]) -> None:
     """Draw rails, platform and sliders, each with where it is."""
     for rail in parts.rails:
         panel.plot(*(1e3 * rail.T), color=RAIL, linewidth=7.0, solid_capstyle="round", zorder=1)
-    for line in mechanism.placed(parts.outline, pose):
+    for line in part_positions.placed(parts.outline, pose):
         panel.add_patch(Polygon(1e3 * line, facecolor=PLATFORM, alpha=0.13, zorder=3))
         panel.plot(*(1e3 * line.T), color=PLATFORM, linewidth=2.0, solid_joinstyle="round", zorder=4)
     positions = inverse(robot, pose).position
-    at = mechanism.sliders(robot, positions[None])[0]
+    at = part_positions.sliders(robot, positions[None])[0]
     panel.plot(*(1e3 * at.T), "o", color="white", markeredgecolor=SLIDER, markersize=10, markeredgewidth=2.4, zorder=6)
     for name, slider, outward, position in zip("ABC", at, _outward(parts), positions, strict=True):
         value = f"{position * 1e3:+.0f} mm".replace("-", "−") if abs(position) > 1e-9 else "0"
@@ -66,7 +66,7 @@ def _robot(panel: Axes, robot: Geometry, parts: Mechanism, pose: tuple[float, fl
         _text(panel, 1e3 * slider + 38.0 * outward, f"{name}  {value}", SLIDER, ha=side)
 
 
-def _directions(panel: Axes, robot: Geometry, parts: Mechanism) -> None:
+def _directions(panel: Axes, robot: Geometry, parts: RobotParts) -> None:
     """Draw the base frame, and the way in which each slider and the angle rise."""
     _axes(panel, (0.0, 0.0), 0.0, 100.0, BASE, ("+x", "+y"))
     _text(panel, (8.0, -17.0), "O = G", INK, ha="left")
@@ -118,7 +118,7 @@ def _text(panel: Axes, at: ArrayLike, words: str, colour: str, ha: str = "center
     panel.text(x, y, words, color=colour, fontsize=13, fontweight="bold", ha=ha, va="center", zorder=9)
 
 
-def _outward(parts: Mechanism) -> Points:
+def _outward(parts: RobotParts) -> Points:
     """Return unit vectors from the middle of the robot across each rail, (3, 2)."""
     away = parts.names - parts.names.mean(axis=0)
     out: Points = away / np.linalg.norm(away, axis=1, keepdims=True)

@@ -92,14 +92,14 @@ class Machine:
         process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
         self._processes.append(process)
 
-        def told() -> str:
+        def verdict() -> str:
             said, _ = process.communicate(timeout=WITHIN)
             can0 = [check for check in json.loads(said)["checks"] if check["name"].startswith("can0")]
             if len(can0) != 4 or any(check["verdict"] != "ok" for check in can0):
                 raise Failed(f"the doctor says of can0: {can0}")
             return ", ".join(f"{check['name']} {check['found']}" for check in can0)
 
-        return told
+        return verdict
 
     def candump(self, channel: str, name: str) -> None:
         """Start the log of all frames that pass an interface: NAME, in memory."""

@@ -19,8 +19,8 @@ PICTURES = ROOT / "tools/pictures"
 KEYWORD = "drawn-from"
 SOURCES: dict[str, tuple[str, ...]] = {
     "panel": ("service/trirail/panel/page/*", "tools/panel_picture.py"),
-    "frames": ("tools/frames_picture.py", "service/trirail/workspace/mechanism.py"),
-    "workspace": ("service/trirail/workspace/plots.py", "service/trirail/workspace/mechanism.py"),
+    "frames": ("tools/frames_picture.py", "service/trirail/workspace/part_positions.py"),
+    "workspace": ("service/trirail/workspace/plots.py", "service/trirail/workspace/part_positions.py"),
     "demo": ("service/trirail/telemetry/blueprint.py", "service/trirail/telemetry/scene.py",
              "service/trirail/telemetry/curves.py", "service/trirail/telemetry/palette.py", "tools/screenshot.py"),
     "paper": ("tools/paper_figures.py", "tools/paper_motions.py"),

@@ -17,8 +17,8 @@ from matplotlib.patches import Polygon
 from trirail.config import SIM, geometry, load
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import inverse
-from trirail.workspace import mechanism
-from trirail.workspace.mechanism import Mechanism
+from trirail.workspace import part_positions
+from trirail.workspace.part_positions import RobotParts
 
 FILE = Path(__file__).parent / "pictures/stages.svg"
 INK, GREY, RAIL, TABLE, CARRIAGE, CROSS = "#1f2933", "#7b8794", "#d3d9e0", "#f0772b", "#1b7f4d", "#2166ac"
@@ -41,7 +41,7 @@ def draw(file: Path) -> None:
         for panel, (name, title) in zip(panels, PANELS, strict=True):
             config = load(SIM.with_name(f"{name}.toml"))
             robot = geometry(config.geometry)
-            _stage(panel, robot, Mechanism.of(robot, config.limits.slider))
+            _stage(panel, robot, RobotParts.of(robot, config.limits.slider))
             panel.set_title(title, color=INK, fontsize=12)
             panel.set_aspect("equal")
             panel.set_axis_off()
@@ -49,19 +49,19 @@ def draw(file: Path) -> None:
         figure.savefig(file, format="svg", metadata={"Date": None})
 
 
-def _stage(panel: Axes, robot: Geometry, parts: Mechanism) -> None:
+def _stage(panel: Axes, robot: Geometry, parts: RobotParts) -> None:
     """Draw rails, table, carriages, cross slides and pivots."""
     for rail in parts.rails:
         panel.plot(*(1e3 * rail.T), color=RAIL, linewidth=9.0, solid_capstyle="round", zorder=1)
     table = parts.outline[-1]
     panel.plot(*(1e3 * table.T), color=GREY, linewidth=1.0, linestyle=(0, (4, 3)), zorder=2)
-    (turned,) = mechanism.placed([table], TURNED)
+    (turned,) = part_positions.placed([table], TURNED)
     panel.add_patch(Polygon(1e3 * turned, facecolor=TABLE, edgecolor=TABLE, alpha=0.15, zorder=2))
     panel.plot(*(1e3 * turned.T), color=TABLE, linewidth=1.8, zorder=3)
     pose = np.array([TURNED])
-    at = mechanism.sliders(robot, inverse(robot, pose).position)
-    held = mechanism.pivots(robot, at, pose)[0]
-    lines = mechanism.cross_slides(robot, parts, at, pose[:, 2])[0]
+    at = part_positions.sliders(robot, inverse(robot, pose).position)
+    held = part_positions.pivots(robot, at, pose)[0]
+    lines = part_positions.cross_slides(robot, parts, at, pose[:, 2])[0]
     for label, carriage, pivot, line in zip(robot.labels, at[0], held, lines, strict=True):
         along = (line[1] - line[0]) / np.linalg.norm(line[1] - line[0])
         slide = np.array([carriage - SLIDE * along, carriage + SLIDE * along])

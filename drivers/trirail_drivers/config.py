@@ -57,8 +57,7 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
     start: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     """Slider positions at power-on [m]."""
     built: tuple[Built, Built, Built] | None = None
-    """How the simulated sliders A, B, C are built and wired, for `trirail commission` to find out where [drives] says
-    otherwise; faults on demand start from it. As [drives] says, if absent."""
+    """How the simulated sliders are built, where otherwise than [drives] says: `trirail commission` finds it out."""
 
 
 OptionNumber = Annotated[int, Meta(ge=-(10**12), le=10**12)] | Annotated[float, Meta(ge=-1e12, le=1e12)]
@@ -74,7 +73,7 @@ class Can(Struct, frozen=True, forbid_unknown_fields=True):
     channel: Name = ""
     """The interface's channel, as `can0`."""
     bitrate: Annotated[int, Meta(ge=10_000, le=8_000_000)] = 1_000_000
-    """Bits per second: for the bus load, and for interfaces that set it themselves. A wire has at most 1 Mbit/s."""
+    """Bits per second: for the bus load, and for interfaces that set it themselves; 1 Mbit/s at most on a wire."""
     options: dict[OptionName, bool | OptionNumber | Name] = {}
     """Handed to python-can as they are: `index` of gs_usb, `host` and `port` of socketcand, `tty_baudrate` of slcan."""
     simulated: Simulated = Simulated()
@@ -84,7 +83,7 @@ class Homing(Struct, frozen=True, forbid_unknown_fields=True):
     """How a drive with an incremental encoder finds its zero, in homing mode: [drives.A.homing], and so on."""
 
     method: Annotated[int, Meta(ge=-128, le=127)]
-    """Object 6098h. Its directions are those of the drive's own counts; negative ones are the maker's."""
+    """Object 6098h; directions are those of the drive's counts, negative methods the maker's."""
     speed_switch: Velocity
     """Object 6099h:01, while the switch is searched [m/s]."""
     speed_zero: Velocity
@@ -92,7 +91,7 @@ class Homing(Struct, frozen=True, forbid_unknown_fields=True):
     acceleration: Acceleration
     """Object 609Ah [m/s²]."""
     timeout: Annotated[float, Meta(ge=0.01, le=180.0)] = 60.0
-    """How long it may take [s]; so it bounds the way that a slider goes where it meets no switch."""
+    """How long it may take [s]: bounds the way of a slider that meets no switch."""
 
     def __post_init__(self) -> None:
         if self.method == 0:
@@ -100,8 +99,8 @@ class Homing(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ObjectWrite(Struct, frozen=True, forbid_unknown_fields=True):
-    """An object of the drive's maker that is given a value when the drive is set up, and read back: for what the set-up
-    does not do itself. Node id, bitrate and what stores are refused."""
+    """An object of the maker's, written and read back at set-up. Refused: what set-up writes itself, node id, bitrate,
+    storing."""
 
     object: Annotated[int, Meta(ge=0x1000, le=0xFFFF)]
     """Its index, as 0x208E."""
@@ -144,24 +143,20 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     homing: Homing | None = None
     """None where the encoder is absolute."""
     eds: Name | None = None
-    """Its maker's EDS, relative to the configuration file: which objects are mappable, and what types those have that
-    cannot be read. All else the drive is asked for."""
+    """Its maker's EDS, relative to this file: which objects are mappable, types that the drive cannot tell."""
     velocity_unit: UnitName | None = None
-    """The drive's unit of velocity, as "counts/s", "0.1 counts/s", "rpm", "deg/s", "mm/s": wanted where it does not
-    tell (objects 60A9h, 6096h); refused where it contradicts the drive."""
+    """Unit of velocity, as "0.1 counts/s", "rpm", "deg/s", "mm/s", where the drive tells none (60A9h, 6096h); refused
+    where it contradicts the drive."""
     acceleration_unit: UnitName | None = None
-    """The drive's unit of acceleration, as "counts/s2", "rpm/s", "rev/s2", "mm/s2": wanted where it does not tell
-    (objects 60AAh, 6097h); refused where it contradicts the drive."""
+    """Likewise of acceleration, as "counts/s2", "rpm/s", "rev/s2", "mm/s2" (60AAh, 6097h)."""
     revolutions_per_metre: Annotated[float, Meta(ge=1e-6, le=1e9)] | None = None
-    """Revolutions by which the drive counts velocities, per metre of the slider: wanted where these are in rpm or
-    the like and the drive does not tell how many counts a revolution has."""
+    """Revolutions per metre of the slider, where velocities are in rpm or the like and the drive does not tell how many
+    counts a revolution has."""
     endpoints: Name | None = None
-    """An ODrive's flat_endpoints.json, relative to the configuration file: the maker's, for its firmware and hardware,
-    where trirail has not the numbers of its settings."""
+    """An ODrive's flat_endpoints.json, relative to this file, for firmware or hardware that trirail does not know."""
     accept_without: tuple[ProtectionName, ...] = ()
-    """Protections that the drive may lack, each named by its object, as ["1006", "6007"], or an ODrive's setting, as
-    ["enable_watchdog"]: those of the tables in drivers/README.md; "6041" where bit 12 of its statusword says
-    nothing."""
+    """Protections that the drive may lack, of the tables in drivers/README.md: objects, as ["1006", "6007"], or an
+    ODrive's settings, as ["enable_watchdog"]; "6041" where bit 12 of its statusword is never set."""
     write: tuple[ObjectWrite, ...] = ()
     """Objects of its maker's that it is to be given."""
 
@@ -177,19 +172,18 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     master_node: NodeId = 126
     """The node id of the service itself, for its heartbeat on CANopen."""
     heartbeat: Annotated[float, Meta(ge=0.001, le=21.845)] = 0.1
-    """Period of everyone's heartbeat [s]; three missed ones are a loss. An ODrive must have been given it."""
+    """Period of everyone's heartbeat [s], which an ODrive must have been given; three missed ones are a loss."""
     missed_positions: Annotated[int, Meta(ge=1, le=1000)] = 3
     """So many cycles in a row without a drive's position are a loss of that drive."""
     following_error: Distance = 0.005
-    """The following error window [m]: the drives' own, object 6065h; for ODrives, which have none, the driver's. Wider
-    than `[limits.slider] following_error`, so that the service stops all three before one of them faults."""
+    """The drives' own window [m], object 6065h; the driver's for ODrives. Wider than `[limits.slider] following_error`:
+    the service stops all three before one of them faults."""
     quick_stop_deceleration: Acceleration = 10.0
-    """The quick-stop ramp [m/s²]: the drives' own, object 6085h; for ODrives, which have none, the driver's."""
+    """The quick-stop ramp [m/s²]: the drives' own, object 6085h; the driver's for ODrives."""
     stop_timeout: Timeout = 1.0
     """How long a drive may take to lose its power, down the quick-stop ramp or when it is disabled [s]."""
     sdo_timeout: Timeout = 0.5
-    """How long a drive may take to answer a configuration request, and to have what was written [s]; CiA 402 drives ten
-    times that to boot."""
+    """How long a drive may take to answer at set-up, and to have what was written [s]; ten times that to boot."""
 
     @property
     def each(self) -> tuple[Drive, Drive, Drive]:

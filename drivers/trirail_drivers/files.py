@@ -22,7 +22,7 @@ _KINDS = {
 }
 
 
-def opened(path: Path) -> BinaryIO:
+def open_regular(path: Path) -> BinaryIO:
     """Open a regular file to be read. Raises FileError, where there is none or where reading might never end."""
     try:
         # Opening a device may do something, and a FIFO without O_NONBLOCK waits for somebody to write to it.
@@ -42,7 +42,7 @@ def opened(path: Path) -> BinaryIO:
 
 def text(path: Path) -> str:
     """Read a text file in UTF-8. Raises FileError."""
-    with opened(path) as file:
+    with open_regular(path) as file:
         try:
             content = file.read(LARGEST_TEXT + 1)
         except OSError as error:

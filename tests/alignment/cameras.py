@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Mapping
 from typing import TypeVar
 
 import numpy as np
-from trirail.alignment.calibration import placed
+from trirail.alignment.camera_calibration import placed
 from trirail.alignment.images import CameraView, Lens, Pair, pixels
 from trirail.alignment.procedure import LOOK, Sighting, StageMotion, Wish
 from trirail.alignment.rigid import turned

@@ -7,7 +7,7 @@ import pytest
 from alignment.cameras import Stage, camera
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.alignment.calibration import CameraCalibration, Sight, calibrate, placed
+from trirail.alignment.camera_calibration import CameraCalibration, Sight, calibrate, placed
 from trirail.alignment.images import LENSES, Lens, pixels, places, slopes
 from trirail.alignment.procedure import MOVES, calibration_by_moves
 from trirail.errors import AlignmentError, AlignmentFault

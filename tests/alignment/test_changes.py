@@ -9,7 +9,7 @@ import numpy as np
 from alignment.cameras import Stage, camera, part_at
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.alignment.calibration import CameraCalibration
+from trirail.alignment.camera_calibration import CameraCalibration
 from trirail.alignment.changes import ViewChange, view_changes
 from trirail.alignment.images import CameraView, Pair
 from trirail.alignment.procedure import calibration_again, calibration_by_moves

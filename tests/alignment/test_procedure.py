@@ -9,7 +9,7 @@ import pytest
 from alignment.cameras import Stage, camera, part_at
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.alignment.calibration import CameraCalibration
+from trirail.alignment.camera_calibration import CameraCalibration
 from trirail.alignment.images import Pair
 from trirail.alignment.procedure import BEYOND, Alignment, AlignmentEnd, Task, align, calibration_by_moves, look_only
 from trirail.errors import AlignmentError, AlignmentFault

@@ -72,7 +72,7 @@ def test_faults_are_numbered_at_their_moment_and_told_below_the_curves(tmp_path:
         recorder.event(fault)
     name = "g $x_{1}$ %s"
     recorder.event(Event(20, 1.9, 1900, 1.7e9, "goal", "info", "done", id=name, outcome="done"))
-    recorder.given(ControlInput(1, 100, 0, GoalRequest(1, "somebody", name, SlidersGoal((0.0, 0.0, 0.0)), 0)))
+    recorder.control_input(ControlInput(1, 100, 0, GoalRequest(1, "somebody", name, SlidersGoal((0.0, 0.0, 0.0)), 0)))
     recorder.close()
     picture = tmp_path / "session.svg"
     assert recording_commands.report(tmp_path / "session.rrd", plot=picture) == 0

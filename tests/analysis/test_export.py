@@ -13,7 +13,7 @@ from pyarrow import csv, parquet
 from trirail.analysis import export
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
-from trirail.telemetry import tables
+from trirail.telemetry import recording_table
 from trirail.telemetry.reading import Line, Recording, read
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.goals import MoveGoal
@@ -89,16 +89,16 @@ def test_a_part_has_the_cycles_between_and_the_first_of_every_so_long(
 
 
 def test_columns_are_names_of_fields_or_words_of_these(recording: Recording) -> None:
-    every = set(tables.table(recording).column_names)
+    every = set(recording_table.table(recording).column_names)
     for name in DTYPE.names or ():
-        found = set(tables.table(recording, [name]).column_names)
+        found = set(recording_table.table(recording, [name]).column_names)
         assert found - {"t"} == {column for column in every if column.removeprefix(name) in ENDINGS}
     for word in {word for name in DTYPE.names or () for word in name.split("_")} - set(DTYPE.names or ()):
-        found = set(tables.table(recording, [word]).column_names) - {"t"}
+        found = set(recording_table.table(recording, [word]).column_names) - {"t"}
         assert found == {column for column in every if word in column.split("_")}
-    assert tables.table(recording, ["error", "following_error"]).num_columns == 4
+    assert recording_table.table(recording, ["error", "following_error"]).num_columns == 4
     with pytest.raises(ServiceError, match="no column poze"):
-        tables.table(recording, ["poze"])
+        recording_table.table(recording, ["poze"])
 
 
 def test_a_dataframe_is_the_table_by_time(recording: Recording) -> None:

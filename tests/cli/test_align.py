@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
 from trirail.cli import mark_source
 from trirail.cli.mark_options import MarkSource
-from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
 from trirail_drivers.interface import Triple
@@ -30,7 +28,7 @@ import json, sys
 from pathlib import Path
 import numpy as np
 from trirail import Robot
-from trirail.alignment.calibration import placed
+from trirail.alignment.camera_calibration import placed
 from trirail.alignment.images import CameraView, pixels
 with Robot("demo", sys.argv[1]) as robot:
     for _ in sys.stdin:
@@ -43,14 +41,6 @@ with Robot("demo", sys.argv[1]) as robot:
             seen[name] = pixels(view, placed(place, pose)[None])[0].tolist()
         print(json.dumps(seen), flush=True)
 """
-
-
-@pytest.fixture(scope="module")
-def locator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    folder = tmp_path_factory.mktemp("al")
-    config, locator = own_service.private(folder)
-    with own_service.service(config, folder / "align.rrd"):
-        yield locator
 
 
 def trirail(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
@@ -138,16 +128,16 @@ def test_several_marks_of_one_picture_are_each_found_in_its_window(tmp_path: Pat
     cv2 = pytest.importorskip("cv2")
     cv2.imwrite(str(tmp_path / "top.png"), drawn(TWO))
     options = [f"{name}=top:{','.join(map(str, at))}" for name, at in WINDOWS.items()]
-    with MarkSource(pictures=tmp_path, window=tuple(options), shape="disc", size=40.0).opened() as (look, views):
+    with MarkSource(pictures=tmp_path, window=tuple(options), shape="disc", size=40.0).open_source() as (look, views):
         assert look() == {"a": pytest.approx((85.0, 120.0), abs=0.05), "b": pytest.approx((235.0, 95.0), abs=0.05)}
         assert views == {"a": "top", "b": "top"}
     with (
-        MarkSource(pictures=tmp_path, window=("a=top:200,0,160,240",)).opened() as (look, _),
+        MarkSource(pictures=tmp_path, window=("a=top:200,0,160,240",)).open_source() as (look, _),
         pytest.raises(TrirailError, match="beyond its picture of 320 × 240"),
     ):
         look()
     with (
-        MarkSource(pictures=tmp_path, window=("a=side:0,0,1,1",)).opened() as (look, _),
+        MarkSource(pictures=tmp_path, window=("a=side:0,0,1,1",)).open_source() as (look, _),
         pytest.raises(TrirailError, match="no picture side for mark a; there are top"),
     ):
         look()
@@ -172,7 +162,7 @@ def test_one_camera_that_shows_several_marks_is_opened_once_and_read_once_a_look
     path = film(tmp_path / "film.avi", [drawn(TWO, pose) for pose in poses])
     windows = tuple(f"{name}={','.join(map(str, at))}" for name, at in WINDOWS.items())
     source = MarkSource(camera=(f"a={path}", f"b={path}"), window=windows, shape="disc", size=40.0)
-    with source.opened() as (look, views):
+    with source.open_source() as (look, views):
         assert views is not None
         assert len(set(views.values())) == 1
         for n in (1, 3, 5, 7):
@@ -197,7 +187,7 @@ def test_one_camera_that_shows_several_marks_is_opened_once_and_read_once_a_look
 )
 def test_what_cannot_be_meant_of_a_source_is_said(options: dict[str, Any], words: str) -> None:
     pytest.importorskip("cv2")
-    with pytest.raises(TrirailError, match=words), MarkSource(**options).opened():
+    with pytest.raises(TrirailError, match=words), MarkSource(**options).open_source():
         pass
 
 

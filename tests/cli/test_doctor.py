@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from trirail.cli import doctor, doctor_cycle, doctor_network, probes
 from trirail.cli.machine import Gathered, Machine, Passed
 from trirail.config import SIM, Config, Tls, everything, load
-from trirail.diagnosis import Check, drives
+from trirail.diagnosis import Check, drive_checks
 from trirail.errors import ServiceError
 from trirail.processes import bare_loop
 from trirail.processes.bare_loop import Cycles
@@ -282,7 +282,7 @@ def test_protections_that_drives_may_lack_are_listed_once_each_with_their_drives
 )
 def test_bus_load(bitrate: int, rate: int, verdict: str) -> None:
     config = changed(changed(REAL, "can", bitrate=bitrate), "loop", rate_hz=rate)
-    assert next(drives.load(config)).verdict == verdict
+    assert next(drive_checks.load(config)).verdict == verdict
 
 
 RATES = st.sampled_from([1, 10, 50, 100, 125, 200, 250, 400, 500, 800, 1000, 1250, 2000, 4000])
@@ -304,7 +304,7 @@ def test_the_bus_load_is_judged_as_the_driver_does(protocol: str, rate: int, bit
     clock = count(1000.0, 1e-6)
     bus = simulated_bus(config.can, config.drives, lambda: next(clock))
     driver = PROTOCOLS[protocol].driver(bus, bitrate, config.drives, lambda: next(clock))
-    check = next(drives.load(config))
+    check = next(drive_checks.load(config))
     refused = ""
     try:
         driver.configure(config.period)

@@ -14,12 +14,13 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
-from cli.test_pendant import Operator, until
+from cli.test_pendant import Operator
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.cli import pendant
 from trirail.cli.gamepad import QUIET, Button, Code, EventType, Gamepad, Pad, StickRange, is_gamepad
 from trirail.errors import ServiceError
+from waiting import wait_until
 
 SIDE = StickRange(-32768, 32767)
 RANGES: dict[int, StickRange] = {Code.X: SIDE, Code.Y: SIDE, Code.RX: SIDE, Code.HAT_Y: StickRange(-1, 1)}
@@ -141,7 +142,7 @@ def test_the_other_buttons_stop_and_set_the_speed(hand: Hand) -> None:
     hand.feel(stick(Code.HAT_Y, 1), stick(Code.HAT_Y, 0))
     assert hand.operator.pendant.speed == usual
     hand.feel(key(Button.EAST))
-    until(lambda: "stop" in hand.operator.robot.commands)
+    wait_until(lambda: "stop" in hand.operator.robot.commands)
 
 
 events = st.builds(Event, st.just(EventType.KEY), st.sampled_from(Button), st.integers(0, 2)) | st.builds(
@@ -233,7 +234,7 @@ def test_a_pad_that_is_unplugged_while_it_moves_the_robot_ends_it_and_says_so() 
     pulling.join()
     assert device.closed
     assert operator.sent(4)[-1] == (0.0, 0.0, 0.0)
-    until(lambda: operator.robot.state().mode == "holding")
+    wait_until(lambda: operator.robot.state().mode == "holding")
     operator.pendant.close()
 
 
@@ -243,7 +244,7 @@ def test_the_pad_stops_the_robot_and_the_operator_leaves_by_the_terminal() -> No
     with at_terminal() as keyboard, Pad(device) as pad:
 
         def leave() -> None:
-            until(lambda: "stop" in operator.robot.commands)
+            wait_until(lambda: "stop" in operator.robot.commands)
             os.write(keyboard, b"q")
 
         leaving = threading.Thread(target=leave)

@@ -16,7 +16,7 @@ from trirail.cli import app, doctor_network, key_folder, probes, terminal
 from trirail.cli.key_folder import KeyFolder
 from trirail.config import Tls, Zenoh
 from trirail.errors import ServiceError
-from trirail.processes.guard import Guard
+from trirail.processes.session_guard import Guard
 from trirail.wire.certificates import Pair, issue
 from trirail.wire.credentials import Credentials, revoked
 from trirail.wire.vocabulary import Role

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import given
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.cli.keyboard import keys
 from trirail.cli.pendant import REPEAT, Pendant
+from waiting import wait_until
 
 TOP = (0.25, 0.25, 1.5)
 
@@ -56,15 +56,8 @@ class Operator:
 
     def sent(self, number: int) -> list[tuple[float, float, float]]:
         """What has been sent, as soon as it is so many."""
-        until(lambda: len(self.robot.sent) >= number)
+        wait_until(lambda: len(self.robot.sent) >= number)
         return [(goal.x, goal.y, goal.phi) for goal in self.robot.sent]
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
 
 
 @pytest.fixture
@@ -107,15 +100,15 @@ def test_another_key_ends_what_is_held(operator: Operator) -> None:
         operator.sent(1)
         operator.press(other)
         assert operator.sent(2)[1] == (0.0, 0.0, 0.0)
-        until(lambda: operator.robot.state().goal is None)
+        wait_until(lambda: operator.robot.state().goal is None)
     assert operator.pendant.over
 
 
 @pytest.mark.parametrize("key", [" ", "escape"])
 def test_space_and_escape_stop_also_what_others_have_begun(operator: Operator, key: str) -> None:
     operator.press(key)
-    until(lambda: "stop" in operator.robot.commands)
-    until(lambda: operator.pendant.said == "stopped")
+    wait_until(lambda: "stop" in operator.robot.commands)
+    wait_until(lambda: operator.pendant.said == "stopped")
 
 
 def test_the_speed_goes_up_and_down_within_its_bounds(operator: Operator) -> None:
@@ -133,4 +126,4 @@ def test_the_speed_goes_up_and_down_within_its_bounds(operator: Operator) -> Non
 def test_a_refusal_is_shown(operator: Operator) -> None:
     operator.robot.command("disable")
     operator.press("up")
-    until(lambda: "send enable first" in operator.pendant.said)
+    wait_until(lambda: "send enable first" in operator.pendant.said)

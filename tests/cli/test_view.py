@@ -9,8 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.sinks import free_port
 from trirail.wire.endpoints import is_local
+from waiting import wait_until
 
 VIEWS = {
     "demo: 3-PRP planar robot",
@@ -75,13 +75,6 @@ def near(picture: Image.Image, colour: tuple[int, ...]) -> int:
     return int(np.count_nonzero(np.abs(np.asarray(picture.convert("RGB")).astype(int) - colour[:3]).max(axis=2) < 24))
 
 
-def until(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + WITHIN
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.1)
-
-
 @pytest.mark.viewer
 @needs_vulkan
 def test_the_viewer_shows_every_view_without_complaint(recording: Path, tmp_path: Path) -> None:
@@ -120,7 +113,7 @@ def test_the_browser_shows_a_recording(recording: Path, tmp_path: Path) -> None:
     with trirail_view(recording) as url, chromium("chromium", tmp_path) as page:
         page.open(f"{url}&renderer=webgl")
         found = lambda: all(near(page.picture(), colour) > 50 for colour in palette.SLIDERS)  # noqa: E731
-        until(found, "the sliders' colours")
+        wait_until(found, "the sliders' colours")
         assert colours(page.picture()) > 40
 
 

@@ -6,7 +6,7 @@ import asyncio
 import math
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 from alignment.cameras import FOCUS, part_at
-from trirail.alignment.calibration import placed
+from trirail.alignment.camera_calibration import placed
 from trirail.alignment.images import CameraView, Pair, pixels
-from trirail.client import calibration_file, own_service
+from trirail.client import calibration_file
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.errors import AlignmentError, AlignmentFault, RefusedError, TrirailError
@@ -28,14 +28,6 @@ VIEWS = {
     "right": CameraView((0.06, 0.01), (1100.0, 700.0), ((-FOCUS, 1e4), (2e4, -FOCUS))),
 }
 ERROR = (0.0008, -0.0006, math.radians(0.35))
-
-
-@pytest.fixture(scope="module")
-def locator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    folder = tmp_path_factory.mktemp("align")
-    config, locator = own_service.private(folder)
-    with own_service.service(config, folder / "align.rrd"):
-        yield locator
 
 
 def seen(part: dict[str, Pair], pose: tuple[float, float, float]) -> dict[str, Pair]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable
 from contextlib import aclosing
 
 import pytest
 from refusals import refused_as
-from trirail.client import own_service
 from trirail.client.async_client import AsyncRobot
 from trirail.errors import RefusalCode
 from trirail.wire.goals import TrajectoryPoint
@@ -20,14 +19,6 @@ pytestmark = pytest.mark.slow
 
 WITHIN = 30.0
 Work = Callable[[AsyncRobot], Awaitable[None]]
-
-
-@pytest.fixture(scope="module")
-def locator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    folder = tmp_path_factory.mktemp("async")
-    config, locator = own_service.private(folder)
-    with own_service.service(config, folder / "async.rrd"):
-        yield locator
 
 
 def run(locator: str, work: Work) -> None:

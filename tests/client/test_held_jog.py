@@ -9,6 +9,7 @@ import pytest
 from panel.fake_robot import FakeRobot
 from trirail.client.held_jog import TIMEOUT, HeldJog
 from trirail.errors import RefusalCode, RefusedError
+from waiting import wait_until
 
 RIGHT = (0.01, 0.0, 0.0)
 
@@ -33,12 +34,6 @@ class Hand:
             self.jog.hold(RIGHT)
             time.sleep(TIMEOUT / 4)
 
-    def wait(self, until: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 20.0
-        while not until():
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
-
 
 @pytest.fixture
 def hand() -> Iterator[Hand]:
@@ -50,7 +45,7 @@ def hand() -> Iterator[Hand]:
 def test_signs_are_one_jog_and_letting_go_ends_it_at_once(hand: Hand) -> None:
     hand.hold(lambda: len(hand.robot.sent) >= 8)
     hand.jog.release()
-    hand.wait(lambda: hand.velocities()[-1] == 0.0)
+    wait_until(lambda: hand.velocities()[-1] == 0.0)
     assert len({goal.id for goal in hand.robot.sent}) == 1
     assert {goal.timeout for goal in hand.robot.sent[:-1]} == {TIMEOUT}
     assert hand.robot.sent[-1].timeout < TIMEOUT
@@ -60,37 +55,37 @@ def test_signs_are_one_jog_and_letting_go_ends_it_at_once(hand: Hand) -> None:
 def test_a_new_press_is_a_new_jog(hand: Hand) -> None:
     for _ in range(3):
         hand.jog.hold(RIGHT)
-        hand.wait(lambda: hand.robot.sent[-1:] != [] and hand.velocities()[-1] > 0.0)
+        wait_until(lambda: hand.robot.sent[-1:] != [] and hand.velocities()[-1] > 0.0)
         hand.jog.release()
-        hand.wait(lambda: hand.velocities()[-1] == 0.0)
+        wait_until(lambda: hand.velocities()[-1] == 0.0)
     assert len({goal.id for goal in hand.robot.sent}) == 3
 
 
 def test_without_signs_nothing_is_renewed(hand: Hand) -> None:
     hand.jog.hold(RIGHT)
-    hand.wait(lambda: hand.robot.goal is not None)
-    hand.wait(lambda: hand.robot.state().goal is None)
+    wait_until(lambda: hand.robot.goal is not None)
+    wait_until(lambda: hand.robot.state().goal is None)
     assert len(hand.robot.sent) == 1
 
 
 def test_a_sign_that_has_waited_for_a_slow_service_is_thrown_away(hand: Hand) -> None:
     with hand.robot.hanging("goal"):
         hand.jog.hold(RIGHT)
-        hand.wait(lambda: len(hand.robot.sent) == 1)
+        wait_until(lambda: len(hand.robot.sent) == 1)
         hand.jog.hold(RIGHT)
         time.sleep(1.5 * TIMEOUT)  # the second sign grows old: that is what is tried here
-    hand.wait(lambda: hand.robot.goal is not None)
-    hand.wait(lambda: hand.robot.state().goal is None)
+    wait_until(lambda: hand.robot.goal is not None)
+    wait_until(lambda: hand.robot.state().goal is None)
     assert len(hand.robot.sent) == 1
 
 
 def test_letting_go_while_the_service_is_slow_is_not_forgotten(hand: Hand) -> None:
     with hand.robot.hanging("goal"):
         hand.jog.hold(RIGHT)
-        hand.wait(lambda: len(hand.robot.sent) == 1)
+        wait_until(lambda: len(hand.robot.sent) == 1)
         hand.jog.hold(RIGHT)
         hand.jog.release()
-    hand.wait(lambda: hand.velocities() == [RIGHT[0], 0.0])
+    wait_until(lambda: hand.velocities() == [RIGHT[0], 0.0])
 
 
 @pytest.mark.parametrize("code", [RefusalCode.NOT_ENABLED, RefusalCode.STOPPING, RefusalCode.AT_LIMIT])

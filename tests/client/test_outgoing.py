@@ -23,7 +23,7 @@ from conftest import carried
 from cyclopts import App, CycloptsError
 from msgspec import structs
 from trirail.cli.app import app
-from trirail.cli.robot_commands import telling
+from trirail.cli.robot_commands import command_line_of
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.client.outgoing import number, seconds
@@ -32,7 +32,7 @@ from trirail.wire import boundary
 from trirail.wire.goals import KINDS as EVERY_KIND
 from trirail.wire.goals import Goal, OwnLimits, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import CommandReply, Event, GoalReply
-from trirail.wire.stop_door import STOPS
+from trirail.wire.stop_protocol import STOPS
 from trirail.wire.vocabulary import AcquireLease, Command, Override, ReleaseLease, Stop
 from trirail.wire.zenoh_session import open_service
 
@@ -230,7 +230,7 @@ def test_the_command_line_sends_a_goal_of_any_kind(line: str, connect: str) -> N
 
 def test_the_command_line_sends_a_command_with_the_numbers_that_it_cannot_come_without(connect: str) -> None:
     made = App()
-    made.command(telling(Command.OVERRIDE), name="override")
+    made.command(command_line_of(Command.OVERRIDE), name="override")
     made(["override", "50", "--connect", connect], exit_on_error=False, result_action="return_value")
     assert SERVICE[0].taken() == [Override(50.0)]
     with pytest.raises(CycloptsError):

@@ -15,7 +15,7 @@ from trirail.config import SIM, geometry, load
 from trirail.kinematics.robot import inverse
 from trirail.processes.publications import info
 from trirail.wire.state import Commanded, GoalState, Sliders, State
-from trirail.workspace import mechanism
+from trirail.workspace import part_positions
 
 SHIPPED = sorted(SIM.parent.glob("*.toml"))
 SVG = "{http://www.w3.org/2000/svg}"
@@ -43,7 +43,7 @@ def test_the_drawing_shows_carriages_and_platform_where_they_are(
     left, top, width, height = map(float, svg.attrib["viewBox"].split())
     circles = [(float(each.attrib["cx"]), float(each.attrib["cy"])) for each in svg.iter(f"{SVG}circle")]
     robot = geometry(config.geometry)
-    carriages = mechanism.sliders(robot, np.array([state.sliders.position]))[0]
+    carriages = part_positions.sliders(robot, np.array([state.sliders.position]))[0]
     np.testing.assert_allclose(circles[:3], carriages, rtol=1e-5, atol=1e-6 * width)
     np.testing.assert_allclose(circles[-1], pose[:2], rtol=1e-5, atol=1e-9)
     for x, y in circles:

@@ -55,8 +55,8 @@ def test_sliders_stand_where_those_of_drives_with_play_do(seed: int) -> None:
     play, motors = rng.uniform(0.0, 5e-5, 3), walk(rng, 60, 1e-5)
     stage = StageAsBuilt(ROBOT, (float(play[0]), float(play[1]), float(play[2])))
     cut = int(rng.integers(1, 59))
-    stage.take(records(motors[:cut]))
-    stage.take(records(motors[cut:], cut * 1e-3))
+    stage.add_records(records(motors[:cut]))
+    stage.add_records(records(motors[cut:], cut * 1e-3))
     wanted = []
     for path, width in zip(motors.T, play, strict=True):
         servo = Servo(0.0, time_constant=0.0, max_velocity=1.0, max_acceleration=1.0)
@@ -79,7 +79,7 @@ def test_the_table_stands_where_the_stages_own_errors_have_it(seed: int) -> None
     built, pose = bent(rng, 5e-5), rng.uniform(-1.0, 1.0, 3) * (0.03, 0.03, 0.2)
     believed = inverse(ROBOT, pose).position
     stage = StageAsBuilt(built)
-    stage.take(records(np.tile(believed, (2, 1))))
+    stage.add_records(records(np.tile(believed, (2, 1))))
     true = stage.pose_at(0.001)
     assert inverse(built, true).position == pytest.approx(believed, abs=1e-12)
     assert built.correction is not None
@@ -110,7 +110,7 @@ def test_a_picture_is_of_the_time_of_its_exposure_and_smeared_by_the_way_in_it(
     x = speed * (np.arange(101) * 1e-3 - 0.05)
     poses = np.stack([x, np.zeros(101), np.zeros(101)], axis=1)
     stage = StageAsBuilt(ROBOT)
-    stage.take(records(inverse(ROBOT, poses).position))
+    stage.add_records(records(inverse(ROBOT, poses).position))
     camera = CAMERA._replace(exposure=exposure, delay=delay)
     rng = np.random.default_rng(0)
     middle, width = moments(camera.picture(stage.pose_at, time, rng))
@@ -127,14 +127,14 @@ def test_what_has_not_settled_is_seen_where_it_is(lag: float, step: float, waite
     t = np.arange(101) * 1e-3
     x = step * (1.0 - np.exp(-t / lag))
     stage = StageAsBuilt(ROBOT)
-    stage.take(records(inverse(ROBOT, np.stack([x, 0.0 * x, 0.0 * x], axis=1)).position))
+    stage.add_records(records(inverse(ROBOT, np.stack([x, 0.0 * x, 0.0 * x], axis=1)).position))
     middle, _ = moments(CAMERA.picture(stage.pose_at, waited, np.random.default_rng(0)))
     assert (middle - 160.0) / SCALE == pytest.approx(step * (1.0 - math.exp(-waited / lag)), abs=5e-8 + 0.02 * step)
 
 
 def test_records_of_a_time_are_waited_for_and_those_that_are_gone_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     stage = StageAsBuilt(ROBOT)
-    timer = threading.Timer(0.05, lambda: stage.take(records(np.zeros((10, 3)), 5.0)))
+    timer = threading.Timer(0.05, lambda: stage.add_records(records(np.zeros((10, 3)), 5.0)))
     timer.start()
     assert stage.pose_at(5.004) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
     timer.join()
@@ -151,7 +151,7 @@ def test_a_mark_of_the_table_goes_where_the_table_really_goes() -> None:
     stage = StageAsBuilt(ROBOT, play)
     ends = inverse(ROBOT, np.array([(0.0, 0.0, 0.0), (2e-4, 0.0, 0.0)])).position
     ways = np.linspace(0.0, 1.0, 50)[:, None]
-    stage.take(records(ends[0] + ways * (ends[1] - ends[0])))
+    stage.add_records(records(ends[0] + ways * (ends[1] - ends[0])))
     moved = ends[1] - ends[0]
     true = stage.pose_at(0.049)
     sliders = ends[1] - np.sign(np.where(np.abs(moved) > 2e-5, moved, 0.0)) * 2e-5
@@ -186,7 +186,7 @@ class StageWithPlay(Stage):
 
     def _to(self, pose: Triple) -> None:
         end = inverse(ROBOT, pose).position
-        self._stage.take(records(np.stack([end]), self._time + 1e-3))
+        self._stage.add_records(records(np.stack([end]), self._time + 1e-3))
         self._time += 1e-3
 
 

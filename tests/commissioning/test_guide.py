@@ -17,7 +17,7 @@ from conftest import CONFIG
 from trirail.commissioning import bench as benches
 from trirail.commissioning.guide import Guide
 from trirail.commissioning.judgement import Judged
-from trirail.commissioning.opening import opened
+from trirail.commissioning.opening import open_steps
 from trirail.commissioning.person import Question, Quit
 from trirail.commissioning.report import CommissioningReport, Keeper, StepReport
 from trirail.commissioning.steps import Steps
@@ -84,7 +84,7 @@ class Run:
         if not self.path.exists():
             self.path.write_text(source.read_text(encoding="utf-8"), encoding="utf-8")
         self.written: Path | None = None
-        with opened(robot, faults, self.person, lambda: False, sleep=lambda _: None) as steps:
+        with open_steps(robot, faults, self.person, lambda: False, sleep=lambda _: None) as steps:
             self.steps: Steps = steps
             guide = Guide(robot, self.path, steps, self.person, self.keeper)
             guide.run()
@@ -416,7 +416,7 @@ def noted(name: str, do: Callable[[], None], told: list[str]) -> Callable[[], No
 def test_ctrl_c_stops_in_that_cycle_and_ends_without_power(monkeypatch: pytest.MonkeyPatch) -> None:
     pressed = [False]
     told: list[str] = []
-    with opened(CONFIG, [], Beside(), lambda: pressed[0], sleep=lambda _: None) as steps:
+    with open_steps(CONFIG, [], Beside(), lambda: pressed[0], sleep=lambda _: None) as steps:
         steps.session.set_up()
         bench = steps.session.bench()
         for name in ("sync", "quick_stop"):

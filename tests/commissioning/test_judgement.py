@@ -10,9 +10,9 @@ from conftest import CONFIG
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from trirail.commissioning.coupling import COARSE, SCALE, MoveSeen, PushSeen, judge_move, judge_push
-from trirail.commissioning.exchange import merged
 from trirail.commissioning.judgement import Judged, judge_square, judge_switches, judge_watchdog
 from trirail.commissioning.moves import DISTANCE
+from trirail.commissioning.node_swaps import merged
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES
 

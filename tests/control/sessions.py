@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 
 import numpy as np
-from conftest import CONFIG, carried
+from conftest import CONFIG, Cycles, carried
 from numpy.typing import NDArray
 from trirail.config import Config
 from trirail.control.control import Control, Given
 from trirail.control.local_planner import LocalPlanner
-from trirail.control.notices import Notice
 from trirail.wire.goals import Goal
-from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
+from trirail.wire.packets import CommandRequest, GoalRequest, Request
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import MODES, Command, Mode
 from trirail_drivers.interface import DriveFault, Feedback, MissingProtection, PowerState, Triple
@@ -75,27 +73,21 @@ class PerfectDrives:
         """Do nothing."""
 
 
-class Session:
+class Session(Cycles):
     """A robot that is enabled, and what it was sent and told; `rows` are the records of its cycles."""
 
     def __init__(self, config: Config = CONFIG, delay: int = 1) -> None:
+        super().__init__()
         self.config = config
         self.drives = PerfectDrives()
         self.planner = LocalPlanner(config, delay)
         self.control = Control(config, self.drives, self.planner)
         self.control.start(self.drives.read())
-        self.answers: list[Answer] = []
-        self.notices: list[Notice] = []
         self.rows: list[NDArray[np.void]] = []
         self._tickets = itertools.count(1)
         self._now = 100.0
         self.order(Command.ENABLE)
         self.until(lambda: self.mode is Mode.HOLDING, 10)
-
-    @property
-    def mode(self) -> Mode:
-        """The robot's mode."""
-        return self.control.state.mode
 
     def cycle(self, request: Request | None = None) -> None:
         """Run one cycle, with a request or without."""
@@ -108,24 +100,7 @@ class Session:
         record = self.control.measured.record.copy()
         record["mode"] = MODES.index(self.mode)
         self.rows.append(record)
-        ledger = self.control.ledger
-        self.answers += ledger.answers
-        self.notices += ledger.notices
-        ledger.answers.clear()
-        ledger.notices.clear()
-
-    def cycles(self, number: int) -> None:
-        """Run so many cycles."""
-        for _ in range(number):
-            self.cycle()
-
-    def until(self, condition: Callable[[], bool], within: int) -> int:
-        """Run cycles until something holds; return how many."""
-        for number in range(within):
-            if condition():
-                return number
-            self.cycle()
-        raise AssertionError(f"not within {within} cycles; the mode is {self.mode}")
+        self.keep_what_was_said()
 
     def order(self, name: Command, value: float | None = None) -> None:
         """Send a command in the next cycle."""

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 import pytest
 from conftest import CONFIG
+from control.sessions import PerfectDrives
 from trirail.config import geometry
 from trirail.control.control import Control, Given
 from trirail.control.local_planner import LocalPlanner
@@ -27,7 +28,7 @@ from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers.interface import DriveFault, Feedback, MissingProtection, PowerState, Triple
+from trirail_drivers.interface import Feedback, PowerState, Triple
 
 log = logging.getLogger(__name__)
 
@@ -73,26 +74,22 @@ class Slider:
         self.measured = self._place + self._chance.gauss(0.0, self._noise)
 
 
-class Sliders:
+class Sliders(PerfectDrives):
     """Three of them, with power and a bus that loses an answer now and then: trirail_drivers.interface.DriveGroup."""
 
-    bus_load = 0.0
-    traffic = 0
-    missing_protections: tuple[MissingProtection, ...] = ()
-    reported_faults: tuple[DriveFault | None, ...] = (None, None, None)
-
     def __init__(self, chance: random.Random) -> None:
+        super().__init__()
         self._chance = chance
         self._sliders = [Slider(chance) for _ in range(3)]
         self._loses = chance.choice((0.0, 0.05))
-        self._due = self._next = (0.0, 0.0, 0.0)
+        self._followed = self._written = (0.0, 0.0, 0.0)
         self._said = Feedback((0.0, 0.0, 0.0), OFF, None)
 
     def sync(self) -> None:
         """Move, by the setpoints of the cycle before the last one, and measure."""
         position, age = list(self._said.position), list(self._said.age)
         for i, slider in enumerate(self._sliders):
-            slider.follow(self._due[i])
+            slider.follow(self._followed[i])
             if self._chance.random() < self._loses and age[i] < 3:
                 age[i] += 1
             else:
@@ -100,7 +97,7 @@ class Sliders:
         a, b, c = position
         u, v, w = age
         self._said = self._said._replace(position=(a, b, c), age=(u, v, w))
-        self._due = self._next
+        self._followed = self._written
 
     def read(self) -> Feedback:
         """See trirail_drivers.interface.DriveGroup."""
@@ -108,33 +105,12 @@ class Sliders:
 
     def write(self, position: Triple, velocity: Triple) -> None:
         """See trirail_drivers.interface.DriveGroup."""
-        self._next = position
+        self._written = position
 
     def enable(self, alone: str | None = None) -> None:
         """Have power at once."""
         assert alone is None
         self._said = self._said._replace(state=ON)
-
-    def configure(self, period: float, fastest: float | None = None) -> None:
-        """See trirail_drivers.interface.DriveGroup."""
-
-    def home(self) -> None:
-        """See trirail_drivers.interface.DriveGroup."""
-
-    def stop_homing(self) -> None:
-        """See trirail_drivers.interface.DriveGroup."""
-
-    def disable(self) -> None:
-        """See trirail_drivers.interface.DriveGroup."""
-
-    def quick_stop(self) -> None:
-        """See trirail_drivers.interface.DriveGroup."""
-
-    def reset(self) -> None:
-        """See trirail_drivers.interface.DriveGroup."""
-
-    def close(self) -> None:
-        """See trirail_drivers.interface.DriveGroup."""
 
 
 class Target(NamedTuple):

@@ -9,36 +9,32 @@ import can
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Delay, Rig, changed
+from conftest import CONFIG, Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from refusals import refusal
 from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState, rest
 from trirail.wire.goals import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import FaultDetail
-from trirail.wire.packets import Accepted, Answer, Confirmed, GoalRequest, Refused
+from trirail.wire.packets import Accepted, Confirmed, GoalRequest
 from trirail.wire.vocabulary import FaultCause, Mode
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.interface import PowerState
 
 PERIOD = CONFIG.period
 ROBOT = geometry(CONFIG.geometry)
 
 
-def refusal(answer: Answer) -> Refused:
-    assert isinstance(answer, Refused), answer
-    return answer
-
-
 def quick_stops(rig: Rig) -> set[int]:
     """Nodes that got the quick stop command (controlword xxxx xxxx xxxx x01x) in the last cycle."""
     return {
-        message.arbitration_id - frames.RPDO1
+        message.arbitration_id - canopen_frames.RPDO1
         for message in rig.sent
-        if message.arbitration_id - frames.RPDO1 in (1, 2, 3) and message.data[0] & 0b110 == 0b010
+        if message.arbitration_id - canopen_frames.RPDO1 in (1, 2, 3) and message.data[0] & 0b110 == 0b010
     }
 
 
@@ -309,18 +305,6 @@ def test_goals_in_the_wrong_mode(rig: Rig) -> None:
 # ---------------------------------------------------------------------- feedback that is on its way
 
 
-def part_of_a_cycle(message: can.Message) -> float:
-    return 0.4 * PERIOD
-
-
-def a_cycle(message: can.Message) -> float:
-    return PERIOD
-
-
-def one_drive_late(message: can.Message) -> float:
-    return 0.4 * PERIOD if message.arbitration_id == frames.TPDO2 + 2 else 0.0
-
-
 def as_it_comes(message: can.Message) -> float:
     return zlib.crc32(bytes(message.data)) % 10 * 0.1 * PERIOD
 
@@ -359,7 +343,7 @@ def test_a_lost_answer_is_no_step_in_error_or_velocity(late: float) -> None:
     lost: list[float] = []
 
     def delay(message: can.Message) -> float:
-        if lost and message.arbitration_id == frames.TPDO2 + 2:
+        if lost and message.arbitration_id == canopen_frames.TPDO2 + 2:
             return lost.pop()
         return late * PERIOD
 
@@ -454,7 +438,7 @@ def test_the_last_gate(rig: Rig, commanded: MotionState, said: str) -> None:
     assert rig.mode is Mode.FAULT
     assert quick_stops(rig) == {1, 2, 3}
     assert said in (rig.control.fault or "")
-    assert not any(message.arbitration_id - frames.RPDO2 in (1, 2, 3) for message in rig.sent)
+    assert not any(message.arbitration_id - canopen_frames.RPDO2 in (1, 2, 3) for message in rig.sent)
     assert np.abs(rig.setpoints()[-1, 0] - sent).max() < 1e-3  # what it would send is where the robot is
 
 

@@ -8,9 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig
-from control.test_control import PERIOD, assert_within_limits, refusal
+from control.test_control import PERIOD, assert_within_limits
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refusal
 from trirail.config import Config, FramesTable
 from trirail.errors import RefusedError
 from trirail.motion.goal_planner import meant

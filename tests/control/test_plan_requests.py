@@ -15,7 +15,7 @@ from control.test_control import assert_within_limits
 from control.test_stop import PROMPT, STEP, braking, confirmed_after, play
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from trirail.motion.feasibility import Look
+from trirail.motion.feasibility import Sampled
 from trirail.motion.motion_planner import MotionPlanner, revision
 from trirail.motion.paths import Path
 from trirail.motion.runs import nominal
@@ -452,14 +452,14 @@ def test_no_cycle_looks_at_more_of_the_longest_path_than_it_has_time_for(
     rig = at_rate(rate_hz)
     rig.send("g1", wave(MAX_POINTS, 1.2))
     looked: list[int] = []
-    look = TimeScaling.look
+    sample = TimeScaling.sample
 
-    def counted(self: TimeScaling, path: Path, law: Path, first: float, until: float, pose: Any) -> Look:
+    def counted(self: TimeScaling, path: Path, law: Path, first: float, until: float, pose: Any) -> Sampled:
         begin, end = (nominal(law, time).pose[0] for time in (first, until))
         looked.append(int(((path.knots > begin) & (path.knots < end)).sum()))
-        return look(self, path, law, first, until, pose)
+        return sample(self, path, law, first, until, pose)
 
-    monkeypatch.setattr(TimeScaling, "look", counted)
+    monkeypatch.setattr(TimeScaling, "sample", counted)
     for name, value in (("override", 2.0), ("override", 0.3), ("pause", None), ("resume", None), ("stop", None)):
         rig.order(name, value)
         for _ in range(60):

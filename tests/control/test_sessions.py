@@ -168,7 +168,7 @@ def quickest(session: Session) -> float:
     times = [run.ends - run.time]
     for share in 0.97 ** np.arange(100.0):
         law = scaling.ramp(run.at, 0.0, float(share))
-        if law is not None and scaling.look(run.path, law, 0.0, scaling.until(run, law, 0.0), pose).within_limits:
+        if law is not None and scaling.sample(run.path, law, 0.0, scaling.until(run, law, 0.0), pose).within_limits:
             times.append(float(law.knots[-2]))
             break
     return min(times)

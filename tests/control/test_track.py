@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig
-from control.test_control import assert_within_limits, refusal
+from control.test_control import assert_within_limits
 from control.test_stop import PROMPT, braking, confirmed_after
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from refusals import refusal
 from trirail.wire.goals import TrackGoal, VelocityGoal
 from trirail.wire.packets import Accepted, GoalRequest, Refused
 from trirail.wire.vocabulary import Mode

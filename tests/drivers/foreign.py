@@ -19,6 +19,7 @@ import can
 import canopen
 from canopen.objectdictionary import ODRecord, ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
+from rigs import Clock
 
 DRIVES: Final = Path(__file__).parents[1] / "data" / "drives"
 Key = tuple[int, int]
@@ -563,16 +564,6 @@ class Wires(can.BusABC):
         self.inner.shutdown()
         for node in self.nodes:
             node.shutdown()
-
-
-class Clock:
-    """Time that passes when told to."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 def three(

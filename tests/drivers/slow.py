@@ -9,7 +9,8 @@ from itertools import count
 from typing import Any, Final
 
 import can
-from drivers.foreign import DISABLED, ENABLED, Clock, ForeignDrive, Habits, Truth, Wires
+from drivers.foreign import DISABLED, ENABLED, ForeignDrive, Habits, Truth, Wires
+from rigs import Clock
 
 Delay = Callable[[], float]
 """Draws how long something takes [s]."""

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -18,11 +18,12 @@ from types import ModuleType
 import can
 import msgspec
 import pytest
+from drivers.real_time import cycle, cycle_until
 from trirail.config import SIM, load
 from trirail_drivers.config import Can, Simulated
 from trirail_drivers.connection import opening
 from trirail_drivers.errors import BusError
-from trirail_drivers.interface import DriveGroup, Feedback, PowerState
+from trirail_drivers.interface import PowerState
 
 ROOT = Path(__file__).parents[2]
 SIMULATED = load(SIM)
@@ -148,25 +149,6 @@ def slowly() -> float:
     return 0.1 * time.monotonic()
 
 
-def cycle(drives: DriveGroup, position: float = 0.0) -> Feedback:
-    """One cycle, as slow as the answers to its SYNC."""
-    drives.sync()
-    deadline = time.monotonic() + WITHIN
-    while True:
-        feedback = drives.read()
-        if feedback.age == (0, 0, 0) or feedback.fault or time.monotonic() > deadline:
-            drives.write((position,) * 3, (0.0,) * 3)
-            return feedback
-        os.sched_yield()
-
-
-def until(drives: DriveGroup, condition: Callable[[Feedback], bool], position: float = 0.0) -> None:
-    deadline = time.monotonic() + WITHIN
-    while not condition(feedback := cycle(drives, position)):
-        assert feedback.fault is None, feedback.fault
-        assert time.monotonic() < deadline, feedback
-
-
 def multicast(tmp_path: Path) -> Path:
     """A configuration whose bus is a multicast group that does not leave this machine."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
@@ -194,8 +176,8 @@ def test_drives_of_another_process_by_udp_multicast(tmp_path: Path) -> None:
             drives.configure(config.period)
             cycle(drives)
             drives.enable()
-            until(drives, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
-            until(drives, lambda feedback: min(feedback.position) > 0.9e-4, position=1e-4)
+            cycle_until(drives, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
+            cycle_until(drives, lambda feedback: min(feedback.position) > 0.9e-4, position=1e-4)
         finally:
             drives.close()
             served.terminate()
@@ -266,7 +248,7 @@ def test_slcan_whose_adapter_acknowledges_every_frame(taken: bytes) -> None:
             drives.configure(0.01)
             cycle(drives)
             drives.enable()
-            until(drives, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
+            cycle_until(drives, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
             for number in range(300):
                 feedback = cycle(drives, number * 1e-6)
                 assert (feedback.fault, feedback.age) == (None, (0, 0, 0)), number

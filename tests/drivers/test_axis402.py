@@ -6,7 +6,7 @@ import math
 
 import msgspec
 import pytest
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import REGISTER_TIME, Cia402Axis
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.scaling import Scale
@@ -17,8 +17,8 @@ ENABLED, READY, FAULT = b"\x37\x02", b"\x31\x02", b"\x18\x02"
 ERROR = bytes.fromhex("1043 08 0000000000")
 OVER = bytes(8)
 OPERATIONAL, PRE_OPERATIONAL, BOOT_UP = b"\x05", b"\x7f", b"\0"
-WANTED: frames.Wanted = P.OPERATION_ENABLED
-OFF: frames.Wanted = P.SWITCH_ON_DISABLED
+WANTED: canopen_frames.Wanted = P.OPERATION_ENABLED
+OFF: canopen_frames.Wanted = P.SWITCH_ON_DISABLED
 T = 50.0
 EACH = Drive(1, 1e6)
 UNHURRIED = Drives("cia402", EACH, EACH, EACH, heartbeat=100.0)
@@ -30,7 +30,7 @@ def made() -> Cia402Axis:
     axis = Cia402Axis("B", 2, Scale(-1e6, 0.1), UNHURRIED)
     axis.on_heartbeat(OPERATIONAL, T)
     axis.on_status(ENABLED, T)
-    axis.on_position(frames.POSITION.pack(1000), T)
+    axis.on_position(canopen_frames.POSITION.pack(1000), T)
     assert axis.fault(T, WANTED) is None
     return axis
 
@@ -72,25 +72,27 @@ def test_a_quick_stop_ends_without_power_once_the_slider_has_stood_for_a_tenth_o
     stopping = axis.word(T, P.QUICK_STOP_ACTIVE)
     moved = T + 0.05
     for time, counts in ((T, 1000), (moved, 1000 + sign * 21), (moved + 0.05, 1000 + sign * 2)):
-        axis.on_position(frames.POSITION.pack(counts), time)
+        axis.on_position(canopen_frames.POSITION.pack(counts), time)
         assert axis.word(time, P.QUICK_STOP_ACTIVE) == stopping
-    axis.on_position(frames.POSITION.pack(1000 + sign * 45), moved + 0.06)
+    axis.on_position(canopen_frames.POSITION.pack(1000 + sign * 45), moved + 0.06)
     stands = moved + 0.06
-    for after, word in ((0.0999, stopping), (0.1001, frames.DISABLE_VOLTAGE)):
-        axis.on_position(frames.POSITION.pack(1000 + sign * 64), stands + after)
+    for after, word in ((0.0999, stopping), (0.1001, canopen_frames.DISABLE_VOLTAGE)):
+        axis.on_position(canopen_frames.POSITION.pack(1000 + sign * 64), stands + after)
         assert axis.word(stands + after, P.QUICK_STOP_ACTIVE) == word
-    assert stopping != frames.DISABLE_VOLTAGE
+    assert stopping != canopen_frames.DISABLE_VOLTAGE
 
 
 @pytest.mark.parametrize("wanted", [OFF, WANTED, P.QUICK_STOP_ACTIVE])
-def test_a_fault_from_before_the_start_is_told_and_left_alone_until_it_is_to_be_reset(wanted: frames.Wanted) -> None:
+def test_a_fault_from_before_the_start_is_told_and_left_alone_until_it_is_to_be_reset(
+    wanted: canopen_frames.Wanted,
+) -> None:
     axis = Cia402Axis("B", 2, Scale(1e6, 0.0), UNHURRIED)
     axis.on_heartbeat(OPERATIONAL, T)
     axis.on_status(FAULT, T)
     assert axis.fault(T, wanted) == ("B", "fault", 0, "drive B: fault")
-    assert not axis.word(T, wanted) & frames.FAULT_RESET
+    assert not axis.word(T, wanted) & canopen_frames.FAULT_RESET
     axis.forgive(T)
-    assert axis.word(T, wanted) == frames.FAULT_RESET
+    assert axis.word(T, wanted) == canopen_frames.FAULT_RESET
 
 
 def test_a_fault_has_the_code_of_its_emergency_until_it_is_over() -> None:
@@ -136,7 +138,7 @@ def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -
     if told_by == "heartbeat":
         axis.on_heartbeat(OPERATIONAL, T)
     else:
-        axis.on_position(frames.POSITION.pack(0), T)
+        axis.on_position(canopen_frames.POSITION.pack(0), T)
     assert not axis.mute
     axis.on_heartbeat(PRE_OPERATIONAL, T)
     assert axis.fault(T, WANTED) == ("B", "state", 0, "drive B: left NMT operational: is pre-operational")
@@ -181,7 +183,7 @@ def test_only_the_answer_about_the_statusword_is_one() -> None:
 
 @pytest.mark.parametrize("state", P)
 @pytest.mark.parametrize("wanted", [P.SWITCH_ON_DISABLED, P.OPERATION_ENABLED, P.QUICK_STOP_ACTIVE])
-def test_only_a_drive_that_followed_setpoints_can_leave_that_unasked(state: P, wanted: frames.Wanted) -> None:
+def test_only_a_drive_that_followed_setpoints_can_leave_that_unasked(state: P, wanted: canopen_frames.Wanted) -> None:
     axis = made()
     axis.state = state
     fault = axis.fault(T, wanted)
@@ -223,6 +225,6 @@ def test_as_many_positions_may_be_missed_as_the_configuration_says(most: int) ->
         assert axis.fault(T, WANTED) is None, cycle
         axis.sync_sent()
         if cycle == 0:
-            axis.on_position(frames.POSITION.pack(1000), T)
+            axis.on_position(canopen_frames.POSITION.pack(1000), T)
         axis.read_over()
     assert axis.fault(T, WANTED) == ("B", "silent", 0, f"drive B: no position for {most} cycles in a row")

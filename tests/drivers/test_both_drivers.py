@@ -22,21 +22,6 @@ def new(request: pytest.FixtureRequest) -> Iterator[AnyRig]:
     rig.drives.close()
 
 
-@pytest.fixture
-def ready(new: AnyRig) -> AnyRig:
-    """Drives that are set up, without power."""
-    new.ready()
-    return new
-
-
-@pytest.fixture
-def enabled(ready: AnyRig) -> AnyRig:
-    """Drives with power, holding their position."""
-    ready.enable()
-    ready.bus.sent.clear()
-    return ready
-
-
 def test_a_dead_bus_cannot_be_set_up(new: AnyRig) -> None:
     new.bus.broken = True
     with pytest.raises(BusError, match="cannot send"):
@@ -98,3 +83,13 @@ def test_closing_on_a_dead_bus_shuts_it_down(enabled: AnyRig) -> None:
     enabled.bus.broken = True
     enabled.drives.close()
     assert enabled.bus.shutdowns == 1
+
+
+def test_silence_is_a_fault_at_the_third_sync(ready: AnyRig) -> None:
+    ready.cycle()
+    ready.devices[1].silent = True
+    assert ready.cycle().fault is None
+    assert ready.cycle().fault is None
+    fault = ready.cycle().fault
+    assert fault is not None
+    assert fault[:3] == ("B", "silent", 0)

@@ -12,7 +12,7 @@ import canopen
 import msgspec
 import pytest
 from rigs import START, STEP, Bus, Clock, DriverRig, ideal_servo
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.codes import words
 from trirail_drivers.cia402.drives import REPEAT_AFTER, Cia402
 from trirail_drivers.cia402.eds import SERVO
@@ -59,7 +59,9 @@ class Rig(DriverRig[SimulatedDrive, Cia402]):
         return [[data for can_id, data in self.bus.sent if can_id == base + d.node] for d in self.devices]
 
     def controlwords(self) -> list[list[int]]:
-        return [[frames.CONTROLWORD.unpack(data)[0] for data in each] for each in self.sent_to(frames.RPDO1)]
+        return [
+            [canopen_frames.CONTROLWORD.unpack(data)[0] for data in each] for each in self.sent_to(canopen_frames.RPDO1)
+        ]
 
 
 @pytest.fixture
@@ -68,21 +70,6 @@ def new() -> Iterator[Rig]:
     rig = Rig()
     yield rig
     rig.drives.close()
-
-
-@pytest.fixture
-def ready(new: Rig) -> Rig:
-    """Drives that are set up, without power."""
-    new.ready()
-    return new
-
-
-@pytest.fixture
-def enabled(ready: Rig) -> Rig:
-    """Drives with power, holding their position."""
-    ready.enable()
-    ready.bus.sent.clear()
-    return ready
 
 
 class TestConfigure:
@@ -133,7 +120,7 @@ class TestConfigure:
             assert device.objects[0x1801, 1].value & 0x8000_07FF == 0x280 + drive.node
 
     def test_leaves_them_operational_and_without_power(self, ready: Rig) -> None:
-        assert [device.nmt for device in ready.devices] == [frames.OPERATIONAL] * 3
+        assert [device.nmt for device in ready.devices] == [canopen_frames.OPERATIONAL] * 3
         assert [device.state for device in ready.devices] == [P.SWITCH_ON_DISABLED] * 3
         assert ready.drives.bus_load == pytest.approx(0.75, abs=0.001)
 
@@ -146,7 +133,7 @@ class TestConfigure:
 
     def test_takes_power_off_that_was_left_on(self, new: Rig) -> None:
         device = new.devices[1]
-        for word in (frames.SHUTDOWN, frames.SWITCH_ON, frames.ENABLE_OPERATION):
+        for word in (canopen_frames.SHUTDOWN, canopen_frames.SWITCH_ON, canopen_frames.ENABLE_OPERATION):
             device.objects[0x6040, 0].write(word)
         assert device.state is P.OPERATION_ENABLED
         new.drives.configure(PERIOD)
@@ -192,7 +179,9 @@ class TestConfigure:
         other = Rig()
         other.drives.configure(PERIOD)
         writes = [
-            data for can_id, data in other.bus.sent if can_id == frames.SDO_REQUEST + 1 and data[0] & 0xE2 == 0x22
+            data
+            for can_id, data in other.bus.sent
+            if can_id == canopen_frames.SDO_REQUEST + 1 and data[0] & 0xE2 == 0x22
         ]
         settings = [*dict.fromkeys((int.from_bytes(data[1:3], "little"), data[3]) for data in writes)]
         settings = [key for key in settings if key not in ((0x6040, 0), (0x6060, 0))]  # 6041 and 6061 tell
@@ -341,8 +330,8 @@ class TestPower:
         ready.drives.enable()
         ready.cycle()
         ids = [can_id for can_id, _ in ready.bus.sent]
-        last_setpoint = max(i for i, can_id in enumerate(ids) if can_id & 0x780 == frames.RPDO2)
-        first_controlword = min(i for i, can_id in enumerate(ids) if can_id & 0x780 == frames.RPDO1)
+        last_setpoint = max(i for i, can_id in enumerate(ids) if can_id & 0x780 == canopen_frames.RPDO2)
+        first_controlword = min(i for i, can_id in enumerate(ids) if can_id & 0x780 == canopen_frames.RPDO1)
         assert last_setpoint < first_controlword
 
     def test_disable_takes_power_off(self, enabled: Rig) -> None:
@@ -364,7 +353,7 @@ class TestPower:
         enabled.bus.sent.clear()
         enabled.drives.quick_stop()
         enabled.drives.write(feedback.position, ZERO)
-        assert enabled.bus.sent == [(frames.RPDO1 + d.node, b"\x02\x00") for d in enabled.devices]
+        assert enabled.bus.sent == [(canopen_frames.RPDO1 + d.node, b"\x02\x00") for d in enabled.devices]
 
     def test_quick_stop_from_speed_ends_without_power_until_enabled(self, enabled: Rig) -> None:
         position = list(START)
@@ -450,7 +439,7 @@ class TestPower:
         assert enabled.cycles(1500).fault is None
 
     def test_drive_that_drops_out_unasked(self, enabled: Rig) -> None:
-        enabled.devices[1].objects[0x6040, 0].write(frames.DISABLE_VOLTAGE)
+        enabled.devices[1].objects[0x6040, 0].write(canopen_frames.DISABLE_VOLTAGE)
         feedback = enabled.found("state", within=1)
         assert feedback.fault is not None
         assert feedback.fault.drive == "B"
@@ -458,7 +447,7 @@ class TestPower:
         assert enabled.controlwords() == [[0x02]] * 3
 
     def test_impossible_statusword(self, enabled: Rig) -> None:
-        enabled.bus.inject(frames.TPDO1 + 1, b"\x01\x00")
+        enabled.bus.inject(canopen_frames.TPDO1 + 1, b"\x01\x00")
         assert enabled.drives.read().fault == (
             "A", "state", 0, "drive A: statusword 0001 is that of no CiA 402 state"
         )  # fmt: skip
@@ -482,7 +471,7 @@ class TestSetpoints:
 
     def test_carry_velocity_as_feed_forward(self, enabled: Rig) -> None:
         enabled.cycle(START, (0.1, 0.1, -0.2))
-        velocities = [frames.SETPOINT.unpack(each[-1])[1] for each in enabled.sent_to(frames.RPDO2)]
+        velocities = [canopen_frames.SETPOINT.unpack(each[-1])[1] for each in enabled.sent_to(canopen_frames.RPDO2)]
         assert velocities == [100_000, -200_000, -200_000]
 
     @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e9])
@@ -496,7 +485,7 @@ class TestSetpoints:
             enabled.drives.write((START[0], bad, START[2]), ZERO)
         else:
             enabled.drives.write(START, (0.0, bad, 0.0))
-        assert enabled.bus.sent == [(frames.RPDO1 + d.node, b"\x02\x00") for d in enabled.devices]
+        assert enabled.bus.sent == [(canopen_frames.RPDO1 + d.node, b"\x02\x00") for d in enabled.devices]
         fault = enabled.drives.read().fault
         assert fault is not None
         assert (fault.drive, fault.cause) == ("B", "setpoint")
@@ -514,11 +503,11 @@ class TestFaults:
         assert feedback.state == (P.SWITCH_ON_DISABLED, P.SWITCH_ON_DISABLED, P.FAULT)
 
     def test_end_of_errors_is_no_fault(self, enabled: Rig) -> None:
-        enabled.bus.inject(frames.EMCY + 1, bytes(8))
+        enabled.bus.inject(canopen_frames.EMCY + 1, bytes(8))
         assert enabled.cycle().fault is None
 
     def test_fault_without_emergency(self, enabled: Rig) -> None:
-        enabled.bus.inject(frames.TPDO1 + 5, b"\x18\x02")
+        enabled.bus.inject(canopen_frames.TPDO1 + 5, b"\x18\x02")
         fault = enabled.drives.read().fault
         assert fault == ("B", "fault", 0, "drive B: fault")
 
@@ -529,15 +518,6 @@ class TestFaults:
         fault = enabled.cycles(5).fault
         assert fault is not None
         assert fault[:3] == ("A", "emcy", 0x2310)
-
-    def test_silence_is_a_fault_at_the_third_sync(self, ready: Rig) -> None:
-        ready.cycle()
-        ready.devices[1].silent = True
-        assert ready.cycle().fault is None
-        assert ready.cycle().fault is None
-        fault = ready.cycle().fault
-        assert fault is not None
-        assert fault[:3] == ("B", "silent", 0)
 
     def test_prompt_positions_have_no_age_and_lost_ones_leave_none(self, ready: Rig) -> None:
         assert ready.cycle().age == (0, 0, 0)
@@ -555,7 +535,7 @@ class TestFaults:
             ready.drives.sync()
             assert ready.drives.read().fault is None
             for node in (1, 5, 9):
-                ready.bus.inject(frames.TPDO2 + node, bytes(4))
+                ready.bus.inject(canopen_frames.TPDO2 + node, bytes(4))
         ready.drives.sync()
         feedback = ready.drives.read()
         assert feedback.age == (1, 1, 1)
@@ -608,10 +588,10 @@ class TestFaults:
     @pytest.mark.parametrize(
         ("base", "data"),
         [
-            (frames.TPDO2, b"\0\0\0"),
-            (frames.TPDO1, b"\0\0\0"),
-            (frames.EMCY, b"\0"),
-            (frames.HEARTBEAT, b""),
+            (canopen_frames.TPDO2, b"\0\0\0"),
+            (canopen_frames.TPDO1, b"\0\0\0"),
+            (canopen_frames.EMCY, b"\0"),
+            (canopen_frames.HEARTBEAT, b""),
         ],
     )
     def test_frame_of_wrong_length(self, ready: Rig, base: int, data: bytes) -> None:
@@ -674,7 +654,7 @@ class TestFaults:
         enabled.drives.sync()
         enabled.drives.write(enabled.drives.read().position, ZERO)
         order = [can_id & 0x780 for can_id, _ in enabled.bus.sent]
-        assert order == [frames.SYNC, *[frames.RPDO1] * 3, *[frames.RPDO2] * 3]
+        assert order == [canopen_frames.SYNC, *[canopen_frames.RPDO1] * 3, *[canopen_frames.RPDO2] * 3]
 
     def test_a_controller_near_its_end_is_told_of_and_no_fault(self, enabled: Rig) -> None:
         for _ in range(3):
@@ -696,10 +676,10 @@ class TestFaults:
         monkeypatch.undo()
 
     def test_frames_of_others_are_no_concern(self, enabled: Rig) -> None:
-        enabled.bus.inject(frames.TPDO2 + 20, b"\xff")
-        enabled.bus.inject(frames.TPDO2 + 1, b"\xff" * 4, is_extended_id=True)
-        enabled.bus.inject(frames.TPDO2 + 1, b"", is_remote_frame=True)
-        enabled.bus.inject(frames.TPDO1 + 1, bytes(8), is_error_frame=True)
+        enabled.bus.inject(canopen_frames.TPDO2 + 20, b"\xff")
+        enabled.bus.inject(canopen_frames.TPDO2 + 1, b"\xff" * 4, is_extended_id=True)
+        enabled.bus.inject(canopen_frames.TPDO2 + 1, b"", is_remote_frame=True)
+        enabled.bus.inject(canopen_frames.TPDO1 + 1, bytes(8), is_error_frame=True)
         feedback = enabled.cycle()
         assert feedback.fault is None
         assert feedback.position == pytest.approx(START, abs=1e-6)
@@ -817,8 +797,8 @@ class TestReset:
 class TestHeartbeat:
     def test_is_sent_from_the_cycle_at_its_period(self, ready: Rig) -> None:
         ready.cycles(1000)
-        heartbeats = [data for can_id, data in ready.bus.sent if can_id == frames.HEARTBEAT + 126]
-        assert heartbeats == [bytes([frames.OPERATIONAL])] * 10
+        heartbeats = [data for can_id, data in ready.bus.sent if can_id == canopen_frames.HEARTBEAT + 126]
+        assert heartbeats == [bytes([canopen_frames.OPERATIONAL])] * 10
 
     def test_without_it_the_drives_stop_by_themselves(self, enabled: Rig) -> None:
         enabled.clock.now += 10.0
@@ -834,7 +814,7 @@ class TestClose:
     def test_leaves_drives_without_power_and_pre_operational(self, enabled: Rig) -> None:
         enabled.drives.close()
         assert [device.state for device in enabled.devices] == [P.SWITCH_ON_DISABLED] * 3
-        assert [device.nmt for device in enabled.devices] == [frames.PRE_OPERATIONAL] * 3
+        assert [device.nmt for device in enabled.devices] == [canopen_frames.PRE_OPERATIONAL] * 3
         assert enabled.controlwords() == [[0x02, 0x00]] * 3
         assert enabled.bus.shutdowns == 1
 
@@ -843,7 +823,11 @@ class TestClose:
         """In NMT pre-operational, where a drive without object 6007h keeps its power, it hears SDOs only."""
         device = enabled.devices[index]
         device.objects[0x6007, 0].value = 0
-        device.receive(frames.NMT, frames.NMT_COMMAND.pack(frames.NMT_PRE_OPERATIONAL, device.node), enabled.clock.now)
+        device.receive(
+            canopen_frames.NMT,
+            canopen_frames.NMT_COMMAND.pack(canopen_frames.NMT_PRE_OPERATIONAL, device.node),
+            enabled.clock.now,
+        )
         assert device.state is P.OPERATION_ENABLED
         enabled.drives.close()
         assert [device.state for device in enabled.devices] == [P.SWITCH_ON_DISABLED] * 3

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail_drivers.cia402.axis import Cia402Axis
+from trirail_drivers.cia402.canopen_frames import EMERGENCY
 from trirail_drivers.cia402.codes import words
-from trirail_drivers.cia402.frames import EMERGENCY
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import LONGEST
 from trirail_drivers.odrive import codes as odrive
-from trirail_drivers.odrive.frames import Error
+from trirail_drivers.odrive.cansimple import Error
 
 SUPPLY = "look at the supply; braking feeds back into it"
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import can
 import pytest
 from trirail_drivers.bus.unixbus import UnixBus
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
 from trirail_drivers.protocols import CIA402, ODRIVE, PROTOCOLS
@@ -57,7 +57,7 @@ class Rig:
     def heartbeats(self, seconds: float) -> list[int]:
         """How many of each drive."""
         heard = [can_id for can_id, _ in self.wait(seconds)]
-        return [heard.count(frames.HEARTBEAT + node) for node in (1, 2, 3)]
+        return [heard.count(canopen_frames.HEARTBEAT + node) for node in (1, 2, 3)]
 
     def upload(self, node: int) -> list[bytes]:
         """Ask a drive for its device type."""
@@ -256,7 +256,7 @@ def test_a_rebooting_drive_is_away_and_tells_of_its_return(rig: Rig) -> None:
     rig.faults.add("B reboot for 0.1")
     rig.wait(0.001)
     assert rig.heartbeats(0.09)[1] == 0
-    assert (frames.HEARTBEAT + 2, b"\0") in rig.wait(0.02)
+    assert (canopen_frames.HEARTBEAT + 2, b"\0") in rig.wait(0.02)
     assert rig.drives[1].objects[0x1017, 0].value == 0  # its set-up is gone
     assert rig.bus.drives[1].state is PowerState.SWITCH_ON_DISABLED
 
@@ -277,7 +277,7 @@ def test_bus_off_lets_nothing_through_and_is_told_by_error_frames(rig: Rig) -> N
     assert frame is not None
     assert (frame.is_error_frame, frame.arbitration_id) == (True, 0x040)
     with pytest.raises(can.CanOperationError, match="No buffer space"):
-        rig.bus.send(frames.nmt(frames.NMT_START, 1).message())
+        rig.bus.send(canopen_frames.nmt(canopen_frames.NMT_START, 1).message())
     assert rig.heartbeats(0.09) == [0, 0, 0]
     rig.wait(0.02)
     assert rig.upload(1)

@@ -18,7 +18,7 @@ from trirail.config import Config
 from trirail.control.cycle import FAR
 from trirail.wire.packets import CommandRequest, Confirmed, Refused
 from trirail.wire.vocabulary import Command, Mode
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.interface import PowerState
 
 REAL = changed(CONFIG, missed_syncs=3)
@@ -75,17 +75,19 @@ class Cia402Rig(FaultRig):
 
     def _note(self, message: can.Message, timeout: float | None = None) -> None:
         super()._note(message, timeout)
-        node = message.arbitration_id - frames.RPDO2
+        node = message.arbitration_id - canopen_frames.RPDO2
         if node in NODES:
             drive = self.drives[node - 1]
             enabled = drive.state is PowerState.OPERATION_ENABLED
-            target = frames.SETPOINT.unpack(message.data)[0] if drive.objects[0x6061, 0].value == 8 else math.nan
+            target = (
+                canopen_frames.SETPOINT.unpack(message.data)[0] if drive.objects[0x6061, 0].value == 8 else math.nan
+            )
             self.targets[node].append((target, enabled))
 
     def told_to_stop(self) -> set[int]:
         """By the quick stop command."""
-        stop = frames.CONTROLWORD.pack(frames.QUICK_STOP)
-        return {m.arbitration_id - frames.RPDO1 for m in self.sent if bytes(m.data) == stop}
+        stop = canopen_frames.CONTROLWORD.pack(canopen_frames.QUICK_STOP)
+        return {m.arbitration_id - canopen_frames.RPDO1 for m in self.sent if bytes(m.data) == stop}
 
     def assert_no_jump(self) -> None:
         """No step is above the velocity limit, and none of an enabled drive changes by more than the acceleration.

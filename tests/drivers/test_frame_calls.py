@@ -14,7 +14,7 @@ from trirail_drivers.bus.can_frame import CAN_FRAME
 from trirail_drivers.bus.frame_calls import FrameCalls
 from trirail_drivers.bus.frame_io import Received
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.bus.packets import Packets, packets
+from trirail_drivers.bus.packed_frames import PackedFrames, packed_frames
 
 ROOM = 8
 NUMBER = ctypes.c_int64
@@ -46,7 +46,7 @@ class Fake:
         """Hear all."""
 
 
-def called(address: int, frames: Packets, number: int) -> int:
+def called(address: int, frames: PackedFrames, number: int) -> int:
     """Call as compiled code does."""
     function = ctypes.CFUNCTYPE(NUMBER, NUMBER, NUMBER)(address)
     return int(function(frames.frames.ctypes.data, number))
@@ -58,7 +58,7 @@ frames_of_any_length = st.tuples(st.integers(0, 0x7FF), st.binary(max_size=64).m
 @given(arriving=st.lists(frames_of_any_length, max_size=2 * ROOM), handed_in=st.integers(0, ROOM))
 def test_what_is_handed_in_is_received_once_more_in_its_order(arriving: list[Received], handed_in: int) -> None:
     """Frames of CAN FD too, which are longer than there is room for."""
-    frames, room = FrameCalls(Fake(arriving)), Packets(ROOM)
+    frames, room = FrameCalls(Fake(arriving)), PackedFrames(ROOM)
     number = called(frames.access.receive, room, ROOM)
     assert number == min(len(arriving), ROOM)
     for row, (identifier, data) in zip(room.frames[:number], arriving, strict=False):
@@ -73,7 +73,7 @@ def test_what_is_handed_in_is_received_once_more_in_its_order(arriving: list[Rec
 def test_an_error_is_raised_behind_the_frames_before_it_and_once(before: int, error: BaseException) -> None:
     first: list[Received] = [(0x181 + i, bytearray([i])) for i in range(before)]
     last: Received = 0x7FF, bytearray(b"last")
-    frames, room = FrameCalls(Fake([*first, error, last])), Packets(ROOM)
+    frames, room = FrameCalls(Fake([*first, error, last])), PackedFrames(ROOM)
     assert called(frames.access.receive, room, ROOM) == ~before
     frames.hand_in(room, before, 0)
     assert [frames.receive() for _ in range(before)] == first
@@ -87,7 +87,7 @@ def test_an_error_is_raised_behind_the_frames_before_it_and_once(before: int, er
 def test_a_refused_frame_is_refused_again_and_not_tried_twice(refused: int, error: BaseException) -> None:
     bus = Fake(refused=refused)
     bus.error = error
-    frames, sent = FrameCalls(bus), packets([Frame(0x200 + i, bytes([i])) for i in range(4)])
+    frames, sent = FrameCalls(bus), packed_frames([Frame(0x200 + i, bytes([i])) for i in range(4)])
     taken = called(frames.access.send, sent, 4)
     assert taken == min(refused, 4)
     for number in range(taken, 4):

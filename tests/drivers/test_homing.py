@@ -13,15 +13,16 @@ import msgspec
 import numpy as np
 import pytest
 from canopen.profiles.p402 import BaseNode402
-from conftest import CONFIG, Delay, Rig, changed
+from conftest import CONFIG, Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
+from refusals import refusal
 from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import inverse
-from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused
+from trirail.wire.packets import Accepted, CommandRequest, Confirmed
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.homing import HomingSequence
@@ -56,11 +57,6 @@ def rig() -> Iterator[Rig]:
     made = Rig(incremental())
     yield made
     made.bus.shutdown()
-
-
-def refusal(answer: Answer) -> Refused:
-    assert isinstance(answer, Refused), answer
-    return answer
 
 
 def true_positions(rig: Rig) -> list[float]:
@@ -145,18 +141,6 @@ def test_only_what_is_not_absolute_is_homed() -> None:
 # ---------------------------------------------------------------------- how it gets there
 
 
-def part_of_a_cycle(message: can.Message) -> float:
-    return 0.4 * PERIOD
-
-
-def a_cycle(message: can.Message) -> float:
-    return PERIOD
-
-
-def one_drive_late(message: can.Message) -> float:
-    return 0.4 * PERIOD if message.arbitration_id == frames.TPDO2 + 2 else 0.0
-
-
 @pytest.mark.core
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("method", [19, 37])
@@ -200,19 +184,19 @@ def test_the_frames_of_one_drive(rig: Rig) -> None:
     begin(rig)
     at_first = rig.sent.copy()
     said: list[str] = []
-    word = frames.ENABLE_OPERATION
+    word = canopen_frames.ENABLE_OPERATION
     while rig.control.measured.feedback.homing is False or not rig.control.measured.feedback.homed[0]:
         rig.cycle()
         for message in (*at_first, *rig.sent):
-            if message.arbitration_id == frames.SDO_REQUEST + 1 and message.data[0] == 0x2F:
+            if message.arbitration_id == canopen_frames.SDO_REQUEST + 1 and message.data[0] == 0x2F:
                 said.append(f"mode {message.data[4]}")
-            elif message.arbitration_id == frames.RPDO1 + 1:
-                before, (word,) = word, frames.CONTROLWORD.unpack(message.data)
+            elif message.arbitration_id == canopen_frames.RPDO1 + 1:
+                before, (word,) = word, canopen_frames.CONTROLWORD.unpack(message.data)
                 if word != before:  # else it is sent again, for it may have got lost
                     said.append(f"controlword {word:04X}")
         at_first.clear()
-        setpoints = [m.arbitration_id for m in rig.sent if m.arbitration_id & 0x780 == frames.RPDO2]
-        assert setpoints == [frames.RPDO2 + node for node in (1, 2, 3)]
+        setpoints = [m.arbitration_id for m in rig.sent if m.arbitration_id & 0x780 == canopen_frames.RPDO2]
+        assert setpoints == [canopen_frames.RPDO2 + node for node in (1, 2, 3)]
     assert said == ["mode 6", "controlword 001F", "controlword 000F", "mode 8"]
 
 
@@ -238,7 +222,7 @@ def test_a_controlword_that_gets_lost_is_sent_again(rig: Rig, monkeypatch: pytes
     lost: list[bytes] = []
 
     def lose(can_id: int, data: bytes, now: float) -> None:
-        if can_id == frames.RPDO1 + 1 and data == frames.CONTROLWORD.pack(word) and not lost:
+        if can_id == canopen_frames.RPDO1 + 1 and data == canopen_frames.CONTROLWORD.pack(word) and not lost:
             lost.append(data)
         else:
             receive(can_id, data, now)
@@ -261,7 +245,7 @@ def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pyte
     def keep() -> None:  # a drive that tells of its last homing until the next one is started
         attained = drive.homing.attained
         forget()
-        drive.homing.attained = attained and drive.objects[0x6040, 0].value & frames.HOMING_START == 0
+        drive.homing.attained = attained and drive.objects[0x6040, 0].value & canopen_frames.HOMING_START == 0
 
     monkeypatch.setattr(drive.homing, "forget", keep)
     rig.enable()
@@ -351,7 +335,7 @@ def test_a_standstill_from_before_the_start_is_not_taken_for_that_of_the_halt(wh
     """Statuswords come three cycles late, from a drive that is fast at once and brakes slowly."""
 
     def late_status(message: can.Message) -> float:
-        return 3.0 * PERIOD if message.arbitration_id == frames.TPDO1 + 1 else 0.0
+        return 3.0 * PERIOD if message.arbitration_id == canopen_frames.TPDO1 + 1 else 0.0
 
     rig = Rig(braking_slowly(acceleration=50.0), late_status)
     rig.enable()
@@ -368,9 +352,9 @@ def test_the_held_setpoint_is_taken_up_before_setpoints_are_followed(rig: Rig) -
 
     def recv(timeout: float | None = None) -> can.Message | None:
         message = receive(timeout)
-        if message is not None and message.arbitration_id == frames.TPDO2 + 1 and not asked:
-            (counts,) = frames.POSITION.unpack(message.data)
-            message.data[:] = frames.POSITION.pack(counts + next(flicker))
+        if message is not None and message.arbitration_id == canopen_frames.TPDO2 + 1 and not asked:
+            (counts,) = canopen_frames.POSITION.unpack(message.data)
+            message.data[:] = canopen_frames.POSITION.pack(counts + next(flicker))
         return message
 
     rig.bus.recv = recv  # type: ignore[method-assign]
@@ -379,8 +363,10 @@ def test_the_held_setpoint_is_taken_up_before_setpoints_are_followed(rig: Rig) -
     rig.order("stop")
     while rig.mode is not Mode.HOLDING:
         rig.cycle()
-        held += [bytes(message.data) for message in rig.sent if message.arbitration_id == frames.RPDO2 + 1]
-        if any(m.arbitration_id == frames.SDO_REQUEST + 1 and m.data[:5] == b"\x2f\x60\x60\0\x08" for m in rig.sent):
+        held += [bytes(message.data) for message in rig.sent if message.arbitration_id == canopen_frames.RPDO2 + 1]
+        if any(
+            m.arbitration_id == canopen_frames.SDO_REQUEST + 1 and m.data[:5] == b"\x2f\x60\x60\0\x08" for m in rig.sent
+        ):
             asked.append(len(held))  # the setpoint of this cycle goes out after the request
     (since,) = asked
     # Those of this cycle, of the two SYNCs before it, and of the one at which the drive's place was read.
@@ -421,9 +407,9 @@ def test_a_fault_stops_it_at_once_and_it_can_begin_again(rig: Rig, cause: str, w
     else:
         rig.drives[2].silent = True
     rig.until(lambda: rig.mode is Mode.FAULT, 4)
-    words = {m.arbitration_id - frames.RPDO1 for m in rig.sent if m.data[:2] == b"\x02\x00"}
+    words = {m.arbitration_id - canopen_frames.RPDO1 for m in rig.sent if m.data[:2] == b"\x02\x00"}
     assert words == {1, 2, 3}
-    assert not any(m.arbitration_id & 0x780 == frames.RPDO2 for m in rig.sent)
+    assert not any(m.arbitration_id & 0x780 == canopen_frames.RPDO2 for m in rig.sent)
     rig.cycles(400)  # one that does not hear has stopped by its own watch on SYNC
     rig.drives[2].silent = False
     rig.cycles(150)  # it tells its state from time to time

@@ -20,7 +20,7 @@ from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
 from trirail_drivers.simulated import SimulatedDrive
 from trirail_drivers.simulated.dictionary import SdoAbort
-from trirail_drivers.simulated.sdo import SdoServer
+from trirail_drivers.simulated.sdo_server import SdoServer
 
 FASTEST = 0.5
 HOMING = Homing(method=19, speed_switch=0.02, speed_zero=0.005, acceleration=0.5)

@@ -31,8 +31,8 @@ from trirail.wire.vocabulary import Mode
 from trirail_drivers.bus.wire import UNSENT_CYCLES
 from trirail_drivers.driver.ramp import braked
 from trirail_drivers.interface import PowerState
-from trirail_drivers.odrive import frames
-from trirail_drivers.odrive.frames import AxisState
+from trirail_drivers.odrive import cansimple
+from trirail_drivers.odrive.cansimple import AxisState
 from trirail_drivers.odrive.setpoints import SETTLING
 from trirail_drivers.simulated import SimulatedOdrive
 
@@ -40,14 +40,14 @@ ODRIVES = odrives(REAL)
 PERIOD = ODRIVES.period
 TURNS = ODRIVES.drives.A.counts_per_metre
 DECELERATION = ODRIVES.drives.quick_stop_deceleration
-ROUNDING = frames.VELOCITY_STEP / TURNS
+ROUNDING = cansimple.VELOCITY_STEP / TURNS
 """The velocity feed-forward comes in steps of this [m/s]."""
 ROLLING = 400
 """Cycles in which a slider stands that its drive has let go of: 0.4 m/s at 2 m/s² take 200, and a heartbeat or so."""
 DEAF = 750
 """Cycles in which a drive stands that hears nothing: its watchdog disarms it after 0.3 s."""
 BEAT = round(ODRIVES.drives.heartbeat / PERIOD) + 2
-ASKED = round(3 * frames.ERROR_PERIOD / PERIOD) + 2
+ASKED = round(3 * cansimple.ERROR_PERIOD / PERIOD) + 2
 """Cycles in which a drive is asked for its errors once."""
 
 
@@ -95,18 +95,18 @@ class OdriveRig(FaultRig):
 
     def _note(self, message: can.Message, timeout: float | None = None) -> None:
         node, number = divmod(message.arbitration_id, 1 << 5)
-        if number == frames.SET_INPUT_POS:
-            turns, velocity, _ = frames.INPUT_POS.unpack(message.data)
-            metres = turns / TURNS, velocity * frames.VELOCITY_STEP / TURNS
+        if number == cansimple.SET_INPUT_POS:
+            turns, velocity, _ = cansimple.INPUT_POS.unpack(message.data)
+            metres = turns / TURNS, velocity * cansimple.VELOCITY_STEP / TURNS
             armed = self.bus.drives[node].power is PowerState.OPERATION_ENABLED
             self.setpoints_of[node].append(Setpoint(len(self.rows), *metres, armed, taken=False))
-        elif number == frames.SET_AXIS_STATE:
-            self.states_of[node].append((len(self.rows), frames.AXIS_STATE.unpack(message.data)[0]))
+        elif number == cansimple.SET_AXIS_STATE:
+            self.states_of[node].append((len(self.rows), cansimple.AXIS_STATE.unpack(message.data)[0]))
         error = self.refuse()
         if error is not None:
             raise error
         super()._note(message, timeout)
-        if number == frames.SET_INPUT_POS:
+        if number == cansimple.SET_INPUT_POS:
             self.setpoints_of[node][-1] = self.setpoints_of[node][-1]._replace(taken=True)
 
     def cycle(self, request: Request | None = None) -> None:
@@ -225,17 +225,19 @@ def full_queue(rig: OdriveRig, cycles: int = 2) -> None:
 
 def no_number(rig: OdriveRig) -> None:
     """Drive C does not know its position any more."""
-    rig.spoilt[frames.identifier(2, frames.GET_ENCODER_ESTIMATES)] = lambda _data: frames.ESTIMATES.pack(math.nan, 0.0)
+    rig.spoilt[cansimple.identifier(2, cansimple.GET_ENCODER_ESTIMATES)] = lambda _data: cansimple.ESTIMATES.pack(
+        math.nan, 0.0
+    )
 
 
 def elsewhere(rig: OdriveRig) -> None:
     """Drive C says that it is 50 mm farther than it is."""
 
     def farther(data: bytes) -> bytes:
-        turns, velocity = frames.ESTIMATES.unpack(data)
-        return frames.ESTIMATES.pack(turns + 0.05 * TURNS, velocity)
+        turns, velocity = cansimple.ESTIMATES.unpack(data)
+        return cansimple.ESTIMATES.pack(turns + 0.05 * TURNS, velocity)
 
-    rig.spoilt[frames.identifier(2, frames.GET_ENCODER_ESTIMATES)] = farther
+    rig.spoilt[cansimple.identifier(2, cansimple.GET_ENCODER_ESTIMATES)] = farther
 
 
 def short_watchdog(rig: OdriveRig) -> None:
@@ -409,7 +411,7 @@ def test_drives_whose_service_is_gone_are_disarmed_by_their_watchdogs(rig: Odriv
         for drive in rig.odrives:
             drive.poll(rig.now)
     assert rig.stands()
-    assert {drive.disarm_reason for drive in rig.odrives} == {frames.Error.WATCHDOG_TIMER_EXPIRED}
+    assert {drive.disarm_reason for drive in rig.odrives} == {cansimple.Error.WATCHDOG_TIMER_EXPIRED}
 
 
 @pytest.mark.parametrize("mode", [*map(tried, IN_MOTION)])

@@ -17,8 +17,8 @@ from trirail.config.loading import everything
 from trirail.errors import ConfigError
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES
-from trirail_drivers.odrive import endpoints, frames
-from trirail_drivers.odrive.endpoints import KNOWN, Version
+from trirail_drivers.odrive import cansimple, flat_endpoints
+from trirail_drivers.odrive.flat_endpoints import KNOWN, Version
 from trirail_drivers.odrive.protections import CYCLIC, HEARTBEAT, PROTECTIONS, SCALE, WATCHDOG, WATCHDOG_TIMEOUT
 
 S1 = Version((5, 2, 0), (0, 6, 10))
@@ -148,7 +148,7 @@ def test_a_firmware_that_nobody_knows_is_a_missing_protection(firmware: tuple[in
                 continue
             rig.drives.configure(PERIOD)
             assert [(found.drive, found.object) for found in rig.drives.missing_protections] == [("A", "endpoints")]
-            asked = [can_id for can_id, _ in rig.bus.sent if can_id == frames.identifier(0, frames.RX_SDO)]
+            asked = [can_id for can_id, _ in rig.bus.sent if can_id == cansimple.identifier(0, cansimple.RX_SDO)]
             assert asked == []
         finally:
             rig.drives.close()
@@ -188,7 +188,7 @@ def test_a_users_own_table_makes_a_firmware_known(
     rigs: list[Rig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "flat_endpoints.json").write_text(table(UNKNOWN, {WATCHDOG: 999}))
-    own = endpoints.read("A", tmp_path / "flat_endpoints.json")
+    own = flat_endpoints.read("A", tmp_path / "flat_endpoints.json")
     monkeypatch.setattr("trirail_drivers.simulated.odrive.KNOWN", (own,))  # such a drive numbers them so
     rig = Rig(with_file(tmp_path / "flat_endpoints.json"))
     rigs.append(rig)
@@ -196,7 +196,7 @@ def test_a_users_own_table_makes_a_firmware_known(
         device.version = UNKNOWN
     rig.drives.configure(PERIOD)
     assert rig.drives.missing_protections == ()
-    asked = {struct.unpack_from("<BHB", data)[1] for can_id, data in rig.bus.sent if can_id & 31 == frames.RX_SDO}
+    asked = {struct.unpack_from("<BHB", data)[1] for can_id, data in rig.bus.sent if can_id & 31 == cansimple.RX_SDO}
     assert 999 in asked
 
 
@@ -243,14 +243,14 @@ def test_an_answer_that_is_lost_is_asked_for_again(rigs: list[Rig], lost: int) -
     rig = Rig()
     rigs.append(rig)
     device, left = rig.devices[1], [lost]
-    keep = device._handlers[frames.RX_SDO]
+    keep = device._handlers[cansimple.RX_SDO]
 
     def deaf(data: bytes) -> None:
         left[0] -= 1
         if left[0] < 0:
             keep(data)
 
-    device._handlers[frames.RX_SDO] = deaf
+    device._handlers[cansimple.RX_SDO] = deaf
     if lost < 3:
         rig.drives.configure(PERIOD)
     else:
@@ -260,8 +260,8 @@ def test_an_answer_that_is_lost_is_asked_for_again(rigs: list[Rig], lost: int) -
 
 def test_the_maker_s_own_bytes() -> None:
     """Its example can_param_access.py: struct '<BHB', opcode 0 to read, and the value of the endpoint behind it."""
-    assert frames.SDO.pack(frames.READ, 214, 0) == bytes.fromhex("00d60000")
-    assert (frames.RX_SDO, frames.TX_SDO, frames.WRITE) == (0x04, 0x05, 0x01)
+    assert cansimple.SDO.pack(cansimple.READ, 214, 0) == bytes.fromhex("00d60000")
+    assert (cansimple.RX_SDO, cansimple.TX_SDO, cansimple.WRITE) == (0x04, 0x05, 0x01)
 
 
 def test_the_tables_are_the_makers() -> None:
@@ -278,9 +278,9 @@ def test_the_tables_are_the_makers() -> None:
 
 
 def test_states_15_and_16_are_known_by_name() -> None:
-    assert frames.state_name(15) == "harmonic calibration"
-    assert frames.state_name(16) == "harmonic calibration of the commutation encoder"
-    assert {15, 16} <= set(frames.PROCEDURES)
+    assert cansimple.state_name(15) == "harmonic calibration"
+    assert cansimple.state_name(16) == "harmonic calibration of the commutation encoder"
+    assert {15, 16} <= set(cansimple.PROCEDURES)
 
 
 def test_the_guide_has_every_protection() -> None:

@@ -6,18 +6,17 @@ Frames go both ways that they can: by python-can, and on the bus's own socket.
 from __future__ import annotations
 
 import contextlib
-import os
 import selectors
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
 import carriers
 import pytest
 from carriers import NAME, ip, on_vcan
+from drivers.real_time import cycle, cycle_until
 from trirail_drivers.bus import wire as wires
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.unixbus import UnixBus
@@ -27,7 +26,8 @@ from trirail_drivers.connection import opening
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.connection.serving import serve
 from trirail_drivers.errors import BusError
-from trirail_drivers.interface import Feedback, PowerState
+from trirail_drivers.interface import PowerState
+from waiting import wait_until
 
 SIMULATED = Simulated(missed_syncs=1000)
 VCAN = Can(interface="socketcan", channel=NAME, simulated=SIMULATED)
@@ -103,10 +103,7 @@ def served(path: Path, section: Can) -> Iterator[None]:
     """The simulated drives as the service has them: they end when the driver has gone."""
     thread = threading.Thread(target=serve, args=(path, section, DRIVES, lambda: None, lambda: None))
     thread.start()
-    deadline = time.monotonic() + WITHIN
-    while not path.exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
+    wait_until(path.exists)
     yield
     thread.join(WITHIN)
     assert not thread.is_alive()
@@ -122,27 +119,6 @@ def driver(
     assert isinstance(connected, Cia402)
     yield connected
     connected.close()
-
-
-def cycle(driver: Cia402, position: float = 0.0, *, heard: bool = True) -> Feedback:
-    """One cycle, as slow as the answers to its SYNC."""
-    driver.sync()
-    deadline = time.monotonic() + WITHIN
-    while True:
-        feedback = driver.read()
-        answered = feedback.age == (0, 0, 0)
-        if answered or not heard or feedback.fault or time.monotonic() > deadline:
-            driver.write((position,) * 3, (0.0,) * 3)
-            return feedback
-        os.sched_yield()
-
-
-def until(driver: Cia402, condition: Callable[[Feedback], bool], position: float = 0.0) -> Feedback:
-    deadline = time.monotonic() + WITHIN
-    while not condition(feedback := cycle(driver, position)):
-        assert feedback.fault is None, feedback.fault
-        assert time.monotonic() < deadline, feedback
-    return feedback
 
 
 @on_vcan
@@ -172,10 +148,10 @@ def test_drives_are_set_up_powered_moved_and_left_without_power(driver: Cia402) 
     driver.configure(PERIOD)
     cycle(driver)
     driver.enable()
-    until(driver, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
-    until(driver, lambda feedback: min(feedback.position) > 0.9e-4, position=1e-4)
+    cycle_until(driver, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
+    cycle_until(driver, lambda feedback: min(feedback.position) > 0.9e-4, position=1e-4)
     driver.disable()
-    until(driver, lambda feedback: set(feedback.state) == {PowerState.SWITCH_ON_DISABLED}, position=1e-4)
+    cycle_until(driver, lambda feedback: set(feedback.state) == {PowerState.SWITCH_ON_DISABLED}, position=1e-4)
 
 
 @pytest.mark.parametrize("section", [pytest.param("vcan", marks=carriers.NEEDS_VCAN)], indirect=True)
@@ -183,7 +159,7 @@ def test_an_interface_that_goes_down_is_a_fault_of_the_bus(driver: Cia402) -> No
     driver.configure(PERIOD)
     cycle(driver)
     driver.enable()
-    until(driver, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
+    cycle_until(driver, lambda feedback: set(feedback.state) == {PowerState.OPERATION_ENABLED})
     ip("link", "set", NAME, "down")
     cycle(driver, heard=False)
     fault = driver.read().fault

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -16,6 +16,7 @@ from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.config import Can, Drive, Drives
 from trirail_drivers.connection.serving import serve
 from trirail_drivers.errors import DriveError
+from waiting import WITHIN, wait_until
 
 DRIVES = Drives(
     protocol="cia402",
@@ -24,8 +25,6 @@ DRIVES = Drives(
     C=Drive(node=3, counts_per_metre=1e6),
 )
 SECTION = Can("simulated")
-WITHIN = 30.0
-"""How long a busy machine may take for anything [s]."""
 DEVICE_TYPE = bytes.fromhex("4000100000000000")
 """A request to read 1000h, and its answer."""
 SERVO = bytes.fromhex("4300100092010200")
@@ -45,19 +44,12 @@ class Served:
     def begin(self) -> None:
         """Serve; return when they can be connected to."""
         self._thread.start()
-        wait_for(self.path.exists)
+        wait_until(self.path.exists)
 
     def over(self) -> None:
         """Wait until they are served no more."""
         self._thread.join(WITHIN)
         assert not self._thread.is_alive()
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WITHIN
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
 
 
 @pytest.fixture

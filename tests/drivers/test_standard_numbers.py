@@ -14,10 +14,10 @@ from types import ModuleType
 import pytest
 from drivers.test_cia402 import PERIOD
 from rigs import Bus, DeviceRig
-from trirail_drivers.cia402 import frames as canopen
+from trirail_drivers.cia402 import canopen_frames as canopen
 from trirail_drivers.cia402 import homing, process_data, sdo
 from trirail_drivers.interface import PowerState
-from trirail_drivers.odrive import frames as cansimple
+from trirail_drivers.odrive import cansimple
 from trirail_drivers.simulated import Servo, SimulatedDrive, SimulatedOdrive
 
 from drivers import test_cia402, test_odrive

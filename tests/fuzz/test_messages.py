@@ -19,8 +19,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.errors import RefusedError
 from trirail.processes.gateway import Gateway
-from trirail.processes.guard import Guard
 from trirail.processes.incoming import Incoming, Kind
+from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, links, packets, records, text, zenoh_session
 from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal
 from trirail.wire.goals import TrajectoryPoint as Point

@@ -13,8 +13,8 @@ from trirail.kinematics import compiled
 pytestmark = pytest.mark.long
 
 COUNT = """
-from trirail.kinematics import closure
-functions = closure.inverse_into, closure.inverse_batch, closure.forward_into, closure.forward_batch
+from trirail.kinematics import closed_forward, closure
+functions = closure.inverse_into, closure.inverse_batch, closed_forward.forward_into, closed_forward.forward_batch
 print(*(len(function.stats.cache_misses) for function in functions))
 """
 

@@ -2,7 +2,6 @@
 
 import csv
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, reject, settings
 from hypothesis import strategies as st
+from kinematics.calculus import differences, theta
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from trirail.errors import KinematicsError
@@ -52,14 +52,6 @@ def papers_motion(example: str, t: Array) -> tuple[Array, Array, Array]:
         np.outer(w * np.sin(w * t), final),
         np.outer(w * w * np.cos(w * t), final),
     )
-
-
-def differences(function: Callable[[float], Array], t: float, h: float = 1e-2) -> tuple[Array, Array]:
-    """Return the first and second derivative of a smooth function, by central differences of order 8."""
-    first = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0.0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
-    second = np.array([-1 / 560, 8 / 315, -1 / 5, 8 / 5, -205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560])
-    samples = np.array([function(t + k * h) for k in range(-4, 5)])
-    return np.tensordot(first, samples, 1) / h, np.tensordot(second, samples, 1) / h**2
 
 
 # ---- the paper's robot
@@ -146,10 +138,6 @@ def test_connectivity_conditions_are_the_papers(pose: tuple[float, float, float]
     u3 = np.array([0.0, 0.0, 1.0])
     u3_tilde = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     r_3 = L0 / 2 * np.array([0.0, 1.0, -math.sqrt(3) / 3])
-
-    def theta(angle: float) -> Array:
-        c, s = math.cos(angle), math.sin(angle)
-        return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
     velocity, acceleration = np.array(rates[:3]), np.array(rates[3:])
     motion = inverse(PAPER, pose, velocity, acceleration)

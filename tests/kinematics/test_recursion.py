@@ -1,13 +1,13 @@
 """The recursion for any planar leg, against finite differences and the paper's equations in numpy."""
 
 import math
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from kinematics.calculus import differences, theta
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from trirail.kinematics.joints import Joint, serial_leg
@@ -21,21 +21,8 @@ U3 = np.array([0.0, 0.0, 1.0])
 TIME = 0.7
 
 
-def theta(angle: float) -> Array:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
 def tilde(x: Array) -> Array:
     return np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]])
-
-
-def differences(function: Callable[[float], Array], t: float = TIME, h: float = 1e-2) -> tuple[Array, Array]:
-    """Return the first and second derivative of a smooth function, by central differences of order 8."""
-    first = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0.0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
-    second = np.array([-1 / 560, 8 / 315, -1 / 5, 8 / 5, -205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560])
-    samples = np.array([function(t + k * h) for k in range(-4, 5)])
-    return np.tensordot(first, samples, 1) / h, np.tensordot(second, samples, 1) / h**2
 
 
 class Swinging:
@@ -110,8 +97,8 @@ def test_absolute_motions_are_derivatives_of_place(swinging: Swinging) -> None:
 
         q = np.array(place.q)
         omega, epsilon = tilde(np.array(motion.omega)), tilde(np.array(motion.epsilon))
-        turning, turning_twice = differences(q_transposed)
-        velocity, acceleration = differences(position)
+        turning, turning_twice = differences(q_transposed, TIME)
+        velocity, acceleration = differences(position, TIME)
         assert_allclose(omega, q @ turning, atol=1e-11)
         assert_allclose(omega @ omega + epsilon, q @ turning_twice, atol=1e-9)
         assert_allclose(motion.v, q @ velocity, atol=1e-11)
@@ -150,7 +137,7 @@ def test_the_platform_moves_as_its_centre(swinging: Swinging) -> None:
         return np.array(platform_centre(swinging.leg, place))
 
     velocity, acceleration = platform_motion(swinging.leg, *follow(swinging.leg, swinging.rows(TIME)))
-    expected_velocity, expected_acceleration = differences(centre)
+    expected_velocity, expected_acceleration = differences(centre, TIME)
     assert_allclose(velocity[:2], expected_velocity[:2], atol=1e-11)
     assert_allclose(acceleration[:2], expected_acceleration[:2], atol=1e-9)
 
@@ -215,9 +202,9 @@ def test_other_robots_are_closed_by_the_same_recursion(robot: type[Rpr | Prr], t
     place, _ = follow(leg.leg, np.stack([variables, np.zeros(3), np.zeros(3)], axis=1))
     assert_allclose(platform_centre(leg.leg, place)[:2], platform_pose(TIME)[:2], atol=1e-14)
 
-    velocity, acceleration = differences(platform_pose)
+    velocity, acceleration = differences(platform_pose, TIME)
     rates, accelerations = joint_motion(leg.leg, tuple(variables), tuple(velocity), tuple(acceleration))
-    expected_rates, expected_accelerations = differences(lambda t: leg.variables(platform_pose(t)))
+    expected_rates, expected_accelerations = differences(lambda t: leg.variables(platform_pose(t)), TIME)
     assert_allclose(rates, expected_rates, atol=1e-10)
     assert_allclose(accelerations, expected_accelerations, atol=1e-8)
 

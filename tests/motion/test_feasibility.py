@@ -64,14 +64,14 @@ def test_a_change_of_rate_counts_with_what_the_velocities_tell(share: float, wit
     """Within one cycle the accelerations before and after are zero; a slider's velocity takes a step all the same."""
     by = share * LIMITS.slider.jerks[0] * PERIOD**2 / 2.0 / SPEED
     law = slower(by, PERIOD, PERIOD / 20.0)
-    assert CHECKER.look(straight(), law, 0.0, 0.9, (-SPEED / 2.0, 0.0, 0.0)).within_limits is within_limits
+    assert CHECKER.sample(straight(), law, 0.0, 0.9, (-SPEED / 2.0, 0.0, 0.0)).within_limits is within_limits
 
 
 @pytest.mark.parametrize("first", [0.0, 0.3])
 def test_a_path_that_begins_out_of_reach_leaves_it_at_once(first: float) -> None:
     pieces = np.zeros((1, 3, 6))
     pieces[0, 0, :2] = 2.0 * LIMITS.platform.x[1], SPEED
-    found = CHECKER.look(Path(np.array([0.0, 1.0]), pieces), constant(1.0), first, 0.9, (0.0, 0.0, 0.0))
+    found = CHECKER.sample(Path(np.array([0.0, 1.0]), pieces), constant(1.0), first, 0.9, (0.0, 0.0, 0.0))
     assert found.leaves_at == pytest.approx(first, abs=1e-9)
     assert not found.fits
     assert not found.within_limits
@@ -81,7 +81,7 @@ def test_a_path_that_begins_out_of_reach_leaves_it_at_once(first: float) -> None
 def test_where_a_path_leaves_the_workspace_is_said_to_the_moment(share: float) -> None:
     pieces = np.zeros((1, 3, 6))
     pieces[0, 0, :2] = LIMITS.platform.x[1] - share * SPEED, SPEED
-    found = CHECKER.look(Path(np.array([0.0, 1.0]), pieces), constant(1.0), 0.0, 1.0, (0.0, 0.0, 0.0))
+    found = CHECKER.sample(Path(np.array([0.0, 1.0]), pieces), constant(1.0), 0.0, 1.0, (0.0, 0.0, 0.0))
     assert found.leaves_at == pytest.approx(share, abs=1e-4)
 
 
@@ -98,7 +98,7 @@ def test_how_often_a_path_is_looked_at(monkeypatch: pytest.MonkeyPatch, seconds:
 
     monkeypatch.setattr(feasibility, "survey", noted)
     path = stretched(straight(), seconds)
-    found = CHECKER.look(path, constant(1.0), 0.0, seconds, (-SPEED / 2.0, 0.0, 0.0))
+    found = CHECKER.sample(path, constant(1.0), 0.0, seconds, (-SPEED / 2.0, 0.0, 0.0))
     assert math.isnan(found.leaves_at)
     assert asked == [moments]
 

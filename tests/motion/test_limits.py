@@ -8,10 +8,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig, changed
-from control.test_control import GOAL, PERIOD, ROBOT, assert_within_limits, refusal
+from control.test_control import GOAL, PERIOD, ROBOT, assert_within_limits
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from refusals import refusal
 from trirail.control.feedback import Measured
 from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Bounds, Violation, gate

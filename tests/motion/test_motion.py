@@ -11,8 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig
-from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal, slower
+from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits, slower
 from numpy.typing import NDArray
+from refusals import refusal
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from trirail.config import Config
 from trirail.errors import KinematicsError

@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 from conftest import CONFIG, Rig
-from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal
+from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from refusals import refusal
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.robot import forward

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 from conftest import CONFIG, Rig
-from control.test_control import PERIOD, assert_within_limits, refusal
+from control.test_control import PERIOD, assert_within_limits
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refusal
 from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode

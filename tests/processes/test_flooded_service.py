@@ -16,7 +16,7 @@ from refusals import refused_as
 from trirail.client.client import Robot
 from trirail.client.new_stop import NewStop
 from trirail.errors import RefusalCode, ServiceError
-from trirail.wire.stop_door import FARTHER
+from trirail.wire.stop_protocol import FARTHER
 
 pytestmark = pytest.mark.slow
 

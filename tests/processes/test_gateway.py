@@ -14,10 +14,10 @@ import pytest
 from conftest import CONFIG, carried
 from trirail.processes.backlog import MOST_OF_ONE, PATIENCE
 from trirail.processes.gateway import Gateway
-from trirail.processes.guard import Guard
 from trirail.processes.incoming import Incoming, Kind
 from trirail.processes.replies import REFUSALS_PER_SECOND
 from trirail.processes.requests import AHEAD, AHEAD_OF_ALL, UNDER_WAY
+from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.links import Closed
 from trirail.wire.messages import Event

@@ -21,8 +21,8 @@ from trirail.cli.key_folder import KeyFolder
 from trirail.config import Config, Tls, Zenoh
 from trirail.errors import ConfigError, ServiceError
 from trirail.processes import router
-from trirail.processes.guard import Guard
 from trirail.processes.router import RouterConfig
+from trirail.processes.session_guard import Guard
 from trirail.telemetry.sinks import free_port
 from trirail.wire import zenoh_session
 from trirail.wire.credentials import Credentials

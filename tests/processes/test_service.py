@@ -40,9 +40,9 @@ from trirail.wire.messages import Event, GoalReply
 from trirail.wire.state import State
 from trirail.wire.vocabulary import MODES, Mode
 from trirail.wire.zenoh_session import open_client
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.interface import MissingProtection
-from trirail_drivers.odrive import frames as odrive_frames
+from trirail_drivers.odrive import cansimple as odrive_frames
 from warm import WarmProcess, start
 
 pytestmark = pytest.mark.slow
@@ -164,7 +164,11 @@ def in_motion(robot: Robot) -> None:
 
 def positions(sent: list[tuple[int, bytes]], node: int) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Setpoints that a drive was sent [m]."""
-    counts = [frames.SETPOINT.unpack(data)[0] for identifier, data in sent if identifier == frames.RPDO2 + node]
+    counts = [
+        canopen_frames.SETPOINT.unpack(data)[0]
+        for identifier, data in sent
+        if identifier == canopen_frames.RPDO2 + node
+    ]
     return np.array(counts) / 1e7
 
 
@@ -177,7 +181,9 @@ def assert_stopped_smoothly(sent: list[tuple[int, bytes]]) -> None:
 
 
 def controlwords(sent: list[tuple[int, bytes]], node: int) -> list[int]:
-    return [int.from_bytes(data[:2], "little") for identifier, data in sent if identifier == frames.RPDO1 + node]
+    return [
+        int.from_bytes(data[:2], "little") for identifier, data in sent if identifier == canopen_frames.RPDO1 + node
+    ]
 
 
 @pytest.fixture
@@ -224,9 +230,9 @@ def test_a_session(cold_service: Service) -> None:
     assert cold_service.end() == 0
     sent = cold_service.frames()
     assert {identifier for identifier, _ in sent} <= {
-        frames.NMT,
-        frames.SYNC,
-        frames.HEARTBEAT + 126,
+        canopen_frames.NMT,
+        canopen_frames.SYNC,
+        canopen_frames.HEARTBEAT + 126,
         *(base + node for base in (0x180, 0x200, 0x280, 0x300, 0x580, 0x600, 0x700) for node in (1, 2, 3)),
     }
     for node in (1, 2, 3):

@@ -19,12 +19,12 @@ from trirail.config import Config, Zenoh
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.processes import stop_door
 from trirail.processes.descriptors import Reserve
-from trirail.processes.guard import Guard
+from trirail.processes.session_guard import Guard
 from trirail.processes.stop_door import Answer
 from trirail.wire import tls
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply
-from trirail.wire.stop_door import MAX_LINE, STOPS, StopRequest, stop_address
+from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopRequest, stop_address
 from trirail.wire.vocabulary import Command
 
 DONE = CommandReply("stop", "holding", 1)

@@ -18,14 +18,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
-from trirail.processes.guard import Guard
 from trirail.processes.inbox import ALIKE
 from trirail.processes.incoming import REMEMBERED, Copies, Incoming
+from trirail.processes.session_guard import Guard
 from trirail.wire import packets, zenoh_session
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused
 from trirail.wire.records import DTYPE
-from trirail.wire.stop_door import STOPS
+from trirail.wire.stop_protocol import STOPS
 
 USERS = ("ann", "bob")
 CONTENTS = (b"", b"{}", b'{"goal": "bob-1"}', b"no JSON")

@@ -11,19 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rigs import Clock
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
 from trirail.processes.supervisor import WATCHED_BY_SYSTEMD
 from trirail.processes.systemd import FEEDS, Watchdog, notify
 
 UNIT = Path(__file__).parents[2] / "configs" / "trirail.service"
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture

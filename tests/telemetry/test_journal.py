@@ -19,7 +19,7 @@ STOP = ControlInput(4, 1300, 5_050_000_000, CommandRequest(2, "ann", Command.STO
 
 def test_lines_of_one_log_are_one_chunk_with_their_own_times() -> None:
     remark = Entry(EVENTS, 1.5, SAID * 1e-9 + 0.25, "a word", "error")
-    given = [journal.given(what, 1000, 1_000_000_000) for what in (GOAL, STOP)]
+    given = [journal.control_input(what, 1000, 1_000_000_000) for what in (GOAL, STOP)]
     events, requests = journal.chunks([journal.said(EVENT), given[0], remark, given[1]])
     assert (events.entity_path, requests.entity_path) == (EVENTS, REQUESTS)
     batch = events.to_record_batch()

@@ -20,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
+from telemetry.test_recorder import configured
 from trirail.config import SIM, Config, load, parse
 from trirail.processes import loop
 from trirail.processes.recording import GATHER
@@ -56,11 +57,6 @@ class Time:
 
     def wall(self) -> int:
         return WALL_NS + self.ns - made.MONOTONIC_NS
-
-
-def configured(**telemetry: Any) -> Config:
-    config = load(SIM)
-    return msgspec.structs.replace(config, telemetry=msgspec.structs.replace(config.telemetry, **telemetry))
 
 
 def recorder(directory: Path, time: Time, config: Config, **more: Any) -> Recorder:
@@ -371,7 +367,7 @@ def faulted(folder: Path, seconds: float, at: float, after: float) -> tuple[list
     cycle = round(at * 1000)
     box.stands("stands", Standing(None, (0.01, 0.02, 0.1)))
     feed(box, sent[: cycle - 500], time)
-    box.given(goal(cycle - 500))
+    box.control_input(goal(cycle - 500))
     feed(box, sent[cycle - 500 : cycle], time)
     wall = (WALL_NS + cycle * 1_000_000) * 1e-9
     box.event(Event(1, at, cycle, wall, "fault", "error", "drive B: emergency 4310"))

@@ -77,9 +77,9 @@ def record(folder: Path, began: str = "2026-01-31 12:00:00", name: str = "demo",
         pytest.fail,
     )  # fmt: skip
     for taker in (recording, box):
-        taker.given(asked(1, "ann"))
-        taker.given(asked(2, "ben"))
-        taker.given(ControlInput(3, 11, made.MONOTONIC_NS, CommandRequest(3, "eva", Command.STOP)))
+        taker.control_input(asked(1, "ann"))
+        taker.control_input(asked(2, "ben"))
+        taker.control_input(ControlInput(3, 11, made.MONOTONIC_NS, CommandRequest(3, "eva", Command.STOP)))
     sent = made.records(seconds)
     for start in range(0, len(sent), 20):
         time.ns = int(sent[start : start + 20]["deadline_ns"][-1])

@@ -9,7 +9,7 @@ import bus_log
 import pytest
 from bus_log import Frame
 from trirail.config import SIM, load
-from trirail_drivers.cia402 import frames as layout
+from trirail_drivers.cia402 import canopen_frames as layout
 
 CONFIG = load(SIM.parent / "socketcan.toml")
 PERIOD = CONFIG.period

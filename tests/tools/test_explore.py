@@ -105,7 +105,7 @@ def test_what_was_found_is_told_with_the_line_that_keeps_it(folder: Path) -> Non
     assert found.examples["test_some.py::test_drawn"] == 30
     assert found.findings["test_some.py::test_wrong"]["keep"] == "@example(\n    a=1000,\n    b=[],\n)"
     assert found.findings["test_some.py::test_seeded"]["keep"].startswith("@pytest.mark.generated(…, ")
-    said = "\n".join(found.told())
+    said = "\n".join(found.lines())
     assert "found in test_some.py::test_wrong:\nAssertionError: assert 1000 < 1000" in said
     assert "2 findings" in said
     assert "test_plain" not in said

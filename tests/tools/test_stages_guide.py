@@ -52,7 +52,7 @@ def test_what_is_left_after_one_correction(file: str) -> None:
         return np.array([np.hypot(*pose[:2]) * 1e6, abs(pose[2]) * 1e6])
 
     exact, mistaken = (-np.subtract(*travels(each, [off, np.zeros(3)])[0]) for each in (robot, other_kind(robot)))
-    said = re.search(r"leaves (\S+) µm and (\S+) µrad, small angles leave (\d+) to (\d+) µm", GUIDE)
+    said = re.search(r"leaves (\S+) µm and (\S+) µrad, small angles leave (\d+) to (\d+) µm", " ".join(GUIDE.split()))
     assert said is not None
     way, turn, least, most = map(float, said.groups())
     assert left(exact) == pytest.approx([0.0, 0.0], abs=1e-6)

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 from trirail.config import SIM, Config, geometry, load
 from trirail.kinematics.geometry import singular_angles
 from trirail.kinematics.robot import inverse, jacobians
-from trirail.workspace import mechanism
-from trirail.workspace.mechanism import Mechanism
+from trirail.workspace import part_positions
+from trirail.workspace.part_positions import RobotParts
 from trirail.workspace.singularity import conditioning, distance_to_singularity
 from trirail.workspace.violations import violations
 from trirail.workspace.workspace import extent, permitted, reachable
@@ -39,7 +39,7 @@ def test_each_sliders_own_stroke_bounds_the_workspace(stage: Config, seed: int) 
     arms = poses[:, None, :2] - polygon
     cross = sides[:, 0] * arms[..., 1] - sides[:, 1] * arms[..., 0]
     assert ((cross >= 0.0).all(axis=1) & (len(polygon) > 0)).tolist() == inside.tolist()
-    travel = Mechanism.of(robot, slider).travel
+    travel = RobotParts.of(robot, slider).travel
     assert [np.linalg.norm(end - start) for start, end in travel] == pytest.approx(high - low)
 
 
@@ -81,12 +81,12 @@ def test_the_distance_to_a_singularity_is_that_to_the_nearest_singular_angle(sta
 
 def test_rails_carriages_cross_slides_and_table_are_drawn_where_they_are(stage: Config) -> None:
     robot = geometry(stage.geometry)
-    parts = Mechanism.of(robot, stage.limits.slider)
+    parts = RobotParts.of(robot, stage.limits.slider)
     pose = np.array([[0.003, -0.002, 0.06]])
     motion = inverse(robot, pose)
-    carriages = mechanism.sliders(robot, motion.position)
-    pivots = mechanism.pivots(robot, carriages, pose)
-    lines = mechanism.cross_slides(robot, parts, carriages, pose[:, 2])
+    carriages = part_positions.sliders(robot, motion.position)
+    pivots = part_positions.pivots(robot, carriages, pose)
+    lines = part_positions.cross_slides(robot, parts, carriages, pose[:, 2])
     for k, leg in enumerate(robot.each):
         rail = carriages[0, k] - leg.anchor
         assert rail @ (-math.sin(leg.rail_angle), math.cos(leg.rail_angle)) == pytest.approx(0.0, abs=1e-12)

@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 
 from trirail import Robot
-from trirail.alignment.calibration import Marks
+from trirail.alignment.camera_calibration import Marks
 from trirail.alignment.images import CameraView, Pair
 from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera

@@ -4,7 +4,7 @@ import asyncio
 import sys
 
 from trirail import AsyncRobot
-from trirail.alignment.calibration import Marks
+from trirail.alignment.camera_calibration import Marks
 from trirail.alignment.images import CameraView
 from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 from trirail import Robot
-from trirail.alignment.calibration import Marks
+from trirail.alignment.camera_calibration import Marks
 from trirail.alignment.finding import find
 from trirail.alignment.images import CameraView
 from trirail.alignment.shapes import MarkShape

@@ -14,7 +14,7 @@ from typing import Protocol
 from trirail_drivers.bus.can_frame import CAN_FRAME
 from trirail_drivers.bus.frame_io import FrameIO, Received, SocketFrames
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.bus.packets import BusAccess, Packets
+from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 
 _CALL = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
 """Given the address of frames, `struct can_frame` one after the other, and how many these are."""
@@ -27,7 +27,7 @@ class LentFrames(FrameIO, Protocol):
     def access(self) -> BusAccess:
         """How he reaches the bus."""
 
-    def hand_in(self, arrived: Packets, number: int, error: int) -> None:
+    def hand_in(self, arrived: PackedFrames, number: int, error: int) -> None:
         """So many frames that he took and has not looked at, and the error that he met after them (errno.h).
 
         They come before all that is there.
@@ -75,7 +75,7 @@ class FrameCalls:
         """As the frames themselves."""
         self._frames.hear(identifiers)
 
-    def hand_in(self, arrived: Packets, number: int, error: int) -> None:  # noqa: ARG002 - both are kept here
+    def hand_in(self, arrived: PackedFrames, number: int, error: int) -> None:  # noqa: ARG002 - both are kept here
         """So many frames of those taken last have not been looked at."""
         self._handed_in.extend(self._taken[:number])
 

@@ -23,7 +23,7 @@ from can.interfaces.udp_multicast import UdpMulticastBus
 from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, HEAD, REMOTE, STANDARD_BITS
 from trirail_drivers.bus.capture import Capture, CapturedBus
 from trirail_drivers.bus.frames import Frame, can_id
-from trirail_drivers.bus.packets import BusAccess, Packets
+from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 from trirail_drivers.bus.unixbus import UnixBus
 
 MOST_NOTHINGS = 64
@@ -128,7 +128,7 @@ class SocketFrames:
         """The socket."""
         return BusAccess(self._socket.fileno())
 
-    def hand_in(self, arrived: Packets, number: int, error: int) -> None:
+    def hand_in(self, arrived: PackedFrames, number: int, error: int) -> None:
         """So many frames that somebody else took from the socket, and the error that he met after them (errno.h)."""
         self._handed_in.extend(arrived.unpacked(number))
         self._error = error

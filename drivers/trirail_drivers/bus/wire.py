@@ -13,7 +13,7 @@ from trirail_drivers.bus.can_frame import ERROR, EXTENDED_BITS
 from trirail_drivers.bus.frame_calls import lendable
 from trirail_drivers.bus.frame_io import frame_io
 from trirail_drivers.bus.frames import BITS, Frame
-from trirail_drivers.bus.packets import BusAccess, Packets
+from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 from trirail_drivers.interface import Clock, DriveFault
 
 MOST_FRAMES = 1000
@@ -78,7 +78,7 @@ class Wire:
         """Whether nothing is wrong, nothing is to be told, and the bus takes what it is given."""
         return self.fault is None and not self._warnings and not self._unsent and self._unsent_cycles == 0
 
-    def hand_in(self, arrived: Packets, number: int, error: int) -> None:
+    def hand_in(self, arrived: PackedFrames, number: int, error: int) -> None:
         """So many frames that somebody else took and has not looked at, and the error that he met after them."""
         self._frames.hand_in(arrived, number, error)
 

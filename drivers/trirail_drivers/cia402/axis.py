@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from trirail_drivers.cia402 import frames, process_data
+from trirail_drivers.cia402 import canopen_frames, process_data
 from trirail_drivers.cia402.codes import words
 from trirail_drivers.cia402.duplicate_node import AnswersAfter, AnswersPerSync, warning
 from trirail_drivers.cia402.shown_mode import ShownMode
@@ -17,17 +17,17 @@ from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
 MISSED_STATUSES = 3
-FOLLOW_TIME = MISSED_STATUSES * frames.STATUS_PERIOD
+FOLLOW_TIME = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
 """How long an enabled drive may take to say that it follows setpoints [s]."""
 REGISTER_TIME = 0.5
 """How long a drive may take to tell its error register after a reset [s]."""
 STILL = 2e-5
 """A slider that has been within this [m] of a place for STILL_FOR [s] stands."""
 STILL_FOR = 0.1
-RESET_TIME = 2 * frames.STATUS_PERIOD
+RESET_TIME = 2 * canopen_frames.STATUS_PERIOD
 """How long a drive may take to leave fault after a fault reset, in which it tells its state twice [s]."""
 
-_NMT_STATES = {frames.STOPPED: "stopped", frames.PRE_OPERATIONAL: "pre-operational"}
+_NMT_STATES = {canopen_frames.STOPPED: "stopped", canopen_frames.PRE_OPERATIONAL: "pre-operational"}
 _STATE_BITS = 0x6F
 """Bits of a statusword that tell the state."""
 _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
@@ -47,11 +47,11 @@ class Cia402Axis(Axis):
         self.velocity_step, self.velocity_bytes = 1.0, 4
         self.still = max(1.0, abs(scale.counts_per_metre) * STILL)
         self.status_heard = self.stands_since = math.inf
-        self.status_within = MISSED_STATUSES * frames.STATUS_PERIOD
+        self.status_within = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
         self.has_setpoint = False
         """It was sent one."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
-        self.controlword = frames.DISABLE_VOLTAGE
+        self.controlword = canopen_frames.DISABLE_VOLTAGE
         """The last one sent."""
         self.mode_bits = 0
         """Controlword bits that go with "enable operation"."""
@@ -115,7 +115,7 @@ class Cia402Axis(Axis):
             self.take_status(statusword)
         self._operational = True  # CiA 301: PDOs are sent in NMT operational only
 
-    def rests(self, wanted: frames.Wanted) -> bool:
+    def rests(self, wanted: canopen_frames.Wanted) -> bool:
         """Whether nothing is to be done for it, nor found out, as long as its frames say nothing new."""
         settled = self.state is wanted and wanted is not PowerState.QUICK_STOP_ACTIVE
         told = self.event is None and not self.error_code and self.reset_until == -math.inf
@@ -133,8 +133,8 @@ class Cia402Axis(Axis):
 
     def expected(self, number: int) -> list[tuple[Any, ...]]:
         """The frames that say nothing new of it, as rows of trirail_drivers.driver.cyclic.EXPECTED; it has a number."""
-        way, word = self.way, frames.STATUSWORD.pack(self.statusword)
-        decides = frames.STATUSWORD.pack(_STATE_BITS | (frames.FOLLOWS if way.tells_following else 0))
+        way, word = self.way, canopen_frames.STATUSWORD.pack(self.statusword)
+        decides = canopen_frames.STATUSWORD.pack(_STATE_BITS | (canopen_frames.FOLLOWS if way.tells_following else 0))
         feedback, place = way.feedback, way.feedback.place(process_data.STATUSWORD)
         data, mask = bytearray(feedback.size), bytearray(feedback.size)
         if place >= 0:
@@ -143,9 +143,9 @@ class Cia402Axis(Axis):
         rows = [expected(identifier, number, bytes(data), bytes(mask), position_at=position, status_at=place)]
         if way.status is not None:
             rows.append(expected(way.status, number, word, decides, status_at=0))
-        alive = frames.NMT_STATE.pack(frames.OPERATIONAL)
-        bits = bytes([frames.NMT_STATE_BITS if way.guarded else 0xFF])
-        rows.append(expected(frames.HEARTBEAT + self.node, number, alive, bits, lives=way.heard))
+        alive = canopen_frames.NMT_STATE.pack(canopen_frames.OPERATIONAL)
+        bits = bytes([canopen_frames.NMT_STATE_BITS if way.guarded else 0xFF])
+        rows.append(expected(canopen_frames.HEARTBEAT + self.node, number, alive, bits, lives=way.heard))
         return rows
 
     def take_position(self, counts: int) -> None:
@@ -159,11 +159,11 @@ class Cia402Axis(Axis):
             return
         if data[1:3] == self.sdo_asked:
             self.sdo_answer, self.sdo_asked = bytes(data), None
-        if data[:4] == frames.MODE_DISPLAY_UPLOADED and self.awaits_mode:
+        if data[:4] == canopen_frames.MODE_DISPLAY_UPLOADED and self.awaits_mode:
             self._take_mode(data[4])
-        elif data[:4] == frames.STATUSWORD_UPLOADED:
+        elif data[:4] == canopen_frames.STATUSWORD_UPLOADED:
             self.on_status(data[4:6], now)
-        elif data[:4] == frames.ERROR_REGISTER_UPLOADED and now < self._register_until:
+        elif data[:4] == canopen_frames.ERROR_REGISTER_UPLOADED and now < self._register_until:
             self._register_until = -math.inf
             if data[4] == 0:
                 self.error_code = 0  # CiA 301, 1001h: there is no error
@@ -183,7 +183,7 @@ class Cia402Axis(Axis):
         """What it is to be asked for by SDO: its statusword, the mode that it shows, or both in turn."""
         both = self.way.polled or self.mute
         for_mode = self.awaits_mode and self.mode.is_next(alone=not both)
-        return frames.MODE_DISPLAY_UPLOAD if for_mode else frames.STATUSWORD_UPLOAD
+        return canopen_frames.MODE_DISPLAY_UPLOAD if for_mode else canopen_frames.STATUSWORD_UPLOAD
 
     @property
     def holds(self) -> int | None:
@@ -192,7 +192,7 @@ class Cia402Axis(Axis):
 
     def on_status(self, data: bytes | bytearray, now: float) -> None:
         """TPDO1: the statusword, when it changes and from time to time."""
-        (statusword,) = frames.STATUSWORD.unpack(data)
+        (statusword,) = canopen_frames.STATUSWORD.unpack(data)
         self.status_heard = now
         self.take_status(statusword)
 
@@ -200,7 +200,7 @@ class Cia402Axis(Axis):
         """Note the state in a statusword."""
         self.statusword = statusword
         self.seen_clear |= ~statusword
-        state = frames.power_state(statusword)
+        state = canopen_frames.power_state(statusword)
         if state is None:
             self.note_fault("state", 0, f"statusword {statusword:04X} is that of no CiA 402 state")
             return
@@ -234,7 +234,7 @@ class Cia402Axis(Axis):
 
     def on_emergency(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """EMCY: an error code, of which 00xxh say that errors are over (CiA 301)."""
-        code, register, _ = frames.EMERGENCY.unpack(data)
+        code, register, _ = canopen_frames.EMERGENCY.unpack(data)
         if code & 0xFF00 == 0:
             self.error_code = 0
             return
@@ -243,15 +243,15 @@ class Cia402Axis(Axis):
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
         """Heartbeat, answer to node guarding or boot-up: the drive lives, and should be operational."""
-        (state,) = frames.NMT_STATE.unpack(data)
+        (state,) = canopen_frames.NMT_STATE.unpack(data)
         if self.way.guarded:
-            state &= frames.NMT_STATE_BITS
+            state &= canopen_frames.NMT_STATE_BITS
         if self.way.heard:
             self.heard = now
-        self.stopped = state == frames.STOPPED
-        if state == frames.OPERATIONAL:
+        self.stopped = state == canopen_frames.STOPPED
+        if state == canopen_frames.OPERATIONAL:
             self._operational = True
-        elif state == frames.BOOT_UP:
+        elif state == canopen_frames.BOOT_UP:
             self._restarted = True
             self.state = PowerState.NOT_READY_TO_SWITCH_ON
             # Takes the place of an earlier event, for it is the one that a reset cannot help.
@@ -261,7 +261,7 @@ class Cia402Axis(Axis):
             self.leave_operational()
             self.note_fault("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
             self._answers_after.begin(self.event)
-        self.mute = self.left_operational and state != frames.OPERATIONAL
+        self.mute = self.left_operational and state != canopen_frames.OPERATIONAL
 
     def leave_operational(self) -> None:
         """It hears PDOs no more: its state is unknown until it answers, which stopped ones do not."""
@@ -290,26 +290,26 @@ class Cia402Axis(Axis):
             self.register_wanted = True
             self._register_until = now + REGISTER_TIME
 
-    def word(self, now: float, wanted: frames.Wanted) -> int:
+    def word(self, now: float, wanted: canopen_frames.Wanted) -> int:
         """The controlword that the drive is to have at time `now`, on its way to the state that is `wanted`."""
         if self.state is PowerState.FAULT and now < self.reset_until:
             # Bit 7 stays up until the drive is out of fault: some look at it once in a few cycles only.
-            return frames.FAULT_RESET
+            return canopen_frames.FAULT_RESET
         if self.state is PowerState.QUICK_STOP_ACTIVE and self._stands(now):
             # 605Ah = 5 to 8: it would stay there, with power (CiA 402-2, transition 12). Before, it would coast.
-            return frames.DISABLE_VOLTAGE
-        word = frames.controlword(self.state, wanted)
-        if word != frames.ENABLE_OPERATION:
+            return canopen_frames.DISABLE_VOLTAGE
+        word = canopen_frames.controlword(self.state, wanted)
+        if word != canopen_frames.ENABLE_OPERATION:
             return word
         interpolates = self.way.mode == process_data.INTERPOLATED_POSITION and self.cyclic
         if interpolates and self.state is PowerState.OPERATION_ENABLED:
-            word |= frames.INTERPOLATE
+            word |= canopen_frames.INTERPOLATE
         return word | self.mode_bits
 
-    def is_not_followed(self, word: int, wanted: frames.Wanted) -> bool:
+    def is_not_followed(self, word: int, wanted: canopen_frames.Wanted) -> bool:
         """Whether a controlword, by what the drive says, has not taken it where it is to go."""
         if self.state is PowerState.QUICK_STOP_ACTIVE:
-            return word == frames.DISABLE_VOLTAGE
+            return word == canopen_frames.DISABLE_VOLTAGE
         if wanted is PowerState.OPERATION_ENABLED:
             return self.state in _ON_THE_WAY or not self.cyclic  # of its mode's bits the state does not tell
         return self.state in _CAN_MOVE_OR_SOON
@@ -328,7 +328,7 @@ class Cia402Axis(Axis):
         text = f"is {self.state} {seconds:g} s after {wanted}; switch on disabled was expected"
         return self.made("timeout", 0, text)
 
-    def fault(self, now: float, wanted: frames.Wanted) -> DriveFault | None:
+    def fault(self, now: float, wanted: canopen_frames.Wanted) -> DriveFault | None:
         """What is wrong with the drive at time `now`, given what it was asked for."""
         if self.event is not None:
             return self.event
@@ -355,13 +355,13 @@ class Cia402Axis(Axis):
             return self._not_following(now, wanted)
         return None
 
-    def _not_following(self, now: float, wanted: frames.Wanted) -> DriveFault | None:
+    def _not_following(self, now: float, wanted: canopen_frames.Wanted) -> DriveFault | None:
         """CiA 402-2, modes 7 and 8: bit 12 of the statusword says that setpoints are followed, not ignored."""
         if (waited := self.mode.waited(now, awaited=self.awaits_mode)) is not None:
             return self.made("state", 0, f"shows no mode (object 6061) {waited:.3g} s after it got power")
         enabled = wanted is self.state is PowerState.OPERATION_ENABLED
         meant_to = enabled and self.cyclic and self.mode.shown and self.way.tells_following
-        if not meant_to or self.statusword & frames.FOLLOWS:
+        if not meant_to or self.statusword & canopen_frames.FOLLOWS:
             self._followed = meant_to
             self.has_followed = self.has_followed or meant_to
             self._unfollowed_since = None

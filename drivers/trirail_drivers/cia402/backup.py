@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 import can
 from canopen.objectdictionary import ODArray, ODVariable
 
-from trirail_drivers.cia402 import eds, frames, setup
+from trirail_drivers.cia402 import canopen_frames, eds, setup
 from trirail_drivers.cia402.conversations import side_by_side, until
 from trirail_drivers.cia402.makers_objects import address, owned
 from trirail_drivers.cia402.objects import Key
@@ -193,7 +193,7 @@ async def _restore(
     await greet(remote, drive.node, wakes=False)
     await _without_power(remote)
     _check(remote.name, saved.origin, await _origin(remote, drive), replace=replace)
-    send(remote.client.bus, frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node))
+    send(remote.client.bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node))
     kept = {key: _kept(remote, key, each, saved.origin.vendor) for key, each in saved.parameters.items()}
     meant = {key: each for key, each in saved.parameters.items() if not kept[key]}
     written: dict[Key, None] = {}
@@ -296,7 +296,7 @@ def _hex(value: int | None) -> str:
 
 async def _without_power(remote: Remote) -> None:
     statusword = await remote.read(0x6041)
-    state = frames.power_state(statusword)
+    state = canopen_frames.power_state(statusword)
     if state in _POWERED:
         raise DriveError(
             f"drive {remote.name}: parameters are restored without power only; its state is "

@@ -14,8 +14,8 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.bus.packets import packets
-from trirail_drivers.cia402 import frames, process_data, setup
+from trirail_drivers.bus.packed_frames import packed_frames
+from trirail_drivers.cia402 import canopen_frames, process_data, setup
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.homing import HomingSequence
 from trirail_drivers.cia402.objects import means
@@ -39,11 +39,15 @@ class Cia402(Driver[Cia402Axis]):
         for axis in self._axes:
             self._listen(axis)
         self._homing = HomingSequence(self._axes, drives, self._wire.send)
-        self._sync = Frame(frames.SYNC)
-        self._beats = [Frame(frames.HEARTBEAT + drives.master_node, frames.NMT_STATE.pack(frames.OPERATIONAL))]
+        self._sync = Frame(canopen_frames.SYNC)
+        self._beats = [
+            Frame(
+                canopen_frames.HEARTBEAT + drives.master_node, canopen_frames.NMT_STATE.pack(canopen_frames.OPERATIONAL)
+            )
+        ]
         self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
         self._heartbeat_due: float | None = None
-        self._wanted: frames.Wanted = PowerState.SWITCH_ON_DISABLED
+        self._wanted: canopen_frames.Wanted = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
         self._lent_with: list[tuple[int, int]] = []
         """The controlwords and statuswords that the tables are made for."""
@@ -55,7 +59,7 @@ class Cia402(Driver[Cia402Axis]):
         that takes velocities in a unit that cannot say the sliders' limit `fastest` [m/s], where that is given.
         A drive in fault is not an error here; feedback tells of it and `reset` clears it.
         """
-        self._set_period(period, frames.TRAFFIC)
+        self._set_period(period, canopen_frames.TRAFFIC)
         scales = tuple(axis.scale for axis in self._axes)
         done = setup.configure(self._wire.bus, self._drives, scales, period, self._clock, fastest)
         self._set_period(period, process_data.traffic(made.way for made, _ in done))
@@ -68,7 +72,7 @@ class Cia402(Driver[Cia402Axis]):
             axis.take_status(start.statusword)
         self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
         guarded = (axis.node for axis in self._axes if axis.way.guarded)
-        self._beats += [Frame(frames.HEARTBEAT + node, b"\0", remote=True) for node in guarded]
+        self._beats += [Frame(canopen_frames.HEARTBEAT + node, b"\0", remote=True) for node in guarded]
         self._warn_of_setup([made for made, _ in done], means)
 
     def _listen(self, axis: Cia402Axis) -> None:
@@ -77,8 +81,8 @@ class Cia402(Driver[Cia402Axis]):
         if way.status is not None:
             listen(way.status, axis, axis.on_status)
         listen(way.emergency, axis, axis.on_emergency)
-        listen(frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
-        listen(frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
+        listen(canopen_frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
+        listen(canopen_frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
         self._other_masters.listen_to(axis)
 
     def sync(self) -> None:
@@ -184,7 +188,7 @@ class Cia402(Driver[Cia402Axis]):
             return None
         lent, beats = self._tables, len(self._beats)
         if not len(lent.end):
-            lent.begin, lent.beats, lent.setpoints = map(packets, ([self._sync], self._beats, self._setpoints))
+            lent.begin, lent.beats, lent.setpoints = map(packed_frames, ([self._sync], self._beats, self._setpoints))
             lent.end = lent.setpoints.headers
         lent.times[0] = self._off_by, due, self._drives.heartbeat, beats, 0, NOWHERE, lent.times[0]["traffic"]
         words = [(axis.controlword, axis.statusword) for axis in self._axes]
@@ -264,28 +268,28 @@ class Cia402(Driver[Cia402Axis]):
             self._give_time_to_stop("reset")
         for axis in self._axes:
             if axis.left_operational:  # its set-up is still there: only a restarted drive needs a new one
-                self._wire.send(frames.nmt(frames.NMT_START, axis.node))
+                self._wire.send(canopen_frames.nmt(canopen_frames.NMT_START, axis.node))
             axis.forgive(now)
             if axis.register_wanted:
                 axis.register_wanted = False
-                self._wire.send(Frame(frames.SDO_REQUEST + axis.node, frames.ERROR_REGISTER_UPLOAD))
+                self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, canopen_frames.ERROR_REGISTER_UPLOAD))
         self._command()
 
     def _leave(self) -> None:
         for axis in self._axes:
-            self._send_word(axis, frames.DISABLE_VOLTAGE)
-            self._send_word_by_sdo(axis, frames.DISABLE_VOLTAGE)
+            self._send_word(axis, canopen_frames.DISABLE_VOLTAGE)
+            self._send_word_by_sdo(axis, canopen_frames.DISABLE_VOLTAGE)
         for axis in self._axes:
-            self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
+            self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
 
     def _poll_by_sdo(self, axis: Cia402Axis, now: float) -> None:
         """Ask for what no PDO tells, without waiting: one request at a time."""
         if axis.sdo_asked is not None:
             return
         if axis.mute or ((axis.way.polled or axis.awaits_mode) and now >= axis.poll_due):
-            self._wire.send(Frame(frames.SDO_REQUEST + axis.node, axis.request()))
+            self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, axis.request()))
             axis.mute = False
-            axis.poll_due = now + frames.POLL_PERIOD
+            axis.poll_due = now + canopen_frames.POLL_PERIOD
 
     def _command(self) -> None:
         """Send the controlwords that are due: one transition per drive at a time."""
@@ -307,7 +311,7 @@ class Cia402(Driver[Cia402Axis]):
     def _send_word(self, axis: Cia402Axis, word: int) -> bool:
         """Send a controlword by PDO; where it goes with the setpoint, with the last one or with where the drive is."""
         if axis.way.controlword is not None:
-            return self._wire.send(Frame(axis.way.controlword, frames.CONTROLWORD.pack(word)))
+            return self._wire.send(Frame(axis.way.controlword, canopen_frames.CONTROLWORD.pack(word)))
         frame = axis.way.setpoints.frame()
         axis.way.setpoints.fill(frame, *axis.setpoint, word)
         return self._wire.send(frame)
@@ -315,16 +319,16 @@ class Cia402(Driver[Cia402Axis]):
     def _send_word_by_sdo(self, axis: Cia402Axis, word: int) -> None:
         """Send a controlword by SDO, which is heard in pre-operational too; a stopped node is first brought there."""
         if axis.stopped:
-            self._wire.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, axis.node))
-        data = frames.CONTROLWORD_DOWNLOAD + frames.CONTROLWORD.pack(word) + bytes(2)
-        self._wire.send(Frame(frames.SDO_REQUEST + axis.node, data))
+            self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
+        data = canopen_frames.CONTROLWORD_DOWNLOAD + canopen_frames.CONTROLWORD.pack(word) + bytes(2)
+        self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, data))
 
     @property
-    def _next(self) -> frames.Wanted:
+    def _next(self) -> canopen_frames.Wanted:
         """What drives are asked for now: none gets power while one of them may not follow setpoints."""
         return PowerState.QUICK_STOP_ACTIVE if self._homing.restoring else self._wanted
 
-    def _power_off(self, wanted: frames.Wanted, asked: str) -> None:
+    def _power_off(self, wanted: canopen_frames.Wanted, asked: str) -> None:
         if self._wanted is not wanted:
             self._give_time_to_stop(asked)
         self._wanted = wanted
@@ -344,7 +348,7 @@ class Cia402(Driver[Cia402Axis]):
         return any(axis.state in HAS_POWER for axis in self._axes)
 
 
-def _asked_of(axis: Cia402Axis, wanted: frames.Wanted) -> frames.Wanted:
+def _asked_of(axis: Cia402Axis, wanted: canopen_frames.Wanted) -> canopen_frames.Wanted:
     """What a drive is asked for where the drives are `wanted` in a state: one that is left out gets no power."""
     left_off = axis.left_out and wanted is PowerState.OPERATION_ENABLED
     return PowerState.SWITCH_ON_DISABLED if left_off else wanted

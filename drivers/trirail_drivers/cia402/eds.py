@@ -24,10 +24,23 @@ SERVO: Final = Path(__file__).with_name("servo.eds")
 def load(drive: str, file: Path, node: int) -> ObjectDictionary:
     """The objects of the drive called `drive`; DriveError if the file cannot be used."""
     try:
-        with files.opened(file) as content, io.TextIOWrapper(content, encoding="utf-8", errors="replace") as text:
+        return read(file, node)
+    except DriveError as error:
+        raise DriveError(f"drive {drive}: {error}") from error
+
+
+def read(file: Path, node: int) -> ObjectDictionary:
+    """The objects of a device with this node id. Raises DriveError if the file is no EDS."""
+    try:
+        with open_text(file) as text:
             return canopen.import_od(text, node)
     except (FileError, OSError) as error:
-        raise DriveError(f"drive {drive}: cannot read EDS {error}") from error
+        raise DriveError(f"cannot read EDS {error}") from error
     except (configparser.Error, ValueError, KeyError, AttributeError) as error:
         reason = " ".join(str(error).split())
-        raise DriveError(f"drive {drive}: {file} is not an EDS as CiA 306 has it: {reason}") from error
+        raise DriveError(f"{file} is not an EDS as CiA 306 has it: {reason}") from error
+
+
+def open_text(file: Path) -> io.TextIOWrapper:
+    """Open a file of a maker's, who writes names in whatever encoding he has: numbers are ASCII in all of them."""
+    return io.TextIOWrapper(files.open_regular(file), encoding="utf-8", errors="replace")

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import can
 
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.conversations import Wait
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.objects import title
@@ -97,12 +97,12 @@ async def _answers(drive: Differences, node: int) -> bool:
     """Whether the drive answers a remote request for its state."""
     client = drive.remote.client
     try:
-        client.bus.send(Frame(frames.HEARTBEAT + node, b"\0", remote=True).message())
+        client.bus.send(Frame(canopen_frames.HEARTBEAT + node, b"\0", remote=True).message())
     except (can.CanError, OSError, NotImplementedError):
         return False
 
     def is_answer(message: can.Message) -> bool:
-        own = message.arbitration_id == frames.HEARTBEAT + node
+        own = message.arbitration_id == canopen_frames.HEARTBEAT + node
         return own and not message.is_remote_frame and len(message.data) > 0
 
     return await Wait(is_answer, client.clock() + client.timeout) is not None
@@ -110,10 +110,10 @@ async def _answers(drive: Differences, node: int) -> bool:
 
 async def _emergency(drive: Differences, drives: Drives, node: int) -> int:
     """The identifier of the drive's EMCY: the predefined one, or what it keeps instead."""
-    remote, usual = drive.remote, frames.EMCY + node
+    remote, usual = drive.remote, canopen_frames.EMCY + node
     found = await remote.peek(0x1014)
     if found is not None and found & _EMCY_BITS != usual and not await drive.is_given((0x1014, 0), usual):
-        others = {frames.EMCY + other.node for other in drives.each} | {frames.SYNC}
+        others = {canopen_frames.EMCY + other.node for other in drives.each} | {canopen_frames.SYNC}
         kept = shown(0x1014, 0, found)
         if found & INVALID:
             drive.add_note(

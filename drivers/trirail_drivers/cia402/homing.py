@@ -17,7 +17,7 @@ from typing import Final
 
 from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.interface import DriveFault, PowerState
 
@@ -144,7 +144,7 @@ class HomingSequence:
         yield from self._sdo(axis, _READ, _STATUSWORD)
         axis.seen_clear = ~axis.statusword
         if not self._stopping:
-            axis.mode_bits = frames.HOMING_START
+            axis.mode_bits = canopen_frames.HOMING_START
             yield from self._until(lambda: self._stopping or _attained(axis), timeout, "home was not attained")
         attained = _attained(axis)
         if not attained:
@@ -154,7 +154,7 @@ class HomingSequence:
         axis.homed = attained
 
     def _halt(self, axis: Cia402Axis) -> Steps:
-        axis.mode_bits = frames.HALT
+        axis.mode_bits = canopen_frames.HALT
         answered = axis.sampled + FRESH
         yield from self._until(
             lambda: axis.sampled >= answered and bool(axis.statusword & _REACHED),
@@ -189,7 +189,7 @@ class HomingSequence:
     def _sdo(self, axis: Cia402Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
         """One SDO, without waiting: the cycle goes on, and a later one has the answer."""
         axis.sdo_answer, axis.sdo_asked = None, index.to_bytes(2, "little")
-        self._send(Frame(frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value]))))
+        self._send(Frame(canopen_frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value]))))
         deadline = self._now + self._sdo_timeout
         while (answer := axis.sdo_answer) is None:
             if self._now >= deadline:

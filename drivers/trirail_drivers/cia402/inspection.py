@@ -7,7 +7,7 @@ from typing import Any
 
 import can
 
-from trirail_drivers.cia402 import frames, setup
+from trirail_drivers.cia402 import canopen_frames, setup
 from trirail_drivers.cia402.one_drive import SetUp
 from trirail_drivers.cia402.sdo import together
 from trirail_drivers.config import Drives
@@ -35,7 +35,7 @@ def inspect(
         raise_all([DriveError(text) for text in refused])
         done = setup.configure(bus, drives, scales, period, clock, fastest)
         for drive in drives.each:
-            bus.send(frames.nmt(frames.NMT_PRE_OPERATIONAL, drive.node).message())
+            bus.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node).message())
         return [_as_json(made) for made, _ in done]
     ends = setup.survey(bus, drives, scales, period, clock, fastest)
     looked = [end for end in ends if not isinstance(end, DriveError)]

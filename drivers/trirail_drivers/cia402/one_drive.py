@@ -7,17 +7,17 @@ from typing import Final, NamedTuple
 import can
 
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.conversations import LOG
 from trirail_drivers.cia402.differences import Difference, Differences
 from trirail_drivers.cia402.drive_units import read_units
+from trirail_drivers.cia402.dry_run import DryRun
 from trirail_drivers.cia402.guarding import give_watchdogs
 from trirail_drivers.cia402.makers_objects import give_makers_objects
-from trirail_drivers.cia402.modes import choose_modes, give_mode
 from trirail_drivers.cia402.objects import FOLLOWING_BIT
+from trirail_drivers.cia402.operation_mode import choose_modes, give_mode
 from trirail_drivers.cia402.pdos import Pdos
 from trirail_drivers.cia402.process_data import Exchange
-from trirail_drivers.cia402.rehearsal import Rehearsal
 from trirail_drivers.cia402.sdo import Remote, RestartedError, SdoRefused
 from trirail_drivers.cia402.settings import give_cycle, give_homing, give_reactions, heartbeat_of
 from trirail_drivers.cia402.units import Units
@@ -93,15 +93,15 @@ async def look_over(one: OneDrive, *, asks: bool = False) -> SetUp:
     Where it `asks`, not even that is done: the drive tells what it would take.
     """
     await greet(one.remote, one.drive.node, wakes=not asks)
-    rehearsal = Rehearsal(one.remote, asks=asks)
-    await _take_power_off(rehearsal if asks else one.remote, one.drives.stop_timeout)
-    made = await bring(one, rehearsal)
-    await start(rehearsal)
+    dry_run = DryRun(one.remote, asks=asks)
+    await _take_power_off(dry_run if asks else one.remote, one.drives.stop_timeout)
+    made = await bring(one, dry_run)
+    await start(dry_run)
     return made
 
 
 async def bring(one: OneDrive, remote: Remote) -> SetUp:
-    """Bring one drive to what the cycle needs, or a rehearsal of it."""
+    """Bring one drive to what the cycle needs, or a dry run of it."""
     drive, drives = one.drive, one.drives
     differences = Differences(remote)
     modes = await choose_modes(remote, homes=drive.homing is not None)
@@ -180,7 +180,7 @@ async def greet(remote: Remote, node: int, *, wakes: bool) -> None:
             remote.boots = True
         except RestartedError:
             if wakes:
-                send(client.bus, frames.nmt(frames.NMT_PRE_OPERATIONAL, node))
+                send(client.bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, node))
     remote.boots = False
     if device_type & 0xFFFF != 402:
         raise DriveError(
@@ -191,12 +191,12 @@ async def greet(remote: Remote, node: int, *, wakes: bool) -> None:
 
 async def _take_power_off(remote: Remote, seconds: float) -> None:
     """Tell a drive to lose its power, and wait until it has: a brake takes its time to close."""
-    await remote.write(0x6040, 0, frames.DISABLE_VOLTAGE)
+    await remote.write(0x6040, 0, canopen_frames.DISABLE_VOLTAGE)
     found, waited = await remote.becomes(
-        (0x6041, 0), lambda statusword: frames.power_state(statusword) not in HAS_POWER, seconds
+        (0x6041, 0), lambda statusword: canopen_frames.power_state(statusword) not in HAS_POWER, seconds
     )
     statusword = await remote.read(0x6041) if found is None else found
-    if not remote.rehearsed and frames.power_state(statusword) in HAS_POWER:
+    if not remote.rehearsed and canopen_frames.power_state(statusword) in HAS_POWER:
         raise DriveError(
             f"drive {remote.name}: keeps its power on when told off, after {waited:.3g} s (statusword {statusword:04X})"
         )
@@ -205,7 +205,7 @@ async def _take_power_off(remote: Remote, seconds: float) -> None:
 async def start(remote: Remote) -> Start:
     """What a drive says of itself now."""
     statusword = await remote.read(0x6041)
-    in_fault = frames.power_state(statusword) in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
+    in_fault = canopen_frames.power_state(statusword) in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
     error_code = 0
     if in_fault and await remote.has(0x603F):
         try:

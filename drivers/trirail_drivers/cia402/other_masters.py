@@ -8,7 +8,7 @@ from typing import Final
 import can
 
 from trirail_drivers.bus.wire import Handler, Wire
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import DriveFault
@@ -31,9 +31,9 @@ class OtherMasters:
         self._wire = wire
         self._axes = {axis.node: axis for axis in axes}
         self._master_node = master_node
-        wire.listen(frames.NMT, self, self._on_nmt)
-        wire.listen(frames.SYNC, self, self._sends("sends SYNC"))
-        wire.listen(frames.HEARTBEAT + master_node, self, self._on_heartbeat)
+        wire.listen(canopen_frames.NMT, self, self._on_nmt)
+        wire.listen(canopen_frames.SYNC, self, self._sends("sends SYNC"))
+        wire.listen(canopen_frames.HEARTBEAT + master_node, self, self._on_heartbeat)
         for axis in axes:
             self.listen_to(axis)
 
@@ -53,7 +53,7 @@ class OtherMasters:
         self._wire.fail(DriveFault("", "bus", 0, f"CAN bus: another master is on it: it {text}; only one may be"))
 
     def _on_nmt(self, data: bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
-        command, node = frames.NMT_COMMAND.unpack(data)
+        command, node = canopen_frames.NMT_COMMAND.unpack(data)
         meant = [axis for each, axis in self._axes.items() if node in (0, each)]
         if not meant:
             return
@@ -66,7 +66,7 @@ class OtherMasters:
         self._warn(f'commands {whom} by NMT "{name}"')
 
     def _on_heartbeat(self, data: bytearray, now: float) -> None:  # noqa: ARG002
-        frames.NMT_STATE.unpack(data)
+        canopen_frames.NMT_STATE.unpack(data)
         self._warn(f"has this service's node id {self._master_node}")
 
 
@@ -79,11 +79,15 @@ class NoOtherMaster(can.BusABC):
     def __init__(self, bus: can.BusABC, nodes: Sequence[int], master_node: int) -> None:
         self.inner = bus
         self.channel_info = bus.channel_info
-        bases = {frames.SDO_REQUEST: "asks drives by SDO", frames.RPDO1: "sends PDOs", frames.RPDO2: "sends PDOs"}
+        bases = {
+            canopen_frames.SDO_REQUEST: "asks drives by SDO",
+            canopen_frames.RPDO1: "sends PDOs",
+            canopen_frames.RPDO2: "sends PDOs",
+        }
         self._masters = {base + node: text for base, text in bases.items() for node in nodes}
-        self._masters |= {frames.NMT: "commands by NMT", frames.SYNC: "sends SYNC"}
-        self._masters[frames.HEARTBEAT + master_node] = f"sends the heartbeat of node {master_node}"
-        self._guarded = {frames.HEARTBEAT + node for node in nodes}
+        self._masters |= {canopen_frames.NMT: "commands by NMT", canopen_frames.SYNC: "sends SYNC"}
+        self._masters[canopen_frames.HEARTBEAT + master_node] = f"sends the heartbeat of node {master_node}"
+        self._guarded = {canopen_frames.HEARTBEAT + node for node in nodes}
         super().__init__(channel=bus.channel_info)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:

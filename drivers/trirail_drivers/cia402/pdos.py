@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.objects import title
 from trirail_drivers.cia402.process_data import (
@@ -81,9 +81,11 @@ class Pdos:
         wanted: list[tuple[int, ...]] = [(position,)]
         if mode == CYCLIC_SYNCHRONOUS_POSITION and await self._mappable(VELOCITY_OFFSET):
             wanted.insert(0, (position, VELOCITY_OFFSET))
-        control = await self._map(RPDO, frames.RPDO1 + self._node, ON_CHANGE, (CONTROLWORD,))
+        control = await self._map(RPDO, canopen_frames.RPDO1 + self._node, ON_CHANGE, (CONTROLWORD,))
         for entries in wanted:
-            if (identifier := await self._map(RPDO + 1, frames.RPDO2 + self._node, EVERY_SYNC, entries)) is not None:
+            if (
+                identifier := await self._map(RPDO + 1, canopen_frames.RPDO2 + self._node, EVERY_SYNC, entries)
+            ) is not None:
                 found = SetpointPdo(identifier, entries)
                 break
         else:
@@ -100,7 +102,7 @@ class Pdos:
         timed = await self._remote.has(TPDO, 5) and await self._can_be_prompt(TPDO)
         wanted = [(ACTUAL_POSITION,)] if timed else [(ACTUAL_POSITION, STATUSWORD), (ACTUAL_POSITION,)]
         for entries in wanted:
-            identifier = await self._map(TPDO + 1, frames.TPDO2 + self._node, EVERY_SYNC, entries)
+            identifier = await self._map(TPDO + 1, canopen_frames.TPDO2 + self._node, EVERY_SYNC, entries)
             if identifier is not None:
                 found = FeedbackPdo(identifier, entries)
                 break
@@ -116,7 +118,7 @@ class Pdos:
         status = await self._status()
         polled = status is None or not await self._timer()
         if polled:
-            self._drive.add_note(f"its statusword is also asked for by SDO, every {frames.POLL_PERIOD:g} s")
+            self._drive.add_note(f"its statusword is also asked for by SDO, every {canopen_frames.POLL_PERIOD:g} s")
         return found, status, polled
 
     async def switch_off_others(self) -> None:
@@ -235,7 +237,9 @@ class Pdos:
         """What repeats a statusword; of an RPDO it is a deadline, and controlwords come on change (CiA 301, 1400h)."""
         if index < TPDO:
             return await self._parameter(index, 5, 0)
-        return await self._parameter(index, 5, round(1000 * frames.STATUS_PERIOD)) if kind == ON_CHANGE else None
+        return (
+            await self._parameter(index, 5, round(1000 * canopen_frames.STATUS_PERIOD)) if kind == ON_CHANGE else None
+        )
 
     async def _parameter(self, index: int, subindex: int, value: int) -> tuple[int, int] | None:
         """A communication parameter that the drive has and that is to change."""
@@ -307,7 +311,7 @@ class Pdos:
     # ------------------------------------------------------------------ the statusword
 
     async def _status(self) -> int | None:
-        identifier = await self._map(TPDO, frames.TPDO1 + self._node, ON_CHANGE, (STATUSWORD,))
+        identifier = await self._map(TPDO, canopen_frames.TPDO1 + self._node, ON_CHANGE, (STATUSWORD,))
         if identifier is not None:
             return identifier
         for index in await self._all(TPDO):
@@ -324,7 +328,7 @@ class Pdos:
 
     async def _timer(self) -> bool:
         """Whether the drive repeats its statusword by itself."""
-        return await self._remote.peek(TPDO, 5) == round(1000 * frames.STATUS_PERIOD)
+        return await self._remote.peek(TPDO, 5) == round(1000 * canopen_frames.STATUS_PERIOD)
 
     async def _can_be_prompt(self, index: int) -> bool:
         """Whether the inhibit time is 0, or can be set to it: else a statusword may come late."""

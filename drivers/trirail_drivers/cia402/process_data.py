@@ -9,7 +9,7 @@ from typing import Final
 
 from trirail_drivers.bus.frames import Frame, frame_bits
 from trirail_drivers.bus.load import Traffic
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 
 INTERPOLATED_POSITION: Final = 7
 CYCLIC_SYNCHRONOUS_POSITION: Final = 8
@@ -150,11 +150,11 @@ def usual(node: int) -> Exchange:
     """The way of a drive that has all that CiA 301 and CiA 402-2 leave optional."""
     return Exchange(
         CYCLIC_SYNCHRONOUS_POSITION,
-        SetpointPdo(frames.RPDO2 + node, (TARGET_POSITION, VELOCITY_OFFSET)),
-        frames.RPDO1 + node,
-        FeedbackPdo(frames.TPDO2 + node, (ACTUAL_POSITION,)),
-        frames.TPDO1 + node,
-        emergency=frames.EMCY + node,
+        SetpointPdo(canopen_frames.RPDO2 + node, (TARGET_POSITION, VELOCITY_OFFSET)),
+        canopen_frames.RPDO1 + node,
+        FeedbackPdo(canopen_frames.TPDO2 + node, (ACTUAL_POSITION,)),
+        canopen_frames.TPDO1 + node,
+        emergency=canopen_frames.EMCY + node,
     )
 
 
@@ -162,8 +162,8 @@ def traffic(ways: Iterable[Exchange]) -> Traffic:
     """What drives that go these ways put on the bus, and the service with them."""
     ways = tuple(ways)
     cycle = frame_bits(0) + sum(frame_bits(way.setpoints.size) + frame_bits(way.feedback.size) for way in ways)
-    status = sum(frame_bits(2) for way in ways if way.status) / frames.STATUS_PERIOD
-    polls = sum(2 * frame_bits(8) for way in ways if way.polled) / frames.POLL_PERIOD
+    status = sum(frame_bits(2) for way in ways if way.status) / canopen_frames.STATUS_PERIOD
+    polls = sum(2 * frame_bits(8) for way in ways if way.polled) / canopen_frames.POLL_PERIOD
     lives = frame_bits(1) * (1 + sum(1 + way.guarded for way in ways))
     return Traffic(
         cycle_bits=cycle,

@@ -10,7 +10,7 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.cia402 import duplicate_node, frames
+from trirail_drivers.cia402 import canopen_frames, duplicate_node
 from trirail_drivers.cia402.conversations import Wait
 from trirail_drivers.interface import Clock
 
@@ -138,7 +138,7 @@ class Client:
             self._abort(*struct.unpack_from("<HB", request, 1), code=_TIMED_OUT)
             raise NoAnswerError("no answer")
         answer = bytes(frame.data)
-        if frame.arbitration_id == frames.HEARTBEAT + self.node:
+        if frame.arbitration_id == canopen_frames.HEARTBEAT + self.node:
             raise BootedError("it has restarted")
         self.answered += 1
         if answer[0] >> 5 == _ABORT:
@@ -149,7 +149,7 @@ class Client:
         self._send(struct.pack("<BHBI", _ABORT << 5, index, subindex, code))
 
     def _send(self, data: bytes) -> None:
-        self.bus.send(Frame(frames.SDO_REQUEST + self.node, data).message())
+        self.bus.send(Frame(canopen_frames.SDO_REQUEST + self.node, data).message())
 
     def _is_awaited(self, message: can.Message) -> bool:
         """Whether a frame ends the waiting: the answer, a boot-up message in its place, an answer once too often.
@@ -159,9 +159,9 @@ class Client:
         if message.is_error_frame or message.is_remote_frame:
             return False
         data = bytes(message.data)
-        if message.arbitration_id == frames.HEARTBEAT + self.node:
-            return self._asked is not None and data == bytes([frames.BOOT_UP])
-        if message.arbitration_id != frames.SDO_ANSWER + self.node:
+        if message.arbitration_id == canopen_frames.HEARTBEAT + self.node:
+            return self._asked is not None and data == bytes([canopen_frames.BOOT_UP])
+        if message.arbitration_id != canopen_frames.SDO_ANSWER + self.node:
             return False
         if self._asked is not None and answers(self._asked, data):
             return True

@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from trirail_drivers.bus.packets import BusAccess, Packets
+from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 from trirail_drivers.driver.axis_row import AXIS, NOWHERE
 from trirail_drivers.interface import Feedback
 
@@ -75,13 +75,13 @@ class Cyclic:
         self.axes: NDArray[np.void] = np.zeros(3, AXIS)
         self.times: NDArray[np.void] = np.zeros(1, TIMES)
         self.expected: NDArray[np.void] = np.zeros(0, EXPECTED)
-        self.begin = self.beats = self.setpoints = Packets(0)
+        self.begin = self.beats = self.setpoints = PackedFrames(0)
         """What begins a cycle; what goes behind that from time to time, as signs of life; a frame for each drive."""
         self.end = self.setpoints.headers
         """What ends a cycle: those, or none of them where they go with what begins the next."""
         self.history = np.full((history, 3), np.nan)
         """Positions that the drives were to have reached at SYNC n, in row n modulo their number [m]; NaN for none."""
-        self.arrived = Packets(MOST_FRAMES)
+        self.arrived = PackedFrames(MOST_FRAMES)
 
     def expect(self, rows: Sequence[tuple[Any, ...]]) -> None:
         """Expect these frames: rows of EXPECTED."""

@@ -10,12 +10,12 @@ from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.cyclic import expected
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
-from trirail_drivers.odrive import frames
+from trirail_drivers.odrive import cansimple
+from trirail_drivers.odrive.cansimple import AxisState, ProcedureResult
 from trirail_drivers.odrive.codes import words
-from trirail_drivers.odrive.endpoints import Version
-from trirail_drivers.odrive.frames import AxisState, ProcedureResult
+from trirail_drivers.odrive.flat_endpoints import Version
 
-RESET_TIME = 3 * 3 * frames.ERROR_PERIOD
+RESET_TIME = 3 * 3 * cansimple.ERROR_PERIOD
 """How long errors may be told of after they were cleared, in which each drive is asked three times [s]."""
 STALE_HEARTBEATS = 1
 """So many heartbeats after a request may still be from before it."""
@@ -30,7 +30,7 @@ class OdriveAxis(Axis):
         self.floats, self.still = True, math.inf
         self.velocity_per_metre, self.velocity_step, self.velocity_bytes = (
             scale.counts_per_metre,
-            frames.VELOCITY_STEP,
+            cansimple.VELOCITY_STEP,
             2,
         )
         self.position_at, self.velocity_at = 0, 4
@@ -69,33 +69,33 @@ class OdriveAxis(Axis):
         """The frames that say nothing new of it, as rows of trirail_drivers.driver.cyclic.EXPECTED; it has a number."""
 
         def of(command: int) -> int:
-            return frames.identifier(self.node, command)
+            return cansimple.identifier(self.node, command)
 
-        beat, decides = frames.BEAT.pack(0, *self.said, 0), frames.BEAT.pack(0xFFFFFFFF, 0xFF, 0xFF, 0)
-        nothing, any_of_it = bytes(frames.ESTIMATES.size), b"\xff" * frames.ERRORS.size
+        beat, decides = cansimple.BEAT.pack(0, *self.said, 0), cansimple.BEAT.pack(0xFFFFFFFF, 0xFF, 0xFF, 0)
+        nothing, any_of_it = bytes(cansimple.ESTIMATES.size), b"\xff" * cansimple.ERRORS.size
         return [
-            expected(of(frames.GET_ENCODER_ESTIMATES), number, nothing, nothing, position_at=0),
-            expected(of(frames.HEARTBEAT), number, beat, decides, lives=True),
-            expected(of(frames.GET_ERROR), number, bytes(frames.ERRORS.size), any_of_it),
+            expected(of(cansimple.GET_ENCODER_ESTIMATES), number, nothing, nothing, position_at=0),
+            expected(of(cansimple.HEARTBEAT), number, beat, decides, lives=True),
+            expected(of(cansimple.GET_ERROR), number, bytes(cansimple.ERRORS.size), any_of_it),
         ]
 
     def input_pos(self, position: float, velocity: float) -> bytes:
         """Set_Input_Pos of a setpoint [m], [m/s]; OverflowError or struct.error where it holds none such."""
-        return frames.input_pos(self.scale.exact(position), self.scale.counts_per_metre * velocity)
+        return cansimple.input_pos(self.scale.exact(position), self.scale.counts_per_metre * velocity)
 
     def on_version(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
         """Get_Version."""
-        _, line, number, variant, major, minor, revision, unreleased = frames.VERSION.unpack(data)
+        _, line, number, variant, major, minor, revision, unreleased = cansimple.VERSION.unpack(data)
         self.version = Version((line, number, variant), (major, minor, revision), bool(unreleased))
 
     def on_sdo(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """TxSdo: the value of an endpoint that was asked for; its length is the endpoint's."""
-        _, endpoint, _ = frames.SDO.unpack_from(data)
-        self.sdo = endpoint, bytes(data[frames.SDO.size :])
+        _, endpoint, _ = cansimple.SDO.unpack_from(data)
+        self.sdo = endpoint, bytes(data[cansimple.SDO.size :])
 
     def on_estimates(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """Get_Encoder_Estimates: the position when the request came."""
-        turns, _ = frames.ESTIMATES.unpack(data)
+        turns, _ = cansimple.ESTIMATES.unpack(data)
         self.answer()
         if math.isfinite(turns):
             self.position = self.scale.metres(turns)
@@ -104,13 +104,13 @@ class OdriveAxis(Axis):
 
     def on_errors(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
         """Get_Error: active errors and disarm reason."""
-        active, reason = frames.ERRORS.unpack(data)
+        active, reason = cansimple.ERRORS.unpack(data)
         self.reported = True
         self._take_errors(active | reason)
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
         """Heartbeat: the drive lives; its state, errors and how the last procedure ended."""
-        errors, self.state, self._result, _ = frames.BEAT.unpack(data)
+        errors, self.state, self._result, _ = cansimple.BEAT.unpack(data)
         self.heard = now
         self._beats += 1
         self._take_errors(errors)
@@ -161,17 +161,17 @@ class OdriveAxis(Axis):
             return self.made("fault", self.errors, f"error {words(self.errors)}")
         if silent := self.silence(now):
             return silent
-        if self.state in frames.PROCEDURES:
-            return self.made("state", 0, f"is in {frames.state_name(self.state)}, on whoever's command")
+        if self.state in cansimple.PROCEDURES:
+            return self.made("state", 0, f"is in {cansimple.state_name(self.state)}, on whoever's command")
         if follows and self.powered_up and self.state != AxisState.CLOSED_LOOP_CONTROL:
-            return self.made("state", 0, f"left closed loop control unasked: {frames.state_name(self.state)}")
+            return self.made("state", 0, f"left closed loop control unasked: {cansimple.state_name(self.state)}")
         return None
 
     def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
         """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not."""
         if not self.powered:
             return None
-        text = f"is in {frames.state_name(self.state)} {seconds:g} s after {wanted}; idle was expected"
+        text = f"is in {cansimple.state_name(self.state)} {seconds:g} s after {wanted}; idle was expected"
         return self.made("timeout", 0, text)
 
     @property
@@ -187,7 +187,7 @@ class OdriveAxis(Axis):
 
     def _watch_restart(self) -> None:
         """A drive that begins anew may have lost count of its turns."""
-        begins = self.state == AxisState.UNDEFINED or bool(self.errors & frames.Error.INITIALIZING)
+        begins = self.state == AxisState.UNDEFINED or bool(self.errors & cansimple.Error.INITIALIZING)
         if not begins:
             self._initialised = True
         elif self._initialised:

@@ -12,8 +12,8 @@ from trirail_drivers.driver.requirements import Requirements, Rule, resolution
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
-from trirail_drivers.odrive import endpoints, setup
-from trirail_drivers.odrive.frames import MAX_FEED_FORWARD
+from trirail_drivers.odrive import flat_endpoints, setup
+from trirail_drivers.odrive.cansimple import MAX_FEED_FORWARD
 
 _FLOAT_DIGITS: Final = 23
 """Binary digits of an ODrive's position after the first, a 32-bit float."""
@@ -45,7 +45,7 @@ def files(drives: Drives) -> Iterator[Rule]:
     """Yield what refuses a flat_endpoints.json that is not there, or is none."""
     for name, drive in zip(NAMES, drives.each, strict=True):
         if drive.endpoints is not None:
-            yield Rule(f"drives.{name}.endpoints", (), partial(endpoints.read, name, Path(drive.endpoints)))
+            yield Rule(f"drives.{name}.endpoints", (), partial(flat_endpoints.read, name, Path(drive.endpoints)))
 
 
 def _check_canopen_only(name: str, drive: Drive, key: str) -> None:

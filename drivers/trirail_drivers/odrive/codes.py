@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from trirail_drivers.odrive.frames import Error
+from trirail_drivers.odrive.cansimple import Error
 
 _TUNING: Final = "look at load, limits and gains"
 _SUPPLY: Final = "look at the supply and at the brake resistor, for braking feeds back"

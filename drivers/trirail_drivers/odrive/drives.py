@@ -21,9 +21,9 @@ from trirail_drivers.driver.axis_row import NOWHERE
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
-from trirail_drivers.odrive import frames, setup
+from trirail_drivers.odrive import cansimple, setup
 from trirail_drivers.odrive.axis import OdriveAxis
-from trirail_drivers.odrive.frames import AxisState
+from trirail_drivers.odrive.cansimple import AxisState
 from trirail_drivers.odrive.lending import Lending
 from trirail_drivers.odrive.protections import means
 from trirail_drivers.odrive.setpoints import SetpointSender
@@ -45,15 +45,15 @@ class Odrive(Driver[OdriveAxis]):
         super().__init__(bus, bitrate, drives, clock, OdriveAxis, history=drives.missed_positions)
         for axis in self._axes:
             for number, handler in (
-                (frames.GET_VERSION, axis.on_version),
-                (frames.HEARTBEAT, axis.on_heartbeat),
-                (frames.GET_ERROR, axis.on_errors),
-                (frames.GET_ENCODER_ESTIMATES, axis.on_estimates),
-                (frames.TX_SDO, axis.on_sdo),
+                (cansimple.GET_VERSION, axis.on_version),
+                (cansimple.HEARTBEAT, axis.on_heartbeat),
+                (cansimple.GET_ERROR, axis.on_errors),
+                (cansimple.GET_ENCODER_ESTIMATES, axis.on_estimates),
+                (cansimple.TX_SDO, axis.on_sdo),
             ):
-                self._wire.listen(frames.identifier(axis.node, number), axis, handler)
-        self._requests = tuple(frames.request(axis.node, frames.GET_ENCODER_ESTIMATES) for axis in self._axes)
-        self._error_requests = tuple(frames.request(axis.node, frames.GET_ERROR) for axis in self._axes)
+                self._wire.listen(cansimple.identifier(axis.node, number), axis, handler)
+        self._requests = tuple(cansimple.request(axis.node, cansimple.GET_ENCODER_ESTIMATES) for axis in self._axes)
+        self._error_requests = tuple(cansimple.request(axis.node, cansimple.GET_ERROR) for axis in self._axes)
         self._next_request = 0
         self._errors_due: float | None = None
         self._enabled = False
@@ -67,7 +67,7 @@ class Odrive(Driver[OdriveAxis]):
         for one that is not set as it must be, where its configuration does not accept that. One with errors is none;
         feedback tells of it and `reset` clears it.
         """
-        self._set_period(period, frames.TRAFFIC)
+        self._set_period(period, cansimple.TRAFFIC)
         self._setpoints.period = period
         self._warn_of_setup(setup.configure(self._wire, self._axes, self._drives, period, self._clock), means)
 
@@ -98,7 +98,7 @@ class Odrive(Driver[OdriveAxis]):
                 self._wire.send(request)
             axis.sync_sent()
         if now >= errors_due:
-            self._errors_due = now + frames.ERROR_PERIOD
+            self._errors_due = now + cansimple.ERROR_PERIOD
             self._wire.send(self._error_requests[self._next_request])
             self._next_request = (self._next_request + 1) % len(self._error_requests)
 
@@ -153,7 +153,7 @@ class Odrive(Driver[OdriveAxis]):
         if not all(axis.rests(self._wanted(axis)) for axis in self._axes):
             return None
         times, asks = self._tables.times, (1, self._next_request)
-        times[0] = self._off_by, due, frames.ERROR_PERIOD, *asks, NOWHERE, times[0]["traffic"]
+        times[0] = self._off_by, due, cansimple.ERROR_PERIOD, *asks, NOWHERE, times[0]["traffic"]
         self._lending.fill(follow=self._enabled, within=self._drives.following_error)
         return self._tables
 
@@ -225,12 +225,12 @@ class Odrive(Driver[OdriveAxis]):
         for axis in self._axes:
             axis.forgive(now)
             if axis.errors:
-                self._wire.send(frames.command(axis.node, frames.CLEAR_ERRORS, frames.CLEAR.pack(0)))
+                self._wire.send(cansimple.command(axis.node, cansimple.CLEAR_ERRORS, cansimple.CLEAR.pack(0)))
 
     def _leave(self) -> None:
-        idle = frames.AXIS_STATE.pack(AxisState.IDLE)
+        idle = cansimple.AXIS_STATE.pack(AxisState.IDLE)
         for axis in self._axes:
-            self._wire.send(frames.command(axis.node, frames.SET_AXIS_STATE, idle))
+            self._wire.send(cansimple.command(axis.node, cansimple.SET_AXIS_STATE, idle))
 
     def _wants_power(self) -> bool:
         return self._enabled
@@ -268,10 +268,12 @@ class Odrive(Driver[OdriveAxis]):
             if wanted is None or axis.requested is wanted:
                 continue
             if wanted is AxisState.CLOSED_LOOP_CONTROL:  # with every power-up, for a drive may have restarted
-                mode = frames.CONTROLLER_MODE.pack(frames.POSITION_CONTROL, frames.PASSTHROUGH)
-                if not self._wire.send(frames.command(axis.node, frames.SET_CONTROLLER_MODE, mode)):
+                mode = cansimple.CONTROLLER_MODE.pack(cansimple.POSITION_CONTROL, cansimple.PASSTHROUGH)
+                if not self._wire.send(cansimple.command(axis.node, cansimple.SET_CONTROLLER_MODE, mode)):
                     return
-            if self._wire.send(frames.command(axis.node, frames.SET_AXIS_STATE, frames.AXIS_STATE.pack(wanted))):
+            if self._wire.send(
+                cansimple.command(axis.node, cansimple.SET_AXIS_STATE, cansimple.AXIS_STATE.pack(wanted))
+            ):
                 axis.note_request(wanted)
 
     def _wanted(self, axis: OdriveAxis) -> AxisState | None:

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 from trirail_drivers.bus.can_frame import DATA_AT
 from trirail_drivers.bus.frames import Frame
-from trirail_drivers.bus.packets import packets
+from trirail_drivers.bus.packed_frames import packed_frames
 from trirail_drivers.driver.cyclic import Cyclic
-from trirail_drivers.odrive import frames
+from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.axis import OdriveAxis
 
 
@@ -26,11 +26,11 @@ class Lending:
         """`errors` and `requests` are what asks each drive for its errors and position."""
         self._tables = tables
         self._axes = axes
-        setpoint = frames.input_pos(0.0, 0.0)
-        setpoints = [frames.command(axis.node, frames.SET_INPUT_POS, setpoint) for axis in axes]
-        self._all = packets([*setpoints, *requests])
+        setpoint = cansimple.input_pos(0.0, 0.0)
+        setpoints = [cansimple.command(axis.node, cansimple.SET_INPUT_POS, setpoint) for axis in axes]
+        self._all = packed_frames([*setpoints, *requests])
         self._asking = self._all.part(len(setpoints), len(setpoints) + len(requests))
-        tables.beats, tables.setpoints = packets(errors), self._all.part(0, len(setpoints))
+        tables.beats, tables.setpoints = packed_frames(errors), self._all.part(0, len(setpoints))
         self._data = [frame[DATA_AT:].data for frame in tables.setpoints.frames]
         self._expected: list[tuple[int, int]] = []
         """The states and results that are expected."""

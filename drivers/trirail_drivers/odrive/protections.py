@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.errors import DriveError
-from trirail_drivers.odrive.frames import VELOCITY_SCALE
+from trirail_drivers.odrive.cansimple import VELOCITY_SCALE
 
 WATCHDOG: Final = "axis0.config.enable_watchdog"
 WATCHDOG_TIMEOUT: Final = "axis0.config.watchdog_timeout"

@@ -10,7 +10,7 @@ from typing import Final
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.ramp import braked
 from trirail_drivers.interface import Triple
-from trirail_drivers.odrive import frames
+from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.axis import OdriveAxis
 
 SETTLING: Final = 0.05
@@ -93,7 +93,7 @@ class SetpointSender:
         stopping = self.stopping
         for number, (axis, (metres, rate)) in enumerate(zip(self._axes, setpoints, strict=True)):
             data = axis.input_pos(metres, rate)
-            if number < taken or self._wire.send(frames.command(axis.node, frames.SET_INPUT_POS, data)):
+            if number < taken or self._wire.send(cansimple.command(axis.node, cansimple.SET_INPUT_POS, data)):
                 axis.in_force = metres
             else:
                 axis.setpoints_lost += 1

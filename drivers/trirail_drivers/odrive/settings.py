@@ -10,10 +10,10 @@ from trirail_drivers.bus.wire import Wire
 from trirail_drivers.config import Drives
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock
-from trirail_drivers.odrive import endpoints, frames
+from trirail_drivers.odrive import cansimple, flat_endpoints
 from trirail_drivers.odrive.asking import late, send
 from trirail_drivers.odrive.axis import OdriveAxis
-from trirail_drivers.odrive.endpoints import Endpoint
+from trirail_drivers.odrive.flat_endpoints import Endpoint
 from trirail_drivers.odrive.protections import NEEDED, SETTINGS, Settings
 
 TRIES: Final = 3
@@ -26,7 +26,7 @@ def read(wire: Wire, axes: Sequence[OdriveAxis], drives: Drives, clock: Clock) -
     Raises DriveError; DriveTimeout for a drive that does not answer.
     """
     tables = [
-        None if axis.version is None else endpoints.of(name, axis.version, drive.endpoints)
+        None if axis.version is None else flat_endpoints.of(name, axis.version, drive.endpoints)
         for name, axis, drive in zip(NAMES, axes, drives.each, strict=True)
     ]
     for name, table in zip(NAMES, tables, strict=True):
@@ -50,8 +50,8 @@ def _read_each(
         axis.sdo = None
     for _ in range(TRIES):
         for axis in missing:
-            data = frames.SDO.pack(frames.READ, wanted[axis.name], 0)
-            send(wire, frames.command(axis.node, frames.RX_SDO, data))
+            data = cansimple.SDO.pack(cansimple.READ, wanted[axis.name], 0)
+            send(wire, cansimple.command(axis.node, cansimple.RX_SDO, data))
         missing = late(
             wire, missing, clock, timeout / TRIES, lambda axis: axis.sdo is None or axis.sdo[0] != wanted[axis.name]
         )
@@ -62,7 +62,7 @@ def _read_each(
 def _value(axis: OdriveAxis, endpoint: Endpoint, path: str) -> float:
     _, data = axis.sdo or (0, b"")
     try:
-        (value,) = frames.TYPES[endpoint.type].unpack_from(data)
+        (value,) = cansimple.TYPES[endpoint.type].unpack_from(data)
     except struct.error as error:
         said = f"drive {axis.name}: its answer about {path} has {len(data)} bytes, too few for {endpoint.type}"
         raise DriveError(said) from error
@@ -74,7 +74,7 @@ def _check_table(name: str, table: Mapping[str, Endpoint] | None) -> None:
     for path in SETTINGS if table is not None else ():
         endpoint = table.get(path) if table is not None else None
         if endpoint is None and path in NEEDED:
-            raise DriveError(f"drives.{name}.endpoints: it has no {path}; the maker's: {endpoints.DOWNLOADS}")
-        if endpoint is not None and not (endpoint.type in frames.TYPES and 0 <= endpoint.id <= 0xFFFF):
+            raise DriveError(f"drives.{name}.endpoints: it has no {path}; the maker's: {flat_endpoints.DOWNLOADS}")
+        if endpoint is not None and not (endpoint.type in cansimple.TYPES and 0 <= endpoint.id <= 0xFFFF):
             said = f"{path} is endpoint {endpoint.id} of type {endpoint.type!r}, which no message holds"
-            raise DriveError(f"drives.{name}.endpoints: {said}; the maker's: {endpoints.DOWNLOADS}")
+            raise DriveError(f"drives.{name}.endpoints: {said}; the maker's: {flat_endpoints.DOWNLOADS}")

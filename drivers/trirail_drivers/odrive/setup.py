@@ -23,10 +23,10 @@ from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.driver.refusals import judged, raise_all
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock
-from trirail_drivers.odrive import frames, settings
+from trirail_drivers.odrive import cansimple, settings
 from trirail_drivers.odrive.asking import late, send
 from trirail_drivers.odrive.axis import OdriveAxis
-from trirail_drivers.odrive.frames import AxisState
+from trirail_drivers.odrive.cansimple import AxisState
 from trirail_drivers.odrive.protections import PROTECTIONS, Settings, check_watchdog, lacking
 
 OLDEST_FIRMWARE = (0, 6, 0)
@@ -37,8 +37,8 @@ def check_nodes(drives: Drives) -> None:
     """Refuse node ids that CANSimple does not have, or that two drives share, with DriveError."""
     nodes = {f"drives.{name}.node": drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
     for key, node in nodes.items():
-        if node not in frames.NODES:
-            raise DriveError(f"{key} = {node}: an ODrive has 0 to {frames.NODES[-1]}")
+        if node not in cansimple.NODES:
+            raise DriveError(f"{key} = {node}: an ODrive has 0 to {cansimple.NODES[-1]}")
     if len(set(nodes.values())) < len(nodes):
         raise DriveError(f"node ids must differ, but are {', '.join(f'{key} = {node}' for key, node in nodes.items())}")
 
@@ -61,11 +61,11 @@ def configure(
     Raises DriveError; of its kinds, DriveTimeout for a drive that does not answer. Errors of a drive are none here.
     """
     for axis in axes:
-        send(wire, frames.command(axis.node, frames.SET_AXIS_STATE, frames.AXIS_STATE.pack(AxisState.IDLE)))
+        send(wire, cansimple.command(axis.node, cansimple.SET_AXIS_STATE, cansimple.AXIS_STATE.pack(AxisState.IDLE)))
         axis.note_request(AxisState.IDLE)
         axis.sync_sent()
-        for number in (frames.GET_VERSION, frames.GET_ERROR, frames.GET_ENCODER_ESTIMATES):
-            send(wire, frames.request(axis.node, number))
+        for number in (cansimple.GET_VERSION, cansimple.GET_ERROR, cansimple.GET_ENCODER_ESTIMATES):
+            send(wire, cansimple.request(axis.node, number))
     for axis in late(wire, axes, clock, drives.sdo_timeout, _missing):
         raise DriveTimeout(axis.name, f"answer to {_missing(axis)}", drives.sdo_timeout)
     for axis in axes:
@@ -76,7 +76,7 @@ def configure(
         if axis.state == AxisState.UNDEFINED:
             raise DriveTimeout(axis.name, "heartbeat (heartbeat_msg_rate_ms)", timeout)
         raise DriveError(
-            f"drive {axis.name}: keeps its power on when told off (it is in {frames.state_name(axis.state)})"
+            f"drive {axis.name}: keeps its power on when told off (it is in {cansimple.state_name(axis.state)})"
         )
     return done
 

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from trirail_drivers import config
-from trirail_drivers.cia402 import checks, frames, units
+from trirail_drivers.cia402 import canopen_frames, checks, units
 from trirail_drivers.cia402.backup import restore, save
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.inspection import inputs, inspect
@@ -59,7 +59,7 @@ CIA402 = Protocol(
     driver=Cia402,
     rules=checks.rules,
     files=checks.files,
-    traffic=frames.TRAFFIC,
+    traffic=canopen_frames.TRAFFIC,
     simulated_drive=_simulated_drive,
     inspect=inspect,
     inputs=inputs,
@@ -67,16 +67,16 @@ CIA402 = Protocol(
     restore=restore,
     protections={name: means(name) for name in PROTECTIONS},
     fault_frames={
-        "nmt": Frames(True, frames.NMT),
-        "sync": Frames(True, frames.SYNC),
-        "rpdo1": Frames(True, frames.RPDO1, 1),
-        "rpdo2": Frames(True, frames.RPDO2, 1),
-        "sdo-request": Frames(True, frames.SDO_REQUEST, 1),
-        "emcy": Frames(False, frames.EMCY, 1),
-        "tpdo1": Frames(False, frames.TPDO1, 1),
-        "tpdo2": Frames(False, frames.TPDO2, 1),
-        "sdo-answer": Frames(False, frames.SDO_ANSWER, 1),
-        "heartbeat": Frames(False, frames.HEARTBEAT, 1),
+        "nmt": Frames(True, canopen_frames.NMT),
+        "sync": Frames(True, canopen_frames.SYNC),
+        "rpdo1": Frames(True, canopen_frames.RPDO1, 1),
+        "rpdo2": Frames(True, canopen_frames.RPDO2, 1),
+        "sdo-request": Frames(True, canopen_frames.SDO_REQUEST, 1),
+        "emcy": Frames(False, canopen_frames.EMCY, 1),
+        "tpdo1": Frames(False, canopen_frames.TPDO1, 1),
+        "tpdo2": Frames(False, canopen_frames.TPDO2, 1),
+        "sdo-answer": Frames(False, canopen_frames.SDO_ANSWER, 1),
+        "heartbeat": Frames(False, canopen_frames.HEARTBEAT, 1),
     },
 )
 """CiA 402 on CANopen, in cyclic synchronous position mode."""

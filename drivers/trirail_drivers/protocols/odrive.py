@@ -6,7 +6,7 @@ from typing import Final
 
 from trirail_drivers import config
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
-from trirail_drivers.odrive import checks, frames
+from trirail_drivers.odrive import cansimple, checks
 from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.odrive.protections import PROTECTIONS, means
 from trirail_drivers.protocols.protocol import Protocol
@@ -14,7 +14,7 @@ from trirail_drivers.simulated import Frames, Servo, SimulatedDevice, SimulatedO
 
 FRICTION: Final = 2.0
 """How a simulated ODrive's slider slows down that coasts [m/s²]."""
-_NODE: Final = frames.identifier(1, 0)
+_NODE: Final = cansimple.identifier(1, 0)
 """What each further node id adds to an identifier."""
 
 
@@ -37,7 +37,7 @@ ODRIVE = Protocol(
     driver=Odrive,
     rules=checks.rules,
     files=checks.files,
-    traffic=frames.TRAFFIC,
+    traffic=cansimple.TRAFFIC,
     simulated_drive=_simulated_drive,
     inspect=None,
     inputs=None,
@@ -45,17 +45,17 @@ ODRIVE = Protocol(
     restore=None,
     protections={name: means(name) for name in PROTECTIONS},
     fault_frames={  # named as in the manual
-        "set_axis_state": Frames(True, frames.SET_AXIS_STATE, _NODE),
-        "set_controller_mode": Frames(True, frames.SET_CONTROLLER_MODE, _NODE),
-        "set_input_pos": Frames(True, frames.SET_INPUT_POS, _NODE),
-        "clear_errors": Frames(True, frames.CLEAR_ERRORS, _NODE),
-        "position-request": Frames(True, frames.GET_ENCODER_ESTIMATES, _NODE),
-        "rxsdo": Frames(True, frames.RX_SDO, _NODE),
-        "get_version": Frames(False, frames.GET_VERSION, _NODE),
-        "get_error": Frames(False, frames.GET_ERROR, _NODE),
-        "get_encoder_estimates": Frames(False, frames.GET_ENCODER_ESTIMATES, _NODE),
-        "txsdo": Frames(False, frames.TX_SDO, _NODE),
-        "heartbeat": Frames(False, frames.HEARTBEAT, _NODE),
+        "set_axis_state": Frames(True, cansimple.SET_AXIS_STATE, _NODE),
+        "set_controller_mode": Frames(True, cansimple.SET_CONTROLLER_MODE, _NODE),
+        "set_input_pos": Frames(True, cansimple.SET_INPUT_POS, _NODE),
+        "clear_errors": Frames(True, cansimple.CLEAR_ERRORS, _NODE),
+        "position-request": Frames(True, cansimple.GET_ENCODER_ESTIMATES, _NODE),
+        "rxsdo": Frames(True, cansimple.RX_SDO, _NODE),
+        "get_version": Frames(False, cansimple.GET_VERSION, _NODE),
+        "get_error": Frames(False, cansimple.GET_ERROR, _NODE),
+        "get_encoder_estimates": Frames(False, cansimple.GET_ENCODER_ESTIMATES, _NODE),
+        "txsdo": Frames(False, cansimple.TX_SDO, _NODE),
+        "heartbeat": Frames(False, cansimple.HEARTBEAT, _NODE),
     },
 )
 """ODrive's CANSimple, in position control."""

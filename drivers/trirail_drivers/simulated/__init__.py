@@ -4,10 +4,10 @@ from trirail_drivers.simulated.bus import SimulatedBus
 from trirail_drivers.simulated.carriages import Carriages
 from trirail_drivers.simulated.devices import SimulatedDevice
 from trirail_drivers.simulated.drive import EDS, SimulatedDrive
+from trirail_drivers.simulated.factor_group import Mechanics
 from trirail_drivers.simulated.faultlines import Frames
 from trirail_drivers.simulated.odrive import SimulatedOdrive
 from trirail_drivers.simulated.servo import Servo
-from trirail_drivers.simulated.units import Mechanics
 
 __all__ = [
     "EDS",

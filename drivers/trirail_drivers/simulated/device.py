@@ -13,7 +13,7 @@ from trirail_drivers.simulated.dictionary import Dictionary, ObjectEntry
 from trirail_drivers.simulated.emergency import Emergencies
 from trirail_drivers.simulated.errorcontrol import ErrorControl
 from trirail_drivers.simulated.pdo import ReceivePdo, TransmitPdo
-from trirail_drivers.simulated.sdo import SdoServer
+from trirail_drivers.simulated.sdo_server import SdoServer
 
 CONNECTION_LOST = 0x8100
 HEARTBEAT_LOST = 0x8130

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from canopen.objectdictionary import ODVariable
 
-from trirail_drivers.simulated.edsfile import compact_arrays, read
+from trirail_drivers.cia402.eds import read
+from trirail_drivers.simulated.edsfile import compact_arrays
 
 WRITE_ONLY = 0x06010001
 READ_ONLY = 0x06010002

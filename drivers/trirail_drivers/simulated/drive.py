@@ -9,11 +9,11 @@ from typing import Final
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated.device import Device, Nmt
 from trirail_drivers.simulated.dictionary import ObjectEntry
+from trirail_drivers.simulated.factor_group import Mechanics
 from trirail_drivers.simulated.homing import HomingMode
 from trirail_drivers.simulated.power import FAULT_RESET, STATUS, commanded
 from trirail_drivers.simulated.profile import HOMING, Profile
 from trirail_drivers.simulated.servo import Servo
-from trirail_drivers.simulated.units import Mechanics
 
 MECHANICS: Final = Mechanics()
 EDS: Final = Path(__file__).parents[1] / "cia402" / "servo.eds"

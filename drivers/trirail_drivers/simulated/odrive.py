@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import Final
 
 from trirail_drivers.interface import PowerState
-from trirail_drivers.odrive import frames
-from trirail_drivers.odrive.endpoints import KNOWN, Version
-from trirail_drivers.odrive.frames import AxisState, Error, ProcedureResult
+from trirail_drivers.odrive import cansimple
+from trirail_drivers.odrive.cansimple import AxisState, Error, ProcedureResult
+from trirail_drivers.odrive.flat_endpoints import KNOWN, Version
 from trirail_drivers.simulated.servo import Servo
 
 HARDWARE: Final = (4, 4, 58)
@@ -22,10 +22,14 @@ NEVER: Final = float("inf")
 BOOT: Final = 0.25
 """How long a restarted drive says that it initialises [s]."""
 
-_CYCLIC: Final = {"version": frames.GET_VERSION, "encoder": frames.GET_ENCODER_ESTIMATES, "error": frames.GET_ERROR}
+_CYCLIC: Final = {
+    "version": cansimple.GET_VERSION,
+    "encoder": cansimple.GET_ENCODER_ESTIMATES,
+    "error": cansimple.GET_ERROR,
+}
 _OTHERS: Final = ("iq", "temperature", "bus_voltage", "torques", "powers")
 """What it can send by itself beside heartbeats, and what nobody reads: settings that are told, and not sent."""
-_REQUESTS: Final = (frames.GET_VERSION, frames.GET_ERROR, frames.GET_ENCODER_ESTIMATES)
+_REQUESTS: Final = (cansimple.GET_VERSION, cansimple.GET_ERROR, cansimple.GET_ENCODER_ESTIMATES)
 
 
 def _discard(can_id: int, data: bytes) -> None:
@@ -52,7 +56,7 @@ class SimulatedOdrive:
         """Without calibration it refuses closed loop control."""
         self.silent = False
         """True cuts the wire: nothing is heard or sent any more, while the device itself goes on."""
-        self.modes = (VELOCITY_CONTROL, frames.PASSTHROUGH)
+        self.modes = (VELOCITY_CONTROL, cansimple.PASSTHROUGH)
         """Control mode and input mode; at first whatever somebody else has left there."""
         self.version = Version(HARDWARE, FIRMWARE)
         self.settings: dict[str, float] = {
@@ -71,19 +75,19 @@ class SimulatedOdrive:
         """When each cyclic message is due."""
         self._transmit: Callable[[int, bytes], None] = _discard
         self._handlers: dict[int, Callable[[bytes], None]] = {
-            frames.ESTOP: self._estop,
-            frames.SET_AXIS_STATE: self._set_state,
-            frames.SET_CONTROLLER_MODE: self._set_mode,
-            frames.SET_INPUT_POS: self._set_input,
-            frames.CLEAR_ERRORS: self._clear,
-            frames.RX_SDO: self._sdo,
+            cansimple.ESTOP: self._estop,
+            cansimple.SET_AXIS_STATE: self._set_state,
+            cansimple.SET_CONTROLLER_MODE: self._set_mode,
+            cansimple.SET_INPUT_POS: self._set_input,
+            cansimple.CLEAR_ERRORS: self._clear,
+            cansimple.RX_SDO: self._sdo,
         }
 
     @property
     def state(self) -> str:
         """The axis state in words, and why it was disarmed."""
-        name = frames.state_name(self.axis_state)
-        return f"{name}, {frames.error_names(self.disarm_reason)}" if self.disarm_reason else name
+        name = cansimple.state_name(self.axis_state)
+        return f"{name}, {cansimple.error_names(self.disarm_reason)}" if self.disarm_reason else name
 
     @property
     def power(self) -> PowerState:
@@ -132,7 +136,7 @@ class SimulatedOdrive:
         watchdog = self.settings["axis0.config.watchdog_timeout"]
         if self._armed and self.settings["axis0.config.enable_watchdog"] and now >= self._fed + watchdog:
             self.fail(Error.WATCHDOG_TIMER_EXPIRED)
-        for name, command in (("heartbeat", frames.HEARTBEAT), *_CYCLIC.items()):
+        for name, command in (("heartbeat", cansimple.HEARTBEAT), *_CYCLIC.items()):
             period = self.settings[f"{CAN}.{name}_msg_rate_ms"] / 1000.0
             if period and now >= self._due[name]:
                 self._answer(command)
@@ -153,7 +157,7 @@ class SimulatedOdrive:
 
     def restart(self, now: float) -> None:
         """Lose power for a moment: it comes back idle, without what it had not saved."""
-        self.axis_state, self.modes = AxisState.UNDEFINED, (VELOCITY_CONTROL, frames.PASSTHROUGH)
+        self.axis_state, self.modes = AxisState.UNDEFINED, (VELOCITY_CONTROL, cansimple.PASSTHROUGH)
         self.errors, self.disarm_reason, self.result = Error.INITIALIZING, Error(0), ProcedureResult.SUCCESS
         self._booted = now + BOOT
 
@@ -168,40 +172,40 @@ class SimulatedOdrive:
     def _move(self, step: float) -> None:
         if not self._armed:
             self.servo.roll(self._friction, step)
-        elif self.modes == (frames.POSITION_CONTROL, frames.PASSTHROUGH):
+        elif self.modes == (cansimple.POSITION_CONTROL, cansimple.PASSTHROUGH):
             self.servo.chase(*self._input, step)
 
     def _answer(self, command: int) -> None:
-        if command == frames.HEARTBEAT:
-            data = frames.BEAT.pack(self._error_bits, self.axis_state, self.result, 0)
-        elif command == frames.GET_VERSION:
-            data = frames.VERSION.pack(2, *self.version.hardware, *self.version.firmware, self.version.unreleased)
-        elif command == frames.GET_ERROR:
-            data = frames.ERRORS.pack(self.errors, self.disarm_reason)
+        if command == cansimple.HEARTBEAT:
+            data = cansimple.BEAT.pack(self._error_bits, self.axis_state, self.result, 0)
+        elif command == cansimple.GET_VERSION:
+            data = cansimple.VERSION.pack(2, *self.version.hardware, *self.version.firmware, self.version.unreleased)
+        elif command == cansimple.GET_ERROR:
+            data = cansimple.ERRORS.pack(self.errors, self.disarm_reason)
         else:
-            data = frames.ESTIMATES.pack(self.servo.position, self.servo.velocity)
+            data = cansimple.ESTIMATES.pack(self.servo.position, self.servo.velocity)
         self._send(command, data)
 
     def _sdo(self, data: bytes) -> None:
         """RxSdo: read or write a setting; none of another firmware's numbers is answered."""
-        opcode, number, _ = frames.SDO.unpack_from(data)
+        opcode, number, _ = cansimple.SDO.unpack_from(data)
         table = next((table.endpoints for table in KNOWN if table.is_of(self.version)), {})
         for path, endpoint in table.items():
             if endpoint.id != number or path not in self.settings:
                 continue
-            kind = frames.TYPES[endpoint.type]
-            if opcode == frames.WRITE:
-                (self.settings[path],) = kind.unpack_from(data, frames.SDO.size)
+            kind = cansimple.TYPES[endpoint.type]
+            if opcode == cansimple.WRITE:
+                (self.settings[path],) = kind.unpack_from(data, cansimple.SDO.size)
             else:
                 value = self.settings[path]
                 data = kind.pack(value if endpoint.type in {"float", "bool"} else int(value))
-                self._send(frames.TX_SDO, frames.SDO.pack(0, number, 0) + data)
+                self._send(cansimple.TX_SDO, cansimple.SDO.pack(0, number, 0) + data)
 
     def _estop(self, _data: bytes) -> None:
         self.fail(Error.ESTOP_REQUESTED)
 
     def _set_state(self, data: bytes) -> None:
-        (state,) = frames.AXIS_STATE.unpack(data)
+        (state,) = cansimple.AXIS_STATE.unpack(data)
         if self.axis_state is AxisState.UNDEFINED:
             return
         if state == AxisState.IDLE:
@@ -218,21 +222,21 @@ class SimulatedOdrive:
                 self._input = self.servo.position, 0.0
 
     def _set_mode(self, data: bytes) -> None:
-        control, way = frames.CONTROLLER_MODE.unpack(data)
+        control, way = cansimple.CONTROLLER_MODE.unpack(data)
         self.modes = control, way
 
     def _set_input(self, data: bytes) -> None:
-        position, velocity, _ = frames.INPUT_POS.unpack(data)
+        position, velocity, _ = cansimple.INPUT_POS.unpack(data)
         if math.isfinite(position):
             self._input = position, velocity / self.settings[f"{CAN}.input_vel_scale"]
         else:
             self.fail(Error.MISSING_INPUT)
 
     def _clear(self, data: bytes) -> None:
-        frames.CLEAR.unpack(data)
+        cansimple.CLEAR.unpack(data)
         self.errors &= Error.INITIALIZING
         self.disarm_reason = Error(0)
 
     def _send(self, command: int, data: bytes) -> None:
         if not self.silent:
-            self._transmit(frames.identifier(self.node, command), data)
+            self._transmit(cansimple.identifier(self.node, command), data)

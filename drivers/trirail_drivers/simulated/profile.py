@@ -7,10 +7,10 @@ from collections.abc import Callable
 from typing import Final
 
 from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, ObjectEntry, SdoAbort
+from trirail_drivers.simulated.factor_group import FactorGroup, Mechanics
 from trirail_drivers.simulated.homing import EDGES, STANDING
 from trirail_drivers.simulated.makes import MakersRules
 from trirail_drivers.simulated.servo import Servo
-from trirail_drivers.simulated.units import FactorGroup, Mechanics
 
 DEVICE_TYPE: Final = 0x0002_0192
 """1000h: a servo drive of CiA profile 402."""

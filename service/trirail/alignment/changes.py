@@ -11,7 +11,7 @@ import math
 import msgspec
 import numpy as np
 
-from trirail.alignment.calibration import CameraCalibration, placed
+from trirail.alignment.camera_calibration import CameraCalibration, placed
 from trirail.alignment.images import Pair, pixels, places
 from trirail.alignment.rigid import Floats
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail.alignment.calibration import CameraCalibration, Marks
+from trirail.alignment.camera_calibration import CameraCalibration, Marks
 from trirail.alignment.images import CameraView, places, slopes
 from trirail.alignment.rigid import Floats, RigidError, distance_error, rigid_error, swapped
 from trirail.errors import AlignmentError, AlignmentFault

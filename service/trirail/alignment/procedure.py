@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from trirail_drivers.interface import Triple
 
-from trirail.alignment.calibration import CameraCalibration, Sight, calibrate
+from trirail.alignment.camera_calibration import CameraCalibration, Sight, calibrate
 from trirail.alignment.images import Lens, Pair
 from trirail.alignment.misplacement import DISTANCE, Misplacement, misplacement
 from trirail.alignment.results import Alignment, AlignmentCorrection, AlignmentEnd, Measurement

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from trirail_drivers.interface import Triple
 
-from trirail.alignment.calibration import placed
+from trirail.alignment.camera_calibration import placed
 from trirail.alignment.images import CameraView, Pair, pixels, slopes
 from trirail.alignment.rigid import Floats, turned
 from trirail.alignment.shapes import MarkShape, brightness

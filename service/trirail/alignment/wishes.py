@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 from trirail_drivers.interface import Triple
 
-from trirail.alignment.calibration import Marks
+from trirail.alignment.camera_calibration import Marks
 from trirail.alignment.images import Pair
 from trirail.alignment.results import Measurement
 

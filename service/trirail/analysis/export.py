@@ -9,7 +9,7 @@ from pyarrow import csv, parquet
 
 from trirail.errors import ServiceError
 from trirail.telemetry.reading import Recording
-from trirail.telemetry.tables import table
+from trirail.telemetry.recording_table import table
 
 FORMATS = (".csv", ".parquet")
 """What a file's name may end in."""
@@ -18,7 +18,7 @@ FORMATS = (".csv", ".parquet")
 def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
     """Write the table of a recording, as CSV or Parquet by the end of the file's name; return its rows.
 
-    `columns` as trirail.telemetry.tables.table has them. Raises ServiceError where one is none, the file's name ends
+    `columns` as trirail.telemetry.recording_table.table has them. Raises ServiceError where one is none, the name ends
     otherwise, the file exists, or it cannot be written.
     """
     if path.suffix not in FORMATS:

@@ -79,7 +79,7 @@ def calibrate(
             "a radial lens wants --centre U V, the pixel on its axis: the middle of the picture for most"
         )
     moves = moves_for(lens, by, notation.radians(angle, False))
-    with source.opened() as (look, known), Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with source.open_source() as (look, known), Robot(service.robot, service.connect, tls=service.tls) as robot:
         views = dict.fromkeys(look(), "camera") if one_camera else known
         wishes = calibration_by_moves(moves, views, lens, centre or (0.0, 0.0), looks, _approach(approach))
         found = drive(robot, look, _printed(wishes, service, len(moves) + 1), speed, wait)
@@ -147,7 +147,7 @@ def run(
         looks,
         _approach(approach),
     )
-    with source.opened() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with source.open_source() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
         found = drive(robot, look, _printed(align(task), service), speed, wait)
     if found.confirmed != kept.calibration.confirmed:
         known = msgspec.structs.replace(kept.calibration, confirmed=found.confirmed)
@@ -198,7 +198,7 @@ def check(
 
     kept = _kept(file, service)
     task = Task(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=looks)
-    with source.opened() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with source.open_source() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
         if moves:
             again = calibration_again(kept.calibration, looks)
             now = drive(robot, look, _printed(again, service, len(kept.calibration.poses)), speed, wait)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 from trirail.cli import terminal
 
 if TYPE_CHECKING:
-    from trirail.alignment.calibration import CameraCalibration
+    from trirail.alignment.camera_calibration import CameraCalibration
     from trirail.alignment.changes import ViewChange
     from trirail.alignment.procedure import Alignment, Measurement, Sighting, Wish
     from trirail.alignment.wishes import LookReport

@@ -35,10 +35,10 @@ from trirail.cli import (
     typed,
     workspace_command,
 )
-from trirail.cli.completion import Shell, script
 from trirail.cli.options import ALL_HERE, Flag, Services
+from trirail.cli.tab_completion import Shell, script
 from trirail.errors import TrirailError
-from trirail.wire.stop_door import STOPS
+from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command
 
@@ -208,7 +208,7 @@ app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRID
 app.command(robot_commands.acquire, name=Command.ACQUIRE, help=Command.ACQUIRE.help)
 for each in Command:
     if each not in (Command.OVERRIDE, Command.ACQUIRE):
-        made = stop_commands.stopping(each) if each in STOPS else robot_commands.telling(each)
+        made = stop_commands.stopping(each) if each in STOPS else robot_commands.command_line_of(each)
         app.command(made, name=each.replace("_", "-"), help=each.help)
 app.command(config_commands.app)
 app.command(keys_command.app)

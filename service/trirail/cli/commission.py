@@ -61,7 +61,7 @@ def commission(
     """
     from trirail.commissioning import report as reports
     from trirail.commissioning.guide import Guide
-    from trirail.commissioning.opening import opened
+    from trirail.commissioning.opening import open_steps
     from trirail.commissioning.person import Quit
     from trirail.config import load
     from trirail.telemetry.provenance import software
@@ -77,7 +77,7 @@ def commission(
     made = reports.CommissioningReport(settings.robot.name, str(config), reports.now(), simulated, str(software()))
     keeper = reports.Keeper(made, report or Path(name))
     person = Console(by_itself=yes, quiet=json)
-    with interruption() as interrupted, opened(settings, fault, person, interrupted) as steps:
+    with interruption() as interrupted, open_steps(settings, fault, person, interrupted) as steps:
         guide = Guide(settings, config, steps, person, keeper)
         try:
             with contextlib.suppress(Quit):

@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from trirail_drivers.interface import Triple
 
-from trirail.alignment.calibration import placed
+from trirail.alignment.camera_calibration import placed
 from trirail.alignment.finding import find
 from trirail.alignment.images import CameraView, Pair
 from trirail.alignment.procedure import Alignment
@@ -100,7 +100,7 @@ def run(file: Path, recording: Path, parts: int = PARTS, seed: int = 0) -> int:
         if config.telemetry.live_port:
             sinks.append(rr.GrpcSink(f"rerun+http://127.0.0.1:{config.telemetry.live_port}/proxy"))
         stream.set_sinks(*sinks, default_blueprint=_layout())
-        with Robot(config.robot.name, config.zenoh.listen[0], user="demo") as robot, robot.records(stage.take):
+        with Robot(config.robot.name, config.zenoh.listen[0], user="demo") as robot, robot.records(stage.add_records):
             robot.enable()
             cameras = DrawnCameras(stage, stream, seed)
             results = list(_parts(robot, cameras, stream, parts, seed))

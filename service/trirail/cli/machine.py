@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from trirail.cli.key_folder import Issued
 from trirail.processes.bare_loop import Cycles
-from trirail.processes.guard import Guard
+from trirail.processes.session_guard import Guard
 
 
 class Passed(Struct, frozen=True):

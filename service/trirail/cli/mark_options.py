@@ -37,7 +37,7 @@ class MarkSource:
     "By what angle it is turned in the picture, from u to v, in degrees."
 
     @contextlib.contextmanager
-    def opened(self) -> Iterator[mark_source.Source]:
+    def open_source(self) -> Iterator[mark_source.Source]:
         """Open it. Raises TrirailError."""
         from trirail.alignment.shapes import MarkShape
 

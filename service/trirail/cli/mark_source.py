@@ -18,7 +18,7 @@ from trirail_drivers.errors import TrirailError
 from trirail.wire.decoding import decoded, prepare
 
 if TYPE_CHECKING:
-    from trirail.alignment.calibration import Marks
+    from trirail.alignment.camera_calibration import Marks
     from trirail.alignment.shapes import MarkShape
 
 Look = Callable[[], "Marks"]

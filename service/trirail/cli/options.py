@@ -39,17 +39,17 @@ def taught_poses(context: CompletionContext) -> list[str]:
         return [name for name, pose in robot.poses().items() if pose.taught]
 
 
-def tools(context: CompletionContext) -> list[str]:
+def tool_names(context: CompletionContext) -> list[str]:
     """Return the names of its tools."""
     return _frames(context, "tool")
 
 
-def frames(context: CompletionContext) -> list[str]:
+def frame_names(context: CompletionContext) -> list[str]:
     """Return the names of the frames in which a pose may be given."""
     return ["base", *_frames(context, "work")]
 
 
-def axes(context: CompletionContext) -> list[str]:
+def axes_names(context: CompletionContext) -> list[str]:
     """Return the names of the frames along whose axes a move may be."""
     return ["base", "platform", *_frames(context, "work")]
 

@@ -26,8 +26,8 @@ from trirail.config import Config, LoopTable
 from trirail.errors import ServiceError
 from trirail.processes import bare_loop, realtime
 from trirail.processes.bare_loop import Cycles
-from trirail.processes.guard import Guard
 from trirail.processes.interpreter import title
+from trirail.processes.session_guard import Guard
 
 SYSTEM = Path("/sys")
 PROCESSES = Path("/proc")

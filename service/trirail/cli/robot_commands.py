@@ -15,7 +15,7 @@ import msgspec
 from cyclopts import CycloptsError, Parameter, validators
 
 from trirail.cli import live, notation, terminal
-from trirail.cli.options import HERE, Address, Flag, Service, axes, frames, taught_poses, tools
+from trirail.cli.options import HERE, Address, Flag, Service, axes_names, frame_names, taught_poses, tool_names
 from trirail.cli.options import poses as poses_of_robot
 from trirail.naming import Labels
 from trirail.wire import boundary
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from trirail.client.client import GoalHandle, Robot
     from trirail.wire.messages import Event
 
-Tool = Annotated[notation.ToolPoint, Parameter(completer=tools)]
+Tool = Annotated[notation.ToolPoint, Parameter(completer=tool_names)]
 
 
 NO_END = "the jog has no known end"
@@ -45,7 +45,7 @@ def goto(
     speed: notation.Share = 1.0,
     blend: notation.Distance | None = None,
     tool: Tool | None = None,
-    frame: Annotated[str, Parameter(completer=frames)] = "base",
+    frame: Annotated[str, Parameter(completer=frame_names)] = "base",
     deg: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
@@ -104,7 +104,7 @@ def move(
     wait: Annotated[bool, Flag] = False,
     speed: notation.Share = 1.0,
     tool: Tool | None = None,
-    frame: Annotated[str, Parameter(completer=axes)] = "base",
+    frame: Annotated[str, Parameter(completer=axes_names)] = "base",
     measured: Annotated[bool, Flag] = False,
     deg: Annotated[bool, Flag] = False,
     service: Service = HERE,
@@ -449,13 +449,13 @@ def _show_event(service: Service, event: Event) -> None:
 
 
 COMMANDS = (goto, move, goal, sliders, jog, follow, teach, forget, poses, status, watch, events)
-"""Those with parameters of their own, in the order in which the help lists them; the others are made by `telling`."""
+"""Those with parameters of their own, in the order in which the help lists them; the others by `command_line_of`."""
 
 
-def telling(name: Command) -> Callable[..., int]:
+def command_line_of(name: Command) -> Callable[..., int]:
     """Return the command of the command line that sends one, with the numbers that it cannot come without."""
 
-    def tell(*values: float, service: Service = HERE) -> int:
+    def send_command(*values: float, service: Service = HERE) -> int:
         from trirail.client.client import Robot
 
         with Robot(service.robot, service.connect, tls=service.tls) as robot:
@@ -463,14 +463,14 @@ def telling(name: Command) -> Callable[..., int]:
         confirmed(service, name, reply)
         return 0
 
-    signature = inspect.signature(tell)
+    signature = inspect.signature(send_command)
     needed = [field.name for field in msgspec.structs.fields(name.content) if field.required]
     taken = Annotated[float, Parameter(help=f"Of what it takes: {name.content.words}.")]
     each = [inspect.Parameter(field, inspect.Parameter.POSITIONAL_ONLY, annotation=taken) for field in needed]
-    tell.__signature__ = signature.replace(  # type: ignore[attr-defined]  # where cyclopts looks
+    send_command.__signature__ = signature.replace(  # type: ignore[attr-defined]  # where cyclopts looks
         parameters=[*each, signature.parameters["service"].replace(annotation=Service)]
     )
-    return tell
+    return send_command
 
 
 def confirmed(service: Service, name: Command, reply: CommandReply) -> None:

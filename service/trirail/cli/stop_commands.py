@@ -13,7 +13,7 @@ from trirail.wire.vocabulary import Command
 
 
 def stopping(name: Command) -> Callable[..., int]:
-    """Return the command of the command line that sends one of trirail.wire.stop_door.STOPS."""
+    """Return the command of the command line that sends one of trirail.wire.stop_protocol.STOPS."""
 
     def stop(*, service: Service = HERE) -> int:
         from trirail.client.new_stop import NewStop

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 from msgspec import structs
 from trirail_drivers.interface import Triple
 
-from trirail.alignment.calibration import Marks
+from trirail.alignment.camera_calibration import Marks
 from trirail.alignment.wishes import LookReport, Sighting, StageMotion, Wish
 from trirail.client.goal import Result
 from trirail.client.look_reports import LookReports

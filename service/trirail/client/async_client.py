@@ -33,7 +33,7 @@ from trirail.wire.goals import Goal
 from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import CommandReply, Event, GoalReply, RoleReply
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
-from trirail.wire.stop_door import STOPS
+from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Role, Stop
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import uuid
 from collections.abc import Awaitable, Callable
 from typing import Self
 
 import msgspec
 
-from trirail.client.goal import LETTING_GO, STANDS_WITHIN, AcceptedGoal, Result, Velocity
-from trirail.client.outgoing import number, seconds
-from trirail.errors import RefusalCode, RefusedError, TrirailError
+from trirail.client.goal import LETTING_GO, STANDS_WITHIN, AcceptedGoal, HeldVelocity, Result, Velocity
+from trirail.client.outgoing import seconds
+from trirail.errors import TrirailError
 from trirail.wire.goals import Goal, VelocityGoal
-from trirail.wire.messages import GoalReply
 from trirail.wire.vocabulary import Command, Stop
 
 
@@ -52,7 +50,7 @@ class AsyncGoalHandle(AcceptedGoal):
         self._ended.set()
 
 
-class AsyncJog:
+class AsyncJog(HeldVelocity[AsyncGoalHandle]):
     """A velocity that is kept alive while the context lasts, as trirail.client.goal.Jog; renewed by a task."""
 
     def __init__(
@@ -61,25 +59,10 @@ class AsyncJog:
         velocity: Velocity,
         timeout: float,
     ) -> None:
+        super().__init__(velocity, timeout)
         self._send_goal = send
-        self._velocity = velocity
-        self._timeout = number(timeout, "timeout")
-        self._id = uuid.uuid4().hex[:12]
-        self._goal: AsyncGoalHandle | None = None
         self._over = asyncio.Event()
         self._renewing: asyncio.Task[None] | None = None
-        self.error: Exception | None = None
-        """Why it could not be renewed any more."""
-
-    @property
-    def reply(self) -> GoalReply | None:
-        """What the service last said of it, None before it was taken: how much it is `slowed`, for one."""
-        return self._goal.reply if self._goal else None
-
-    @property
-    def result(self) -> Result | None:
-        """How it ended, None while it has not."""
-        return self._goal.result if self._goal else None
 
     async def __aenter__(self) -> Self:
         self._goal = await self._send(self._velocity, self._timeout)
@@ -90,7 +73,7 @@ class AsyncJog:
         self._over.set()
         if self._renewing is not None:
             await self._renewing  # a renewal that is on its way is not taken back
-        if self._goal is not None and self._goal.result is None and self.error is None:
+        if self._goal is not None and self._moves:
             with contextlib.suppress(TrirailError):  # it has ended, or does by its time-out
                 await self._send((0.0, 0.0, 0.0), LETTING_GO)
             await self._goal.wait(self._timeout + STANDS_WITHIN)
@@ -110,6 +93,5 @@ class AsyncJog:
             try:
                 await self._send(self._velocity, self._timeout)
             except TrirailError as error:
-                at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
-                self.error = None if at_limit else error  # at a limit it has ended as it should
+                self._renewal_failed(error)
                 return

@@ -10,7 +10,7 @@ import msgspec
 from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
-from trirail.alignment.calibration import CameraCalibration, Marks
+from trirail.alignment.camera_calibration import CameraCalibration, Marks
 from trirail.alignment.images import Pair
 from trirail.wire.decoding import decoded, prepare
 

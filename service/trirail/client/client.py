@@ -44,12 +44,12 @@ from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import CommandReply, Event, GoalReply, RoleReply
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
-from trirail.wire.stop_door import STOPS
+from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import check_name, check_new_pose, quoted
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override, Role
 
 if TYPE_CHECKING:  # numpy, which most programs do without
-    from trirail.alignment.calibration import CameraCalibration
+    from trirail.alignment.camera_calibration import CameraCalibration
     from trirail.alignment.images import Lens
     from trirail.alignment.procedure import Alignment
     from trirail.client.alignment import Look

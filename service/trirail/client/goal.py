@@ -6,7 +6,7 @@ import contextlib
 import threading
 import uuid
 from collections.abc import Callable
-from typing import NamedTuple, Self
+from typing import Generic, NamedTuple, Self, TypeVar
 
 import msgspec
 
@@ -104,7 +104,40 @@ class GoalHandle(AcceptedGoal):
         self._ended.set()
 
 
-class Jog:
+Handle = TypeVar("Handle", bound=AcceptedGoal)
+
+
+class HeldVelocity(Generic[Handle]):
+    """A jog, whether a thread or a task renews it: what is sent of it, and what the service says."""
+
+    def __init__(self, velocity: Velocity, timeout: float) -> None:
+        self._velocity = velocity
+        self._timeout = number(timeout, "timeout")
+        self._id = uuid.uuid4().hex[:12]
+        self._goal: Handle | None = None
+        self.error: Exception | None = None
+        """Why it could not be renewed any more."""
+
+    @property
+    def reply(self) -> GoalReply | None:
+        """What the service last said of it, None before it was taken: how much it is `slowed`, for one."""
+        return self._goal.reply if self._goal else None
+
+    @property
+    def result(self) -> Result | None:
+        """How it ended, None while it has not."""
+        return self._goal.result if self._goal else None
+
+    @property
+    def _moves(self) -> bool:
+        return self._goal is not None and self.result is None and self.error is None
+
+    def _renewal_failed(self, error: TrirailError) -> None:
+        at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
+        self.error = None if at_limit else error  # at a limit it has ended as it should
+
+
+class Jog(HeldVelocity[GoalHandle]):
     """A velocity that is kept alive while the context lasts; `result` tells afterwards how it ended.
 
     It is renewed three times in each time-out, by a thread of its own. A program that hangs or dies renews it no more,
@@ -123,25 +156,10 @@ class Jog:
         velocity: Velocity,
         timeout: float,
     ) -> None:
+        super().__init__(velocity, timeout)
         self._send_goal = send
-        self._velocity = velocity
-        self._timeout = number(timeout, "timeout")
-        self._id = uuid.uuid4().hex[:12]
         self._over = threading.Event()
         self._renewing = threading.Thread(target=self._renew, name="jog", daemon=True)
-        self._goal: GoalHandle | None = None
-        self.error: Exception | None = None
-        """Why it could not be renewed any more."""
-
-    @property
-    def reply(self) -> GoalReply | None:
-        """What the service last said of it, None before it was taken: how much it is `slowed`, for one."""
-        return self._goal.reply if self._goal else None
-
-    @property
-    def result(self) -> Result | None:
-        """How it ended, None while it has not."""
-        return self._goal.result if self._goal else None
 
     def __enter__(self) -> Self:
         self._goal = self._send(self._velocity, self._timeout)
@@ -151,7 +169,7 @@ class Jog:
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._renewing.join()
-        if self._goal is not None and self._goal.result is None and self.error is None:
+        if self._goal is not None and self._moves:
             with contextlib.suppress(TrirailError):  # it has ended, or does by its time-out
                 self._send((0.0, 0.0, 0.0), LETTING_GO)
             self._goal.wait(self._timeout + STANDS_WITHIN)
@@ -164,6 +182,5 @@ class Jog:
             try:
                 self._send(self._velocity, self._timeout)
             except TrirailError as error:
-                at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
-                self.error = None if at_limit else error  # at a limit it has ended as it should
+                self._renewal_failed(error)
                 return

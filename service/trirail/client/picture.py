@@ -13,8 +13,8 @@ from trirail.telemetry import palette
 from trirail.telemetry.palette import Colour
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.state import Info, State
-from trirail.workspace import mechanism
-from trirail.workspace.mechanism import Mechanism
+from trirail.workspace import part_positions
+from trirail.workspace.part_positions import RobotParts
 
 WIDTH = 360
 """Of the drawing [px]."""
@@ -46,26 +46,28 @@ def html(info: Info, state: State) -> str:
 
 def drawing(robot: ShownRobot, state: State) -> str:
     """Return the robot at a state as an SVG picture, x to the right and y upwards."""
-    parts = Mechanism.of(robot.geometry, robot.limits.slider)
-    placed = mechanism.placed(parts.outline, state.pose)
+    parts = RobotParts.of(robot.geometry, robot.limits.slider)
+    placed = part_positions.placed(parts.outline, state.pose)
     everything = np.concatenate([parts.bounds, *placed])
     (left, bottom), (right, top) = everything.min(axis=0), everything.max(axis=0)
     size = max(right - left, top - bottom)
     edge, thin = MARGIN * size, LINE * size
     width, height = right - left + 2.0 * edge, top - bottom + 2.0 * edge
     pose = np.array([state.pose])
-    carriages = mechanism.sliders(robot.geometry, np.array([state.sliders.position]))
-    slides = mechanism.cross_slides(robot.geometry, parts, carriages, pose[:, 2])[0]
-    held = mechanism.pivots(robot.geometry, carriages, pose)[0]
+    carriages = part_positions.sliders(robot.geometry, np.array([state.sliders.position]))
+    slides = part_positions.cross_slides(robot.geometry, parts, carriages, pose[:, 2])[0]
+    held = part_positions.pivots(robot.geometry, carriages, pose)[0]
     colours = palette.SLIDERS
     shapes = [
         *_lines(parts.rails, [palette.FRAME] * 3, 2.0 * thin),
         *_lines(parts.travel, colours, thin),
         *_lines(parts.stops, [palette.LIMIT] * 6, thin),
-        *_lines(mechanism.placed(parts.outline, state.commanded.pose), [palette.COMMANDED] * len(placed), 4.0 * thin),
+        *_lines(
+            part_positions.placed(parts.outline, state.commanded.pose), [palette.COMMANDED] * len(placed), 4.0 * thin
+        ),
         *_lines(list(slides), colours, THICK * size),
         *_lines(placed, [palette.ARMS] * len(placed), 2.0 * thin),
-        *_lines(mechanism.placed(parts.arms, state.pose), [palette.ARMS] * 3, thin),
+        *_lines(part_positions.placed(parts.arms, state.pose), [palette.ARMS] * 3, thin),
         *(_disc(at, THICK * size, colour) for at, colour in zip(carriages[0], colours, strict=True)),
         *(_disc(at, 1.5 * thin, palette.PIN) for at in held),
         _disc(state.pose[:2], 2.5 * thin, palette.CENTRE),

@@ -44,7 +44,7 @@ def built_otherwise(robot: Geometry, rng: np.random.Generator, places: float, an
 
 
 class StageAsBuilt:
-    """The sliders and the table of a robot, from its records: `robot.records(stage.take)`.
+    """The sliders and the table of a robot, from its records: `robot.records(stage.add_records)`.
 
     `built` is the geometry of the stage itself, with its own errors as a correction; `play` is how far each motor turns
     before its slider goes along, where it turns back [m]. Motors begin in the middle of it.
@@ -57,7 +57,7 @@ class StageAsBuilt:
         self._cycles: deque[tuple[float, tuple[float, ...]]] = deque(maxlen=HISTORY)
         self._sliders: np.ndarray[tuple[int], np.dtype[np.float64]] | None = None
 
-    def take(self, batch: bytes) -> None:
+    def add_records(self, batch: bytes) -> None:
         """Take a batch of records."""
         rows = unpack(batch)
         motors = rows["position"]

@@ -22,7 +22,7 @@ from trirail.wire import tls, zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.decoding import decoded
 from trirail.wire.messages import CommandReply, ErrorReply
-from trirail.wire.stop_door import MAX_LINE, StopAddress, StopAnswer, StopRequest, encode, stop_address
+from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopAnswer, StopRequest, encode, stop_address
 
 HEARD_WITHIN: Final = 2.0
 """How long the door may take to let one in before it is tried anew [s]."""

@@ -12,8 +12,8 @@ from trirail_drivers.interface import NAMES
 from trirail import naming
 from trirail.commissioning import configuration
 from trirail.commissioning.bench import INTERRUPTED
-from trirail.commissioning.exchange import merged
 from trirail.commissioning.judgement import Judged
+from trirail.commissioning.node_swaps import merged
 from trirail.commissioning.person import Person, Question, choose
 from trirail.commissioning.report import Keeper
 from trirail.commissioning.session import Done

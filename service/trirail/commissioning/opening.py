@@ -47,7 +47,7 @@ class SimulatedTime:
 
 
 @contextmanager
-def opened(
+def open_steps(
     config: Config,
     faults: Sequence[str],
     person: Person,

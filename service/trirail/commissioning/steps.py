@@ -93,7 +93,7 @@ class Steps:
             return Judged("skipped", (told,)), {}
         changed, turned, slider = 0, 0, f"slider {self.labelled(name)}"
 
-        def look() -> None:
+        def read_switches() -> None:
             nonlocal changed, turned
             self.session.idle()
             turned += 1
@@ -102,13 +102,13 @@ class Steps:
 
         if (press := self._place.press) is None:
             text = f"Press each limit switch and the home switch of {slider} for a second; Enter when that is done"
-            choose(self._person, look, Question(text, "done"), {"done": "all were pressed"})
+            choose(self._person, read_switches, Question(text, "done"), {"done": "all were pressed"})
         else:
             self._person.show(f"  A simulated hand presses the switches of {slider}.")
             for bits in (*SWITCHES, 0):
                 press(NAMES.index(name), bits)
                 for _ in range(round(2.0 * LOOK / bench.period)):
-                    look()
+                    read_switches()
         found = [switch for bit, switch in SWITCHES.items() if changed & bit]
         seen = self._see.yes(f"Seen were: {', '.join(found) or 'none'}. Are those all that {slider} has?")
         return judge_switches(name, rest, changed, seen, self._labels), {"at_rest": rest & 7, "changed": changed & 7}

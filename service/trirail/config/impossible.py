@@ -49,12 +49,12 @@ def mistakes(config: Config, impossible: Sequence[str] = ()) -> tuple[list[Mista
 
     Files that are named are read.
     """
-    from trirail_drivers.connection import checks
+    from trirail_drivers.connection import settings_checks
 
     found: dict[str, Mistake] = {}
     left: dict[str, None] = {}
     wrong = list(impossible)
-    for rule in itertools.chain(rules(config), checks.files(config.drives)):
+    for rule in itertools.chain(rules(config), settings_checks.files(config.drives)):
         if overlap((rule.key, *rule.reads), wrong):
             left[rule.key] = None
             continue
@@ -69,7 +69,7 @@ def mistakes(config: Config, impossible: Sequence[str] = ()) -> tuple[list[Mista
 
 def rules(config: Config) -> Iterator[Rule]:
     """Yield every check of what is well-formed; a later one takes for granted what the earlier ones refuse."""
-    from trirail_drivers.connection import checks
+    from trirail_drivers.connection import settings_checks
 
     platform, slider = config.limits.platform, config.limits.slider
     ranges = {
@@ -93,8 +93,8 @@ def rules(config: Config) -> Iterator[Rule]:
     for name in config.poses:
         yield Rule(f"poses.{name}", ("geometry", "correction", *ranges), partial(_check_pose, config, name))
     yield Rule("loop.rate_hz", (), partial(_check_rate, config))
-    yield from checks.bus_rules(config.can)
-    yield from checks.rules(config.drives, _required(config))
+    yield from settings_checks.bus_rules(config.can)
+    yield from settings_checks.rules(config.drives, _required(config))
 
 
 def _check_range(key: str, low: float, high: float) -> None:

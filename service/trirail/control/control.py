@@ -200,7 +200,7 @@ class Control:
             drive, cause, code, message = feedback.fault
             if mode is Mode.FAULT and feedback.fault != before.fault:
                 # The first one stays, but this came of it.
-                self.ledger.tell("fault", "error", message, fault=FaultDetail(cause, drive, code))
+                self.ledger.announce("fault", "error", message, fault=FaultDetail(cause, drive, code))
             self.modes.trip(message, cause, drive, code)
         elif mode is Mode.ENABLING:
             self._power_up()
@@ -219,7 +219,7 @@ class Control:
     def _tell_warnings(self, feedback: Feedback) -> None:
         """Tell what people should know of the drives: they say it in one feedback only, some in the first."""
         for warning in feedback.warnings:
-            self.ledger.tell("service", "warning", warning)
+            self.ledger.announce("service", "warning", warning)
 
     def solve(self) -> None:
         """Move the commanded motion on by one period, solve the sliders by the paper's recursion, pass the last gate.
@@ -304,14 +304,14 @@ class Control:
             elif isinstance(request, CommandRequest):
                 self._commands.carry_out(request)
             elif isinstance(request, PoseChanged):
-                self.ledger.tell("pose", "info", request.message, user=request.user)
+                self.ledger.announce("pose", "info", request.message, user=request.user)
             elif isinstance(request, Looked):
                 look, words = request.look, request.message
-                self.ledger.tell("alignment", request.level, words, user=request.user, alignment=look)
+                self.ledger.announce("alignment", request.level, words, user=request.user, alignment=look)
             elif isinstance(request, Remark):
-                self.ledger.tell("service", request.level, request.message)
+                self.ledger.announce("service", request.level, request.message)
             else:
-                self.ledger.tell("refused", "warning", request.message, user=request.user)
+                self.ledger.announce("refused", "warning", request.message, user=request.user)
         except RefusedError as refusal:
             self.ledger.refuse(request, refusal)
 

@@ -26,7 +26,8 @@ from trirail_drivers.interface import PowerState
 from trirail.control.backlash import BACKLASH, add_offset, due_offset, keep_offset, let_go, taking_up
 from trirail.control.in_position import MONITOR, monitor
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.closure import forward_into, inverse_motion
+from trirail.kinematics.closed_forward import forward_into
+from trirail.kinematics.closure import inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.limits import BOUNDS, gate

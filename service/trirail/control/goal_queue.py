@@ -216,7 +216,7 @@ class GoalQueue:
         """Tell everyone, once until it has said something, that a goal waits for a planner that is busy."""
         busy = self._planner.how_busy
         if busy and not self._told_busy:
-            self._ledger.tell("service", "warning", f"{busy}: goal {request.id} waits", user=request.user)
+            self._ledger.announce("service", "warning", f"{busy}: goal {request.id} waits", user=request.user)
         self._told_busy = bool(busy)
 
     def _check_age(self, sent: _Sent, cycle: int) -> None:

@@ -165,7 +165,7 @@ class Ledger:
         goal, told = request.goal, self.goals[0]
         if goal.target is not None and taken.bound not in (None, told.bound):
             text = f"the target of goal {told.id} is beyond the limit of {taken.bound}: the robot waits there"
-            self.tell("service", "warning", text, user=told.user)
+            self.announce("service", "warning", text, user=told.user)
         bound = taken.bound or (told.bound if goal.target is not None else None)  # a limit is told of once
         self.goals[0] = told._replace(bound=bound, target=goal.target, lag=taken.lag)
 
@@ -209,18 +209,18 @@ class Ledger:
         text = str(refusal)
         self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))
         if isinstance(request, CommandRequest):
-            self.tell("refused", "warning", f"{request.name} refused: {text}", user=request.user)
+            self.announce("refused", "warning", f"{request.name} refused: {text}", user=request.user)
             return
         if request.goal.frequent:
             before, self._refused = self._refused, (request.id, refusal.code)
             if before == self._refused:
                 return
         if refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT, RefusalCode.JOG_OVER):
-            self.tell("refused", "warning", text, user=request.user)
+            self.announce("refused", "warning", text, user=request.user)
         else:
             outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
             if self.renewed_by(request):
-                self.tell("refused", "warning", text, user=request.user)
+                self.announce("refused", "warning", text, user=request.user)
                 if not request.goal.frequent:  # whoever asked for that is not to have the old one either
                     self.keep_alive(request, -math.inf)
             else:
@@ -284,7 +284,7 @@ class Ledger:
 
     # ------------------------------------------------------------------ everyone
 
-    def tell(
+    def announce(
         self,
         kind: str,
         level: Level,

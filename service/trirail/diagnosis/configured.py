@@ -8,10 +8,16 @@ from pathlib import Path
 from trirail_drivers.errors import shortened
 
 from trirail.config import Config, Mistake, overlap
-from trirail.diagnosis import bench, drives, limits, stopping, times
+from trirail.diagnosis import contradictions, dial_gauge, drive_checks, stopping, times
 from trirail.diagnosis.check import Check
 
-JUDGEMENTS = (*bench.JUDGEMENTS, *stopping.JUDGEMENTS, *limits.JUDGEMENTS, *times.JUDGEMENTS, *drives.JUDGEMENTS)
+JUDGEMENTS = (
+    *dial_gauge.JUDGEMENTS,
+    *stopping.JUDGEMENTS,
+    *contradictions.JUDGEMENTS,
+    *times.JUDGEMENTS,
+    *drive_checks.JUDGEMENTS,
+)
 
 
 def diagnose(config: Config, impossible: Sequence[str] = ()) -> list[Check]:

@@ -16,17 +16,6 @@ from trirail.kinematics.loops import SlideLine
 from trirail.kinematics.mechanism import beta, close, demand, line, move
 from trirail.kinematics.recursion import ZERO
 
-__all__ = [
-    "J2_SINGULAR",
-    "LEGS_TYPE",
-    "LOOPS_OPEN",
-    "ROUNDING",
-    "forward_batch",
-    "forward_into",
-    "forward_motion",
-    "loop_equation",
-]
-
 ROUNDING = 1e-15  # part of the squares whose difference is (det J2)² that their rounding can make up
 LOOPS_OPEN, J2_SINGULAR = 4, 5  # codes of forward_into; 1 to 3 are the legs'
 LEGS_TYPE = "Array(f8, 3, 'C', readonly=True)"  # numba's name for what Geometry.packed() returns

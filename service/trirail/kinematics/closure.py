@@ -9,36 +9,12 @@ import math
 
 from trirail.kinematics.algebra import times
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.closed_forward import (
-    J2_SINGULAR,
-    LEGS_TYPE,
-    LOOPS_OPEN,
-    ROUNDING,
-    forward_batch,
-    forward_into,
-    forward_motion,
-    loop_equation,
-)
+from trirail.kinematics.closed_forward import LEGS_TYPE
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.corrected import corrected_motion, is_corrected
 from trirail.kinematics.leg import PARALLEL
 from trirail.kinematics.mechanism import beta, close, move
 from trirail.kinematics.recursion import ZERO
-
-__all__ = [
-    "J2_SINGULAR",
-    "LEGS_TYPE",
-    "LOOPS_OPEN",
-    "ROUNDING",
-    "forward_batch",
-    "forward_into",
-    "forward_motion",
-    "inverse_batch",
-    "inverse_into",
-    "inverse_motion",
-    "jacobians_batch",
-    "loop_equation",
-]
 
 UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 

@@ -15,17 +15,15 @@ from numpy.typing import ArrayLike
 
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.closure import (
+from trirail.kinematics.closed_forward import (
     J2_SINGULAR,
     LOOPS_OPEN,
     ROUNDING,
     forward_batch,
     forward_into,
-    inverse_batch,
-    inverse_into,
-    jacobians_batch,
     loop_equation,
 )
+from trirail.kinematics.closure import inverse_batch, inverse_into, jacobians_batch
 from trirail.kinematics.geometry import LEGS, PARALLEL, Geometry
 from trirail.quantities import apart, worded
 

@@ -32,7 +32,7 @@ PLATFORM_LAWS = (0.997, 0.99, 0.985)
 ROUNDED = 1.0 + 1e-6
 """How many times more than its share a path or law may take, by rounding."""
 SUBJECTS = ("a slider", *(f"the platform's {name}" for name in (*COORDINATES, "centre in x", "centre in y")))
-"""What the rows of Look.worst are of. The centre has its own where a path is that of another point: limits hold for
+"""What the rows of Sampled.worst are of. The centre has its own where a path is that of another point: limits hold for
 both."""
 GAP = 0.005
 """Between moments at which a path is looked at, besides its knots [s]: where its rate changes as well, an acceleration
@@ -46,7 +46,7 @@ LONGEST = 600.0
 """No path is looked at for longer [s]."""
 
 
-class Look(NamedTuple):
+class Sampled(NamedTuple):
     """What was found along a path."""
 
     worst: Array
@@ -128,8 +128,8 @@ class Checker:
         self._period = period
         self._box = np.array([platform.x, platform.y, platform.phi, *slider.positions, *[slider.passive] * 3]).T.copy()
 
-    def look(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Look:
-        """Look at a path under a law from one time of the law to another [s], from near a pose on.
+    def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Sampled:
+        """Sample a path under a law from one time of the law to another [s], from near a pose on.
 
         It gives a sign of life: each loop of the planner's looks at a path in each of its turns.
         """
@@ -145,17 +145,17 @@ class Checker:
         )
         worst /= self._planned
         within_limits = math.isnan(leaves_at) and self.bears(worst) and not falls(*law[:2])
-        return Look(worst, within_limits, leaves_at)
+        return Sampled(worst, within_limits, leaves_at)
 
     def bears(self, worst: Array) -> bool:
         """Whether sliders and platform can bear a motion of such shares, with what is kept for changes of rate."""
         return bool((worst <= self._laws).all())
 
     def whole(self, path: Path, pose: Sequence[float]) -> Array:
-        """Return Look.worst of a whole path. Raises RefusedError where it leaves the workspace."""
+        """Return Sampled.worst of a whole path. Raises RefusedError where it leaves the workspace."""
         law, worst = constant(1.0), np.zeros((len(SUBJECTS), 3))
         for first, until in parts(path, law, 0.0, path.duration, KNOTS_A_PART):
-            found = self.look(path, law, first, until, pose)
+            found = self.sample(path, law, first, until, pose)
             if not math.isnan(found.leaves_at):
                 raise self.refusal(path, found.leaves_at, pose)
             np.maximum(worst, found.worst, out=worst)

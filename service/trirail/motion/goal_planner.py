@@ -199,4 +199,4 @@ class GoalPlanner:
         last = longer.reaches(longer.path.duration)
         if not math.isfinite(last):  # it is to stop before: it will go on at full speed at most, or be looked at anew
             law, first, last = constant(1.0), s, longer.path.duration
-        return self._checker.look(longer.path, law, first, last, nominal(run.path, s).pose).within_limits
+        return self._checker.sample(longer.path, law, first, last, nominal(run.path, s).pose).within_limits

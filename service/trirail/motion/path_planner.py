@@ -166,7 +166,7 @@ class PathPlanner:
                 share = limit / abs(value)
         for _ in range(JOGS):
             ramp, brake, path = self._jog(start, [share * value for value in velocity], hold)
-            found = self.checker.look(path, constant(1.0), 0.0, path.duration, start.pose)
+            found = self.checker.sample(path, constant(1.0), 0.0, path.duration, start.pose)
             if found.fits or (found.within_limits and not start.at_rest):
                 return Plan(path, 1.0 / share, bound)
             if math.isnan(found.leaves_at):

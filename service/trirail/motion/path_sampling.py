@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.closure import LEGS_TYPE, inverse_motion
+from trirail.kinematics.closed_forward import LEGS_TYPE
+from trirail.kinematics.closure import inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.motion.paths import HALVINGS, ROUNDING, law_at, platform_at, reached, tool_at, transfer
 

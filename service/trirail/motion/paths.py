@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trirail.kinematics.arrays import Array, Vector
-from trirail.kinematics.closure import LEGS_TYPE, forward_motion
+from trirail.kinematics.closed_forward import LEGS_TYPE, forward_motion
 from trirail.kinematics.compiled import compiled
 
 __all__ = [

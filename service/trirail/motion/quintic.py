@@ -78,7 +78,7 @@ def _filled(given: Sequence[Sequence[float] | None], t: Array, values: Array) ->
 def check_ends(points: Sequence[Point], start: MotionState) -> None:
     """Raise RefusedError where points do not begin as the robot stands, or do not end at rest.
 
-    What they begin or end with of an acceleration counts as the jerk over one cycle that it is (Checker.look).
+    What they begin or end with of an acceleration counts as the jerk over one cycle that it is (Checker.sample).
     """
     if not start.at_rest:
         raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it stands")

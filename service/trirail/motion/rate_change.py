@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail.motion.feasibility import SUBJECTS, Look, parts
+from trirail.motion.feasibility import SUBJECTS, Sampled, parts
 from trirail.motion.paths import Path, constant
 from trirail.motion.runs import Run, arrival
 from trirail.motion.schedule import Schedule
@@ -108,12 +108,14 @@ class RateChange:
         """Look at one part of the rest of the path, for the greatest rate at which it can be taken."""
         if self._unbounded:
             first, until = self._unbounded.pop()
-            found = self._scaling.look(run.path, constant(1.0, self._from), first, until, self._schedule.commanded.pose)
+            found = self._scaling.sample(
+                run.path, constant(1.0, self._from), first, until, self._schedule.commanded.pose
+            )
             np.maximum(found.worst, self._worst, out=self._worst)
             if not math.isnan(found.leaves_at):
                 self._leaves_at = found.leaves_at
         if not self._unbounded:
-            self._possible = greatest(self.rate, Look(self._worst, False, self._leaves_at))
+            self._possible = greatest(self.rate, Sampled(self._worst, False, self._leaves_at))
             self._unbounded = None
 
     def _try(self, run: Run) -> None:
@@ -129,7 +131,7 @@ class RateChange:
             return
         if candidate.ahead:
             first, until = candidate.ahead.pop()
-            found = self._scaling.look(run.path, candidate.law, first, until, self._schedule.commanded.pose)
+            found = self._scaling.sample(run.path, candidate.law, first, until, self._schedule.commanded.pose)
             if not found.within_limits:
                 self._go_on_trying()
                 return

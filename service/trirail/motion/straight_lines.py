@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.closure import LEGS_TYPE, forward_motion, inverse_motion
+from trirail.kinematics.closed_forward import LEGS_TYPE, forward_motion
+from trirail.kinematics.closure import inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.recursion import ZERO
 from trirail.motion.paths import ROUNDING, Path, law_at, transfer

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
 from trirail.kinematics.geometry import Geometry
-from trirail.motion.feasibility import Checker, Look
+from trirail.motion.feasibility import Checker, Sampled
 from trirail.motion.paths import Path, constant, falls
 from trirail.motion.ruckig_call import solved
 from trirail.motion.runs import Rate, Run, arrival, law_from_ruckig
@@ -39,13 +39,13 @@ class TimeScaling:
 
     def possible(self, path: Path, rate: float, pose: Sequence[float]) -> float:
         """Return the rate, or the greatest at which sliders and platform can take a whole path."""
-        return rate if rate <= 1.0 else greatest(rate, self.look(path, constant(1.0), 0.0, path.duration, pose))
+        return rate if rate <= 1.0 else greatest(rate, self.sample(path, constant(1.0), 0.0, path.duration, pose))
 
     def stop(self, run: Run, pose: Sequence[float], shares: Sequence[float]) -> Path | None:
         """Return the law of a stop, from where a run is: the first of some shares of the quickest that fits, if any."""
         for share in shares:
             law = self.ramp(run.at, 0.0, share)
-            if law is not None and self.look(run.path, law, 0.0, self.until(run, law, 0.0), pose).within_limits:
+            if law is not None and self.sample(run.path, law, 0.0, self.until(run, law, 0.0), pose).within_limits:
                 return law
         return None
 
@@ -53,9 +53,9 @@ class TimeScaling:
         """Return until when a law is to be looked at that leads a run to a rate [s]: after that nothing is new."""
         return min(arrival(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
 
-    def look(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Look:
-        """Look at a path under a law: Checker.look."""
-        return self._checker.look(path, law, first, until, pose)
+    def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Sampled:
+        """Sample a path under a law: Checker.sample."""
+        return self._checker.sample(path, law, first, until, pose)
 
     def ramp(self, at: Rate, rate: float, share: float) -> Path | None:
         """Return the law from one rate to another, at a share of the quickest change; None without one.
@@ -75,7 +75,7 @@ class TimeScaling:
         return None if falls(law.knots, law.pieces) else law
 
 
-def greatest(rate: float, found: Look) -> float:
+def greatest(rate: float, found: Sampled) -> float:
     """Return the rate, or the greatest one that a path bears that has been looked at at its nominal rate.
 
     Every path fits at one: above that there is only what makes it slower than its limits.

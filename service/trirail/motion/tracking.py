@@ -16,7 +16,7 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
 from trirail.errors import RefusedError
 from trirail.kinematics.arrays import Array
-from trirail.motion.feasibility import Look
+from trirail.motion.feasibility import Sampled
 from trirail.motion.path_planner import GENTLEST, ROOM, TOO_FAST_IN_MOTION, PathPlanner, Plan
 from trirail.motion.paths import Path, constant
 from trirail.motion.quintic import Point, between
@@ -127,7 +127,7 @@ class Tracker:
 
     def _until(
         self, start: MotionState, meeting: Path, velocity: Sequence[float], hold: float
-    ) -> tuple[Path, Look, str | None]:
+    ) -> tuple[Path, Sampled, str | None]:
         """Return the way to a target and on with it up to a time, then to rest, and what was found along it.
 
         Where it would lead out of the workspace behind the target it brakes before that; then the bound is named.
@@ -136,7 +136,7 @@ class Tracker:
         for _ in range(SHORTER + 1):
             brake = self._planner.to_velocity(nominal(way, until), STILL)
             path = joined([cut(way, until), brake])
-            found = self._checker.look(path, constant(1.0), 0.0, path.duration, start.pose)
+            found = self._checker.sample(path, constant(1.0), 0.0, path.duration, start.pose)
             if math.isnan(found.leaves_at) or found.leaves_at <= max(meeting.duration, brake.duration):
                 break
             bound = self._checker.bound(path, found.leaves_at, start.pose)

@@ -15,7 +15,7 @@ from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.sizes import MAX_MESSAGE
 from trirail.wire.state import Info
 from trirail.wire.vocabulary import Role
-from trirail.workspace.mechanism import Mechanism
+from trirail.workspace.part_positions import RobotParts
 
 STAGE = 0.05
 """Whose platform goes no further along x [m] is a stage, of which tenths of a micrometre matter."""
@@ -33,7 +33,7 @@ def shown(info: Info) -> ShownRobot:
 
 def describe(info: Info, robot: ShownRobot, user: str, role: Role | None) -> dict[str, Any]:
     """Return what a tab must know, ready to be encoded, whose user has a role."""
-    parts = Mechanism.of(robot.geometry, robot.limits.slider)
+    parts = RobotParts.of(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform
     return {
         "tell": "robot",

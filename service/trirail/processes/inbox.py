@@ -17,7 +17,7 @@ from trirail.processes.incoming import Incoming, Kind
 from trirail.processes.stop_door import Answer
 from trirail.wire import zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_UNREAD
-from trirail.wire.stop_door import MAX_LINE, STOPS, StopRequest
+from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopRequest
 from trirail.wire.text import is_id
 
 UNREAD = 8192

@@ -24,8 +24,9 @@ from trirail_drivers.driver.cyclic import MOST_FRAMES
 from trirail.control import cycle
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
+from trirail.processes.bus_calls import memcpy, receive_frames, send_frames
 from trirail.processes.clock import DOORS, SPARE_NS, called, now_ns, sleep, wait
-from trirail.processes.exchange import (
+from trirail.processes.cycle_frames import (
     AXES,
     EXPECTATIONS,
     FRAMES,
@@ -37,7 +38,6 @@ from trirail.processes.exchange import (
     take_frames,
 )
 from trirail.processes.heartbeats import HASTE
-from trirail.processes.packet_calls import memcpy, receive_frames, send_frames
 from trirail.wire.records import LONGEST, Part
 
 __all__ = ["COMMAND", "FOLLOW", "HOLD", "STATE", "Reached", "run"]
@@ -214,7 +214,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     """Run cycles; return how far the newest has come: Reached.
 
     `kept` (n, 3) are addresses and sizes of all that a cycle changes, and of copies of it; `moment` (2,) room for a
-    struct timespec, `bus` (3,) a trirail_drivers.bus.packets.BusAccess, `doors` (n, 2) as poll takes them, the
+    struct timespec, `bus` (3,) a BusAccess, `doors` (n, 2) as poll takes them, the
     gateway's first, `hearts` the counters of trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made`
     (SIZE,) the bytes of `record`. All else as in control.cycle and exchange.
     """

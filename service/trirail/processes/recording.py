@@ -108,8 +108,8 @@ class Intake:
                 recorder.event(event)
                 box.event(event)
             case ControlInput():
-                recorder.given(said)
-                box.given(said)
+                recorder.control_input(said)
+                box.control_input(said)
             case Status():
                 standing = Standing(said.goal, said.target, said.override, said.fault)
                 recorder.stands(standing)

@@ -166,7 +166,7 @@ class Reports:
         if self._recorder.take_lost() and self._recorded:
             self._recorded = False
             self._unrecorded = "the recorder has gone: nothing is recorded until it is back"
-            self._control.ledger.tell("service", "warning", self._unrecorded)
+            self._control.ledger.announce("service", "warning", self._unrecorded)
             self._publish_status()
         if packet is None:
             return
@@ -175,10 +175,10 @@ class Reports:
         try:
             said = decode_recorder(memoryview(packet)[1:])
         except msgspec.DecodeError as error:  # the recorder must not be able to stop the robot
-            self._control.ledger.tell("service", "warning", f"the recorder said something unreadable: {error}")
+            self._control.ledger.announce("service", "warning", f"the recorder said something unreadable: {error}")
             return
         if isinstance(said, Remark):
-            self._control.ledger.tell("service", said.level, said.message)
+            self._control.ledger.announce("service", said.level, said.message)
         else:
             self._unrecorded = quoted(said.why) if said.why else ""
         self._publish_status()

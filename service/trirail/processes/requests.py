@@ -17,18 +17,18 @@ import msgspec
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.backlog import Backlog
-from trirail.processes.guard import Guard
 from trirail.processes.inbox import Inbox
 from trirail.processes.incoming import Incoming
 from trirail.processes.loop_death import LoopDeath
 from trirail.processes.publications import StateMaker
 from trirail.processes.replies import Replies
+from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Goal
 from trirail.wire.links import PacketLink
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.packets import CommandRequest, GoalRequest, message
-from trirail.wire.stop_door import STOPS
+from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
 

@@ -7,7 +7,7 @@ import struct
 from pathlib import Path
 from typing import Any
 
-from trirail.wire.stop_door import StopAddress
+from trirail.wire.stop_protocol import StopAddress
 
 SOCKET_MODE = 0o660
 """Of a Unix socket: its owner and its group may connect, which takes the right to write; nobody else."""

@@ -27,7 +27,7 @@ from trirail.processes.stop_addresses import listen, source
 from trirail.wire import tls
 from trirail.wire.decoding import decoded
 from trirail.wire.messages import CommandReply, ErrorReply
-from trirail.wire.stop_door import MAX_LINE, StopAddress, StopRequest, answer_with
+from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopRequest, answer_with
 from trirail.wire.text import quoted
 
 PLACES: Final = 4096

@@ -85,7 +85,7 @@ class BlackBox:
         if event.kind == "fault":
             self._faults.append(event)
 
-    def given(self, what: ControlInput) -> None:
+    def control_input(self, what: ControlInput) -> None:
         """Take what the control was given."""
         self._keep_packed(what)
 
@@ -147,4 +147,4 @@ def _say(recorder: Recorder, packed: bytes) -> None:
         case Happened(event):
             recorder.event(event)
         case ControlInput() as what:
-            recorder.given(what)
+            recorder.control_input(what)

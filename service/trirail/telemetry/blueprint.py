@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 
 from trirail.telemetry import curves, journal, readout, shown_alignment
 from trirail.telemetry.shown_robot import ShownRobot
-from trirail.workspace.mechanism import Points
+from trirail.workspace.part_positions import Points
 
 WINDOW = 8.0
 """How much of the past the plots show [s]."""

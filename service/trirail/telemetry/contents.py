@@ -75,7 +75,7 @@ class Contents(msgspec.Struct):
         if event.kind == "fault":
             self.faults.append(FaultEntry(event.time, event.fault or FaultDetail(""), event.message))
 
-    def given(self, what: ControlInput) -> None:
+    def control_input(self, what: ControlInput) -> None:
         """Take what the control was given."""
         match what.given:
             case GoalRequest(user=user) | CommandRequest(user=user) | RefusedRequest(user=user) | Looked(user=user) if (
@@ -104,7 +104,7 @@ def of_file(path: Path) -> Contents:
         if line.event is not None:
             found.event(line.event)
     for what in recording.requests:
-        found.given(what)
+        found.control_input(what)
     if path.name.startswith(BLACK_BOX):
         found.reason = _reason(found)
     return found

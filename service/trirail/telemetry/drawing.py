@@ -14,8 +14,8 @@ from trirail.naming import Labels
 from trirail.telemetry import columns, palette
 from trirail.telemetry.columns import Column
 from trirail.telemetry.palette import Colour
-from trirail.workspace import mechanism
-from trirail.workspace.mechanism import Mechanism, Points
+from trirail.workspace import part_positions
+from trirail.workspace.part_positions import Points, RobotParts
 
 ORIGIN = 0.02
 """Arms of the cross at the base frame's origin, as a share of the robot's size."""
@@ -26,7 +26,7 @@ QUATERNION = rr.Transform3D.descriptor_quaternion()
 _CROSS = (np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]]))
 
 
-def still(parts: Mechanism, frames: FramesTable, names: Labels) -> Iterator[tuple[str, rr.AsComponents]]:
+def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tuple[str, rr.AsComponents]]:
     """Yield what is logged once, as static: entity path and archetype."""
     yield "/robot", rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # 2D views have y downwards
     yield "/robot/rails", _lines(parts.rails, [palette.FRAME], 4.5, order=10)
@@ -93,11 +93,11 @@ def still(parts: Mechanism, frames: FramesTable, names: Labels) -> Iterator[tupl
     )
 
 
-def moving(geometry: Geometry, parts: Mechanism, before: NDArray[np.void], records: NDArray[np.void]) -> list[Column]:
+def moving(geometry: Geometry, parts: RobotParts, before: NDArray[np.void], records: NDArray[np.void]) -> list[Column]:
     """Return where the moving parts are in `records`, (N,), and the trace of the centre there from `before`."""
-    sliders = mechanism.sliders(geometry, records["position"])
-    crossing = mechanism.cross_slides(geometry, parts, sliders, records["pose"][:, 2])
-    pivots = mechanism.pivots(geometry, sliders, records["pose"])
+    sliders = part_positions.sliders(geometry, records["position"])
+    crossing = part_positions.cross_slides(geometry, parts, sliders, records["pose"][:, 2])
+    pivots = part_positions.pivots(geometry, sliders, records["pose"])
     steps = np.stack([before["pose"][:, :2], records["pose"][:, :2]], axis=1)[:, None]
     return [
         *_placed("/robot/platform", records["pose"]),
@@ -108,12 +108,12 @@ def moving(geometry: Geometry, parts: Mechanism, before: NDArray[np.void], recor
     ]
 
 
-def goal(parts: Mechanism, pose: Sequence[float] | None) -> Column:
+def goal(parts: RobotParts, pose: Sequence[float] | None) -> Column:
     """Return the platform where the goal leads it, with a cross at its centre; nothing without a goal."""
     if pose is None:
         return Column("/robot/goal", STRIPS, columns.ragged([[]]))
     cross = [axis * ORIGIN * np.ptp(parts.bounds) for axis in _CROSS]
-    return Column("/robot/goal", STRIPS, columns.ragged([mechanism.placed([*parts.outline, *cross], pose)]))
+    return Column("/robot/goal", STRIPS, columns.ragged([part_positions.placed([*parts.outline, *cross], pose)]))
 
 
 def _named(frames: FramesTable, size: float) -> Iterator[tuple[str, rr.AsComponents]]:
@@ -131,7 +131,7 @@ def _named(frames: FramesTable, size: float) -> Iterator[tuple[str, rr.AsCompone
             ),
         )
     for name, frame in frames.work.items():
-        axes = mechanism.placed([np.array([[0.0, 0.0], [size, 0.0]]), np.array([[0.0, 0.0], [0.0, size]])], frame)
+        axes = part_positions.placed([np.array([[0.0, 0.0], [size, 0.0]]), np.array([[0.0, 0.0], [0.0, size]])], frame)
         yield (
             f"/robot/frames/{name}",
             rr.LineStrips2D(

@@ -58,7 +58,7 @@ def said(event: Event) -> Entry:
     return Entry(EVENTS, event.t, event.time, event.message, event.level, event)
 
 
-def given(what: ControlInput, rate_hz: int, wall_offset_ns: int) -> Entry:
+def control_input(what: ControlInput, rate_hz: int, wall_offset_ns: int) -> Entry:
     """Return what the control was given, at the nominal time of its cycle."""
     wall = (what.now_ns + wall_offset_ns) / SECOND
     return Entry(REQUESTS, what.cycle / rate_hz, wall, _words(what), message=what)

@@ -110,9 +110,9 @@ class Recording(NamedTuple):
         Of the rows of such a time the first is taken, none is a mean. Requests are kept, for who looks up a goal.
         Raises ServiceError where nothing is left, or there is no such goal.
         """
-        from trirail.telemetry import tables
+        from trirail.telemetry import recording_table
 
-        return tables.part(self, begin, end, goal=goal, every=every)
+        return recording_table.part(self, begin, end, goal=goal, every=every)
 
     @property
     def alignments(self) -> list[RecordedAlignment]:
@@ -127,9 +127,9 @@ class Recording(NamedTuple):
         SI units and radians; `columns` are names of fields, or words of names, as pose or error: all if absent. A
         pose's numbers end in _x, _y, _phi, those of sliders in _a, _b, _c. Raises ServiceError where a column is none.
         """
-        from trirail.telemetry import tables
+        from trirail.telemetry import recording_table
 
-        return tables.frame(self, every, columns)
+        return recording_table.frame(self, every, columns)
 
 
 def read(path: Path) -> Recording:
@@ -213,7 +213,7 @@ def _whole(path: Path, *, growing: bool = False) -> Iterator[Path]:
 
 def _whole_length(path: Path) -> int:
     """Return how many bytes of a file end with a whole message; all of a file that was closed."""
-    with files.opened(path) as file:
+    with files.open_regular(path) as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise ServiceError(f"{path}: not a recording: an RRD file begins with {_MAGIC.decode()}")
         size, end = os.fstat(file.fileno()).st_size, _FILE_HEADER

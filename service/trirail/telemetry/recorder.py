@@ -175,11 +175,11 @@ class Recorder:
         if self._contents is not None:
             self._contents.event(event)
 
-    def given(self, what: ControlInput) -> None:
+    def control_input(self, what: ControlInput) -> None:
         """Take what the control was given."""
-        self._streams.given(what)
+        self._streams.control_input(what)
         if self._contents is not None:
-            self._contents.given(what)
+            self._contents.control_input(what)
 
     def stands(self, standing: Standing) -> None:
         """Take what holds from now on and records do not say."""

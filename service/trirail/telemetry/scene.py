@@ -20,7 +20,7 @@ from trirail.telemetry.columns import FIELDS, RECORD, Column
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.vocabulary import MODES
-from trirail.workspace.mechanism import Mechanism
+from trirail.workspace.part_positions import RobotParts
 from trirail.workspace.reach import Reach
 
 DRAWN_HZ = 100
@@ -41,7 +41,7 @@ class Scene:
         self._rate_hz = robot.rate_hz
         self._timelines = columns.Timelines(self._rate_hz, wall_offset_ns)
         self._geometry, self._frames = robot.geometry, robot.frames
-        self._parts = Mechanism.of(robot.geometry, robot.limits.slider)
+        self._parts = RobotParts.of(robot.geometry, robot.limits.slider)
         self._reach = Reach(robot.geometry, robot.limits)
         self._plots = curves.plots(robot)
         self.bounds = self._parts.bounds

@@ -113,11 +113,11 @@ class SessionIndex:
         known: set[str] = set()
         running: set[str] = set()
 
-        def look(index: sqlite3.Connection) -> None:
+        def note_names(index: sqlite3.Connection) -> None:
             for name, runs in index.execute("SELECT name, running FROM recording"):
                 (running if runs else known).add(name)
 
-        self._do(look)
+        self._do(note_names)
         there = {path.name: path for path in self._folder.glob("*.rrd")}
         if gone := (known | running) - set(there):
             self.forget(gone)
@@ -135,24 +135,24 @@ class SessionIndex:
         """Return the sessions that are wanted, in the order in which they began."""
         found: dict[str, RecordedSession] = {}
 
-        def look(index: sqlite3.Connection) -> None:
+        def select_sessions(index: sqlite3.Connection) -> None:
             found.clear()
             found.update(_sessions(index, wanted))
 
-        if self._do(look):
+        if self._do(select_sessions):
             for _ in self.update():  # it was thrown away: all of it is to be read again
                 pass
-            self._do(look)
+            self._do(select_sessions)
         return list(found.values())
 
     def faults(self) -> list[str]:
         """Return every fault that is recorded, by cause and code, each once."""
         found: list[str] = []
 
-        def look(index: sqlite3.Connection) -> None:
+        def select_faults(index: sqlite3.Connection) -> None:
             found.extend(said for (said,) in index.execute(f"SELECT DISTINCT {_CAUSE} FROM fault ORDER BY cause, code"))
 
-        self._do(look)
+        self._do(select_faults)
         return found
 
     def _do(self, what: Callable[[sqlite3.Connection], object]) -> bool:

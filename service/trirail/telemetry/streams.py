@@ -118,9 +118,9 @@ class Streams:
         if event.alignment is not None:
             self._waiting += self._alignment.drawing_of(event, event.alignment)
 
-    def given(self, what: ControlInput) -> None:
+    def control_input(self, what: ControlInput) -> None:
         """Take what the control was given."""
-        self._entries.append(journal.given(what, self._rate_hz, self._wall_offset_ns))
+        self._entries.append(journal.control_input(what, self._rate_hz, self._wall_offset_ns))
 
     def say(self, level: Level, message: str) -> None:
         """Write a line of the log at the time of the newest record."""

@@ -19,7 +19,7 @@ from trirail.config import Limits
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
 from trirail.workspace.aspect import range_of_phi
-from trirail.workspace.mechanism import Mechanism
+from trirail.workspace.part_positions import RobotParts
 from trirail.workspace.singularity import conditioning
 from trirail.workspace.workspace import Extent, area, permitted, reachable
 
@@ -50,7 +50,7 @@ def draw(
     figure.suptitle(title, x=0.008, ha="left", color=INK, fontsize=16, fontweight="bold")
     slices, below = figure.subfigures(2, 1, height_ratios=[height, STRIP])  # type: ignore[misc]
     panels = slices.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    parts = Mechanism.of(geometry, limits.slider)
+    parts = RobotParts.of(geometry, limits.slider)
     for panel, phi in zip(panels.flat, angles, strict=False):
         _slice(panel, geometry, limits, parts, phi)
     for panel in panels.flat[len(angles) :]:
@@ -71,7 +71,7 @@ def draw(
     figure.savefig(file)
 
 
-def _slice(panel: Axes, geometry: Geometry, limits: Limits, parts: Mechanism, phi: float) -> None:
+def _slice(panel: Axes, geometry: Geometry, limits: Limits, parts: RobotParts, phi: float) -> None:
     """Draw the slice at one angle, with the rails and the platform as it is turned at the origin."""
     for rail in parts.rails:
         panel.plot(*(MM * rail.T), color=RAIL, linewidth=4.0, solid_capstyle="round", zorder=1)

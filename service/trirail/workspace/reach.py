@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from trirail.config import Limits
 from trirail.kinematics.geometry import Geometry, singular_angles
-from trirail.workspace.mechanism import Points
+from trirail.workspace.part_positions import Points
 from trirail.workspace.workspace import permitted
 
 ANGLE = math.radians(0.5)

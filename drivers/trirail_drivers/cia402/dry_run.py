@@ -8,7 +8,7 @@ from trirail_drivers.cia402.objects import MODE, MODE_DISPLAY, Key
 from trirail_drivers.cia402.sdo import Remote, shown
 
 
-class Rehearsal(Remote):
+class DryRun(Remote):
     """A drive's object dictionary that nothing is written to; where it `asks`, the drive says whether it would take it.
 
     What is written is read back as if the drive held it. What a drive says of a value itself, it says only when it

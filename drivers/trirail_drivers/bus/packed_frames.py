@@ -22,7 +22,7 @@ class BusAccess(NamedTuple):
     """Address of a function that sends so many frames; returns how many the bus has taken, before the first refused."""
 
 
-class Packets:
+class PackedFrames:
     """Frames as libc's sendmmsg and recvmmsg take them: `struct mmsghdr` of sys/socket.h, one `iovec` each."""
 
     def __init__(self, number: int) -> None:
@@ -35,9 +35,9 @@ class Packets:
             vector[:] = frame.ctypes.data, CAN_FRAME.size
             header[2:4] = vector.ctypes.data, 1
 
-    def part(self, first: int, end: int) -> Packets:
+    def part(self, first: int, end: int) -> PackedFrames:
         """Return some of them, which stay the same."""
-        part = Packets.__new__(Packets)
+        part = PackedFrames.__new__(PackedFrames)
         part.frames, part._vectors, part.headers = self.frames[first:end], self._vectors, self.headers[first:end]
         return part
 
@@ -56,8 +56,8 @@ class Packets:
         return found
 
 
-def packets(frames: Sequence[Frame]) -> Packets:
-    """Return frames as packets."""
-    made = Packets(len(frames))
+def packed_frames(frames: Sequence[Frame]) -> PackedFrames:
+    """Pack frames."""
+    made = PackedFrames(len(frames))
     made.fill(frames)
     return made

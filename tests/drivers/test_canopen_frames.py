@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail_drivers.bus.frames import frame_bits
-from trirail_drivers.cia402 import frames
+from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.interface import PowerState
 
 P = PowerState
@@ -42,14 +42,14 @@ def test_worst_case_is_reached() -> None:
 
 
 def test_a_kilohertz_fills_three_quarters_of_a_megabit() -> None:
-    assert frames.TRAFFIC.cycle_bits == 745
-    assert frames.TRAFFIC.bus_load(1000, 1_000_000, 0.1) == pytest.approx(0.75, abs=0.001)
+    assert canopen_frames.TRAFFIC.cycle_bits == 745
+    assert canopen_frames.TRAFFIC.bus_load(1000, 1_000_000, 0.1) == pytest.approx(0.75, abs=0.001)
 
 
 @given(bitrate=st.sampled_from([125_000, 250_000, 500_000, 1_000_000]), heartbeat=st.floats(0.05, 1.0))
 def test_the_highest_rate_fills_the_bus(bitrate: int, heartbeat: float) -> None:
-    rate = frames.TRAFFIC.highest_rate(bitrate, heartbeat)
-    assert frames.TRAFFIC.bus_load(rate, bitrate, heartbeat) == pytest.approx(1.0)
+    rate = canopen_frames.TRAFFIC.highest_rate(bitrate, heartbeat)
+    assert canopen_frames.TRAFFIC.bus_load(rate, bitrate, heartbeat) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
@@ -71,12 +71,12 @@ def test_the_highest_rate_fills_the_bus(bitrate: int, heartbeat: float) -> None:
     ],
 )
 def test_statusword(statusword: int, state: PowerState | None) -> None:
-    assert frames.power_state(statusword) is state
+    assert canopen_frames.power_state(statusword) is state
 
 
 @given(statusword=st.integers(0, 0xFFFF))
 def test_only_seven_bits_make_the_state(statusword: int) -> None:
-    assert frames.power_state(statusword) is frames.power_state(statusword & 0x6F)
+    assert canopen_frames.power_state(statusword) is canopen_frames.power_state(statusword & 0x6F)
 
 
 @pytest.mark.parametrize(
@@ -93,16 +93,16 @@ def test_only_seven_bits_make_the_state(statusword: int) -> None:
     ],
 )
 def test_controlwords_towards_operation(state: PowerState, word: int) -> None:
-    assert frames.controlword(state, P.OPERATION_ENABLED) == word
+    assert canopen_frames.controlword(state, P.OPERATION_ENABLED) == word
 
 
 @pytest.mark.parametrize("state", list(PowerState))
 def test_stopping_asks_the_same_of_every_state(state: PowerState) -> None:
-    assert frames.controlword(state, P.QUICK_STOP_ACTIVE) == 0x02
-    assert frames.controlword(state, P.SWITCH_ON_DISABLED) == 0x00
+    assert canopen_frames.controlword(state, P.QUICK_STOP_ACTIVE) == 0x02
+    assert canopen_frames.controlword(state, P.SWITCH_ON_DISABLED) == 0x00
 
 
 @pytest.mark.parametrize("state", list(PowerState))
 @pytest.mark.parametrize("wanted", [P.OPERATION_ENABLED, P.QUICK_STOP_ACTIVE, P.SWITCH_ON_DISABLED])
-def test_no_transition_resets_a_fault(state: PowerState, wanted: frames.Wanted) -> None:
-    assert not frames.controlword(state, wanted) & frames.FAULT_RESET
+def test_no_transition_resets_a_fault(state: PowerState, wanted: canopen_frames.Wanted) -> None:
+    assert not canopen_frames.controlword(state, wanted) & canopen_frames.FAULT_RESET

@@ -51,7 +51,7 @@ def receive_frames(
 ) -> tuple[int, int]:
     """Take what has arrived; return how many frames that are, and the error with which it has failed after them.
 
-    `bus` (3,) is a trirail_drivers.bus.packets.BusAccess; `headers` and `frames` are of Packets, with room for
+    `bus` (3,) is a BusAccess; `headers` and `frames` are of PackedFrames, with room for
     MOST_FRAMES. An error is a number of errno.h; 0 for none, below 0 where whoever receives next finds it again.
     """
     if bus[0] < 0:
@@ -70,7 +70,7 @@ def receive_frames(
 
 @compiled()
 def send_frames(bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8]) -> int:
-    """Send frames, of Packets; return how many the bus has taken, before the first that it has refused."""
+    """Send frames, of PackedFrames; return how many the bus has taken, before the first that it has refused."""
     if len(headers) == 0:
         return 0
     if bus[0] < 0:

@@ -26,7 +26,7 @@ TABLE = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mechanism:
+class RobotParts:
     """The robot's parts; a line is an array of points, (N, 2)."""
 
     anchors: Points
@@ -50,7 +50,7 @@ class Mechanism:
     """(2, 2): lowest and highest x and y of everything at the pose (0, 0, 0)."""
 
     @classmethod
-    def of(cls, geometry: Geometry, limits: SliderLimits) -> Mechanism:
+    def of(cls, geometry: Geometry, limits: SliderLimits) -> RobotParts:
         """Lay out a robot's parts."""
         legs, ends_of = geometry.each, limits.positions
         # a rail reaches as far beyond its slider's travel as it begins before it
@@ -94,7 +94,7 @@ def sliders(geometry: Geometry, position: Points) -> Points:
     return at
 
 
-def cross_slides(geometry: Geometry, parts: Mechanism, carriages: Points, phi: Points) -> Points:
+def cross_slides(geometry: Geometry, parts: RobotParts, carriages: Points, phi: Points) -> Points:
     """Return the cross slides as lines, (N, 3, 2, 2), on carriages (N, 3, 2) for angles (N,).
 
     The sleeve of an edge turns with the platform; a cross slide that is fixed to its carriage does not.

@@ -17,7 +17,7 @@ from trirail.wire.access import access_control
 from trirail.wire.credentials import Credentials, with_role
 from trirail.wire.dialling import why_not
 from trirail.wire.endpoints import ReachableBy, reach, same_port, socket_file, tcp_address
-from trirail.wire.stop_door import StopRequest, command_of, stop_address
+from trirail.wire.stop_protocol import StopRequest, command_of, stop_address
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Role
 

@@ -26,7 +26,7 @@ from trirail.client.client import Robot
 from trirail.config import Config, Tls, Zenoh
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.processes.gateway import Gateway
-from trirail.processes.guard import Guard
+from trirail.processes.session_guard import Guard
 from trirail.telemetry.sinks import free_port
 from trirail.wire import packets, zenoh_session
 from trirail.wire.credentials import Credentials
