@@ -199,6 +199,7 @@ def jog(
     /,
     *,
     seconds: notation.Time | None = None,
+    tool: Tool | None = None,
     gamepad: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
@@ -214,6 +215,9 @@ def jog(
         Rate of the platform's angle [rad/s], or with a unit: 2deg/s.
     seconds
         How long [s].
+    tool
+        The point of the platform that moves so, and about which it turns: U V in the platform's own frame [m], or its
+        name in [frames.tool].
     gamepad
         By a gamepad too, whose sticks move the robot while one of its shoulder buttons is held.
     """
@@ -225,14 +229,14 @@ def jog(
 
         with ExitStack() as opened:
             pad = opened.enter_context(Pad.first()) if gamepad else None
-            return pendant.run(opened.enter_context(Robot(service.robot, service.connect, tls=service.tls)), pad)
+            return pendant.run(opened.enter_context(Robot(service.robot, service.connect, tls=service.tls)), pad, tool)
     if vy is None or w is None or gamepad:
         raise CycloptsError(
             msg="jog takes VX, VY and W, or none of them: then keys, or a gamepad, move the robot while they are held"
         )
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         try:
-            with robot.jog(x=vx, y=vy, phi=w) as jogging:
+            with robot.jog(x=vx, y=vy, phi=w, tool=tool) as jogging:
                 taken = jogging.reply
                 if not service.json and taken is not None and (words := terminal.slowed(taken)):
                     terminal.complain(words)

@@ -13,7 +13,7 @@ import msgspec
 from trirail.client.goal import LETTING_GO, STANDS_WITHIN, AcceptedGoal, Result, Velocity
 from trirail.client.outgoing import number, seconds
 from trirail.errors import RefusalCode, RefusedError, TrirailError
-from trirail.wire.goals import Goal, VelocityGoal
+from trirail.wire.goals import Goal, Tool, VelocityGoal
 from trirail.wire.messages import GoalReply
 from trirail.wire.vocabulary import Command, Stop
 
@@ -60,8 +60,10 @@ class AsyncJog:
         send: Callable[[Callable[[str], Goal], str], Awaitable[AsyncGoalHandle]],
         velocity: Velocity,
         timeout: float,
+        tool: Tool | None = None,
     ) -> None:
         self._send_goal = send
+        self._tool = tool
         self._velocity = velocity
         self._timeout = number(timeout, "timeout")
         self._id = uuid.uuid4().hex[:12]
@@ -103,7 +105,10 @@ class AsyncJog:
             return False
 
     async def _send(self, velocity: Velocity, timeout: float) -> AsyncGoalHandle:
-        return await self._send_goal(lambda name: VelocityGoal(*velocity, timeout=timeout, id=name), self._id)
+        def made(name: str) -> VelocityGoal:
+            return VelocityGoal(*velocity, timeout=timeout, id=name, tool=self._tool)
+
+        return await self._send_goal(made, self._id)
 
     async def _renew(self) -> None:
         while not await self._is_over(self._timeout / 3.0):

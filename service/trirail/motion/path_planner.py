@@ -17,7 +17,7 @@ from trirail.motion.limits import COORDINATES, UNITS, Bounds
 from trirail.motion.paths import Path, constant
 from trirail.motion.quintic import Point, check_ends, quintic
 from trirail.motion.ruckig_call import Kinodynamic, Solver
-from trirail.motion.runs import NO_TOOL, STILL, MotionState, joined, of_centre, of_tool, rest, stretched
+from trirail.motion.runs import NO_TOOL, STILL, MotionState, joined, of_centre, of_tool, rest, stretched, tools_of
 from trirail.motion.straight_lines import time_optimal
 from trirail.quantities import apart, beyond, worded
 
@@ -153,31 +153,35 @@ class PathPlanner:
         sliders = MotionState(*rows[:3].tolist())
         return self._to_rest(start, sliders, target, self._sliders, speed, in_sliders=True)
 
-    def jog(self, start: MotionState, velocity: Sequence[float], timeout: float) -> Plan:
+    def jog(
+        self, start: MotionState, velocity: Sequence[float], timeout: float, tool: Sequence[float] = NO_TOOL
+    ) -> Plan:
         """Plan to a velocity, held until `timeout` is surely over or a limit comes near, and to rest.
 
+        It is that of a tool, (u, v) in the platform's frame [m], about which the platform turns.
         `timeout` is real time, and time along the path runs at up to twice its rate: who ends the jog is the control.
         Faster than platform or sliders may: as fast as they may. Raises RefusedError where not even braking stays
         inside.
         """
-        share, hold, bound = 1.0, FASTEST_OVERRIDE * timeout, None
+        share, slower, hold, bound = 1.0, 1.0, FASTEST_OVERRIDE * timeout, None
         for value, limit in zip(velocity, self.platform.velocity, strict=True):
             if abs(value) * share > limit:
                 share = limit / abs(value)
         for _ in range(JOGS):
-            ramp, brake, path = self._jog(start, [share * value for value in velocity], hold)
+            asked = [share / slower * value for value in velocity]
+            ramp, brake, path = self._jog(of_tool(start, tool), asked, hold, tool, _slower(self.platform, slower))
             found = self.checker.look(path, constant(1.0), 0.0, path.duration, start.pose)
             if found.fits or (found.within_limits and not start.at_rest):
-                return Plan(path, 1.0 / share, bound)
+                return Plan(path, slower / share, bound)
             if math.isnan(found.leaves_at):
-                share *= ROOM / found.excess
+                slower *= found.excess / ROOM
                 continue
             bound = self.checker.bound(path, found.leaves_at, start.pose)
             if hold > 0.0:
                 hold = max(0.0, found.leaves_at - ramp - brake)  # to rest where it would have been out of reach
             else:
                 share /= 2.0
-        path = self.to_velocity(start, STILL)
+        path = self._solver.to_velocity(of_tool(start, tool), STILL, self.platform, tool)
         if not self.checker.bears(self.checker.whole(path, start.pose)):
             raise TOO_FAST_IN_MOTION
         return Plan(path, bound=bound)
@@ -274,9 +278,11 @@ class PathPlanner:
             factor *= found * A_HAIR_MORE
         raise RefusedError(RefusalCode.TOO_FAST, f"the path does not fit its limits even {factor:.3g} times slower")
 
-    def _jog(self, start: MotionState, velocity: Sequence[float], hold: float) -> tuple[float, float, Path]:
-        """Return how long it takes to reach a velocity, and to brake from it, and the whole path."""
-        ramp = self.to_velocity(start, velocity)
+    def _jog(
+        self, start: MotionState, velocity: Sequence[float], hold: float, tool: Sequence[float], limits: Kinodynamic
+    ) -> tuple[float, float, Path]:
+        """Return how long it takes a tool to reach a velocity, and to brake from it, and the whole path."""
+        ramp = self._solver.to_velocity(start, velocity, limits, tool)
         if not any(velocity):
             return ramp.duration, 0.0, ramp
         pose = ramp.end
@@ -284,8 +290,15 @@ class PathPlanner:
         held[0, :, 0], held[0, :, 1] = pose, velocity
         hold = max(hold, self._period)
         end = [value + hold * rate for value, rate in zip(pose, velocity, strict=True)]
-        brake = self.to_velocity(MotionState(end, velocity, STILL), STILL)
-        return ramp.duration, brake.duration, joined([ramp, Path(np.array([0.0, hold]), held), brake])
+        brake = self._solver.to_velocity(MotionState(end, velocity, STILL), STILL, limits, tool)
+        whole = joined([ramp, Path(np.array([0.0, hold]), held, tools=tools_of(tool, 1)), brake])
+        return ramp.duration, brake.duration, whole
+
+
+def _slower(limits: Kinodynamic, factor: float) -> Kinodynamic:
+    """Return the limits of the same motion that many times slower."""
+    powers = factor ** np.arange(1.0, 4.0)
+    return Kinodynamic(*(np.array(limits) / powers[:, None]).tolist())
 
 
 def _meant(value: float, limit: float, unit: str) -> str:
