@@ -11,7 +11,7 @@ from rich.text import Text
 
 from trirail.cli import alignment_lines, notation, terminal
 from trirail.cli.options import Flag
-from trirail.errors import ServiceError, TrirailError
+from trirail.errors import ServiceError
 from trirail.naming import Labels, label
 from trirail.telemetry import palette
 
@@ -170,14 +170,10 @@ def _read(files: tuple[Path, ...]) -> Recording:
 
 
 def _draw(file: Path, recording: Recording, summed: Summary) -> None:
-    try:
+    with terminal.drawing(file):
         from trirail.analysis import charts
-    except ImportError as error:
-        raise TrirailError("--plot needs matplotlib: pip install 'trirail[analysis]'") from error
-    try:
+
         charts.draw(file, recording, summed)
-    except (OSError, ValueError) as error:
-        raise TrirailError(f"cannot draw to {file}: {error}") from error
 
 
 def _print_comparison(

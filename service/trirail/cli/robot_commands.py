@@ -79,10 +79,10 @@ def goto(
         if y is not None:
             typed = f"X = {x} and Y = {notation.written(y, 'mm', 3)}"
             raise CycloptsError(msg=f"goto takes X, Y and PHI: here are {typed}, and PHI is missing, the angle, as 0")
-        if notation.is_length(x) or tool is not None or frame != "base":
-            raise CycloptsError(
-                msg="goto takes X, Y and PHI, or the NAME of a pose, that knows no --tool and no --frame"
-            )
+        if notation.is_length(x):
+            raise CycloptsError(msg=f"goto takes X, Y and PHI, or the NAME of a pose: here is X = {x.strip()} alone")
+        if tool is not None or frame != "base":
+            raise CycloptsError(msg="the pose of a NAME is where it was taught: it knows no --tool and no --frame")
         check_name(x, "pose")
         with Robot(service.robot, service.connect, tls=service.tls) as robot:
             return _follow(service, robot, robot.move_to_named(x, speed=speed, blend=blend), wait, x)

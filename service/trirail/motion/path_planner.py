@@ -35,7 +35,8 @@ FASTEST_OVERRIDE = 2.0
 """At how many times its nominal rate the time along a path may be told to run."""
 A_HAIR_MORE = 1.0 + 1e-6
 """What rounding may lose."""
-MEANT = {"m": 1e-3, "rad": math.pi / 180.0}
+MEANT = {"m": (1e-3, 1.0), "rad": (math.pi / 180.0, 2.0)}
+"""What millimetres and degrees are in SI, and from which number on they are taken to have been meant."""
 RATES = "/s", "/s²", "/s³"
 TOO_FAST_IN_MOTION = RefusedError(
     RefusalCode.TOO_FAST, "from its present motion the robot cannot take this path within its sliders' limits"
@@ -85,9 +86,10 @@ class PathPlanner:
         The pose is that of a tool, (u, v) in the platform's frame [m]; the workspace that of the platform's centre.
         """
         if violation := self.bounds.pose(of_centre(rest(target), tool).pose):
+            meant = _meant(violation.value, violation.limit, violation.unit)
             raise RefusedError(
                 RefusalCode.OUT_OF_WORKSPACE,
-                f"the goal is out of the workspace: {violation}",
+                f"the goal is out of the workspace: {violation}{meant}",
                 value=violation.value,
                 limit=violation.limit,
             )
@@ -106,7 +108,7 @@ class PathPlanner:
             if abs(value) > limit * A_HAIR_MORE:
                 most = math.copysign(limit, value)
                 asked, allowed = apart(value, most, f"{unit}/s")
-                meant = _meant(value, most, unit)
+                meant = _meant(value, most, f"{unit}/s")
                 text = f"the jog's velocity {asked} in {name} is above the limit of {allowed}{meant}"
                 raise RefusedError(RefusalCode.ABOVE_LIMIT, text, value=value, limit=most)
 
@@ -303,5 +305,6 @@ def _slower(limits: Kinodynamic, factor: float) -> Kinodynamic:
 
 def _meant(value: float, limit: float, unit: str) -> str:
     """Return what a bare number may have meant that is above a limit: millimetres or degrees."""
-    meant = value * MEANT[unit]
-    return f": did you mean {worded(meant, f'{unit}/s')}?" if abs(meant) <= abs(limit) else ""
+    size, least = MEANT[unit.removesuffix("/s")]
+    likely = abs(value) >= least and abs(value) * size <= abs(limit)
+    return f": did you mean {worded(value * size, unit)}?" if likely else ""
