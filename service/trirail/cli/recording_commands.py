@@ -73,7 +73,9 @@ def replay(
 
 
 def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
-    """Sum a recorded session up: goals and outcomes, tracking error, timing, faults, and what is missing.
+    """Sum a recorded session up.
+
+    Goals and outcomes, tracking error, timing, faults, and what is missing.
 
     Parameters
     ----------
@@ -110,7 +112,9 @@ def export(
     goal: str | None = None,
     json: Annotated[bool, Flag] = False,
 ) -> int:
-    """Write a recorded session as a table, a row a cycle, in SI units: CSV or Parquet.
+    """Write a recorded session as a table, CSV or Parquet.
+
+    A row a cycle, in SI units.
 
     Parameters
     ----------

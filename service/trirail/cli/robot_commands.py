@@ -169,7 +169,9 @@ def sliders(
     speed: notation.Share = 1.0,
     service: Service = HERE,
 ) -> int:
-    """Move the sliders to positions; also the way out of a pose that goto refuses.
+    """Move the sliders to positions.
+
+    Also the way out of a pose that goto refuses.
 
     Parameters
     ----------
@@ -203,7 +205,9 @@ def jog(
     gamepad: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
-    """Move at a velocity while the command lasts: until Ctrl-C, or for some seconds. Without one, while a key is held.
+    """Move at a velocity until Ctrl-C, or while keys are held.
+
+    With --seconds for so long; without a velocity while a key is held.
 
     Parameters
     ----------
@@ -286,7 +290,9 @@ def follow(
 
 
 def teach(name: str, /, *, service: Service = HERE) -> int:
-    """Keep where the robot is measured to stand as a pose of a name, for goto; with power or moved by hand.
+    """Keep where the robot stands as a pose of a name, for goto.
+
+    Where it is measured to stand, with power or moved by hand.
 
     Parameters
     ----------
@@ -417,7 +423,9 @@ def events(
     follow: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
-    """Print past events and those to come until Ctrl-C; with --last only past ones.
+    """Print past events and those to come, until Ctrl-C.
+
+    With --last only past ones.
 
     Parameters
     ----------
