@@ -13,7 +13,7 @@ import pytest
 import trirail
 import trirail_drivers
 
-HEAVY = ("numba", "numpy", "zenoh", "rerun", "can", "canopen", "ruckig", "rich", "cyclopts")
+HEAVY = ("numba", "numpy", "zenoh", "rerun", "can", "canopen", "ruckig", "rich", "cyclopts", "pandas")
 
 
 def loaded_by(statement: str) -> set[str]:

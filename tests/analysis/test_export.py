@@ -58,7 +58,7 @@ def test_every_number_comes_back(suffix: str, recording: Recording, tmp_path: Pa
 def test_a_file_is_never_written_over_and_its_name_says_its_format(recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("mine")
-    with pytest.raises(ServiceError, match="File exists"):
+    with pytest.raises(ServiceError, match="exists already: name another file"):
         export.write(recording, path)
     assert path.read_text() == "mine"
     with pytest.raises(ServiceError, match=r"must end in \.csv or \.parquet"):
@@ -97,8 +97,10 @@ def test_columns_are_names_of_fields_or_words_of_these(recording: Recording) -> 
         found = set(recording_table.table(recording, [word]).column_names) - {"t"}
         assert found == {column for column in every if word in column.split("_")}
     assert recording_table.table(recording, ["error", "following_error"]).num_columns == 4
-    with pytest.raises(ServiceError, match="no column poze"):
+    with pytest.raises(ServiceError, match=r"no column poze: did you mean pose\?"):
         recording_table.table(recording, ["poze"])
+    with pytest.raises(ServiceError, match="no column torque: a word of these was expected: wall, mode, cycle"):
+        recording_table.table(recording, ["torque"])
 
 
 def test_a_dataframe_is_the_table_by_time(recording: Recording) -> None:

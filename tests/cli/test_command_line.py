@@ -77,6 +77,8 @@ def test_what_is_seldom_needed_is_on_the_page_of_all_alone(run: Run) -> None:
         found = {line.split()[1] for line in out.splitlines() if line.startswith("│ ") and line[2].isalpha()}
         assert code == 0
         assert found & names == (shown if shown is not None else names - {*help_pages.SELDOM})
+    lines = run("--help")[1].splitlines()
+    assert not [line for line in lines if line.startswith("│   ")]  # each command takes one line
     assert run("help", "keys", "add")[1] == run("keys", "add", "--help")[1]
     assert "Unknown command" in run("help", "nonsense")[2]
 

@@ -192,7 +192,7 @@ def test_the_plot_is_a_picture(angles: str, tmp_path: Path, capsys: pytest.Captu
 def test_a_plot_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(TrirailError, match=r"cannot draw to .*Format 'xyz' is not supported"):
         call(f"workspace --phi 0 --plot {tmp_path / 'a.xyz'}")
-    with pytest.raises(TrirailError, match=r"cannot draw to .*No such file"):
+    with pytest.raises(TrirailError, match=r"cannot draw to \S*a\.png: No such file or directory$"):
         call(f"workspace --phi 0 --plot {tmp_path / 'nowhere' / 'a.png'}")
 
 

@@ -201,10 +201,11 @@ def test_a_tool_is_a_point_or_a_name(line: str, tool: object) -> None:
         ("goto 0 0 0 --tool 20mm,x", "'x' is not a length"),
         ("goto 0 0 0 --tool a/b", "'a/b' is neither a point, as 20mm 0, nor a name"),
         ("goto 0 0", "goto takes X, Y and PHI: here are X = 0 and Y = 0.000 mm, and PHI is missing"),
-        ("goto 0.5", "goto takes X, Y and PHI, or the NAME of a pose"),
+        ("goto 0.5", "goto takes X, Y and PHI, or the NAME of a pose: here is X = 0.5 alone"),
+        ("goto 10 mm 20 mm 0", "a bare number is in m: no space stands before a unit"),
         (
             "goto pick --tool camera",
-            "goto takes X, Y and PHI, or the NAME of a pose, that knows no --tool and no --frame",
+            "the pose of a NAME is where it was taught: it knows no --tool and no --frame",
         ),
         ("goto pick 0 0", "Invalid value for X: 'pick' is not a length"),
     ],

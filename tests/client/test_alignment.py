@@ -176,6 +176,11 @@ def test_a_file_that_is_none_is_refused_with_its_name_and_the_remedy(how: str, t
         calibration_file.read(path)
 
 
+def test_a_file_that_is_not_there_is_made_by_a_calibration(tmp_path: Path) -> None:
+    with pytest.raises(TrirailError, match=r"camera\.json: no such file; trirail align calibrate makes it"):
+        calibration_file.read(tmp_path / "camera.json")
+
+
 def test_numbers_of_a_file_are_kept_to_the_last_digit(tmp_path: Path, calibrated: Any) -> None:
     path = tmp_path / "camera.json"
     calibration_file.write(path, "demo", calibrated, {})

@@ -144,7 +144,7 @@ CALLS: dict[str, Call] = {
     "move_sliders": lambda robot, n: robot.move_sliders(n, n, n, speed=n, valid_for=n),
     "follow": lambda robot, n: robot.follow([TrajectoryPoint(0.0, n, n, n), TrajectoryPoint(n, n, n, n, (n, n, n))]),
     "follow, rows": lambda robot, n: robot.follow([(0.0, n, n, n), [n, n, n, n]]),
-    "jog": lambda robot, n: robot.jog(n, n, n, timeout=n),
+    "jog": lambda robot, n: robot.jog(n, n, n, timeout=n, tool=(n, n)),
     "track": lambda robot, n: robot.track(timeout=n),
     "override": lambda robot, n: robot.override(n),
     "lease": lambda robot, n: robot.lease(timeout=n),

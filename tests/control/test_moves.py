@@ -104,7 +104,6 @@ def test_without_tools_a_point_is_asked_for() -> None:
     ("kind", "message"),
     [
         (SlidersGoal, '{"kind":"sliders","position":[0,0,0]%s}'),
-        (VelocityGoal, '{"kind":"velocity","x":0.1,"y":0,"phi":0%s}'),
         (
             TrajectoryGoal,
             '{"kind":"trajectory","points":[{"t":0,"x":0,"y":0,"phi":0},{"t":1,"x":0,"y":0,"phi":0}]%s}',

@@ -406,6 +406,7 @@ def test_a_jog_above_the_platforms_velocity_is_refused_and_one_that_is_not_taken
         ((0.0, -100.0, 0.0), "velocity -100000 mm/s in y is above the limit of -250 mm/s: did you mean -100 mm/s?"),
         ((0.0, 0.0, 20.0), "velocity 1145.92°/s in phi is above the limit of 85.9437°/s: did you mean 20°/s?"),
         ((1000.0, 0.0, 0.0), "velocity 1e+06 mm/s in x is above the limit of 250 mm/s"),
+        ((0.5, 0.0, 0.0), "velocity 500 mm/s in x is above the limit of 250 mm/s"),
     ],
 )
 def test_a_jog_meant_in_millimetres_or_degrees_is_told_so(
@@ -413,6 +414,22 @@ def test_a_jog_meant_in_millimetres_or_degrees_is_told_so(
 ) -> None:
     rig.enable()
     assert refusal(rig.send("j1", VelocityGoal(*velocity))).message.endswith(f"the jog's {said}")
+
+
+@pytest.mark.parametrize(
+    ("pose", "said"),
+    [
+        ((0.01, -20.0, 0.0), "platform y: position -20000 mm is beyond its limit -150 mm: did you mean -20 mm?"),
+        ((0.0, 0.0, 30.0), "platform phi: position 1718.87° is beyond its limit 48.7014°: did you mean 30°?"),
+        ((0.2, 0.0, 0.0), "platform x: position 200 mm is beyond its limit 150 mm"),
+        ((0.0, 0.0, 1.0), "platform phi: position 57.2958° is beyond its limit 48.7014°"),
+    ],
+)
+def test_a_pose_meant_in_millimetres_or_degrees_is_told_so(
+    rig: Rig, pose: tuple[float, float, float], said: str
+) -> None:
+    rig.enable()
+    assert refusal(rig.send("g1", PoseGoal(*pose))).message == f"the goal is out of the workspace: {said}"
 
 
 def test_a_renewal_that_is_refused_ends_the_jog_at_once(rig: Rig) -> None:

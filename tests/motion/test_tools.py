@@ -21,7 +21,7 @@ from trirail.motion.packing import pack_path, unpack_path
 from trirail.motion.paths import Path, path_motion
 from trirail.motion.runs import MotionState, of_centre, of_tool, rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.goals import OwnLimits, PoseGoal
+from trirail.wire.goals import OwnLimits, PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted
 
 Tool = tuple[float, float]
@@ -178,6 +178,37 @@ def test_every_setpoint_keeps_the_tool_on_its_line(config: Config, tool: Tool) -
     assert rig.outcomes() == [("g0", "done"), ("g1", "done")]
     assert_within_limits(rig)
     rig.bus.shutdown()
+
+
+@pytest.mark.parametrize("config", [CONFIG, SLOW], ids=["as shipped", "slow sliders"])
+@pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.4), (0.02, -0.01, 0.4), (0.02, -0.01, 0.0)])
+def test_a_jog_of_a_tool_turns_about_it_and_takes_it_straight(config: Config, velocity: Pose) -> None:
+    """On every setpoint: while it begins, is renewed, and is let go."""
+    rig, tool = Rig(config), (-0.03, 0.11)
+    rig.enable()
+    begun = len(rig.rows) - 1
+    for now in (velocity, velocity, (0.0, 0.0, 0.0)):
+        assert isinstance(rig.send("j1", VelocityGoal(*now, timeout=0.5, tool=tool)), Accepted)
+        rig.cycles(150)
+    solved = setpoints(rig, begun)
+    way = point(solved, tool)
+    assert_straight(way)
+    along = way[-1] - way[0]
+    assert np.hypot(*along) < NANOMETRE if not any(velocity[:2]) else along @ velocity[:2] > 0.002 * 0.02
+    assert (solved[-1, 2] > 0.05) == (velocity[2] > 0.0)
+    assert_platform_within_limits(solved, tool)
+    assert_within_limits(rig)
+    rig.bus.shutdown()
+
+
+def test_a_jog_of_a_far_tool_is_as_slow_as_the_centre_has_to_be(rig: Rig) -> None:
+    rig.enable()
+    rate = 0.9 * CONFIG.limits.platform.velocity[2]
+    answer = rig.send("j1", VelocityGoal(0.0, 0.0, rate, timeout=0.1, tool=(0.5, 0.0)))
+    assert isinstance(answer, Accepted)
+    assert answer.slowed > 1.1
+    begun = len(rig.rows) - 1
+    assert_platform_within_limits(setpoints(rig, begun), (0.0, 0.0))
 
 
 def test_a_far_tool_turns_as_fast_as_the_centre_may_go(goals: dict[bool, GoalPlanner]) -> None:

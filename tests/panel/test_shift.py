@@ -126,6 +126,15 @@ def test_no_jog_is_faster_than_the_platform_may_whatever_its_axes(page: Page, ro
     assert max(abs(goal.y) for goal in robot.sent) == pytest.approx(most[1])
 
 
+def test_a_held_jog_is_about_the_tool_that_is_chosen_until_it_has_braked(page: Page, robot: FakeRobot) -> None:
+    page.choose("#tool", "tip")
+    page.press("[data-axis=phi][data-sign='1']")
+    wait(lambda: any(robot.velocity), "it moves")
+    page.let_go()
+    wait(lambda: robot.sent[-1].phi == 0.0, "it is let go")
+    assert {goal.tool for goal in robot.sent} == {"tip"}
+
+
 def test_a_step_is_of_the_tool_along_the_axes_that_are_chosen(page: Page, robot: FakeRobot) -> None:
     page.choose("#along", "platform")
     page.choose("#tool", "tip")

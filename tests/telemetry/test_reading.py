@@ -23,7 +23,8 @@ from trirail.config import SIM, load
 from trirail.errors import EmptyRecordingError, ServiceError
 from trirail.telemetry import journal, reading
 from trirail.telemetry.columns import FIELDS, RECORD, Column, Timelines, chunks, structs
-from trirail.telemetry.reading import OlderRecordingWarning, read
+from trirail.telemetry.reading import read
+from trirail.telemetry.recorded_cycles import OlderRecordingWarning
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.scene import Scene
 from trirail.telemetry.shown_robot import ShownRobot
@@ -57,6 +58,13 @@ def test_records_are_equal_bit_for_bit(tmp_path: Path) -> None:
     recording = read(tmp_path / "a.rrd")
     assert recording.records.dtype == DTYPE
     assert made.bits(recording.records) == made.bits(sent)
+
+
+def test_nobody_who_reads_waits_for_pandas(tmp_path: Path) -> None:
+    written(tmp_path / "a.rrd", made.records(0.1))
+    code = "import pathlib, sys, trirail; trirail.read(pathlib.Path(sys.argv[1])); print('pandas' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.rrd"], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
 
 
 def test_times_are_nominal_and_of_the_wall_clock(tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
                 csv.write_csv(rows, file)
             else:
                 parquet.write_table(rows, file)
+    except FileExistsError as error:
+        raise ServiceError(f"{path} exists already: name another file") from error
     except OSError as error:
         raise ServiceError(f"cannot write {path}: {error.strerror or error}") from error
     return len(rows)

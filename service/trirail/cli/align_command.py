@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from trirail.alignment.procedure import Sighting, Wish
     from trirail.client.calibration_file import CalibrationFile
 
-app = App(name="align", help="Lay a part right by marks in cameras: calibrate once, then run for each part.")
+app = App(name="align", help="Lay a part right by marks in cameras, calibrated once.")
 FILE = Path("camera.json")
 T = TypeVar("T")
 PROGRAM = MarkSource()

@@ -53,7 +53,9 @@ app = App(
 def run(
     config: Path | None = None, /, *, record: Path | None = None, log: Literal["text", "json"] | None = None
 ) -> int:
-    """Run the service in the foreground until SIGTERM or Ctrl-C: then a controlled stop, drives disabled, exit 0.
+    """Run the service in the foreground until SIGTERM or Ctrl-C.
+
+    Then it stops in a controlled way, disables the drives, and exits with 0.
 
     Parameters
     ----------
@@ -99,7 +101,9 @@ def run(
 
 @app.command
 def demo(name: str = "sim", /, *, stay: Annotated[bool, Flag] = False, record: Path | None = None) -> int:
-    """Start the service on simulated drives, enable it, send it a tour of goals, and report.
+    """Drive simulated drives through a tour of goals, and report.
+
+    It starts a service of its own and enables it.
 
     Parameters
     ----------
@@ -122,7 +126,9 @@ def demo(name: str = "sim", /, *, stay: Annotated[bool, Flag] = False, record: P
 def doctor(
     config: Path | None = None, /, *, quick: Annotated[bool, Flag] = False, json: Annotated[bool, Flag] = False
 ) -> int:
-    """Check this machine and a configuration; exit 1 only if something would keep the robot from running.
+    """Check this machine and a configuration.
+
+    Exit 1 only if something would keep the robot from running.
 
     Ten seconds of it measure which rates this machine holds, by cycles that only exchange the frames.
 
@@ -174,7 +180,9 @@ def view(
     records: Annotated[bool, Flag] = False,
     services: Services = ALL_HERE,
 ) -> int:
-    """Open the Rerun viewer on the robot as it moves, or on a recording, until it is closed or Ctrl-C.
+    """Open the Rerun viewer on the robot, or on a recording.
+
+    Until it is closed, or Ctrl-C.
 
     Several robots, --robot a --robot b, are side by side: those behind one router.
 

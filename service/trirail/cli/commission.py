@@ -37,7 +37,9 @@ def commission(
     fault: Annotated[tuple[str, ...], Parameter(negative="", consume_multiple=False)] = (),
     json: Annotated[bool, Flag] = False,
 ) -> int:
-    """Guide through the first hour with drives: one at a time, 1 mm at 5 mm/s, each step asked for and judged.
+    """Guide through the first hour with drives.
+
+    One drive at a time, 1 mm at 5 mm/s, each step asked for and judged.
 
     Who is on the bus, set-up, each slider by hand, power on one drive alone, 1 mm there and back, homing, watchdogs, a
     square of the platform, of which kind it is; then a new configuration with what was found. Every step can be refused

@@ -15,7 +15,7 @@ from trirail.cli import terminal
 from trirail.cli.options import Flag
 from trirail.errors import ConfigError
 
-app = App(name="config", help="List the shipped configurations, copy one to start from, show what a file comes to.")
+app = App(name="config", help="List and copy shipped configurations, show what one comes to.")
 
 BASE = "sim.toml"
 """The shipped configuration with which others are compared."""

@@ -11,7 +11,7 @@ from cyclopts import App
 from trirail.cli import drive_parameters, terminal
 from trirail.cli.options import Flag
 
-app = App(name="drives", help="Show the drives on the bus; save, compare and restore their parameters.")
+app = App(name="drives", help="Show the drives; save, compare, restore their parameters.")
 for command in drive_parameters.COMMANDS:
     app.command(command)
 

@@ -17,7 +17,9 @@ def panel(
     open_: Annotated[bool, Parameter(name="--open", negative="")] = False,
     service: Service = HERE,
 ) -> int:
-    """Serve the operator's page to browsers on this machine: jog, STOP, commands, the robot live. Ends by Ctrl-C.
+    """Serve the operator's page to browsers on this machine.
+
+    With it the robot is seen live, jogged, stopped and commanded. Ends by Ctrl-C.
 
     Who has the address that is printed can move the robot; it is another one each time.
 

@@ -28,6 +28,7 @@ from trirail.client.held_jog import SPEEDS, USUAL, HeldJog
 from trirail.config import Limits
 from trirail.errors import ServiceError, TrirailError
 from trirail.wire.decoding import converted
+from trirail.wire.goals import Tool
 from trirail.wire.state import State
 from trirail.wire.text import printable
 
@@ -46,10 +47,11 @@ HELP = "← → x   ↑ ↓ y   a d φ   + − speed   Space stop   q leave"
 
 
 class Pendant:
-    """What keys mean: a jog while one is held, a speed, a stop. `top` is the platform's greatest velocity."""
+    """What keys mean: a jog of a tool while one is held, a speed, a stop. `top` is the platform's greatest velocity."""
 
-    def __init__(self, robot: Robot, top: Velocity) -> None:
+    def __init__(self, robot: Robot, top: Velocity, tool: Tool | None = None) -> None:
         self._robot = robot
+        self._tool = tool
         self._top = top
         self._jog = HeldJog(robot.send, self._say)
         self._until = -math.inf
@@ -82,7 +84,7 @@ class Pendant:
         """Take in that the hand wants to go along x, y and φ, each by a share of the speed, -1 to 1."""
         x, y, phi = (share * speed for share, speed in zip(direction, self.speed, strict=True))
         self._until = now + REPEAT
-        self._jog.hold((x, y, phi))
+        self._jog.hold((x, y, phi), self._tool)
 
     def tick(self, now: float) -> None:
         """Let go of a key that has not come again."""
@@ -136,15 +138,16 @@ class _Newest:
             self.state = None
 
 
-def run(robot: Robot, pad: Pad | None = None) -> int:
+def run(robot: Robot, pad: Pad | None = None, tool: Tool | None = None) -> int:
     """Serve the operator, at his terminal and a gamepad, until he leaves or his terminal is gone; return the exit code.
 
-    Raises ServiceError where standard input is no terminal, nobody answers, or the gamepad is gone.
+    What moves is a tool, the platform's centre where there is none. Raises ServiceError where standard input is no
+    terminal, nobody answers, or the gamepad is gone.
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ServiceError("a jog by keys needs a terminal; without one: trirail jog VX VY W --seconds S")
     top = converted(robot.info().limits, Limits).platform.velocity
-    pendant = Pendant(robot, top)
+    pendant = Pendant(robot, top, tool)
     if pad is not None:
         pendant.said = f"{pad.name}: {gamepad.HELP}"
     with _Newest(robot) as newest:

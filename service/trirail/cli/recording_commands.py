@@ -11,7 +11,7 @@ from rich.text import Text
 
 from trirail.cli import alignment_lines, notation, terminal
 from trirail.cli.options import Flag
-from trirail.errors import ServiceError, TrirailError
+from trirail.errors import ServiceError
 from trirail.naming import Labels, label
 from trirail.telemetry import palette
 
@@ -73,7 +73,9 @@ def replay(
 
 
 def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
-    """Sum a recorded session up: goals and outcomes, tracking error, timing, faults, and what is missing.
+    """Sum a recorded session up.
+
+    Goals and outcomes, tracking error, timing, faults, and what is missing.
 
     Parameters
     ----------
@@ -110,7 +112,9 @@ def export(
     goal: str | None = None,
     json: Annotated[bool, Flag] = False,
 ) -> int:
-    """Write a recorded session as a table, a row a cycle, in SI units: CSV or Parquet.
+    """Write a recorded session as a table, CSV or Parquet.
+
+    A row a cycle, in SI units.
 
     Parameters
     ----------
@@ -170,14 +174,10 @@ def _read(files: tuple[Path, ...]) -> Recording:
 
 
 def _draw(file: Path, recording: Recording, summed: Summary) -> None:
-    try:
+    with terminal.drawing(file):
         from trirail.analysis import charts
-    except ImportError as error:
-        raise TrirailError("--plot needs matplotlib: pip install 'trirail[analysis]'") from error
-    try:
+
         charts.draw(file, recording, summed)
-    except (OSError, ValueError) as error:
-        raise TrirailError(f"cannot draw to {file}: {error}") from error
 
 
 def _print_comparison(

@@ -79,10 +79,10 @@ def goto(
         if y is not None:
             typed = f"X = {x} and Y = {notation.written(y, 'mm', 3)}"
             raise CycloptsError(msg=f"goto takes X, Y and PHI: here are {typed}, and PHI is missing, the angle, as 0")
-        if notation.is_length(x) or tool is not None or frame != "base":
-            raise CycloptsError(
-                msg="goto takes X, Y and PHI, or the NAME of a pose, that knows no --tool and no --frame"
-            )
+        if notation.is_length(x):
+            raise CycloptsError(msg=f"goto takes X, Y and PHI, or the NAME of a pose: here is X = {x.strip()} alone")
+        if tool is not None or frame != "base":
+            raise CycloptsError(msg="the pose of a NAME is where it was taught: it knows no --tool and no --frame")
         check_name(x, "pose")
         with Robot(service.robot, service.connect, tls=service.tls) as robot:
             return _follow(service, robot, robot.move_to_named(x, speed=speed, blend=blend), wait, x)
@@ -169,7 +169,9 @@ def sliders(
     speed: notation.Share = 1.0,
     service: Service = HERE,
 ) -> int:
-    """Move the sliders to positions; also the way out of a pose that goto refuses.
+    """Move the sliders to positions.
+
+    Also the way out of a pose that goto refuses.
 
     Parameters
     ----------
@@ -199,10 +201,13 @@ def jog(
     /,
     *,
     seconds: notation.Time | None = None,
+    tool: Tool | None = None,
     gamepad: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
-    """Move at a velocity while the command lasts: until Ctrl-C, or for some seconds. Without one, while a key is held.
+    """Move at a velocity until Ctrl-C, or while keys are held.
+
+    With --seconds for so long; without a velocity while a key is held.
 
     Parameters
     ----------
@@ -214,6 +219,9 @@ def jog(
         Rate of the platform's angle [rad/s], or with a unit: 2deg/s.
     seconds
         How long [s].
+    tool
+        The point of the platform that moves so, and about which it turns: U V in the platform's own frame [m], or its
+        name in [frames.tool].
     gamepad
         By a gamepad too, whose sticks move the robot while one of its shoulder buttons is held.
     """
@@ -225,14 +233,14 @@ def jog(
 
         with ExitStack() as opened:
             pad = opened.enter_context(Pad.first()) if gamepad else None
-            return pendant.run(opened.enter_context(Robot(service.robot, service.connect, tls=service.tls)), pad)
+            return pendant.run(opened.enter_context(Robot(service.robot, service.connect, tls=service.tls)), pad, tool)
     if vy is None or w is None or gamepad:
         raise CycloptsError(
             msg="jog takes VX, VY and W, or none of them: then keys, or a gamepad, move the robot while they are held"
         )
     with Robot(service.robot, service.connect, tls=service.tls) as robot:
         try:
-            with robot.jog(x=vx, y=vy, phi=w) as jogging:
+            with robot.jog(x=vx, y=vy, phi=w, tool=tool) as jogging:
                 taken = jogging.reply
                 if not service.json and taken is not None and (words := terminal.slowed(taken)):
                     terminal.complain(words)
@@ -282,7 +290,9 @@ def follow(
 
 
 def teach(name: str, /, *, service: Service = HERE) -> int:
-    """Keep where the robot is measured to stand as a pose of a name, for goto; with power or moved by hand.
+    """Keep where the robot stands as a pose of a name, for goto.
+
+    Where it is measured to stand, with power or moved by hand.
 
     Parameters
     ----------
@@ -413,7 +423,9 @@ def events(
     follow: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
-    """Print past events and those to come until Ctrl-C; with --last only past ones.
+    """Print past events and those to come, until Ctrl-C.
+
+    With --last only past ones.
 
     Parameters
     ----------

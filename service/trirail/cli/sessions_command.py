@@ -56,7 +56,9 @@ def sessions(
     rebuild: Annotated[bool, Flag] = False,
     json: Annotated[bool, Flag] = False,
 ) -> int:
-    """List sessions, the newest last, running ones too: when, whose goals ended how, faults, why a black box was kept.
+    """List recorded sessions, the newest last, running ones too.
+
+    When, whose goals ended how, faults, why a black box was kept.
 
     What the index of the folder lacks, as after a kill, is read first.
 

@@ -6,6 +6,7 @@ import contextlib
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -52,6 +53,17 @@ def counted(number: int, what: str) -> str:
 def say(words: str) -> None:
     """Print a line."""
     out.print(plain(words), soft_wrap=True)
+
+
+@contextlib.contextmanager
+def drawing(file: Path) -> Iterator[None]:
+    """Say why a picture cannot be drawn to a file. Raises TrirailError."""
+    try:
+        yield
+    except ImportError as error:
+        raise TrirailError("--plot needs matplotlib: pip install 'trirail[analysis]'") from error
+    except (OSError, ValueError) as error:
+        raise TrirailError(f"cannot draw to {file}: {getattr(error, 'strerror', None) or error}") from error
 
 
 def complain(words: str) -> None:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 from trirail.cli import notation, terminal
 from trirail.cli.math_commands import robot_of
 from trirail.cli.options import DEFAULT, Flag, Offline
-from trirail.errors import TrirailError
 
 if TYPE_CHECKING:
     from trirail.config import Config
@@ -91,14 +90,10 @@ def _round_angles(low: float, high: float) -> list[float]:
 
 
 def _draw(file: Path, config: Config, robot: Geometry, angles: list[float], reach: Extent, service: Extent) -> None:
-    try:
+    with terminal.drawing(file):
         from trirail.workspace import plots
-    except ImportError as error:
-        raise TrirailError("--plot needs matplotlib: pip install 'trirail[analysis]'") from error
-    try:
+
         plots.draw(file, f"Workspace of robot {config.robot.name}", robot, config.limits, angles, reach, service)
-    except (OSError, ValueError) as error:
-        raise TrirailError(f"cannot draw to {file}: {error}") from error
 
 
 def _measures(extent: Extent, area_at_zero: float) -> dict[str, object]:

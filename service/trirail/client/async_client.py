@@ -29,7 +29,7 @@ from trirail.client.outgoing import content_message, goal_message, id_of, second
 from trirail.client.track import Taker
 from trirail.client.trajectory import check_arrived
 from trirail.errors import RefusedError, ServiceError
-from trirail.wire.goals import Goal
+from trirail.wire.goals import Goal, Tool
 from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import CommandReply, Event, GoalReply, RoleReply
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
@@ -167,13 +167,17 @@ class AsyncRobot:
     async def _report_look(self, look: bytes) -> None:
         await self._connection.fetch(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)
 
-    def jog(self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2) -> AsyncJog:
+    def jog(
+        self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2, tool: Tool | None = None
+    ) -> AsyncJog:
         """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
+
+        It is that of a `tool`, about which the platform turns; of the centre where there is none.
 
         async with robot.jog(x=0.01):
             await the_key_is_released()
         """
-        return AsyncJog(self.send, (x, y, phi), timeout)
+        return AsyncJog(self.send, (x, y, phi), timeout, tool)
 
     def track(self, *, timeout: float = 0.25, id: str | None = None) -> AsyncTrack:  # noqa: A002
         """Follow a moving target while the context lasts, as Robot.track does.

@@ -12,7 +12,7 @@ import msgspec
 from trirail.client.goal import LETTING_GO, STANDS_WITHIN, AcceptedGoal, HeldVelocity, Result, Velocity
 from trirail.client.outgoing import seconds
 from trirail.errors import TrirailError
-from trirail.wire.goals import Goal, VelocityGoal
+from trirail.wire.goals import Goal, Tool, VelocityGoal
 from trirail.wire.vocabulary import Command, Stop
 
 
@@ -58,9 +58,11 @@ class AsyncJog(HeldVelocity[AsyncGoalHandle]):
         send: Callable[[Callable[[str], Goal], str], Awaitable[AsyncGoalHandle]],
         velocity: Velocity,
         timeout: float,
+        tool: Tool | None = None,
     ) -> None:
         super().__init__(velocity, timeout)
         self._send_goal = send
+        self._tool = tool
         self._over = asyncio.Event()
         self._renewing: asyncio.Task[None] | None = None
 
@@ -86,7 +88,10 @@ class AsyncJog(HeldVelocity[AsyncGoalHandle]):
             return False
 
     async def _send(self, velocity: Velocity, timeout: float) -> AsyncGoalHandle:
-        return await self._send_goal(lambda name: VelocityGoal(*velocity, timeout=timeout, id=name), self._id)
+        def made(name: str) -> VelocityGoal:
+            return VelocityGoal(*velocity, timeout=timeout, id=name, tool=self._tool)
+
+        return await self._send_goal(made, self._id)
 
     async def _renew(self) -> None:
         while not await self._is_over(self._timeout / 3.0):

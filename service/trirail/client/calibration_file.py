@@ -43,6 +43,8 @@ def write(path: Path, robot: str, calibration: CameraCalibration, targets: Marks
 
 def read(path: Path) -> CalibrationFile:
     """Read it. Raises FileError with the file, the field and what would be right."""
+    if not path.exists():
+        raise FileError(f"{path}: no such file; trirail align calibrate makes it")
     text = files.text(path)
     try:
         return decoded(text, CalibrationFile)

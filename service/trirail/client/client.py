@@ -275,13 +275,17 @@ class Robot:
             self._arrive(first_pose(meant))
         return self.send(lambda name: TrajectoryGoal(meant, stretch=stretch, settle=settle, id=name), id)
 
-    def jog(self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2) -> Jog:
+    def jog(
+        self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2, tool: Tool | None = None
+    ) -> Jog:
         """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
+
+        It is that of a `tool`, about which the platform turns; of the centre where there is none.
 
         with robot.jog(x=0.01):
             wait_for_the_key_to_be_released()
         """
-        return Jog(self.send, (x, y, phi), timeout)
+        return Jog(self.send, (x, y, phi), timeout, tool)
 
     def track(self, *, timeout: float = 0.25, id: str | None = None) -> Track:  # noqa: A002 - the field's name on the wire
         """Follow a moving target while the context lasts, told of 10 to 200 times a second; brake when it ends.

@@ -12,7 +12,7 @@ import msgspec
 
 from trirail.client.outgoing import number, seconds
 from trirail.errors import RefusalCode, RefusedError, TrirailError
-from trirail.wire.goals import Goal, VelocityGoal
+from trirail.wire.goals import Goal, Tool, VelocityGoal
 from trirail.wire.messages import GoalReply, Residual
 from trirail.wire.vocabulary import Command, Stop
 
@@ -145,9 +145,9 @@ class Jog(HeldVelocity[GoalHandle]):
     a new one. `error` tells whether it could not be renewed. Leaving the context brakes at once and waits for the
     standstill.
 
-    `velocity` is that of x, y [m/s] and phi [rad/s] in the base frame, `timeout` in seconds. Entering the context
-    raises RefusedError where the service does not take it, leaving it TimeoutError where no end is heard. `send` sends
-    a goal that it is given the id for, as Robot.send does.
+    `velocity` is that of x, y [m/s] and phi [rad/s] in the base frame, of a `tool`, `timeout` in seconds. Entering the
+    context raises RefusedError where the service does not take it, leaving it TimeoutError where no end is heard.
+    `send` sends a goal that it is given the id for, as Robot.send does.
     """
 
     def __init__(
@@ -155,9 +155,11 @@ class Jog(HeldVelocity[GoalHandle]):
         send: Callable[[Callable[[str], Goal], str], GoalHandle],
         velocity: Velocity,
         timeout: float,
+        tool: Tool | None = None,
     ) -> None:
         super().__init__(velocity, timeout)
         self._send_goal = send
+        self._tool = tool
         self._over = threading.Event()
         self._renewing = threading.Thread(target=self._renew, name="jog", daemon=True)
 
@@ -175,7 +177,10 @@ class Jog(HeldVelocity[GoalHandle]):
             self._goal.wait(self._timeout + STANDS_WITHIN)
 
     def _send(self, velocity: Velocity, timeout: float) -> GoalHandle:
-        return self._send_goal(lambda name: VelocityGoal(*velocity, timeout=timeout, id=name), self._id)
+        def made(name: str) -> VelocityGoal:
+            return VelocityGoal(*velocity, timeout=timeout, id=name, tool=self._tool)
+
+        return self._send_goal(made, self._id)
 
     def _renew(self) -> None:
         while not self._over.wait(self._timeout / 3.0):

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from trirail.client.goal import LETTING_GO, GoalHandle, Velocity
 from trirail.errors import RefusalCode, RefusedError, TrirailError
-from trirail.wire.goals import Goal, VelocityGoal
+from trirail.wire.goals import Goal, Tool, VelocityGoal
 
 TIMEOUT = 0.2
 """Real time after which the service brakes a jog that is not renewed [s]."""
@@ -33,18 +33,19 @@ class HeldJog:
         self._send_goal = send
         self._ended = ended
         self._changed = threading.Condition()
-        self._sign: tuple[Velocity, float] | None = None
+        self._sign: tuple[Velocity, Tool | None, float] | None = None
         self._let_go = False
         self._closed = False
         self._goal: GoalHandle | None = None
+        self._tool: Tool | None = None
         self._over = False
         self._thread = threading.Thread(target=self._run, name="held jog", daemon=True)
         self._thread.start()
 
-    def hold(self, velocity: Velocity) -> None:
-        """Take a sign of the hand: it wants this velocity now."""
+    def hold(self, velocity: Velocity, tool: Tool | None = None) -> None:
+        """Take a sign of the hand: it wants this velocity now, of this tool."""
         with self._changed:
-            self._sign = velocity, time.monotonic()
+            self._sign = velocity, tool, time.monotonic()
             self._changed.notify()
 
     def release(self) -> None:
@@ -74,12 +75,13 @@ class HeldJog:
             if closed:
                 return
 
-    def _renew(self, velocity: Velocity, at: float) -> None:
+    def _renew(self, velocity: Velocity, tool: Tool | None, at: float) -> None:
         if self._over or time.monotonic() - at > TIMEOUT:
             return
         if self._goal is not None and self._goal.result is not None:
             self._end(self._goal.result.message)
             return
+        self._tool = tool
         try:
             self._goal = self._send(velocity, TIMEOUT)
         except RefusedError as refusal:
@@ -98,7 +100,7 @@ class HeldJog:
 
     def _send(self, velocity: Velocity, timeout: float, goal_id: str | None = None) -> GoalHandle:
         goal_id = goal_id or (self._goal.id if self._goal is not None else uuid.uuid4().hex[:12])
-        return self._send_goal(lambda name: VelocityGoal(*velocity, timeout=timeout, id=name), goal_id)
+        return self._send_goal(lambda name: VelocityGoal(*velocity, timeout=timeout, id=name, tool=self._tool), goal_id)
 
     def _end(self, why: str) -> None:
         self._goal, self._over = None, True

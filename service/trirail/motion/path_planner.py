@@ -17,7 +17,7 @@ from trirail.motion.limits import COORDINATES, UNITS, Bounds
 from trirail.motion.paths import Path, constant
 from trirail.motion.quintic import Point, check_ends, quintic
 from trirail.motion.ruckig_call import Kinodynamic, Solver
-from trirail.motion.runs import NO_TOOL, STILL, MotionState, joined, of_centre, of_tool, rest, stretched
+from trirail.motion.runs import NO_TOOL, STILL, MotionState, joined, of_centre, of_tool, rest, stretched, tools_of
 from trirail.motion.straight_lines import time_optimal
 from trirail.quantities import apart, beyond, worded
 
@@ -35,7 +35,8 @@ FASTEST_OVERRIDE = 2.0
 """At how many times its nominal rate the time along a path may be told to run."""
 A_HAIR_MORE = 1.0 + 1e-6
 """What rounding may lose."""
-MEANT = {"m": 1e-3, "rad": math.pi / 180.0}
+MEANT = {"m": (1e-3, 1.0), "rad": (math.pi / 180.0, 2.0)}
+"""What millimetres and degrees are in SI, and from which number on they are taken to have been meant."""
 RATES = "/s", "/s²", "/s³"
 TOO_FAST_IN_MOTION = RefusedError(
     RefusalCode.TOO_FAST, "from its present motion the robot cannot take this path within its sliders' limits"
@@ -85,9 +86,10 @@ class PathPlanner:
         The pose is that of a tool, (u, v) in the platform's frame [m]; the workspace that of the platform's centre.
         """
         if violation := self.bounds.pose(of_centre(rest(target), tool).pose):
+            meant = _meant(violation.value, violation.limit, violation.unit)
             raise RefusedError(
                 RefusalCode.OUT_OF_WORKSPACE,
-                f"the goal is out of the workspace: {violation}",
+                f"the goal is out of the workspace: {violation}{meant}",
                 value=violation.value,
                 limit=violation.limit,
             )
@@ -106,7 +108,7 @@ class PathPlanner:
             if abs(value) > limit * A_HAIR_MORE:
                 most = math.copysign(limit, value)
                 asked, allowed = apart(value, most, f"{unit}/s")
-                meant = _meant(value, most, unit)
+                meant = _meant(value, most, f"{unit}/s")
                 text = f"the jog's velocity {asked} in {name} is above the limit of {allowed}{meant}"
                 raise RefusedError(RefusalCode.ABOVE_LIMIT, text, value=value, limit=most)
 
@@ -153,31 +155,35 @@ class PathPlanner:
         sliders = MotionState(*rows[:3].tolist())
         return self._to_rest(start, sliders, target, self._sliders, speed, in_sliders=True)
 
-    def jog(self, start: MotionState, velocity: Sequence[float], timeout: float) -> Plan:
+    def jog(
+        self, start: MotionState, velocity: Sequence[float], timeout: float, tool: Sequence[float] = NO_TOOL
+    ) -> Plan:
         """Plan to a velocity, held until `timeout` is surely over or a limit comes near, and to rest.
 
+        It is that of a tool, (u, v) in the platform's frame [m], about which the platform turns.
         `timeout` is real time, and time along the path runs at up to twice its rate: who ends the jog is the control.
         Faster than platform or sliders may: as fast as they may. Raises RefusedError where not even braking stays
         inside.
         """
-        share, hold, bound = 1.0, FASTEST_OVERRIDE * timeout, None
+        share, slower, hold, bound = 1.0, 1.0, FASTEST_OVERRIDE * timeout, None
         for value, limit in zip(velocity, self.platform.velocity, strict=True):
             if abs(value) * share > limit:
                 share = limit / abs(value)
         for _ in range(JOGS):
-            ramp, brake, path = self._jog(start, [share * value for value in velocity], hold)
+            asked = [share / slower * value for value in velocity]
+            ramp, brake, path = self._jog(of_tool(start, tool), asked, hold, tool, _slower(self.platform, slower))
             found = self.checker.sample(path, constant(1.0), 0.0, path.duration, start.pose)
             if found.fits or (found.within_limits and not start.at_rest):
-                return Plan(path, 1.0 / share, bound)
+                return Plan(path, slower / share, bound)
             if math.isnan(found.leaves_at):
-                share *= ROOM / found.excess
+                slower *= found.excess / ROOM
                 continue
             bound = self.checker.bound(path, found.leaves_at, start.pose)
             if hold > 0.0:
                 hold = max(0.0, found.leaves_at - ramp - brake)  # to rest where it would have been out of reach
             else:
                 share /= 2.0
-        path = self.to_velocity(start, STILL)
+        path = self._solver.to_velocity(of_tool(start, tool), STILL, self.platform, tool)
         if not self.checker.bears(self.checker.whole(path, start.pose)):
             raise TOO_FAST_IN_MOTION
         return Plan(path, bound=bound)
@@ -274,9 +280,11 @@ class PathPlanner:
             factor *= found * A_HAIR_MORE
         raise RefusedError(RefusalCode.TOO_FAST, f"the path does not fit its limits even {factor:.3g} times slower")
 
-    def _jog(self, start: MotionState, velocity: Sequence[float], hold: float) -> tuple[float, float, Path]:
-        """Return how long it takes to reach a velocity, and to brake from it, and the whole path."""
-        ramp = self.to_velocity(start, velocity)
+    def _jog(
+        self, start: MotionState, velocity: Sequence[float], hold: float, tool: Sequence[float], limits: Kinodynamic
+    ) -> tuple[float, float, Path]:
+        """Return how long it takes a tool to reach a velocity, and to brake from it, and the whole path."""
+        ramp = self._solver.to_velocity(start, velocity, limits, tool)
         if not any(velocity):
             return ramp.duration, 0.0, ramp
         pose = ramp.end
@@ -284,11 +292,19 @@ class PathPlanner:
         held[0, :, 0], held[0, :, 1] = pose, velocity
         hold = max(hold, self._period)
         end = [value + hold * rate for value, rate in zip(pose, velocity, strict=True)]
-        brake = self.to_velocity(MotionState(end, velocity, STILL), STILL)
-        return ramp.duration, brake.duration, joined([ramp, Path(np.array([0.0, hold]), held), brake])
+        brake = self._solver.to_velocity(MotionState(end, velocity, STILL), STILL, limits, tool)
+        whole = joined([ramp, Path(np.array([0.0, hold]), held, tools=tools_of(tool, 1)), brake])
+        return ramp.duration, brake.duration, whole
+
+
+def _slower(limits: Kinodynamic, factor: float) -> Kinodynamic:
+    """Return the limits of the same motion that many times slower."""
+    powers = factor ** np.arange(1.0, 4.0)
+    return Kinodynamic(*(np.array(limits) / powers[:, None]).tolist())
 
 
 def _meant(value: float, limit: float, unit: str) -> str:
     """Return what a bare number may have meant that is above a limit: millimetres or degrees."""
-    meant = value * MEANT[unit]
-    return f": did you mean {worded(meant, f'{unit}/s')}?" if abs(meant) <= abs(limit) else ""
+    size, least = MEANT[unit.removesuffix("/s")]
+    likely = abs(value) >= least and abs(value) * size <= abs(limit)
+    return f": did you mean {worded(value * size, unit)}?" if likely else ""

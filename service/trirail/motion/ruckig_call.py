@@ -70,12 +70,14 @@ class Solver:
         request.target_position = list(target)
         return self._solved(self._together, request, limits.jerk, in_sliders, tool)
 
-    def to_velocity(self, start: MotionState, velocity: Sequence[float], limits: Kinodynamic) -> Path:
-        """Return the quickest way to a velocity [m/s, rad/s]. Raises RefusedError."""
+    def to_velocity(
+        self, start: MotionState, velocity: Sequence[float], limits: Kinodynamic, tool: Sequence[float] = NO_TOOL
+    ) -> Path:
+        """Return the quickest way to a tool's velocity [m/s, rad/s]. Raises RefusedError."""
         request = _request(start, limits)
         request.control_interface = ControlInterface.Velocity
         request.target_velocity = list(velocity)
-        return self._solved(self._together, request, limits.jerk)
+        return self._solved(self._together, request, limits.jerk, tool=tool)
 
     def _straight(
         self,

@@ -38,6 +38,13 @@ class NamedFrames:
         return found
 
 
+def point(tool: Tool | None) -> tuple[float, float]:
+    """Return the point of the platform that a planned goal is of: its name is known where the goal came in."""
+    if isinstance(tool, str):
+        raise TypeError(f"tool {tool!r} of a planned goal is no point")
+    return tool or NO_TOOL
+
+
 def rotated(x: float, y: float, angle: float) -> tuple[float, float]:
     """Return a vector, turned counterclockwise [rad]."""
     if angle == 0.0:

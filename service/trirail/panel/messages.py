@@ -44,6 +44,8 @@ class Hold(_Said, frozen=True, tag="hold"):
     """Of x, y [m/s] and phi [rad/s], in the base frame."""
     seen: int
     """The stamp of the newest state that the page has drawn: who sees an old picture must not move the robot."""
+    tool: FrameName | None = None
+    """One of [frames.tool], about which it turns; the centre where there is none."""
 
 
 class Release(_Said, frozen=True, tag="release"):

@@ -76,9 +76,9 @@ class Tab:
                     while self._unseen and self._unseen[0] <= stamp:
                         self._unseen.popleft()
                     self._feed.changed.notify_all()
-            case Hold(velocity, seen):
+            case Hold(velocity, seen, tool):
                 if now() - seen <= FRESH:
-                    self._jog.hold(velocity)
+                    self._jog.hold(velocity, tool)
             case Release():
                 self._jog.release()
             case Tell(name):

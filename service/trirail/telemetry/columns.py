@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -81,6 +81,16 @@ def ragged(rows: Sequence[Sequence[NDArray[np.float64]]]) -> pa.ListArray:
     points = _vectors(np.concatenate([np.empty((0, 2)), *lines]))
     ends = np.cumsum([0, *map(len, rows)], dtype=np.int32)
     return pa.ListArray.from_arrays(ends, _lines(points, np.cumsum([0, *map(len, lines)])))
+
+
+def layout(kind: np.dtype[Any]) -> pa.StructType:
+    """Return the kind of the struct that a record of a kind is in a file."""
+    fields = []
+    for name in kind.names or ():
+        base, shape = kind[name].base, kind[name].shape
+        value = pa.from_numpy_dtype(base)
+        fields.append((name, pa.list_(value, *shape) if shape else value))
+    return pa.struct(fields)
 
 
 def structs(records: NDArray[np.void]) -> pa.ListArray:

@@ -29,13 +29,13 @@ from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
 from trirail.errors import EmptyRecordingError, ServiceError
-from trirail.telemetry.columns import FIELDS, RECORD, SECOND, structs
+from trirail.telemetry import recorded_cycles
+from trirail.telemetry.columns import RECORD
 from trirail.telemetry.journal import EVENTS, JSON, REQUESTS, WORDS
 from trirail.telemetry.provenance import SOFTWARE
 from trirail.wire.decoding import decoded, prepare
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
-from trirail.wire.records import DTYPE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,17 +53,9 @@ _END = 0
 
 _LEVEL = rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
-BY_CYCLE = "cycle"
-"""The field by which records are put in order."""
 _KEPT = (RECORD, EVENTS, REQUESTS)
 T = TypeVar("T", bound=msgspec.Struct)
 prepare(ControlInput, Event)
-_LAYOUT = structs(np.zeros(1, DTYPE)).type.value_type
-"""The records' fields, as they are in a file."""
-
-
-class OlderRecordingWarning(UserWarning):
-    """A recording was written before its records had all the fields that they have now."""
 
 
 class Line(NamedTuple):
@@ -154,7 +146,7 @@ def read(path: Path) -> Recording:
     kept = [chunk for chunk in chunks if chunk.entity_path == RECORD]
     if SOFTWARE in texts and not kept:
         raise EmptyRecordingError(f"{path}: nothing was recorded: its service ended before the first cycle reached it")
-    records, t, wall = _records(kept, path)
+    records, t, wall = recorded_cycles.read([chunk.to_record_batch() for chunk in kept], path)
     return Recording(
         name=next(iter(_static(chunks, "RecordingInfo:name").values()), ""),
         records=records,
@@ -241,42 +233,10 @@ def _chunks(whole: Path, path: Path) -> list[Chunk]:
         raise ServiceError(f"{path}: cannot be read as a recording: {error}") from error
 
 
-def _records(chunks: list[Chunk], path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], NDArray[np.datetime64]]:
-    batches = [chunk.to_record_batch() for chunk in chunks]
-    if not any(batch.num_rows for batch in batches):
-        raise ServiceError(f"{path}: holds no records of cycles (entity {RECORD}): was it made by trirail?")
-    rows = pa.concat_arrays([batch.column(FIELDS.component).flatten() for batch in batches])
-    if odd := set(rows.type) - set(_LAYOUT):
-        names = ", ".join(sorted({field.name for field in odd}))
-        raise ServiceError(f"{path}: written by another version: its records differ in {names}")
-    records = np.zeros(len(rows), DTYPE)
-    there = [field.name for field in rows.type]
-    if missing := [name for name in DTYPE.names or () if name not in there]:
-        if BY_CYCLE in missing:
-            raise ServiceError(f"{path}: written by another version: its records have no {BY_CYCLE}")
-        for name in missing:
-            records[name] = np.nan if np.issubdtype(DTYPE[name].base, np.floating) else 0
-        warnings.warn(
-            f"{path}: written by an older version: its records have no {', '.join(missing)}; read as NaN, or 0 where "
-            "that is none",
-            OlderRecordingWarning,
-            stacklevel=3,
-        )
-    for name in there:
-        values = rows.field(name)
-        flat = values.flatten() if records[name].ndim > 1 else values
-        records[name] = flat.to_numpy().reshape(records[name].shape)
-    t = np.concatenate([batch.column("t").to_numpy() for batch in batches]).astype(np.int64) / SECOND
-    wall = np.concatenate([batch.column("wall").to_numpy() for batch in batches])
-    order = np.argsort(records["cycle"], kind="stable")
-    return records[order], t[order], wall[order]
-
-
 def _events(chunks: list[Chunk], path: Path) -> list[Line]:
     lines: list[Line] = []
     for batch in (chunk.to_record_batch() for chunk in chunks):
-        t = batch.column("t").to_numpy().astype(np.int64) / SECOND
-        wall = batch.column("wall").to_numpy()
+        t, wall = recorded_cycles.times([batch])
         levels, texts = (_texts(batch, name, path, "events") for name in (_LEVEL, WORDS.component))
         spoken = batch.column(JSON.component).to_pylist() if JSON.component in batch.schema.names else [None] * len(t)
         events = [_decoded(content[0], Event, path, "events") if content else None for content in spoken]

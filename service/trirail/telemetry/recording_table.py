@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -108,7 +109,10 @@ def chosen(columns: Sequence[str]) -> tuple[str, ...]:
         exact = [name for name in (*TIMES, *everything) if name == column]
         meant = exact or [name for name in everything if column in name.split("_")]
         if not meant:
-            raise ServiceError(f"no column {quoted(column)}: a word of these was expected: {', '.join(everything)}")
+            words = dict.fromkeys(word for name in everything for word in (name, *name.split("_")))
+            close = difflib.get_close_matches(column, words, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"a word of these was expected: {', '.join(everything)}"
+            raise ServiceError(f"no column {quoted(column)}: {hint}")
         found += meant
     return tuple(dict.fromkeys(found)) if columns else everything
 

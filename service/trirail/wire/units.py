@@ -97,8 +97,9 @@ def quantity(text: str, dimension: Dimension, bare: str | None = None) -> float:
     if match is None or size is None or not math.isfinite(float(match[1])):
         alone = bare or next(iter(dimension.units))
         units = ", ".join(name for name in dimension.units if "μ" not in name and "^" not in name)
+        hint = ": no space stands before a unit" if text.strip() in dimension.units else comma_hint(text)
         raise ValueError(
             f"{quoted(text.strip())!r} is not {dimension.name} such as {dimension.examples}; "
-            f"units are {units}, a bare number is in {alone}{comma_hint(text)}"
+            f"units are {units}, a bare number is in {alone}{hint}"
         )
     return float(Decimal(match[1]) * size)

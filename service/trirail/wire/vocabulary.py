@@ -168,22 +168,22 @@ class Command(StrEnum):
     STOP = _CommandRow("stop", "Stop the robot within its limits.", Role.VIEWER, Stop, stops=True, everybodys=True)
     QUICK_STOP = _CommandRow(
         "quick_stop",
-        "Stop every drive as fast as it can; the robot is in fault until a reset.",
+        "Stop every drive as fast as it can: in fault until a reset.",
         Role.OPERATOR,
         stops=True,
         everybodys=True,
     )
-    RESET = _CommandRow("reset", "Clear a fault whose cause is gone; the robot stays without power.", Role.MAINTAINER)
+    RESET = _CommandRow("reset", "Clear a fault whose cause is gone; power stays off.", Role.MAINTAINER)
     HOME = _CommandRow(
         "home",
-        "Find where the sliders are, where the encoders are not absolute: one drive after the other, slowly.",
+        "Find where sliders without absolute encoders are, slowly.",
         Role.MAINTAINER,
     )
     PAUSE = _CommandRow("pause", "Stop on the path and keep the goal.", Role.OPERATOR, stops=True)
     RESUME = _CommandRow("resume", "Go on with a paused goal.", Role.OPERATOR)
     OVERRIDE = _CommandRow(
         "override",
-        "Let motions run at a share of full speed, 0 or 1 to 200 %, never beyond the limits.",
+        "Let motions run at a share of full speed, 0 or 1 to 200 %.",
         Role.OPERATOR,
         Override,
     )

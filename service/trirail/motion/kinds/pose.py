@@ -9,8 +9,8 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.goal_motion import GoalMotion, Place
 from trirail.motion.path_planner import Plan
 from trirail.motion.ruckig_call import Kinodynamic
-from trirail.motion.runs import NO_TOOL, MotionState
-from trirail.motion.tool_frames import NamedFrames, rotated
+from trirail.motion.runs import MotionState
+from trirail.motion.tool_frames import NamedFrames, point, rotated
 from trirail.wire.goals import PoseGoal
 
 
@@ -35,21 +35,16 @@ class PoseMotion(GoalMotion[PoseGoal]):
 
     def check(self, goal: PoseGoal) -> None:
         """Refuse a pose out of the workspace, and limits above the platform's."""
-        self._planner.check_pose((goal.x, goal.y, goal.phi), _tool(goal))
+        self._planner.check_pose((goal.x, goal.y, goal.phi), point(goal.tool))
         self._limits(goal)
 
     def plan(self, goal: PoseGoal, start: MotionState, rate: float, begins: float) -> Plan:
         """Plan to rest at the pose."""
         del rate, begins
-        return self._planner.to_pose(start, (goal.x, goal.y, goal.phi), goal.speed, self._limits(goal), _tool(goal))
+        return self._planner.to_pose(
+            start, (goal.x, goal.y, goal.phi), goal.speed, self._limits(goal), point(goal.tool)
+        )
 
     def _limits(self, goal: PoseGoal) -> Kinodynamic | None:
         own = goal.limits
         return self._planner.lowered(own.velocity, own.acceleration, own.jerk) if own else None
-
-
-def _tool(goal: PoseGoal) -> tuple[float, float]:
-    """Return the point of the platform that a planned pose is of; its name is known where the goal came in."""
-    if isinstance(goal.tool, str):
-        raise TypeError(f"tool {goal.tool!r} of a planned goal is no point")
-    return goal.tool or NO_TOOL

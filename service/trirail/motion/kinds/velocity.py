@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from trirail.motion.goal_motion import GoalMotion
+import msgspec
+
+from trirail.motion.goal_motion import GoalMotion, Place
 from trirail.motion.path_planner import Plan
 from trirail.motion.runs import MotionState
+from trirail.motion.tool_frames import NamedFrames, point
 from trirail.wire.kinds.velocity import VelocityGoal
 
 
@@ -13,6 +16,12 @@ class VelocityMotion(GoalMotion[VelocityGoal]):
 
     kind = VelocityGoal
 
+    @staticmethod
+    def meant(goal: VelocityGoal, frames: NamedFrames, place: Place) -> VelocityGoal:
+        """Return the jog of a point of the platform."""
+        del place
+        return msgspec.structs.replace(goal, tool=frames.tool(goal.tool))
+
     def check(self, goal: VelocityGoal) -> None:
         """Refuse velocities above the platform's limits."""
         self._planner.check_velocity((goal.x, goal.y, goal.phi))
@@ -20,4 +29,5 @@ class VelocityMotion(GoalMotion[VelocityGoal]):
     def plan(self, goal: VelocityGoal, start: MotionState, rate: float, begins: float) -> Plan:
         """Plan to the velocity, and to rest."""
         del rate, begins
-        return self._planner.jog(start, (goal.x, goal.y, goal.phi), goal.timeout)
+        velocity = goal.x, goal.y, goal.phi
+        return self._planner.jog(start, velocity, goal.timeout, point(goal.tool))

@@ -1,4 +1,4 @@
-// Jogging: while a button is held, or by a step for each press; along the axes of a frame, steps about a tool.
+// Jogging: while a button is held, or by a step for each press; along the axes of a frame, about a tool.
 
 import { offer, rotated } from "./frames.js";
 import { Hold } from "./hold.js";
@@ -16,7 +16,7 @@ export class Jogging {
     this.step = 0; // which of STEPS is chosen
     this.hold = new Hold(
       document.querySelectorAll(".hold"),
-      (direction) => STEPS[this.step] === null && send({ do: "hold", velocity: this.#velocity(direction), seen: now().seen }),
+      (direction) => STEPS[this.step] === null && send({ do: "hold", velocity: this.#velocity(direction), seen: now().seen, tool: byId("tool").value || null }),
       () => send({ do: "release" }),
       ({ axis, sign }) => {
         if (STEPS[this.step] === null) return;

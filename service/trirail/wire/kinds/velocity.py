@@ -7,7 +7,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.goal_kind import Coordinate, GoalKind, Identifier, Validity
+from trirail.wire.goal_kind import Coordinate, GoalKind, Identifier, Tool, Validity
 
 
 class VelocityGoal(GoalKind, frozen=True, tag="velocity"):
@@ -16,17 +16,19 @@ class VelocityGoal(GoalKind, frozen=True, tag="velocity"):
     renewed = True
 
     x: Coordinate
-    """Velocity of the platform's centre along x of the base frame [m/s]."""
+    """Velocity of the platform's centre, or of its `tool`, along x of the base frame [m/s]."""
     y: Coordinate
     """Along y [m/s]."""
     phi: Coordinate
-    """Rate of the platform's angle, counterclockwise [rad/s]."""
+    """Rate of the platform's angle, counterclockwise, about that point [rad/s]."""
     id: Identifier | None = None
     """The same for every renewal of one jog."""
     timeout: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.1
     """Real time, at every override, after which a jog that is not renewed brakes [s]."""
     valid_for: Validity | None = None
     """As of a pose goal [s]."""
+    tool: Tool | None = None
+    """The point that moves at x, y and about which the platform turns; the centre where there is none."""
 
     def check_beginning(self) -> None:
         """Raise RefusedError for a jog that would begin at rest."""
