@@ -8,7 +8,8 @@ from pathlib import Path
 import message_schemas
 import msgspec
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
+from control_rig import CONFIG
 from msgspec.structs import fields
 from trirail.cli.app import app
 from trirail.client.async_client import AsyncRobot

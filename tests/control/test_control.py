@@ -9,7 +9,8 @@ import can
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Delay, Rig, changed
+from conftest import Delay, Rig, changed
+from control_rig import CONFIG
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray

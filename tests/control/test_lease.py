@@ -9,7 +9,8 @@ from typing import Literal, NamedTuple
 
 import msgspec
 import pytest
-from conftest import CONFIG, Rig, carried
+from conftest import Rig
+from control_rig import CONFIG, carried
 from trirail.config import ControlTable
 from trirail.control.lease import REMEMBERED_IDS, LeaseArbiter
 from trirail.errors import RefusalCode, RefusedError

@@ -7,8 +7,9 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
 from control.test_control import PERIOD, assert_within_limits, refusal
+from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import Config, FramesTable

@@ -10,9 +10,10 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
 from control.test_control import assert_within_limits
 from control.test_stop import PROMPT, STEP, braking, confirmed_after, play
+from control_rig import CONFIG
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.motion.feasibility import Look

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
+from control_rig import CONFIG
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.config import geometry

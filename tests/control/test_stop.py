@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig, carried
+from conftest import Rig
+from control_rig import CONFIG, carried
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.config import Config

@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
 from control.test_control import assert_within_limits, refusal
 from control.test_stop import PROMPT, braking, confirmed_after
+from control_rig import CONFIG
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray

@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 from canopen.profiles.p402 import BaseNode402
-from conftest import CONFIG, Delay, Rig, changed
+from conftest import Delay, Rig, changed
+from control_rig import CONFIG
 from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import inverse

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
 from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits
+from control_rig import CONFIG
 from motion.test_motion import only_from_rest
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker

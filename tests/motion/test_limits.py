@@ -7,8 +7,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig, changed
+from conftest import Rig, changed
 from control.test_control import GOAL, PERIOD, ROBOT, assert_within_limits, refusal
+from control_rig import CONFIG
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray

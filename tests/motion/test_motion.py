@@ -10,8 +10,9 @@ from collections import Counter
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
 from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal, slower
+from control_rig import CONFIG
 from numpy.typing import NDArray
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 from trirail.config import Config

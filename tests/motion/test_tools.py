@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
 from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits, refusal
+from control_rig import CONFIG
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray

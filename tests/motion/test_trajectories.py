@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
 from control.test_control import PERIOD, assert_within_limits, refusal
+from control_rig import CONFIG
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.wire.goals import PoseGoal, TrajectoryGoal, TrajectoryPoint
