@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import msgspec
-from conftest import CONFIG
+from control_rig import CONFIG
 from trirail.cli.key_folder import AUTHORITY_KEY, KeyFolder
 from trirail.config import Config, Tls, Zenoh
 from trirail.telemetry.sinks import free_port

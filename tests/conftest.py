@@ -12,7 +12,6 @@ import tempfile
 import traceback
 import tracemalloc
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from typing import cast
 
@@ -21,32 +20,23 @@ import msgspec
 import numpy as np
 import pytest
 import trirail
-from msgspec.structs import fields
+from control_rig import CONFIG, ControlRig
 from numpy.typing import NDArray
-from trirail.config import SIM, Config, load
-from trirail.control.control import Control, Given
-from trirail.control.local_planner import LocalPlanner
-from trirail.control.notices import Notice
-from trirail.motion.paths import FOR_EVER, Path, constant
-from trirail.motion.runs import MotionState
-from trirail.wire.goals import Goal, PoseGoal
-from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
-from trirail.wire.vocabulary import Command, CommandContent, Mode
+from trirail.config import Config
+from trirail.wire.packets import Request
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import Feedback, Triple
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedDrive
 
-SHIPPED = load(SIM)
-# In simulated time no machine keeps the drives waiting: what is lost is lost as soon as that of real ones.
-CONFIG = msgspec.structs.replace(SHIPPED, drives=msgspec.structs.replace(SHIPPED.drives, missed_positions=3))
-
 _STATE = tempfile.TemporaryDirectory(prefix="trirail-tests-")
 os.environ["STATE_DIRECTORY"] = _STATE.name  # the poses that somebody has taught on this machine are no test's
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what it runs beside it without
 pytest_plugins = ["generated", "parsed_eds"]
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells have it for what runs in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def changed(config: Config, **simulated: object) -> Config:
@@ -94,75 +84,22 @@ FRAMES = 25
 """How deep a stack is looked into for who has allocated."""
 
 
-def carried(name: str, rate: float | None = None) -> CommandContent:
-    """What a command carries at least: 1 for each number that it needs, or for override a rate, 1 being full speed."""
-    content = Command(name).content
-    return content(*(1.0 if rate is None else 100.0 * rate for field in fields(content) if field.required))
-
-
-class Cycles(ABC):
-    """Runs cycles of a control, and keeps what it said."""
-
-    control: Control
-
-    def __init__(self) -> None:
-        self.answers: list[Answer] = []
-        self.notices: list[Notice] = []
-
-    @abstractmethod
-    def cycle(self, request: Request | None = None) -> None:
-        """Run one cycle, with a request or without."""
-
-    @property
-    def mode(self) -> Mode:
-        """The robot's mode."""
-        return self.control.state.mode
-
-    def keep_what_was_said(self) -> None:
-        """Move answers and notices from the control's ledger to here."""
-        ledger = self.control.ledger
-        self.answers += ledger.answers
-        self.notices += ledger.notices
-        ledger.answers.clear()
-        ledger.notices.clear()
-
-    def cycles(self, number: int) -> None:
-        """Run so many cycles."""
-        for _ in range(number):
-            self.cycle()
-
-    def until(self, condition: Callable[[], bool], within: int = 5000) -> int:
-        """Run cycles until something holds; return how many."""
-        for number in range(within):
-            if condition():
-                return number
-            self.cycle()
-        raise AssertionError(f"not within {within} cycles; the mode is {self.mode}")
-
-
-class Rig(Cycles):
-    """Runs cycles of control, driver and drives, and keeps what was said and every frame that was sent."""
+class Rig(ControlRig):
+    """The same over the real driver and simulated drives; keeps every frame that was sent."""
 
     def __init__(self, config: Config = CONFIG, delay: Delay | None = None) -> None:
-        super().__init__()
-        self.config = config
+        """`delay`: of the drives' frames."""
         self.now = 100.0
         self.bus = simulated_bus(config.can, config.drives, lambda: self.now)
         self.sent: list[can.Message] = []
+        self.seen: list[list[tuple[int, int]]] = []
         self._send = self.bus.send
         self.bus.send = self._note  # type: ignore[assignment,method-assign]
-        driver = PROTOCOLS[config.drives.protocol].driver
-        self.driver = driver(self.bus, config.can.bitrate, config.drives, lambda: self.now)
-        self.driver.configure(config.period)
+        driver = PROTOCOLS[config.drives.protocol].driver(self.bus, config.can.bitrate, config.drives, lambda: self.now)
+        driver.configure(config.period)
         if delay is not None:
             delay_answers(self.bus, delay, lambda: self.now)
-        self.planner = LocalPlanner(config)
-        self.control = Control(config, self.driver, self.planner)
-        self.driver.sync()
-        self.control.start(self.driver.read())
-        self.rows: list[list[list[float]]] = []
-        self.seen: list[list[tuple[int, int]]] = []
-        self._tickets = itertools.count(1)
+        super().__init__(config, driver)
 
     def _note(self, message: can.Message, timeout: float | None = None) -> None:
         self.sent.append(message)
@@ -172,90 +109,25 @@ class Rig(Cycles):
     def drives(self) -> tuple[SimulatedDrive, ...]:
         return cast(tuple[SimulatedDrive, ...], self.bus.drives)  # tests with another protocol take rig.bus.drives
 
-    def holds(self) -> bool:
-        """Whether the robot stands and is ready for a goal."""
-        return self.mode is Mode.HOLDING
-
     def cycle(self, request: Request | None = None) -> None:
         """Run one cycle, with a request or without; `sent` holds its frames afterwards."""
-        self.now += self.config.period
         self.sent.clear()
-        control = self.control
-        self.driver.sync()
-        now_ns = round(self.now * 1e9)
-        given: list[Given] = [] if request is None else [(request, now_ns)]
-        given += [(answer, now_ns) for answer in self.planner.answers()]
-        control.cycle(self.driver.read, given)
-        self.rows.append(control.setpoints.rows)
+        super().cycle(request)
         self.seen.append(
             [canopen_frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6]
         )
-        self.keep_what_was_said()
-
-    def command(self, name: str, value: float | None = None) -> Answer:
-        """Send a command and run until it is answered."""
-        ticket = next(self._tickets)
-        self.cycle(CommandRequest(ticket, "ann", Command(name), carried(name, value)))
-        self.until(lambda: self._answered(ticket))
-        return self._answer(ticket)
-
-    def goal(self, id: str, x: float, y: float, phi: float, speed: float = 1.0) -> Answer:  # noqa: A002
-        """Send a pose goal; return its answer."""
-        return self.send(id, PoseGoal(x=x, y=y, phi=phi, speed=speed))
-
-    def send(self, id: str, goal: Goal) -> Answer:  # noqa: A002
-        """Send a goal; return its answer."""
-        ticket = next(self._tickets)
-        self.cycle(GoalRequest(ticket, "ann", id, goal, round(self.now * 1e9)))
-        self.until(lambda: self._answered(ticket), 50)
-        return self._answer(ticket)
-
-    def post(self, id: str, goal: Goal) -> None:  # noqa: A002
-        """Send a goal in this cycle and do not wait for its answer."""
-        self.cycle(GoalRequest(next(self._tickets), "ann", id, goal, round(self.now * 1e9)))
-
-    def go_on_with(self, state: MotionState) -> None:
-        """Let the run under way have this motion in the next cycle, whatever it has now."""
-        run = self.control.schedule.runs[0]
-        pieces = np.zeros((1, 3, 6))
-        pieces[0, :, :3] = np.transpose(state)
-        pieces[0, :, 2] /= 2.0
-        run.path = Path(np.array([0.0, FOR_EVER]), pieces)
-        run.change_law(constant(1.0), 1.0)
-        run.time = -self.config.period
-        run.furthest[:] = -math.inf
-
-    def order(self, name: str, value: float | None = None) -> None:
-        """Send a command in this cycle and do not wait for its answer."""
-        self.cycle(CommandRequest(next(self._tickets), "ann", Command(name), carried(name, value)))
-
-    def _answered(self, ticket: int) -> bool:
-        return any(getattr(answer, "ticket", None) == ticket for answer in self.answers)
-
-    def _answer(self, ticket: int) -> Answer:
-        return next(answer for answer in reversed(self.answers) if getattr(answer, "ticket", None) == ticket)
-
-    def enable(self) -> None:
-        self.command("enable")
-        assert self.mode is Mode.HOLDING
-
-    def outcomes(self) -> list[tuple[str | None, str | None]]:
-        return [(said.id, said.outcome) for said in self.notices if said.kind == "goal"]
-
-    def setpoints(self) -> NDArray[np.float64]:
-        """Rows of all cycles so far: (cycles, 6, 3), lambda_10, v_10, gamma_10, lambda_32, v_32, gamma_32."""
-        return np.array(self.rows)
 
     def captured(self) -> NDArray[np.float64]:
-        """Setpoints and velocity offsets [m, m/s] of all cycles so far, as their frames have them: (cycles, 2, 3).
-
-        Not a number where no setpoints were sent.
-        """
+        """Return what the frames of all cycles so far have, not a number where no setpoints were sent."""
         scale = np.array([drive.counts_per_metre * drive.direction for drive in self.config.drives.each])
         offset = np.array([drive.offset for drive in self.config.drives.each])
         nothing = [(math.nan, math.nan)] * 3
         counts = np.array([sent if len(sent) == 3 else nothing for sent in self.seen])
         return np.stack([counts[:, :, 0] / scale + offset, counts[:, :, 1] / scale], axis=1)
+
+
+FRAMES = 25
+"""How deep a stack is looked into for who has allocated."""
 
 
 class Followers:

@@ -14,6 +14,7 @@ import made
 import msgspec
 import numpy as np
 import pytest
+from processes.test_service import until
 from trirail.analysis.replay import again
 from trirail.analysis.summary import summary
 from trirail.client import own_service
@@ -132,7 +133,7 @@ def test_a_corrected_session_comes_out_the_same_without_the_maps_file(tmp_path: 
         robot.enable()
         for x in (0.03, -0.02, 0.01):
             assert robot.move_to(x=x, y=-x, phi=x).wait(20.0).outcome == "done"
-        assert robot.state().pose == pytest.approx((0.01, -0.01, 0.01), abs=1e-4)
+        until(robot, lambda state: state.pose == pytest.approx((0.01, -0.01, 0.01), abs=1e-4))
         assert own_service.end(service) == 0
     (tmp_path / "as_built.toml").unlink()
     recording = read(tmp_path / "session.rrd")

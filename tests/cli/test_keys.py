@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from cyclopts import CycloptsError
 from trirail.cli import app, doctor_network, key_folder, probes, terminal
 from trirail.cli.key_folder import KeyFolder

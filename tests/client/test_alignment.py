@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 from alignment.cameras import FOCUS, part_at
+from processes.test_service import told, until
 from trirail.alignment.camera_calibration import placed
 from trirail.alignment.images import CameraView, Pair, pixels
 from trirail.client import calibration_file
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.errors import AlignmentError, AlignmentFault, RefusedError, TrirailError
+from trirail.wire.messages import Event
 from trirail.wire.vocabulary import Mode
 
 PART: dict[str, Pair] = {"left": (-0.06, 0.01), "right": (0.06, 0.01)}
@@ -34,6 +36,11 @@ def seen(part: dict[str, Pair], pose: tuple[float, float, float]) -> dict[str, P
     return {name: tuple(pixels(VIEWS[name], placed(q, pose)[None])[0].tolist()) for name, q in part.items()}
 
 
+def to_go(event: Event) -> dict[str, object]:
+    """What a look has left to go, by mark."""
+    return {mark.name: mark.to_go for mark in event.alignment.marks} if event.alignment is not None else {}
+
+
 @pytest.mark.slow
 def test_one_correction_with_a_thread(locator: str) -> None:
     with Robot("demo", locator) as robot:
@@ -46,10 +53,11 @@ def test_one_correction_with_a_thread(locator: str) -> None:
         assert found.reached
         assert len(found.corrections) == 1
         assert found.confirmed
-        newest = [event for event in robot.events(history=True, timeout=0.2) if event.kind == "goal"][-1]
+        left = found.measurements[-1].errors
+        heard = told(robot, lambda heard: to_go(heard[-1]) == left)
+        newest = [event for event in heard if event.kind == "goal"][-1]
         assert (newest.id or "").startswith("align-")
-        told = [event.alignment for event in robot.events(history=True, timeout=0.2) if event.alignment is not None]
-        before, after = told[-2:]
+        before, after = [event.alignment for event in heard if event.alignment is not None][-2:]
         assert (newest.id or "").startswith(after.id)
         assert (before.correction, after.end) == (found.corrections[0].by, "reached")
         assert [{mark.name: mark.to_go for mark in look.marks} for look in (before, after)] == [
@@ -136,11 +144,10 @@ def test_ctrl_c_in_a_motion_stops_the_robot(locator: str) -> None:
         with pytest.raises(KeyboardInterrupt):
             robot.calibrate_camera(lambda: seen(PART, robot.state().pose), [(0.05, 0.0, 0.0)], speed=0.02)
         thread.join()
-        state = robot.state()
-        told = [event.alignment for event in robot.events(history=True, timeout=0.2) if event.alignment is not None]
-        assert (told[-1].end, told[-1].words) == ("failed", "KeyboardInterrupt")
-        assert state.mode == Mode.HOLDING
-        assert state.pose[0] < 0.045
+        assert until(robot, lambda state: state.mode == Mode.HOLDING).pose[0] < 0.045
+        ended = told(robot, lambda heard: heard[-1].alignment is not None and heard[-1].alignment.end == "failed")
+        assert ended[-1].alignment is not None
+        assert ended[-1].alignment.words == "KeyboardInterrupt"
 
 
 def test_a_file_keeps_a_calibration_its_date_and_what_made_it(tmp_path: Path, calibrated: Any) -> None:

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 import pytest
 import zenoh
-from conftest import carried
+from control_rig import carried
 from cyclopts import App, CycloptsError
 from msgspec import structs
 from trirail.cli.app import app

@@ -13,7 +13,7 @@ from pathlib import Path
 import can
 import msgspec
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from trirail.commissioning import bench as benches
 from trirail.commissioning.guide import Guide
 from trirail.commissioning.judgement import Judged

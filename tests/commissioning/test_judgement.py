@@ -6,7 +6,7 @@ import itertools
 
 import msgspec
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from trirail.commissioning.coupling import COARSE, SCALE, MoveSeen, PushSeen, judge_move, judge_push

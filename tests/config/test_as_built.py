@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.cli import doctor

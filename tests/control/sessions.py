@@ -2,123 +2,43 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
-from conftest import CONFIG, Cycles, carried
+from control_rig import CONFIG, ControlRig
 from numpy.typing import NDArray
 from trirail.config import Config
-from trirail.control.control import Control, Given
-from trirail.control.local_planner import LocalPlanner
-from trirail.wire.goals import Goal
-from trirail.wire.packets import CommandRequest, GoalRequest, Request
+from trirail.wire.packets import Request
 from trirail.wire.records import DTYPE
-from trirail.wire.vocabulary import MODES, Command, Mode
-from trirail_drivers.interface import DriveFault, Feedback, MissingProtection, PowerState, Triple
+from trirail.wire.vocabulary import MODES, Mode
 
-STILL = (0.0, 0.0, 0.0)
-OFF, ON = (PowerState.SWITCH_ON_DISABLED,) * 3, (PowerState.OPERATION_ENABLED,) * 3
 EXCESS = 1e-3
 """By that share may a setpoint exceed a limit: what lies between the moments at which a path is looked at."""
 
 
-class PerfectDrives:
-    """Drives that are at once where they were told to be two SYNCs ago, and power up and down within a cycle."""
+class Session(ControlRig):
+    """A robot that is enabled; `kept` are the records of its cycles."""
 
-    bus_load = 0.0
-    missing_protections: tuple[MissingProtection, ...] = ()
-    traffic = 0
-    reported_faults: tuple[DriveFault | None, ...] = (None, None, None)
-
-    def __init__(self, position: Triple = STILL) -> None:
-        self._state = OFF
-        self._due = position, position
-        self._position = position
-
-    def configure(self, period: float, fastest: float | None = None) -> None:
-        """Do nothing: there is nothing to set up."""
-
-    def sync(self) -> None:
-        """Reach what was written a cycle before the last one."""
-        self._position = self._due[0]
-
-    def read(self) -> Feedback:
-        """Tell where the sliders are."""
-        return Feedback(self._position, self._state, None)
-
-    def write(self, position: Triple, velocity: Triple) -> None:
-        """Take setpoints, as from the next SYNC on."""
-        self._due = self._due[1], position
-
-    def enable(self, alone: str | None = None) -> None:
-        """Power up."""
-        self._state = ON
-
-    def disable(self) -> None:
-        """Power down."""
-        self._state = OFF
-
-    quick_stop = disable
-
-    def home(self) -> None:
-        """Do nothing: every position is absolute."""
-
-    def stop_homing(self) -> None:
-        """Do nothing."""
-
-    def reset(self) -> None:
-        """Do nothing: they have no fault."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-class Session(Cycles):
-    """A robot that is enabled, and what it was sent and told; `rows` are the records of its cycles."""
-
-    def __init__(self, config: Config = CONFIG, delay: int = 1) -> None:
-        super().__init__()
-        self.config = config
-        self.drives = PerfectDrives()
-        self.planner = LocalPlanner(config, delay)
-        self.control = Control(config, self.drives, self.planner)
-        self.control.start(self.drives.read())
-        self.rows: list[NDArray[np.void]] = []
-        self._tickets = itertools.count(1)
-        self._now = 100.0
-        self.order(Command.ENABLE)
-        self.until(lambda: self.mode is Mode.HOLDING, 10)
+    def __init__(self, config: Config = CONFIG) -> None:
+        self.kept: list[NDArray[np.void]] = []
+        super().__init__(config)
+        self.enable()
 
     def cycle(self, request: Request | None = None) -> None:
         """Run one cycle, with a request or without."""
-        self._now += self.config.period
-        now_ns = round(self._now * 1e9)
-        given: list[Given] = [] if request is None else [(request, now_ns)]
-        given += [(answer, now_ns) for answer in self.planner.answers()]
-        self.drives.sync()
-        self.control.cycle(self.drives.read, given)
+        super().cycle(request)
+        self.rows.clear()
         record = self.control.measured.record.copy()
         record["mode"] = MODES.index(self.mode)
-        self.rows.append(record)
-        self.keep_what_was_said()
-
-    def order(self, name: Command, value: float | None = None) -> None:
-        """Send a command in the next cycle."""
-        self.cycle(CommandRequest(next(self._tickets), "ann", name, carried(name, value)))
-
-    def send(self, name: str, goal: Goal) -> None:
-        """Send a goal in the next cycle."""
-        self.cycle(GoalRequest(next(self._tickets), "ann", name, goal, round((self._now + self.config.period) * 1e9)))
+        self.kept.append(record)
 
     @property
-    def outcomes(self) -> dict[str | None, str | None]:
+    def ended(self) -> dict[str | None, str | None]:
         """How each goal has ended."""
-        return {said.id: said.outcome for said in self.notices if said.kind == "goal"}
+        return dict(self.outcomes())
 
     @property
     def records(self) -> NDArray[np.void]:
         """The records of all cycles, (cycles,)."""
-        return np.concatenate(self.rows) if self.rows else np.zeros(0, DTYPE)
+        return np.concatenate(self.kept) if self.kept else np.zeros(0, DTYPE)
 
 
 def shares(config: Config, records: NDArray[np.void]) -> dict[str, float]:

@@ -16,8 +16,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG
-from control.sessions import PerfectDrives
+from control_rig import CONFIG
 from trirail.config import geometry
 from trirail.control.control import Control, Given
 from trirail.control.local_planner import LocalPlanner

@@ -5,7 +5,8 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
+from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray

@@ -8,7 +8,7 @@ from pathlib import Path
 import message_schemas
 import msgspec
 import pytest
-from conftest import CONFIG, Rig
+from control_rig import CONFIG, ControlRig
 from msgspec.structs import fields
 from trirail.cli.app import app
 from trirail.client.async_client import AsyncRobot
@@ -26,6 +26,11 @@ from trirail_drivers.interface import Feedback, PowerState
 
 GUIDE = Path(__file__).parents[2] / "service/talking.md"
 every_command = pytest.mark.parametrize("name", Command)
+
+
+@pytest.fixture
+def rig() -> ControlRig:
+    return ControlRig()
 
 
 def test_every_command_has_an_effect_and_each_that_changes_the_mode_an_event() -> None:
@@ -53,7 +58,7 @@ def test_a_request_that_is_no_commands_or_carries_what_it_does_not_take_is_not_d
 
 @every_command
 @pytest.mark.parametrize("enabled", [False, True])
-def test_the_control_answers_every_command(rig: Rig, name: Command, enabled: bool) -> None:
+def test_the_control_answers_every_command(rig: ControlRig, name: Command, enabled: bool) -> None:
     if enabled:
         rig.enable()
     assert isinstance(rig.command(name), Confirmed | Refused)

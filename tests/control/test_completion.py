@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import product
 
-from conftest import CONFIG
+from control_rig import CONFIG
 from trirail.config import geometry
 from trirail.control.commands import EFFECTS
 from trirail.control.completion import CommandProgress, still_powered

@@ -9,7 +9,8 @@ import can
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
+from conftest import Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
+from control_rig import CONFIG, ControlRig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -38,7 +39,7 @@ def quick_stops(rig: Rig) -> set[int]:
     }
 
 
-def assert_within_limits(rig: Rig) -> None:
+def assert_within_limits(rig: ControlRig) -> None:
     """Setpoints as sent: velocity and acceleration by differences, inside the sliders' limits."""
     rows, limits = rig.setpoints(), rig.config.limits.slider
     velocity = np.diff(rows[:, 0], axis=0) / PERIOD
@@ -51,8 +52,8 @@ def assert_within_limits(rig: Rig) -> None:
     assert_frames_within_limits(rig)
 
 
-def assert_frames_within_limits(rig: Rig) -> None:
-    """Setpoints as captured from the bus: continuous in position, velocity and acceleration, jerk inside its limit."""
+def assert_frames_within_limits(rig: ControlRig) -> None:
+    """Setpoints as the drives get them: continuous in position, velocity and acceleration, jerk inside its limit."""
     (position, velocity), limits = rig.captured().transpose(1, 0, 2), rig.config.limits.slider
     count = 1.0 / min(drive.counts_per_metre for drive in rig.config.drives.each)
     acceleration = np.diff(velocity, axis=0) / PERIOD
@@ -366,7 +367,7 @@ def test_a_lost_answer_is_no_step_in_error_or_velocity(late: float) -> None:
 # ---------------------------------------------------------------------- faults
 
 
-def moving(rig: Rig) -> None:
+def moving(rig: ControlRig) -> None:
     rig.enable()
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(150)
@@ -666,11 +667,26 @@ COMMAND = st.sampled_from(["stop", "pause", "resume", "lost", 0.0, 0.3, 1.0, 1.7
 STEP = st.tuples(st.one_of(GOAL, GOAL, COMMAND), st.integers(1, 400))
 
 
+STEPS = st.lists(STEP, min_size=1, max_size=10)
+
+
 @pytest.mark.parametrize("config", [CONFIG, SLOW], ids=["as shipped", "slow sliders"])
-@settings(max_examples=60, deadline=None)
-@given(st.lists(STEP, min_size=1, max_size=10))
+@settings(max_examples=60)
+@given(STEPS)
 def test_any_sequence_is_smooth_and_ends_every_goal_once(config: Config, steps: list[tuple[object, int]]) -> None:
-    rig = Rig(config)
+    assert_smooth(ControlRig(config), steps)
+
+
+@settings(max_examples=15)
+@given(STEPS)
+def test_any_sequence_is_smooth_on_the_bus(steps: list[tuple[object, int]]) -> None:
+    rig = Rig()
+    assert_smooth(rig, steps)
+    rig.bus.shutdown()
+
+
+def assert_smooth(rig: ControlRig, steps: list[tuple[object, int]]) -> None:
+    """Any sequence stays within the limits, ends every goal once, and is no fault."""
     rig.enable()
     ids = []
     for number, (what, wait) in enumerate(steps):
@@ -687,7 +703,6 @@ def test_any_sequence_is_smooth_and_ends_every_goal_once(config: Config, steps: 
     rig.command("override", 1.0)
     rig.command("stop")
     rig.until(lambda: rig.mode is Mode.HOLDING)
-    rig.bus.shutdown()
     assert [said.message for said in rig.notices if said.kind == "fault"] == []
     assert sorted(goal_id or "" for goal_id, _ in rig.outcomes()) == sorted(ids)
     assert_within_limits(rig)

@@ -15,7 +15,8 @@ import calibrate
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
+from control_rig import CONFIG
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, corrected_geometry, geometry, load
 from trirail.kinematics.geometry import Geometry

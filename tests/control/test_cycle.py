@@ -8,7 +8,8 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Followers, Rig, alone, what_memory_takes
+from conftest import Followers, Rig, alone, what_memory_takes
+from control_rig import CONFIG
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from trirail.config import geometry

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from hypothesis import example, given
 from hypothesis import strategies as st
 from trirail.config import geometry

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig, changed
+from conftest import Rig, changed
+from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import Config, geometry

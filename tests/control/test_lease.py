@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import msgspec
 import pytest
-from conftest import CONFIG, Rig, carried
+from control_rig import CONFIG, ControlRig, carried
 from trirail.config import ControlTable
 from trirail.control.lease import REMEMBERED_IDS, LeaseArbiter
 from trirail.errors import RefusalCode, RefusedError
@@ -35,7 +35,7 @@ def said_with(name: str, lease: str | None, timeout: float, force: bool) -> Comm
 class Users:
     """Several users of one robot; each request is answered before the next."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: ControlRig) -> None:
         self.rig = rig
         self._tickets = itertools.count(10_000)
 
@@ -60,7 +60,12 @@ class Users:
 
 
 @pytest.fixture
-def users(rig: Rig) -> Users:
+def rig() -> ControlRig:
+    return ControlRig()
+
+
+@pytest.fixture
+def users(rig: ControlRig) -> Users:
     rig.enable()
     return Users(rig)
 
@@ -69,11 +74,11 @@ def code(answer: Answer) -> RefusalCode | None:
     return answer.code if isinstance(answer, Refused) else None
 
 
-def leases(rig: Rig) -> list[tuple[str, str | None]]:
+def leases(rig: ControlRig) -> list[tuple[str, str | None]]:
     return [(said.message, said.user) for said in rig.notices if said.kind == "lease"]
 
 
-def begun(rig: Rig) -> list[str | None]:
+def begun(rig: ControlRig) -> list[str | None]:
     return [said.goal for said in rig.notices if said.mode == Mode.MOVING]
 
 
@@ -106,7 +111,7 @@ def test_every_command_is_its_holders_but_what_stops_the_robot(users: Users, nam
 
 @pytest.mark.parametrize("name", Command)
 def test_where_it_is_required_nothing_else_is_taken_without_it(name: Command) -> None:
-    users = Users(Rig(REQUIRED))
+    users = Users(ControlRig(REQUIRED))
     said = code(users.tell("ann", name))
     assert (said is RefusalCode.NO_LEASE) == (name not in EVERYBODYS - {"release"})
     goal = code(users.send("ann", "g"))
@@ -290,7 +295,7 @@ class Crowd:
 
     def __init__(self, seed: int, policy: LeasePolicy) -> None:
         self.rnd, self.policy = random.Random(seed), policy
-        self.rig = Rig(msgspec.structs.replace(SLOW, control=ControlTable(lease=policy)))
+        self.rig = ControlRig(msgspec.structs.replace(SLOW, control=ControlTable(lease=policy)))
         self.model = Model()
         self.seen: Counter[str] = Counter()
         self._numbers = itertools.count(1)

@@ -9,8 +9,8 @@ from collections import Counter
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG
 from control.sessions import Session, assert_within_limits
+from control_rig import CONFIG
 from numpy.typing import NDArray
 from trirail.config import Config, corrected_geometry, geometry
 from trirail.config.as_built import AsBuilt, geometry_of
@@ -138,17 +138,17 @@ def test_a_long_session_keeps_every_limit_and_ends_every_goal_once(
     outcomes: Counter[str | None] = Counter()
     for k in range(number):
         session.planner.delay = chance.choice(DELAYS)
-        session.send(f"g{k}", random_goal(chance, session))
+        session.post(f"g{k}", random_goal(chance, session))
         for _ in range(chance.choice(WAITS)):
             session.cycle()
             progress.look(next(cycles))
         if chance.random() < 0.4:
             meddle(chance, session, f"g{chance.randrange(max(0, k - 3), k + 1)}")
-        if len(session.rows) > 5000 or k == number - 1:
-            session.rows[:0] = last
+        if len(session.kept) > 5000 or k == number - 1:
+            session.kept[:0] = last
             assert_within_limits(config, session.records)
-            last = session.rows[-1:]
-            session.rows.clear()
+            last = session.kept[-1:]
+            session.kept.clear()
             outcomes.update(said.id for said in session.notices if said.kind == "goal")
             said = {notice.message for notice in session.notices if notice.kind == "fault"}
             assert said <= {"quick_stop by ann"}

@@ -7,8 +7,8 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
 from control.test_control import PERIOD, assert_within_limits
+from control_rig import CONFIG, ControlRig
 from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refusal
@@ -33,7 +33,7 @@ def turned(x: float, y: float, angle: float) -> complex:
     return complex(x, y) * complex(math.cos(angle), math.sin(angle))
 
 
-def arrive(rig: Rig, name: str, goal: Goal) -> Pose:
+def arrive(rig: ControlRig, name: str, goal: Goal) -> Pose:
     answer = rig.send(name, goal)
     assert isinstance(answer, Accepted), answer
     rig.until(rig.holds, 20_000)
@@ -42,6 +42,11 @@ def arrive(rig: Rig, name: str, goal: Goal) -> Pose:
 
 
 # ---------------------------------------------------------------------- what they mean
+
+
+@pytest.fixture
+def rig() -> ControlRig:
+    return ControlRig()
 
 
 @given(STEPS, STEPS, st.sampled_from(["base", "platform", "part"]), TOOLS)
@@ -86,13 +91,12 @@ def test_a_frame_may_be_turned_by_any_angle(angle: float) -> None:
     ],
 )
 def test_a_name_that_there_is_not_is_refused_with_those_that_there_are(goal: Goal, said: str) -> None:
-    rig = Rig(NAMED)
+    rig = ControlRig(NAMED)
     rig.enable()
     answer = refusal(rig.send("g1", goal))
     assert (answer.code, said in answer.message) == ("unknown_frame", True), answer.message
     assert rig.mode is Mode.HOLDING
     assert rig.outcomes() == [("g1", "rejected")]
-    rig.bus.shutdown()
 
 
 def test_without_tools_a_point_is_asked_for() -> None:
@@ -132,7 +136,7 @@ STEP = 1e-6, 0.0, 10e-6
 @pytest.mark.parametrize("tool", [None, (0.05, -0.03)])
 @pytest.mark.parametrize("waits", [True, False])
 def test_ten_corrections_land_where_one_ten_times_as_large_does(
-    rig: Rig, tool: tuple[float, float] | None, waits: bool
+    rig: ControlRig, tool: tuple[float, float] | None, waits: bool
 ) -> None:
     """From commanded to rounding, whether each waits for the one before it or preempts it."""
     rig.enable()
@@ -153,7 +157,7 @@ def test_ten_corrections_land_where_one_ten_times_as_large_does(
 
 def test_from_measured_each_correction_begins_where_the_robot_is() -> None:
     """The last of them lands within what its measurement was off, whatever the ones before did."""
-    rig = Rig(CONFIG)
+    rig = ControlRig(CONFIG)
     rig.enable()
     arrive(rig, "g0", PoseGoal(0.02, -0.01, 0.1))
     for number in range(10):
@@ -161,10 +165,9 @@ def test_from_measured_each_correction_begins_where_the_robot_is() -> None:
         landed = arrive(rig, f"m{number}", MoveGoal(*STEP, origin="measured"))
         assert landed == pytest.approx(np.add(measured, STEP).tolist(), abs=1e-6)
     assert landed == pytest.approx((0.02 + 10e-6, -0.01, 0.1 + 100e-6), abs=5e-6)
-    rig.bus.shutdown()
 
 
-def test_a_move_under_way_counts_from_where_the_goal_leads(rig: Rig) -> None:
+def test_a_move_under_way_counts_from_where_the_goal_leads(rig: ControlRig) -> None:
     rig.enable()
     rig.send("g1", PoseGoal(0.03, 0.0, 0.0))
     rig.cycles(50)
@@ -173,7 +176,7 @@ def test_a_move_under_way_counts_from_where_the_goal_leads(rig: Rig) -> None:
     assert rig.outcomes() == [("g1", "preempted"), ("m1", "done")]
 
 
-def test_a_move_that_waits_counts_from_where_the_goals_before_it_lead(rig: Rig) -> None:
+def test_a_move_that_waits_counts_from_where_the_goals_before_it_lead(rig: ControlRig) -> None:
     rig.enable()
     rig.send("g1", PoseGoal(0.03, 0.0, 0.0, blend=0.005))
     assert isinstance(answer := rig.send("m1", MoveGoal(0.0, 0.01, 0.1, blend=0.005)), Accepted)
@@ -182,7 +185,7 @@ def test_a_move_that_waits_counts_from_where_the_goals_before_it_lead(rig: Rig) 
     assert rig.outcomes() == [("g1", "done"), ("m1", "done"), ("m2", "done")]
 
 
-def test_a_move_after_a_stop_or_in_a_jog_counts_from_where_the_robot_is(rig: Rig) -> None:
+def test_a_move_after_a_stop_or_in_a_jog_counts_from_where_the_robot_is(rig: ControlRig) -> None:
     rig.enable()
     rig.send("g1", PoseGoal(0.05, 0.0, 0.0))
     rig.cycles(80)
@@ -199,7 +202,7 @@ def test_a_move_after_a_stop_or_in_a_jog_counts_from_where_the_robot_is(rig: Rig
 @pytest.mark.parametrize("how", ["pause", "override"])
 def test_a_move_while_a_goal_waits_half_way_is_refused_unless_it_is_from_where_the_robot_is(how: str) -> None:
     """It would count from the end of the goal that waits: who asks for 5 mm would get all that was left, too."""
-    rig = Rig(NAMED)
+    rig = ControlRig(NAMED)
     rig.enable()
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(300)
@@ -216,4 +219,3 @@ def test_a_move_while_a_goal_waits_half_way_is_refused_unless_it_is_from_where_t
     if how == "pause":
         arrive(rig, "m2", MoveGoal(0.005, 0.0, 0.0, origin="measured"))
         assert rig.control.commanded.pose[0] == pytest.approx(stood + 0.005, abs=1e-5)
-    rig.bus.shutdown()

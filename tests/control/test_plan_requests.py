@@ -10,9 +10,9 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
 from control.test_control import assert_within_limits
 from control.test_stop import PROMPT, STEP, braking, confirmed_after, play
+from control_rig import CONFIG, ControlRig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.motion.feasibility import Sampled
@@ -51,7 +51,7 @@ Said = PlanAnswer | PlannerLost
 class Meddler:
     """A planner whose answers can be changed, held back and repeated: as LocalPlanner otherwise."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: ControlRig) -> None:
         self.planner = MotionPlanner(rig.config)
         self.asked: list[PlanRequest] = []
         self.waiting: list[tuple[int, Said]] = []
@@ -74,7 +74,12 @@ class Meddler:
 
 
 @pytest.fixture
-def meddler(rig: Rig) -> Meddler:
+def rig() -> ControlRig:
+    return ControlRig()
+
+
+@pytest.fixture
+def meddler(rig: ControlRig) -> Meddler:
     """In the place of an enabled robot's planner."""
     made = Meddler(rig)
     rig.planner = rig.control._planner._port = made  # type: ignore[assignment]
@@ -82,18 +87,18 @@ def meddler(rig: Rig) -> Meddler:
     return made
 
 
-def moving(rig: Rig) -> None:
+def moving(rig: ControlRig) -> None:
     rig.goal("g1", 0.08, 0.0, 0.0)
     rig.cycles(200)
 
 
-def code(rig: Rig) -> str:
+def code(rig: ControlRig) -> str:
     refused = rig.answers[-1]
     assert isinstance(refused, Refused), refused
     return refused.code
 
 
-def test_a_goal_from_rest_begins_when_its_motion_comes(rig: Rig, meddler: Meddler) -> None:
+def test_a_goal_from_rest_begins_when_its_motion_comes(rig: ControlRig, meddler: Meddler) -> None:
     meddler.delays = [100]
     sent = len(rig.rows)
     rig.post("g1", PoseGoal(0.05, 0.0, 0.0))
@@ -103,7 +108,9 @@ def test_a_goal_from_rest_begins_when_its_motion_comes(rig: Rig, meddler: Meddle
     assert rig.outcomes() == [("g1", "done")]
 
 
-def test_a_motion_from_motion_that_comes_too_late_is_asked_for_anew_with_more_time(rig: Rig, meddler: Meddler) -> None:
+def test_a_motion_from_motion_that_comes_too_late_is_asked_for_anew_with_more_time(
+    rig: ControlRig, meddler: Meddler
+) -> None:
     moving(rig)
     meddler.asked.clear()
     meddler.delays = [round(LEADS[0] / PERIOD) + 1, round(LEADS[1] / PERIOD) + 1, 5]
@@ -116,7 +123,7 @@ def test_a_motion_from_motion_that_comes_too_late_is_asked_for_anew_with_more_ti
     assert_within_limits(rig)
 
 
-def test_a_planner_that_is_always_late_is_asked_three_times(rig: Rig, meddler: Meddler) -> None:
+def test_a_planner_that_is_always_late_is_asked_three_times(rig: ControlRig, meddler: Meddler) -> None:
     moving(rig)
     meddler.asked.clear()
     meddler.delays = [20, 60, 150]
@@ -130,7 +137,7 @@ def test_a_planner_that_is_always_late_is_asked_three_times(rig: Rig, meddler: M
 
 @pytest.mark.parametrize("in_motion", [False, True])
 def test_a_planner_that_says_nothing_costs_a_goal_and_what_is_under_way_goes_on(
-    rig: Rig, meddler: Meddler, in_motion: bool
+    rig: ControlRig, meddler: Meddler, in_motion: bool
 ) -> None:
     if in_motion:
         moving(rig)
@@ -156,7 +163,7 @@ def test_a_goal_waits_its_own_time_for_a_planner_that_is_busy(
     in_motion: bool, delays: list[int], valid_for: float | None
 ) -> None:
     """Whatever each answer takes: it begins, or is refused when its own time is over, and either is said with why."""
-    rig = Rig()
+    rig = ControlRig()
     busy = rig.planner = rig.control._planner._port = Meddler(rig)  # type: ignore[assignment]
     rig.enable()
     if in_motion:
@@ -183,7 +190,7 @@ def test_a_goal_waits_its_own_time_for_a_planner_that_is_busy(
     assert not told or longest > BUSY
 
 
-def test_a_planner_that_has_died_is_said_at_once(rig: Rig, meddler: Meddler) -> None:
+def test_a_planner_that_has_died_is_said_at_once(rig: ControlRig, meddler: Meddler) -> None:
     moving(rig)
     meddler.change = lambda _: [PlannerLost("the planner has died")]
     rig.post("lost", PoseGoal(0.0, 0.05, 0.0))
@@ -193,7 +200,9 @@ def test_a_planner_that_has_died_is_said_at_once(rig: Rig, meddler: Meddler) -> 
     assert rig.outcomes() == [("lost", "rejected"), ("g1", "done")]
 
 
-def test_a_planner_that_dies_while_nobody_waits_for_it_any_more_costs_no_goal(rig: Rig, meddler: Meddler) -> None:
+def test_a_planner_that_dies_while_nobody_waits_for_it_any_more_costs_no_goal(
+    rig: ControlRig, meddler: Meddler
+) -> None:
     meddler.change = lambda _: []
     rig.post("g1", PoseGoal(0.05, 0.0, 0.0))
     rig.cycle(CommandRequest(99, "ann", Command.STOP, Stop("g1")))
@@ -205,7 +214,7 @@ def test_a_planner_that_dies_while_nobody_waits_for_it_any_more_costs_no_goal(ri
 
 
 def test_a_goal_that_comes_while_a_trajectory_dwells_is_planned_from_where_it_goes_on(
-    rig: Rig, meddler: Meddler
+    rig: ControlRig, meddler: Meddler
 ) -> None:
     """The robot stands, and the motion does not: its goal begins when it is told to, not as from rest."""
     still = {"velocity": (0.0, 0.0, 0.0), "acceleration": (0.0, 0.0, 0.0)}
@@ -223,7 +232,7 @@ def test_a_goal_that_comes_while_a_trajectory_dwells_is_planned_from_where_it_go
     assert_within_limits(rig)
 
 
-def test_a_goal_that_follows_another_waits_and_stops_nothing(rig: Rig) -> None:
+def test_a_goal_that_follows_another_waits_and_stops_nothing(rig: ControlRig) -> None:
     rig.enable()
     first = rig.send("g1", PoseGoal(0.05, 0.0, 0.0, blend=0.01))
     second = rig.send("g2", PoseGoal(0.0, 0.05, 0.0))
@@ -238,7 +247,7 @@ def test_a_goal_that_follows_another_waits_and_stops_nothing(rig: Rig) -> None:
     assert (len(rig.rows) - begun) * PERIOD == pytest.approx(second.duration + dwell, abs=0.01)
 
 
-def test_an_answer_that_comes_twice_is_taken_once(rig: Rig, meddler: Meddler) -> None:
+def test_an_answer_that_comes_twice_is_taken_once(rig: ControlRig, meddler: Meddler) -> None:
     meddler.change = lambda answer: [answer, answer]
     for number, x in enumerate([0.05, -0.03, 0.02]):
         assert isinstance(rig.goal(f"g{number}", x, 0.0, 0.0), Accepted)
@@ -248,7 +257,7 @@ def test_an_answer_that_comes_twice_is_taken_once(rig: Rig, meddler: Meddler) ->
     assert_within_limits(rig)
 
 
-def test_an_answer_for_another_motion_is_left_aside(rig: Rig, meddler: Meddler) -> None:
+def test_an_answer_for_another_motion_is_left_aside(rig: ControlRig, meddler: Meddler) -> None:
     moving(rig)
     meddler.change = lambda answer: [msgspec.structs.replace(answer, version=answer.version - 1)]
     rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
@@ -257,7 +266,9 @@ def test_an_answer_for_another_motion_is_left_aside(rig: Rig, meddler: Meddler) 
     assert code(rig) == "expired"
 
 
-def test_an_override_while_a_goal_is_planned_has_it_planned_from_the_new_motion(rig: Rig, meddler: Meddler) -> None:
+def test_an_override_while_a_goal_is_planned_has_it_planned_from_the_new_motion(
+    rig: ControlRig, meddler: Meddler
+) -> None:
     moving(rig)
     meddler.delays = [2]
     rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
@@ -268,7 +279,7 @@ def test_an_override_while_a_goal_is_planned_has_it_planned_from_the_new_motion(
     assert_within_limits(rig)
 
 
-def test_a_motion_that_begins_elsewhere_is_never_begun(rig: Rig, meddler: Meddler) -> None:
+def test_a_motion_that_begins_elsewhere_is_never_begun(rig: ControlRig, meddler: Meddler) -> None:
     """It has the right number and the right version: where the robot is to be then it does not begin."""
     moving(rig)
 
@@ -289,7 +300,7 @@ def test_a_motion_that_begins_elsewhere_is_never_begun(rig: Rig, meddler: Meddle
 @pytest.mark.parametrize("coordinate", range(3))
 @pytest.mark.parametrize("power", range(3))
 def test_a_continuation_that_begins_elsewhere_is_never_appended(
-    rig: Rig, meddler: Meddler, coordinate: int, power: int
+    rig: ControlRig, meddler: Meddler, coordinate: int, power: int
 ) -> None:
     """A goal that is to follow the one under way: beside its end in position, velocity or acceleration."""
 
@@ -320,7 +331,9 @@ GARBAGE = [
 
 @pytest.mark.parametrize("place", ["path", "law"])
 @pytest.mark.parametrize("garbage", GARBAGE)
-def test_garbage_is_refused_and_the_motion_goes_on(rig: Rig, meddler: Meddler, garbage: PackedPath, place: str) -> None:
+def test_garbage_is_refused_and_the_motion_goes_on(
+    rig: ControlRig, meddler: Meddler, garbage: PackedPath, place: str
+) -> None:
     moving(rig)
 
     def spoilt(answer: PlanAnswer) -> list[PlanAnswer]:
@@ -335,7 +348,7 @@ def test_garbage_is_refused_and_the_motion_goes_on(rig: Rig, meddler: Meddler, g
     assert rig.control.fault is None
 
 
-def test_a_jog_whose_dead_man_is_over_before_it_is_planned_does_not_begin(rig: Rig, meddler: Meddler) -> None:
+def test_a_jog_whose_dead_man_is_over_before_it_is_planned_does_not_begin(rig: ControlRig, meddler: Meddler) -> None:
     meddler.delays = [300]
     rig.post("j1", VelocityGoal(0.05, 0.0, 0.0, timeout=0.2))
     rig.cycles(400)
@@ -343,18 +356,18 @@ def test_a_jog_whose_dead_man_is_over_before_it_is_planned_does_not_begin(rig: R
     assert not rig.setpoints()[-400:, 1].any()
 
 
-def test_a_goal_that_is_planned_too_late_for_its_time_expires(rig: Rig, meddler: Meddler) -> None:
+def test_a_goal_that_is_planned_too_late_for_its_time_expires(rig: ControlRig, meddler: Meddler) -> None:
     meddler.delays = [300]
     rig.post("g1", PoseGoal(0.05, 0.0, 0.0, valid_for=0.1))
     rig.cycles(400)
     assert rig.outcomes() == [("g1", "expired")]
 
 
-def answers_more_than(rig: Rig, before: int) -> bool:
+def answers_more_than(rig: ControlRig, before: int) -> bool:
     return len(rig.answers) > before
 
 
-def test_a_goal_may_begin_for_as_long_as_it_is_valid_and_not_a_cycle_longer(rig: Rig, meddler: Meddler) -> None:
+def test_a_goal_may_begin_for_as_long_as_it_is_valid_and_not_a_cycle_longer(rig: ControlRig, meddler: Meddler) -> None:
     valid = 100  # cycles
     begun: list[int] = []
     refused: list[int] = []
@@ -370,7 +383,7 @@ def test_a_goal_may_begin_for_as_long_as_it_is_valid_and_not_a_cycle_longer(rig:
     assert set(refused) == {valid + 1}
 
 
-def test_a_jog_is_over_in_time_though_its_renewals_are_never_answered(rig: Rig, meddler: Meddler) -> None:
+def test_a_jog_is_over_in_time_though_its_renewals_are_never_answered(rig: ControlRig, meddler: Meddler) -> None:
     jog = VelocityGoal(0.05, 0.0, 0.0, timeout=0.1)
     rig.send("j1", jog)
     meddler.change = lambda _: []
@@ -383,7 +396,7 @@ def test_a_jog_is_over_in_time_though_its_renewals_are_never_answered(rig: Rig, 
     assert rig.mode is Mode.HOLDING
 
 
-class Silent(Rig):
+class Silent(ControlRig):
     """A robot whose planner is as a test wants it to be from some time on."""
 
     def spoil(self, how: str) -> None:
@@ -408,10 +421,9 @@ def test_a_stop_is_confirmed_in_time_whatever_the_planner_does(
     play(rig, after)
     assert confirmed_after(rig, "stop", braking(CONFIG) + PROMPT + 5000) <= braking(CONFIG) + PROMPT
     assert rig.control.commanded.at_rest
-    rig.bus.shutdown()
 
 
-def test_a_stop_behind_a_flood_of_goals_is_confirmed_in_time(rig: Rig, meddler: Meddler) -> None:
+def test_a_stop_behind_a_flood_of_goals_is_confirmed_in_time(rig: ControlRig, meddler: Meddler) -> None:
     moving(rig)
     for number in range(200):
         rig.post(f"f{number}", PoseGoal(0.05, 0.001 * number - 0.1, 0.0))
@@ -428,7 +440,7 @@ def wave(points: int, seconds: float) -> TrajectoryGoal:
 
 
 @pytest.mark.parametrize("wait", [50, 200, 350, 600])
-def test_a_stop_on_the_longest_path_is_confirmed_in_time(rig: Rig, wait: int) -> None:
+def test_a_stop_on_the_longest_path_is_confirmed_in_time(rig: ControlRig, wait: int) -> None:
     rig.enable()
     assert isinstance(rig.send("g1", wave(MAX_POINTS, 1.0)), Accepted)
     rig.cycles(wait)
@@ -436,10 +448,12 @@ def test_a_stop_on_the_longest_path_is_confirmed_in_time(rig: Rig, wait: int) ->
     assert_within_limits(rig)
 
 
-def at_rate(rate_hz: int) -> Rig:
+def at_rate(rate_hz: int) -> ControlRig:
     """A robot with another period, and a bus that is fast enough for that, enabled."""
     loop = msgspec.structs.replace(CONFIG.loop, rate_hz=rate_hz)
-    rig = Rig(msgspec.structs.replace(CONFIG, loop=loop, can=msgspec.structs.replace(CONFIG.can, bitrate=8_000_000)))
+    rig = ControlRig(
+        msgspec.structs.replace(CONFIG, loop=loop, can=msgspec.structs.replace(CONFIG.can, bitrate=8_000_000))
+    )
     rig.enable()
     return rig
 
@@ -468,7 +482,6 @@ def test_no_cycle_looks_at_more_of_the_longest_path_than_it_has_time_for(
             assert len(looked) - before <= 1
     assert len(looked) > 5
     assert most // 2 < max(looked) <= most
-    rig.bus.shutdown()
 
 
 def test_at_a_slow_rate_an_answer_has_two_cycles_to_come_in() -> None:
@@ -480,10 +493,9 @@ def test_at_a_slow_rate_an_answer_has_two_cycles_to_come_in() -> None:
     rig.cycles(40)
     assert isinstance(rig.goal("g2", 0.0, 0.05, 0.0), Accepted)
     assert [request.lead for request in made.asked[1:]] == [2]
-    rig.bus.shutdown()
 
 
-def test_a_goal_waits_for_a_change_of_rate_for_a_dozen_cycles_and_no_longer(rig: Rig, meddler: Meddler) -> None:
+def test_a_goal_waits_for_a_change_of_rate_for_a_dozen_cycles_and_no_longer(rig: ControlRig, meddler: Meddler) -> None:
     """To find out how fast the rest of the longest path can be taken needs more than that."""
     rig.send("g1", wave(MAX_POINTS, 1.2))
     rig.cycles(100)
@@ -504,7 +516,7 @@ def test_a_goal_waits_for_a_change_of_rate_for_a_dozen_cycles_and_no_longer(rig:
 
 def test_the_planner_is_a_function_of_the_request() -> None:
     """Asked in any order, by any number of planners, through the wire: the same answer to the last bit."""
-    rig = Rig()
+    rig = ControlRig()
     planner = Meddler(rig)
     rig.planner = rig.control._planner._port = planner  # type: ignore[assignment]
     rig.command("enable")
@@ -523,7 +535,6 @@ def test_the_planner_is_a_function_of_the_request() -> None:
         again = MotionPlanner(CONFIG).plan(decode_plan_request(encode(request)))
         assert encode(again) == answer
         assert decode_plan_answer(answer) == again
-    rig.bus.shutdown()
 
 
 def test_warming_up_plans_each_motion_from_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -540,7 +551,7 @@ def test_warming_up_plans_each_motion_from_the_one_before(monkeypatch: pytest.Mo
     assert begins == [None, 2, 2, 2]
 
 
-def test_a_planner_with_other_limits_plans_nothing(rig: Rig, meddler: Meddler) -> None:
+def test_a_planner_with_other_limits_plans_nothing(rig: ControlRig, meddler: Meddler) -> None:
     limits = msgspec.structs.replace(CONFIG.limits.slider, velocity=CONFIG.limits.slider.velocities[0] / 2.0)
     other = msgspec.structs.replace(CONFIG, limits=msgspec.structs.replace(CONFIG.limits, slider=limits))
     assert revision(other) != revision(CONFIG)
@@ -550,7 +561,7 @@ def test_a_planner_with_other_limits_plans_nothing(rig: Rig, meddler: Meddler) -
     assert code(rig) == "internal"
 
 
-def test_the_largest_goal_on_the_longest_motion_fits_a_packet(rig: Rig, meddler: Meddler) -> None:
+def test_the_largest_goal_on_the_longest_motion_fits_a_packet(rig: ControlRig, meddler: Meddler) -> None:
     rig.send("g1", wave(MAX_POINTS, 3.0))
     rig.cycles(100)
     rig.post("g2", wave(MAX_POINTS, 3.0))
@@ -559,7 +570,7 @@ def test_the_largest_goal_on_the_longest_motion_fits_a_packet(rig: Rig, meddler:
     assert max(map(len, answers)) < MAX_PACKET - 1000  # it goes to the recorder, in a ControlInput
 
 
-def test_an_override_that_never_ends_changing_keeps_no_goal_for_ever(rig: Rig, meddler: Meddler) -> None:
+def test_an_override_that_never_ends_changing_keeps_no_goal_for_ever(rig: ControlRig, meddler: Meddler) -> None:
     moving(rig)
     rig.post("g2", PoseGoal(0.0, 0.05, 0.0))
     for number in range(300):
@@ -575,7 +586,7 @@ def test_an_override_that_never_ends_changing_keeps_no_goal_for_ever(rig: Rig, m
 @given(st.lists(STEP, min_size=1, max_size=8))
 def test_every_answer_is_the_same_when_it_is_read_from_a_recording(steps: list[tuple[object, int]]) -> None:
     """A recording carries it as JSON, which knows no infinity: not even at override zero is there one."""
-    rig = Rig()
+    rig = ControlRig()
     planner = Meddler(rig)
     rig.planner = rig.control._planner._port = planner  # type: ignore[assignment]
     rig.command("enable")
@@ -583,7 +594,6 @@ def test_every_answer_is_the_same_when_it_is_read_from_a_recording(steps: list[t
     rig.post("first", PoseGoal(0.01, 0.0, 0.0))
     rig.cycles(5)
     play(rig, steps)
-    rig.bus.shutdown()
     answers = [planner.planner.plan(request) for request in planner.asked]
     assert any(isinstance(answer, Planned) and answer.duration is None for answer in answers)
     for answer in answers:

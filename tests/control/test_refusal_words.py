@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from conftest import CONFIG, Rig
+from control_rig import CONFIG, ControlRig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.config import geometry
@@ -56,15 +56,15 @@ def assert_readable(words: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def enabled() -> Rig:
-    rig = Rig()
+def enabled() -> ControlRig:
+    rig = ControlRig()
     rig.enable()
     return rig
 
 
 @settings(max_examples=300)
 @given(goal=GOALS)
-def test_a_refusal_has_millimetres_and_degrees(enabled: Rig, goal: Goal) -> None:
+def test_a_refusal_has_millimetres_and_degrees(enabled: ControlRig, goal: Goal) -> None:
     answered = len(enabled.answers)
     enabled.post(f"g{answered}", goal)
     enabled.until(lambda: len(enabled.answers) > answered)

@@ -7,8 +7,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from conftest import CONFIG
 from control.sessions import Session, assert_within_limits
+from control_rig import CONFIG
 from trirail.config import corrected_geometry
 from trirail.control.modes import ModeEvent
 from trirail.motion.feasibility import Checker
@@ -46,8 +46,8 @@ def stands(session: Session) -> bool:
 def cycles_of(path: int) -> int:
     """How many cycles a path takes from rest."""
     session = Session()
-    session.send("g", PATHS[path])
-    return session.until(lambda: "g" in session.outcomes, 2000)
+    session.post("g", PATHS[path])
+    return session.until(lambda: "g" in session.ended, 2000)
 
 
 def happen(session: Session, event: str, chance: random.Random) -> None:
@@ -56,9 +56,9 @@ def happen(session: Session, event: str, chance: random.Random) -> None:
         case "override":
             session.order(Command.OVERRIDE, chance.choice(RATES))
         case "preempt":
-            session.send(f"p{len(session.rows)}", chance.choice(OTHERS))
+            session.post(f"p{len(session.kept)}", chance.choice(OTHERS))
         case "cancel":
-            session.cycle(CommandRequest(10**6 + len(session.rows), "ann", Command.STOP, Stop("g")))
+            session.cycle(CommandRequest(10**6 + len(session.kept), "ann", Command.STOP, Stop("g")))
         case _:
             session.order(Command(event))
 
@@ -68,7 +68,7 @@ def go_through(seed: int, path: int, instant: int, first: str, delay: int, secon
     chance = random.Random(seed)
     session = Session()
     session.order(Command.OVERRIDE, chance.choice(BEFORE))
-    session.send("g", PATHS[path])
+    session.post("g", PATHS[path])
     session.cycles(instant)
     happen(session, first, chance)
     session.cycles(delay)
@@ -79,8 +79,8 @@ def go_through(seed: int, path: int, instant: int, first: str, delay: int, secon
     session.until(lambda: session.mode is Mode.HOLDING and not session.control.state.paused, 6000)
     assert session.control.fault is None
     assert_within_limits(session.config, session.records)
-    assert session.outcomes
-    assert set(session.outcomes.values()) <= {"done", "stopped", "preempted", "rejected"}
+    assert session.ended
+    assert set(session.ended.values()) <= {"done", "stopped", "preempted", "rejected"}
 
 
 @pytest.mark.generated(*range(SAMPLE))
@@ -110,13 +110,13 @@ def test_what_once_ran_back_or_beyond_a_limit(path: int, instant: int, first: st
 def test_raising_a_rate_that_is_still_falling_goes_on_along_the_path(lower: float, delay: int) -> None:
     """Seen from outside: on a straight line from rest the platform never goes back."""
     session = Session()
-    session.send("g", PATHS[0])
+    session.post("g", PATHS[0])
     session.cycles(200)
     session.order(Command.OVERRIDE, lower)
     session.cycles(delay)
     session.order(Command.OVERRIDE, 1.0)
-    session.until(lambda: "g" in session.outcomes, 3000)
-    assert session.outcomes == {"g": "done"}
+    session.until(lambda: "g" in session.ended, 3000)
+    assert session.ended == {"g": "done"}
     x = session.records["commanded_pose"][:, 0]
     assert (np.diff(x) >= -1e-12).all()
     assert_within_limits(session.config, session.records)
@@ -129,8 +129,8 @@ def test_a_queue_that_is_paused_and_then_stopped_has_no_goal_to_pass_on_to(then:
     """A robot that brakes for a pause is stopped while it does, before it comes by where the next goal begins."""
     for instant in range(100, 420, 20):
         session = Session()
-        session.send("g0", PoseGoal(0.1, 0.0, 0.0, blend=0.03))
-        session.send("g1", PoseGoal(0.1, 0.05, 0.0))
+        session.post("g0", PoseGoal(0.1, 0.0, 0.0, blend=0.03))
+        session.post("g1", PoseGoal(0.1, 0.05, 0.0))
         session.cycles(instant)
         session.order(Command.PAUSE)
         session.cycles(later)
@@ -146,7 +146,7 @@ def test_a_queue_that_is_paused_and_then_stopped_has_no_goal_to_pass_on_to(then:
 def test_the_last_gate_refuses_a_time_along_the_path_that_falls() -> None:
     """Whoever has made such a law, and though nothing else is wrong with what it commands: the robot hardly moves."""
     session = Session()
-    session.send("g", PATHS[0])
+    session.post("g", PATHS[0])
     session.cycles(30)
     (run,) = session.control.schedule.runs
     run.law = constant(-1e-6, run.at.s)
@@ -178,7 +178,7 @@ def quickest(session: Session) -> float:
 @pytest.mark.parametrize("path", range(len(PATHS)))
 def test_a_stop_stands_nearly_as_soon_as_any_law_could(path: int, seed: int) -> None:
     session = Session()
-    session.send("g", PATHS[path])
+    session.post("g", PATHS[path])
     session.cycles(random.Random(seed).randrange(5, cycles_of(path) - 30))
     least = quickest(session)
     session.order(Command.STOP)
@@ -195,7 +195,7 @@ def test_a_resume_takes_effect_at_the_latest_when_the_robot_stands(path: int, se
     def paused(wait: int | None) -> tuple[int, int]:
         """How many cycles after the pause it stands or is resumed, and how many more it then takes to the end."""
         session = Session()
-        session.send("g", PATHS[path])
+        session.post("g", PATHS[path])
         session.cycles(instant)
         session.order(Command.PAUSE)
         if wait is None:
@@ -203,10 +203,10 @@ def test_a_resume_takes_effect_at_the_latest_when_the_robot_stands(path: int, se
         else:
             session.cycles(wait)
             waited = wait
-        if "g" not in session.outcomes:
+        if "g" not in session.ended:
             session.order(Command.RESUME)
-        left = session.until(lambda: "g" in session.outcomes, 3000)
-        assert session.outcomes == {"g": "done"}
+        left = session.until(lambda: "g" in session.ended, 3000)
+        assert session.ended == {"g": "done"}
         return waited, left
 
     until_standstill, from_rest = paused(None)

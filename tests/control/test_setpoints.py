@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig, changed
+from conftest import Rig, changed
 from control.test_control import ROBOT
+from control_rig import CONFIG
 from trirail.kinematics.robot import inverse
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode

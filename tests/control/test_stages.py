@@ -1,11 +1,9 @@
 """Alignment stages: whole sessions of shipped configurations, in simulated time, on simulated drives."""
 
-from collections.abc import Iterator
-
 import msgspec
 import numpy as np
 import pytest
-from conftest import Rig
+from control_rig import ControlRig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -23,11 +21,10 @@ POSES = ((0.003, -0.002, 0.05), (-0.004, 0.001, -0.03), (0.0, 0.0, 0.0))
 
 
 @pytest.fixture(params=STAGES)
-def stage(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    rig = Rig(load(SIM.with_name(f"{request.param}.toml")))
+def stage(request: pytest.FixtureRequest) -> ControlRig:
+    rig = ControlRig(load(SIM.with_name(f"{request.param}.toml")))
     rig.enable()
-    yield rig
-    rig.bus.shutdown()
+    return rig
 
 
 def with_own(config: Config, **own: object) -> Config:
@@ -46,7 +43,7 @@ def weak(slider: int) -> dict[str, object]:
 @pytest.mark.parametrize("slider", [0, 1, 2])
 def test_each_slider_keeps_its_own_limits(slider: int) -> None:
     """Goals in pose and in slider space, made as fast as they go: the weak slider at its limits, the others not."""
-    rig = Rig(with_own(load(SIM.with_name("uvw-ppr.toml")), **weak(slider)))
+    rig = ControlRig(with_own(load(SIM.with_name("uvw-ppr.toml")), **weak(slider)))
     rig.enable()
     limits, robot = rig.config.limits.slider, geometry(rig.config.geometry)
     target = tuple(inverse(robot, (-0.002, -0.002, 0.01)).position.tolist())
@@ -70,7 +67,6 @@ def test_each_slider_keeps_its_own_limits(slider: int) -> None:
     answer = rig.send("far", SlidersGoal(tuple(0.0045 if k == slider else 0.0 for k in range(3))))  # type: ignore[arg-type]
     assert isinstance(answer, Refused)
     assert (answer.slider, answer.limit) == ("ABC"[slider], 0.004)
-    rig.bus.shutdown()
 
 
 def three(low: float, high: float) -> st.SearchStrategy[tuple[float, float, float]]:
@@ -94,7 +90,7 @@ def test_whatever_limits_the_sliders_have_planner_and_gate_keep_them(
         load(SIM.with_name(f"{stage}.toml")),
         position=tuple(zip(low, high, strict=True)), velocity=v, acceleration=a, jerk=j,
     )  # fmt: skip
-    rig, robot = Rig(config), geometry(config.geometry)
+    rig, robot = ControlRig(config), geometry(config.geometry)
     rig.enable()
     for number, pose in enumerate(poses):
         sliders, passive = travels(robot, pose)
@@ -122,7 +118,6 @@ def test_whatever_limits_the_sliders_have_planner_and_gate_keep_them(
                 violation = bounds.setpoint(rows)
                 assert (violation is None) is passes
                 assert violation is None or (violation.what, violation.limit) == ("ABC"[leg], limit)
-    rig.bus.shutdown()
 
 
 def read(**own: str) -> SliderLimits:
@@ -173,7 +168,7 @@ def test_a_limit_of_another_shape_is_refused_with_what_is_allowed(wrong: tuple[s
     assert str(refused.value).startswith(WRONG[wrong])
 
 
-def test_goals_end_in_their_windows_and_within_limits(stage: Rig) -> None:
+def test_goals_end_in_their_windows_and_within_limits(stage: ControlRig) -> None:
     robot, limits = geometry(stage.config.geometry), stage.config.limits
     for k, pose in enumerate(POSES):
         assert isinstance(stage.goal(f"g{k}", *pose), Accepted)
@@ -190,7 +185,7 @@ def test_goals_end_in_their_windows_and_within_limits(stage: Rig) -> None:
     assert np.all(np.abs(np.diff(rows[:, 2], axis=0)) <= np.multiply(slider.jerk, 1.001 * stage.config.period))
 
 
-def test_sliders_go_where_they_are_to_go_together(stage: Rig) -> None:
+def test_sliders_go_where_they_are_to_go_together(stage: ControlRig) -> None:
     """A straight path of the sliders runs through the forward kinematics in every cycle."""
     target = tuple(inverse(geometry(stage.config.geometry), (0.002, 0.004, -0.04)).position.tolist())
     assert isinstance(stage.send("s", SlidersGoal(target)), Accepted)
@@ -200,7 +195,7 @@ def test_sliders_go_where_they_are_to_go_together(stage: Rig) -> None:
     assert stage.outcomes() == [("s", "done")]
 
 
-def test_a_goal_beyond_a_sliders_stroke_is_refused_with_the_slider(stage: Rig) -> None:
+def test_a_goal_beyond_a_sliders_stroke_is_refused_with_the_slider(stage: ControlRig) -> None:
     answer = stage.goal("far", 0.0099, -0.0099, 0.087)
     assert isinstance(answer, Refused)
     assert answer.slider in {"A", "B", "C"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig, carried
+from control_rig import CONFIG, ControlRig, carried
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.config import Config
@@ -20,11 +20,11 @@ PROMPT = round(0.05 / PERIOD)
 """What a stop may take beside braking [cycles]."""
 
 
-def answer_to(rig: Rig, ticket: int) -> Answer | None:
+def answer_to(rig: ControlRig, ticket: int) -> Answer | None:
     return next((answer for answer in rig.answers if getattr(answer, "ticket", None) == ticket), None)
 
 
-def confirmed_after(rig: Rig, name: str, within: int) -> int:
+def confirmed_after(rig: ControlRig, name: str, within: int) -> int:
     """Send a command beside what waits; return after how many cycles it is confirmed."""
     ticket = 10**6 + len(rig.rows)
     rig.cycle(CommandRequest(ticket, "bob", Command(name), carried(name)))
@@ -48,8 +48,13 @@ def braking(config: Config) -> int:
     return round(3.0 * max(v / a + a / j for v, a, j in rows) / config.period)
 
 
+@pytest.fixture
+def rig() -> ControlRig:
+    return ControlRig()
+
+
 @pytest.mark.parametrize("name", ["stop", "quick_stop", "disable", "override"])
-def test_goals_that_wait_at_override_zero_deafen_nothing(rig: Rig, name: str) -> None:
+def test_goals_that_wait_at_override_zero_deafen_nothing(rig: ControlRig, name: str) -> None:
     rig.enable()
     rig.command("override", 0.0)
     for number, (x, y) in enumerate([(0.01, 0.0), (0.02, 0.01), (0.03, 0.0), (0.03, 0.02)]):
@@ -61,7 +66,7 @@ def test_goals_that_wait_at_override_zero_deafen_nothing(rig: Rig, name: str) ->
         assert {outcome for _, outcome in rig.outcomes()} == {"faulted" if name == "quick_stop" else "stopped"}
 
 
-def test_goals_blended_at_override_zero_are_run_when_it_is_raised(rig: Rig) -> None:
+def test_goals_blended_at_override_zero_are_run_when_it_is_raised(rig: ControlRig) -> None:
     rig.enable()
     rig.command("override", 0.0)
     for number, (x, y) in enumerate([(0.01, 0.0), (0.02, 0.01), (0.03, 0.0)]):
@@ -73,7 +78,7 @@ def test_goals_blended_at_override_zero_are_run_when_it_is_raised(rig: Rig) -> N
     assert rig.outcomes() == [("g0", "done"), ("g1", "done"), ("g2", "done")]
 
 
-def test_a_plan_that_does_not_end_is_refused(rig: Rig) -> None:
+def test_a_plan_that_does_not_end_is_refused(rig: ControlRig) -> None:
     rig.enable()
     rig.planner.delay = NEVER
     rig.post("g1", PoseGoal(0.01, 0.0, 0.0))
@@ -93,14 +98,14 @@ FAR = PoseGoal(0.03, 0.02, 0.1)
 
 
 @pytest.fixture
-def slow(rig: Rig) -> Rig:
+def slow(rig: ControlRig) -> ControlRig:
     """A robot that is enabled, and whose planner thinks for 20 cycles about every goal."""
     rig.enable()
     rig.planner.delay = 20
     return rig
 
 
-def planned(rig: Rig, goal: PoseGoal, name: str) -> None:
+def planned(rig: ControlRig, goal: PoseGoal, name: str) -> None:
     """Move, and send a goal whose planning is not over."""
     rig.goal("running", -0.12, 0.0, 0.0)
     rig.cycles(150)
@@ -109,7 +114,7 @@ def planned(rig: Rig, goal: PoseGoal, name: str) -> None:
 
 
 @pytest.mark.parametrize("event", [ModeEvent.GATEWAY_LOST, ModeEvent.LATE, ModeEvent.SHUTDOWN])
-def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: Rig, event: ModeEvent) -> None:
+def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: ControlRig, event: ModeEvent) -> None:
     planned(slow, FAR, "g1")
     slow.control.modes.happen(event, "gone")
     slow.until(lambda: slow.mode in (Mode.HOLDING, Mode.DISABLED))
@@ -119,7 +124,7 @@ def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: R
     assert slow.outcomes() == [("running", "stopped"), ("g1", "stopped")]
 
 
-def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow: Rig) -> None:
+def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow: ControlRig) -> None:
     slow.post("g1", FAR)
     slow.control.modes.happen(ModeEvent.GATEWAY_LOST, "gone")
     slow.cycles(100)
@@ -127,7 +132,7 @@ def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow:
     assert slow.outcomes() == [("g1", "stopped")]
 
 
-def test_stop_of_the_running_goal_stops_the_robot_and_what_waits(slow: Rig) -> None:
+def test_stop_of_the_running_goal_stops_the_robot_and_what_waits(slow: ControlRig) -> None:
     planned(slow, FAR, "g1")
     slow.cycle(CommandRequest(99, "ann", Command.STOP, Stop("running")))
     slow.until(slow.holds)
@@ -135,7 +140,7 @@ def test_stop_of_the_running_goal_stops_the_robot_and_what_waits(slow: Rig) -> N
 
 
 @pytest.mark.parametrize("waiting", ["planned", "behind it"])
-def test_stop_of_a_goal_that_has_not_begun_leaves_the_others(slow: Rig, waiting: str) -> None:
+def test_stop_of_a_goal_that_has_not_begun_leaves_the_others(slow: ControlRig, waiting: str) -> None:
     planned(slow, FAR, "g1")
     slow.post("g2", PoseGoal(0.0, 0.03, 0.0))
     slow.cycle(CommandRequest(99, "ann", Command.STOP, Stop("g1" if waiting == "planned" else "g2")))
@@ -153,7 +158,7 @@ def test_stop_of_a_goal_that_has_not_begun_leaves_the_others(slow: Rig, waiting:
 
 
 @pytest.mark.parametrize("name", ["g2", "g3", "g4", "never"])
-def test_stop_of_one_of_several_goals_that_wait_for_the_planner_is_of_that_one_alone(slow: Rig, name: str) -> None:
+def test_stop_of_one_of_several_goals_that_wait_for_a_plan_is_of_that_one_alone(slow: ControlRig, name: str) -> None:
     slow.goal("g0", 0.001, 0.0, 0.0)
     slow.until(slow.holds)
     places = {"g1": 0.01, "g2": 0.02, "g3": 0.03, "g4": 0.04}
@@ -168,7 +173,7 @@ def test_stop_of_one_of_several_goals_that_wait_for_the_planner_is_of_that_one_a
     assert slow.control.commanded.pose == pytest.approx((last, 0.0, 0.0))
 
 
-def test_a_goal_that_has_ended_cannot_be_stopped(rig: Rig) -> None:
+def test_a_goal_that_has_ended_cannot_be_stopped(rig: ControlRig) -> None:
     rig.enable()
     rig.goal("g1", 0.01, 0.0, 0.0)
     rig.until(rig.holds)
@@ -179,14 +184,14 @@ def test_a_goal_that_has_ended_cannot_be_stopped(rig: Rig) -> None:
     assert rig.outcomes() == [("g1", "done")]
 
 
-def test_a_goal_that_runs_for_longer_than_it_was_valid_arrives(rig: Rig) -> None:
+def test_a_goal_that_runs_for_longer_than_it_was_valid_arrives(rig: ControlRig) -> None:
     rig.enable()
     rig.send("g1", PoseGoal(0.05, 0.0, 0.0, valid_for=0.1))
     rig.until(rig.holds)
     assert rig.outcomes() == [("g1", "done")]
 
 
-def test_what_was_sent_before_a_pause_does_not_begin(slow: Rig) -> None:
+def test_what_was_sent_before_a_pause_does_not_begin(slow: ControlRig) -> None:
     planned(slow, FAR, "g1")
     slow.post("g2", FAR)
     slow.command("pause")
@@ -198,7 +203,7 @@ def test_what_was_sent_before_a_pause_does_not_begin(slow: Rig) -> None:
 
 
 @pytest.mark.parametrize("wait", [0, 3, 10, 30])
-def test_a_goal_that_is_sent_to_a_robot_that_pauses_is_not_paused(rig: Rig, wait: int) -> None:
+def test_a_goal_that_is_sent_to_a_robot_that_pauses_is_not_paused(rig: ControlRig, wait: int) -> None:
     rig.enable()
     rig.goal("running", -0.1, 0.0, 0.0)
     rig.cycles(150)
@@ -211,7 +216,7 @@ def test_a_goal_that_is_sent_to_a_robot_that_pauses_is_not_paused(rig: Rig, wait
     assert rig.control.commanded.pose == pytest.approx((0.0, 0.03, 0.0))
 
 
-def test_a_goal_that_is_sent_to_a_paused_robot_begins(slow: Rig) -> None:
+def test_a_goal_that_is_sent_to_a_paused_robot_begins(slow: ControlRig) -> None:
     slow.goal("running", -0.12, 0.0, 0.0)
     slow.cycles(200)
     slow.command("pause")
@@ -223,7 +228,7 @@ def test_a_goal_that_is_sent_to_a_paused_robot_begins(slow: Rig) -> None:
 # ---------------------------------------------------------------------- the dead man
 
 
-def stands_from(rig: Rig) -> int:
+def stands_from(rig: ControlRig) -> int:
     """Return the cycle after which no setpoint has moved."""
     position = rig.setpoints()[:, 0]
     moved = np.flatnonzero((np.abs(np.diff(position, axis=0)) > 1e-12).any(axis=1))
@@ -232,7 +237,7 @@ def stands_from(rig: Rig) -> int:
 
 @pytest.mark.parametrize("override", [0.0, 0.02, 0.1, 0.5, 1.0, 2.0])
 @pytest.mark.parametrize("timeout", [0.05, 0.2, 1.0])
-def test_a_jog_that_nobody_renews_is_over_in_real_time(rig: Rig, override: float, timeout: float) -> None:
+def test_a_jog_that_nobody_renews_is_over_in_real_time(rig: ControlRig, override: float, timeout: float) -> None:
     rig.enable()
     rig.command("override", override)
     sent = len(rig.rows)
@@ -248,7 +253,7 @@ def test_a_jog_that_nobody_renews_is_over_in_real_time(rig: Rig, override: float
 
 
 @pytest.mark.parametrize("override", [0.1, 1.0, 2.0])
-def test_a_jog_lasts_as_long_as_it_is_renewed(rig: Rig, override: float) -> None:
+def test_a_jog_lasts_as_long_as_it_is_renewed(rig: ControlRig, override: float) -> None:
     rig.enable()
     rig.command("override", override)
     for _ in range(30):
@@ -259,7 +264,7 @@ def test_a_jog_lasts_as_long_as_it_is_renewed(rig: Rig, override: float) -> None
     assert rig.outcomes() == []
 
 
-def test_a_jog_goes_on_until_its_time_is_over(rig: Rig) -> None:
+def test_a_jog_goes_on_until_its_time_is_over(rig: ControlRig) -> None:
     rig.enable()
     jog = VelocityGoal(0.05, 0.0, 0.0, timeout=0.2)
     rig.cycle(GoalRequest(500, "ann", "j1", jog, round((rig.now + PERIOD) * 1e9)))
@@ -268,7 +273,7 @@ def test_a_jog_goes_on_until_its_time_is_over(rig: Rig) -> None:
     assert len(rig.rows) - sent == round(0.2 / PERIOD) + 1
 
 
-def test_a_stop_begins_in_the_cycle_in_which_it_is_asked_for(rig: Rig) -> None:
+def test_a_stop_begins_in_the_cycle_in_which_it_is_asked_for(rig: ControlRig) -> None:
     rig.enable()
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(250)
@@ -277,7 +282,7 @@ def test_a_stop_begins_in_the_cycle_in_which_it_is_asked_for(rig: Rig) -> None:
     assert rig.control.commanded.velocity[0] < speed
 
 
-def test_a_jog_that_was_let_go_does_not_come_back(rig: Rig) -> None:
+def test_a_jog_that_was_let_go_does_not_come_back(rig: ControlRig) -> None:
     rig.enable()
     rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.1))
     rig.until(lambda: rig.mode is Mode.STOPPING)
@@ -302,7 +307,7 @@ def test_a_jog_that_was_let_go_does_not_come_back(rig: Rig) -> None:
         ("another", "preempted: preempted by goal g1"),
     ],
 )
-def test_what_was_renewed_and_is_over_says_how_it_ended(rig: Rig, goal: Goal, end: str, said: str) -> None:
+def test_what_was_renewed_and_is_over_says_how_it_ended(rig: ControlRig, goal: Goal, end: str, said: str) -> None:
     """Whatever has ended it, and in every mode: who streams one id looks at the last answer."""
     rig.enable()
     rig.send("j1", goal)
@@ -325,7 +330,7 @@ def test_what_was_renewed_and_is_over_says_how_it_ended(rig: Rig, goal: Goal, en
 @pytest.mark.parametrize(
     "goal", [VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), TrackGoal(0.05, 0.0, 0.0)], ids=["jog", "track"]
 )
-def test_what_was_renewed_and_refused_goes_on_to_say_why(rig: Rig, goal: Goal) -> None:
+def test_what_was_renewed_and_refused_goes_on_to_say_why(rig: ControlRig, goal: Goal) -> None:
     assert getattr(rig.send("j1", goal), "code", None) == "not_enabled"
     answer = rig.send("j1", goal)
     assert isinstance(answer, Refused)
@@ -333,7 +338,7 @@ def test_what_was_renewed_and_refused_goes_on_to_say_why(rig: Rig, goal: Goal) -
     assert "rejected: the robot is disabled: send enable first; begin a new one" in answer.message
 
 
-def test_what_is_refused_in_fault_says_which_and_only_there(rig: Rig) -> None:
+def test_what_is_refused_in_fault_says_which_and_only_there(rig: ControlRig) -> None:
     rig.enable()
     assert "fault" not in refused(rig.command("resume"))
     rig.command("quick_stop")
@@ -345,7 +350,7 @@ def refused(answer: object) -> str:
     return answer.message
 
 
-def test_the_first_reason_of_a_fault_stays_and_is_told_once(rig: Rig) -> None:
+def test_the_first_reason_of_a_fault_stays_and_is_told_once(rig: ControlRig) -> None:
     rig.enable()
     rig.command("quick_stop")
     told = len(rig.notices)
@@ -355,7 +360,7 @@ def test_the_first_reason_of_a_fault_stays_and_is_told_once(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("override", [0.25, 0.5, 2.0])
-def test_what_is_resumed_goes_on_at_the_override(rig: Rig, override: float) -> None:
+def test_what_is_resumed_goes_on_at_the_override(rig: ControlRig, override: float) -> None:
     def takes(rate: float, x: float) -> int:
         """Cycles from a resume just after the start to the end, at a speed that the limits leave room for."""
         rig.command("override", rate)
@@ -369,7 +374,7 @@ def test_what_is_resumed_goes_on_at_the_override(rig: Rig, override: float) -> N
     assert takes(override, 0.05) * override == pytest.approx(takes(1.0, 0.0), rel=0.1)
 
 
-def test_another_goal_may_follow_a_jog_that_brakes(rig: Rig) -> None:
+def test_another_goal_may_follow_a_jog_that_brakes(rig: ControlRig) -> None:
     rig.enable()
     rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.1))
     rig.until(lambda: rig.mode is Mode.STOPPING)
@@ -378,7 +383,7 @@ def test_another_goal_may_follow_a_jog_that_brakes(rig: Rig) -> None:
     assert rig.outcomes() == [("j1", "preempted"), ("g1", "done")]
 
 
-def test_a_pause_ends_a_jog(rig: Rig) -> None:
+def test_a_pause_ends_a_jog(rig: ControlRig) -> None:
     rig.enable()
     rig.send("j1", VelocityGoal(0.1, 0.0, 0.0, timeout=2.0))
     rig.cycles(300)
@@ -395,7 +400,7 @@ def test_a_pause_ends_a_jog(rig: Rig) -> None:
     "goal", [VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), TrackGoal(0.05, 0.0, 0.0)], ids=["jog", "track"]
 )
 @pytest.mark.parametrize("name", ["stop", "quick_stop", "pause", "disable"])
-def test_what_is_stopped_while_its_renewal_is_planned_ends_once(slow: Rig, name: str, goal: Goal) -> None:
+def test_what_is_stopped_while_its_renewal_is_planned_ends_once(slow: ControlRig, name: str, goal: Goal) -> None:
     slow.send("j1", goal)
     slow.post("j1", goal)
     slow.cycles(5)
@@ -406,7 +411,7 @@ def test_what_is_stopped_while_its_renewal_is_planned_ends_once(slow: Rig, name:
     assert len(slow.answers) == len({answer.ticket for answer in slow.answers if hasattr(answer, "ticket")})
 
 
-def test_nobody_else_renews_a_jog(rig: Rig) -> None:
+def test_nobody_else_renews_a_jog(rig: ControlRig) -> None:
     rig.enable()
     jog = VelocityGoal(0.05, 0.0, 0.0, timeout=0.2)
     rig.send("j1", jog)
@@ -420,7 +425,7 @@ def test_nobody_else_renews_a_jog(rig: Rig) -> None:
     assert rig.outcomes() == [("j1", "done")]
 
 
-def test_a_jog_that_waited_too_long_does_not_begin(rig: Rig) -> None:
+def test_a_jog_that_waited_too_long_does_not_begin(rig: ControlRig) -> None:
     rig.enable()
     rig.cycle(GoalRequest(500, "ann", "j1", VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), round((rig.now - 0.3) * 1e9)))
     assert rig.mode is Mode.HOLDING
@@ -451,7 +456,7 @@ STEP = st.tuples(
 )
 
 
-def play(rig: Rig, steps: list[tuple[object, int]]) -> None:
+def play(rig: ControlRig, steps: list[tuple[object, int]]) -> None:
     """Send all of it without waiting for any answer."""
     for number, (what, wait) in enumerate(steps, start=1):
         if isinstance(what, float):
@@ -472,7 +477,7 @@ def play(rig: Rig, steps: list[tuple[object, int]]) -> None:
     [(TrackGoal(0.0, 0.048, -0.3738, timeout=0.3), 200), (PoseGoal(0.0456, 0.0, 0.0), 0), (PoseGoal(0.0, 0.0, 0.0), 0)]
 )
 def test_after_any_sequence_a_stop_is_confirmed_in_time(name: str, steps: list[tuple[object, int]]) -> None:
-    rig = Rig()
+    rig = ControlRig()
     rig.command("enable")
     rig.answers.clear()
     play(rig, steps)
@@ -481,7 +486,6 @@ def test_after_any_sequence_a_stop_is_confirmed_in_time(name: str, steps: list[t
     if name != "quick_stop":  # whose ramp is the drives'
         assert rig.control.commanded.at_rest
     rig.cycles(50)
-    rig.bus.shutdown()
     goals = {f"g{number}" for number, (what, _) in enumerate(steps, start=1) if not isinstance(what, float | str)}
     assert sorted(str(goal) for goal, _ in rig.outcomes()) == sorted(goals)  # each ended once
     answered = [answer.ticket for answer in rig.answers if hasattr(answer, "ticket") and answer.ticket < 10**6]
@@ -506,7 +510,7 @@ def test_a_robot_whose_last_goal_is_a_jog_stands_when_the_dead_man_is_over(
     after: list[tuple[object, int]],
 ) -> None:
     """Whatever was sent before, and however the rate is changed: nothing but a renewal keeps a jog alive."""
-    rig = Rig()
+    rig = ControlRig()
     rig.command("enable")
     play(rig, [*before, ("stop", 600), (1.0, 0)])
     sent = len(rig.rows)
@@ -514,6 +518,5 @@ def test_a_robot_whose_last_goal_is_a_jog_stands_when_the_dead_man_is_over(
     rig.cycle(GoalRequest(900, "ann", "jog", jog, round(rig.now * 1e9)))
     play(rig, after)
     rig.cycles(1000)
-    rig.bus.shutdown()
     assert rig.mode is Mode.HOLDING
     assert stands_from(rig) <= sent + round(timeout / PERIOD) + braking(CONFIG) + PROMPT

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
 from control.test_control import assert_within_limits
 from control.test_stop import PROMPT, braking, confirmed_after
+from control_rig import CONFIG, ControlRig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -56,7 +56,7 @@ def disturbed(rate: float, seconds: float, jitter: float, lost: float, seed: int
 
 
 def track(
-    rig: Rig, target: Target, told: list[Told], until: float | None = None, timeout: float = 0.25
+    rig: ControlRig, target: Target, told: list[Told], until: float | None = None, timeout: float = 0.25
 ) -> list[Vector]:
     """Tell a robot of a target, from now on; return the commanded poses, less the target's, of every cycle."""
     begins, lags, tickets = rig.now, [], itertools.count(10_000)
@@ -87,8 +87,13 @@ def behind(lags: list[Vector], after: float = 1.0) -> float:
 # ---------------------------------------------------------------------- how close
 
 
+@pytest.fixture
+def rig() -> ControlRig:
+    return ControlRig()
+
+
 @pytest.mark.parametrize("delay", [1, 3, 5])
-def test_behind_a_sine_it_is_within_half_a_millimetre(rig: Rig, delay: int) -> None:
+def test_behind_a_sine_it_is_within_half_a_millimetre(rig: ControlRig, delay: int) -> None:
     """Whether the planner answers at once, in time, or so late that it has to be asked for more."""
     rig.enable()
     rig.planner.delay = delay
@@ -97,14 +102,14 @@ def test_behind_a_sine_it_is_within_half_a_millimetre(rig: Rig, delay: int) -> N
 
 
 @pytest.mark.generated(0, 1, 2)
-def test_with_jitter_and_lost_messages_it_is_within_double_that(rig: Rig, seed: int) -> None:
+def test_with_jitter_and_lost_messages_it_is_within_double_that(rig: ControlRig, seed: int) -> None:
     rig.enable()
     assert behind(track(rig, sine(), disturbed(100.0, 4.0, 0.005, 0.05, seed))) < 1.0e-3
     assert_within_limits(rig)
 
 
 @pytest.mark.parametrize("rate", [10.0, 50.0, 200.0])
-def test_it_follows_at_every_rate(rig: Rig, rate: float) -> None:
+def test_it_follows_at_every_rate(rig: ControlRig, rate: float) -> None:
     """Ten times a second a tenth of a second is extrapolated: half of 0.3 m/s² times that squared is 1.5 mm."""
     rig.enable()
     assert behind(track(rig, sine(), regular(rate, 3.0))) < (4e-3 if rate < 20.0 else 0.6e-3)
@@ -112,7 +117,7 @@ def test_it_follows_at_every_rate(rig: Rig, rate: float) -> None:
     assert_within_limits(rig)
 
 
-def test_the_measured_platform_is_where_the_target_is(rig: Rig) -> None:
+def test_the_measured_platform_is_where_the_target_is(rig: ControlRig) -> None:
     rig.enable()
     target, begins = sine(), rig.now
     track(rig, target, regular(100.0, 2.3))
@@ -120,7 +125,7 @@ def test_the_measured_platform_is_where_the_target_is(rig: Rig) -> None:
     assert rig.control.measured.pose == pytest.approx(there, abs=0.5e-3)
 
 
-def test_all_three_coordinates_are_followed(rig: Rig) -> None:
+def test_all_three_coordinates_are_followed(rig: ControlRig) -> None:
     rig.enable()
 
     def circle(t: float) -> tuple[Vector, Vector]:
@@ -133,7 +138,7 @@ def test_all_three_coordinates_are_followed(rig: Rig) -> None:
     assert_within_limits(rig)
 
 
-def test_the_reply_says_how_far_it_is_behind(rig: Rig) -> None:
+def test_the_reply_says_how_far_it_is_behind(rig: ControlRig) -> None:
     rig.enable()
     rig.post("t1", TrackGoal(0.05, 0.0, 0.0))
     rig.until(lambda: bool(rig.answers) and isinstance(rig.answers[-1], Accepted))
@@ -150,7 +155,7 @@ def test_the_reply_says_how_far_it_is_behind(rig: Rig) -> None:
 # ---------------------------------------------------------------------- what cannot be followed
 
 
-def test_a_target_that_is_too_fast_is_followed_as_fast_as_may_be(rig: Rig) -> None:
+def test_a_target_that_is_too_fast_is_followed_as_fast_as_may_be(rig: ControlRig) -> None:
     rig.enable()
     track(rig, lambda t: ((-0.1 + 0.5 * t, 0.0, 0.0), (0.5, 0.0, 0.0)), regular(100.0, 0.3))
     rig.until(lambda: rig.mode is Mode.MOVING)
@@ -160,7 +165,7 @@ def test_a_target_that_is_too_fast_is_followed_as_fast_as_may_be(rig: Rig) -> No
     assert_within_limits(rig)
 
 
-def test_a_target_beyond_the_border_is_waited_for_there(rig: Rig) -> None:
+def test_a_target_beyond_the_border_is_waited_for_there(rig: ControlRig) -> None:
     rig.enable()
     track(rig, lambda _: ((0.2, 0.03, 0.0), STILL), regular(50.0, 2.0))
     assert rig.mode is Mode.MOVING
@@ -172,7 +177,7 @@ def test_a_target_beyond_the_border_is_waited_for_there(rig: Rig) -> None:
     assert_within_limits(rig)
 
 
-def test_a_target_out_of_a_sliders_travel_is_waited_for_too(rig: Rig) -> None:
+def test_a_target_out_of_a_sliders_travel_is_waited_for_too(rig: ControlRig) -> None:
     rig.enable()
     track(rig, lambda _: ((0.14, 0.14, -0.9), STILL), regular(50.0, 3.0))
     assert rig.mode is Mode.MOVING
@@ -184,7 +189,7 @@ def test_a_target_out_of_a_sliders_travel_is_waited_for_too(rig: Rig) -> None:
     assert_within_limits(rig)
 
 
-def test_a_target_that_leaves_through_the_border_and_comes_back(rig: Rig) -> None:
+def test_a_target_that_leaves_through_the_border_and_comes_back(rig: ControlRig) -> None:
     """The platform brakes before the border, and goes on with it when it is back."""
     rig.enable()
     lags = np.array(track(rig, sine(0.18, 0.15), regular(100.0, 4.0)))[:, 0]
@@ -199,7 +204,7 @@ def test_a_target_that_leaves_through_the_border_and_comes_back(rig: Rig) -> Non
 
 @pytest.mark.parametrize("timeout", [0.03, 0.25, 1.0])
 @pytest.mark.parametrize("override", [0.3, 1.0, 2.0])
-def test_a_target_of_which_nobody_tells_is_over_in_real_time(rig: Rig, override: float, timeout: float) -> None:
+def test_a_target_of_which_nobody_tells_is_over_in_real_time(rig: ControlRig, override: float, timeout: float) -> None:
     rig.enable()
     rig.command("override", override)
     track(rig, sine(), regular(100.0, 1.03), timeout=timeout)
@@ -214,7 +219,7 @@ def test_a_target_of_which_nobody_tells_is_over_in_real_time(rig: Rig, override:
     assert_within_limits(rig)
 
 
-def test_the_path_itself_ends_at_rest(rig: Rig) -> None:
+def test_the_path_itself_ends_at_rest(rig: ControlRig) -> None:
     """Also where it is far from its target: no motion that is taken needs anybody to end it."""
     rig.enable()
     rig.post("t1", TrackGoal(0.14, 0.0, 0.0, velocity=(0.1, 0.1, 0.0), timeout=0.1))
@@ -224,7 +229,7 @@ def test_the_path_itself_ends_at_rest(rig: Rig) -> None:
     assert run.state(run.path.duration, rig.control.commanded.pose).velocity == pytest.approx(STILL, abs=1e-9)
 
 
-def test_a_track_that_stands_lasts_as_long_as_it_is_renewed(rig: Rig) -> None:
+def test_a_track_that_stands_lasts_as_long_as_it_is_renewed(rig: ControlRig) -> None:
     rig.enable()
     track(rig, lambda _: ((0.01, 0.0, 0.0), STILL), regular(10.0, 3.0), timeout=0.2)
     assert rig.mode is Mode.MOVING
@@ -233,14 +238,14 @@ def test_a_track_that_stands_lasts_as_long_as_it_is_renewed(rig: Rig) -> None:
     assert rig.outcomes() == [("t1", "done")]
 
 
-def test_a_track_that_was_let_go_does_not_come_back(rig: Rig) -> None:
+def test_a_track_that_was_let_go_does_not_come_back(rig: ControlRig) -> None:
     rig.enable()
     track(rig, sine(), regular(100.0, 1.0), timeout=0.05)
     rig.until(lambda: rig.mode is Mode.STOPPING)
     assert refusal(rig.send("t1", TrackGoal(0.0, 0.0, 0.0))).code == "jog_over"
 
 
-def test_a_pause_ends_it(rig: Rig) -> None:
+def test_a_pause_ends_it(rig: ControlRig) -> None:
     rig.enable()
     track(rig, sine(), regular(100.0, 1.0))
     assert confirmed_after(rig, "pause", braking(CONFIG) + PROMPT)
@@ -248,7 +253,7 @@ def test_a_pause_ends_it(rig: Rig) -> None:
     assert refusal(rig.command("resume")).code == "not_paused"
 
 
-def test_nobody_else_renews_it_nor_does_another_kind(rig: Rig) -> None:
+def test_nobody_else_renews_it_nor_does_another_kind(rig: ControlRig) -> None:
     rig.enable()
     track(rig, sine(), regular(100.0, 0.5))
     rig.cycle(GoalRequest(900, "bob", "t1", TrackGoal(0.0, 0.0, 0.0), round(rig.now * 1e9)))
@@ -259,7 +264,7 @@ def test_nobody_else_renews_it_nor_does_another_kind(rig: Rig) -> None:
     assert rig.mode is Mode.MOVING
 
 
-def test_what_is_told_anew_takes_the_place_of_what_waits_whoever_else_does(rig: Rig) -> None:
+def test_what_is_told_anew_takes_the_place_of_what_waits_whoever_else_does(rig: ControlRig) -> None:
     rig.enable()
     track(rig, sine(), regular(100.0, 0.3))
     rig.planner.delay = 40
@@ -276,7 +281,7 @@ def test_what_is_told_anew_takes_the_place_of_what_waits_whoever_else_does(rig: 
     assert passed == [1, 2, 4]
 
 
-def test_a_pose_preempts_it_and_it_preempts_a_pose(rig: Rig) -> None:
+def test_a_pose_preempts_it_and_it_preempts_a_pose(rig: ControlRig) -> None:
     rig.enable()
     rig.goal("g1", 0.05, 0.0, 0.0)
     rig.cycles(100)
@@ -288,7 +293,7 @@ def test_a_pose_preempts_it_and_it_preempts_a_pose(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(("age", "when"), [(0.6, "0.60"), (-0.6, "in 0.59")])
-def test_a_time_too_far_from_now_is_refused(rig: Rig, age: float, when: str) -> None:
+def test_a_time_too_far_from_now_is_refused(rig: ControlRig, age: float, when: str) -> None:
     rig.enable()
     rig.cycle(GoalRequest(1, "ann", "t1", TrackGoal(0.01, 0.0, 0.0), round(rig.now * 1e9), age=age))
     answer = refusal(rig.answers[-1])
@@ -297,7 +302,7 @@ def test_a_time_too_far_from_now_is_refused(rig: Rig, age: float, when: str) -> 
     assert rig.outcomes() == [("t1", "rejected")]
 
 
-def test_what_has_waited_behind_its_senders_others_is_not_blamed_on_a_clock(rig: Rig) -> None:
+def test_what_has_waited_behind_its_senders_others_is_not_blamed_on_a_clock(rig: ControlRig) -> None:
     rig.enable()
     rig.cycles(2000)
     came = round((rig.now - 1.2) * 1e9)
@@ -309,7 +314,7 @@ def test_what_has_waited_behind_its_senders_others_is_not_blamed_on_a_clock(rig:
     assert "has waited 1.2" in answer.message
 
 
-def test_what_is_refused_hundreds_of_times_is_told_once(rig: Rig) -> None:
+def test_what_is_refused_hundreds_of_times_is_told_once(rig: ControlRig) -> None:
     rig.enable()
     track(rig, sine(), regular(100.0, 0.3))
     rig.command("stop")
@@ -375,19 +380,16 @@ def jumping(legs: list[Way]) -> tuple[Target, float]:
 def test_whatever_is_told_no_limit_is_passed_and_it_stands_at_the_end(
     legs: list[Way], rate: float, jitter: float, lost: float, delay: int, override: float, stop: bool, seed: int
 ) -> None:
-    rig = Rig()
-    try:
-        rig.enable()
-        rig.command("override", override)
-        rig.planner.delay = delay
-        target, seconds = jumping(legs)
-        track(rig, target, disturbed(rate, seconds, jitter, lost, seed) or [Told(0.0, 0.0)], until=seconds)
-        if stop:
-            assert confirmed_after(rig, "stop", braking(CONFIG) + PROMPT) <= braking(CONFIG) + PROMPT
-        rig.until(rig.holds, round(1.0 / PERIOD))
-        assert rig.control.fault is None
-        assert rig.control.commanded.at_rest
-        assert [name for name, _ in rig.outcomes()] in ([], ["t1"])
-        assert_within_limits(rig)
-    finally:
-        rig.bus.shutdown()
+    rig = ControlRig()
+    rig.enable()
+    rig.command("override", override)
+    rig.planner.delay = delay
+    target, seconds = jumping(legs)
+    track(rig, target, disturbed(rate, seconds, jitter, lost, seed) or [Told(0.0, 0.0)], until=seconds)
+    if stop:
+        assert confirmed_after(rig, "stop", braking(CONFIG) + PROMPT) <= braking(CONFIG) + PROMPT
+    rig.until(rig.holds, round(1.0 / PERIOD))
+    assert rig.control.fault is None
+    assert rig.control.commanded.at_rest
+    assert [name for name, _ in rig.outcomes()] in ([], ["t1"])
+    assert_within_limits(rig)

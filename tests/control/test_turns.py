@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from conftest import Rig
+import pytest
+from control_rig import ControlRig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.wire.goals import PoseGoal
 from trirail.wire.packets import Accepted, GoalRequest, Refused
 
 
-def order(rig: Rig, users: list[str]) -> list[str]:
+def order(rig: ControlRig, users: list[str]) -> list[str]:
     """Send a goal of each user named, all in one cycle; return whose were answered, in order."""
     answered = len(rig.answers)
     now_ns = round(rig.now * 1e9)
@@ -27,7 +28,12 @@ def order(rig: Rig, users: list[str]) -> list[str]:
     return [users[ticket] for ticket in answers()]
 
 
-def test_who_sends_many_waits_for_himself(rig: Rig) -> None:
+@pytest.fixture
+def rig() -> ControlRig:
+    return ControlRig()
+
+
+def test_who_sends_many_waits_for_himself(rig: ControlRig) -> None:
     rig.enable()
     assert order(rig, ["eve", "eve", "eve", "eve", "ann", "bob", "ann"]) == [
         "eve",
@@ -45,7 +51,7 @@ def test_who_sends_many_waits_for_himself(rig: Rig) -> None:
 @settings(max_examples=20)
 @given(st.lists(st.sampled_from(["ann", "bob", "eve"]), min_size=1, max_size=12))
 def test_nobody_waits_for_more_than_one_goal_of_each_other(users: list[str]) -> None:
-    rig = Rig()
+    rig = ControlRig()
     rig.enable()
     left = {user: users.count(user) for user in users}
     since: dict[str, list[str]] = {user: [] for user in left}
@@ -56,4 +62,3 @@ def test_nobody_waits_for_more_than_one_goal_of_each_other(users: list[str]) -> 
                 others.append(served)
                 assert len(others) == len(set(others))
         since[served].clear()
-    rig.bus.shutdown()

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import msgspec
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import Config

@@ -12,7 +12,8 @@ import can
 import numpy as np
 import pytest
 from _pytest.mark import ParameterSet
-from conftest import CONFIG, Rig, changed
+from conftest import Rig, changed
+from control_rig import CONFIG
 from drivers.test_homing import incremental
 from trirail.config import Config
 from trirail.control.cycle import FAR

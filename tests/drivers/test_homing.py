@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 from canopen.profiles.p402 import BaseNode402
-from conftest import CONFIG, Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
+from conftest import Delay, Rig, a_cycle, changed, one_drive_late, part_of_a_cycle
+from control_rig import CONFIG
 from refusals import refusal
 from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent

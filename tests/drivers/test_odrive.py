@@ -11,9 +11,9 @@ import can
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG as ROBOT
 from conftest import Rig as ControlRig
 from conftest import changed
+from control_rig import CONFIG as ROBOT
 from numpy.typing import NDArray
 from rigs import START, STEP, Bus, Clock, DriverRig, ideal_servo
 from trirail.config import Config

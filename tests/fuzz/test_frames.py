@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import can
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
+from control_rig import CONFIG
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.config import SIM, Config, parse

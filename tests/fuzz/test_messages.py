@@ -14,7 +14,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
+from control_rig import CONFIG
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.errors import RefusedError

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import geometry

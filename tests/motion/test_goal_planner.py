@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
 from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits
+from control_rig import CONFIG, ControlRig
 from motion.test_motion import only_from_rest
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker
@@ -21,15 +21,20 @@ from trirail.wire.goals import PoseGoal, VelocityGoal
 from trirail.wire.packets import Accepted
 
 
-def accepted(rig: Rig, name: str, goal: PoseGoal) -> Accepted:
+def accepted(rig: ControlRig, name: str, goal: PoseGoal) -> Accepted:
     answer = rig.send(name, goal)
     assert isinstance(answer, Accepted), answer
     return answer
 
 
+@pytest.fixture
+def rig() -> ControlRig:
+    return ControlRig()
+
+
 @pytest.mark.parametrize(("override", "stops"), [(0.05, False), (0.049, True)])
 def test_from_a_path_that_runs_slower_than_a_twentieth_the_robot_stops_first(
-    rig: Rig, override: float, stops: bool
+    rig: ControlRig, override: float, stops: bool
 ) -> None:
     rig.enable()
     rig.command("override", override)
@@ -44,7 +49,7 @@ def test_from_a_path_that_runs_slower_than_a_twentieth_the_robot_stops_first(
 
 def test_a_goal_that_stops_the_robot_first_stops_it_within_a_share_of_the_path_before_it() -> None:
     """It stands on the old path, at once and not where that leads, and the time to arrival is told to a few cycles."""
-    rig = Rig(SLOW)
+    rig = ControlRig(SLOW)
     rig.enable()
     accepted(rig, "g1", PoseGoal(0.08, 0.02, 0.3))
     rig.cycles(400)
@@ -59,7 +64,6 @@ def test_a_goal_that_stops_the_robot_first_stops_it_within_a_share_of_the_path_b
     rig.until(rig.holds)
     assert (len(rig.rows) - begun) * PERIOD == pytest.approx(answer.duration, abs=0.03)
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
 @pytest.mark.parametrize("before", [10, 30, 90])
@@ -68,7 +72,7 @@ def test_a_robot_that_stops_first_beyond_a_waiting_goals_seam_is_still_on_its_wa
 ) -> None:
     """It passes where the goal that waited would have begun: that ends nothing, for the goal it stops for has begun."""
     monkeypatch.setattr(GoalPlanner, "_set_out", only_from_rest)
-    rig = Rig()
+    rig = ControlRig()
     rig.enable()
     accepted(rig, "q0", PoseGoal(0.05, 0.0, 0.0, blend=0.03))
     accepted(rig, "q1", PoseGoal(0.1, 0.05, 0.0))
@@ -83,7 +87,6 @@ def test_a_robot_that_stops_first_beyond_a_waiting_goals_seam_is_still_on_its_wa
     rig.until(rig.holds)
     assert rig.outcomes() == [("q0", "preempted"), ("q1", "preempted"), ("g2", "done")]
     assert rig.control.commanded.pose == pytest.approx((0.0, -0.05, 0.2), abs=1e-9)
-    rig.bus.shutdown()
 
 
 @pytest.mark.parametrize("blend", [0.0, 0.01, 1.0])

@@ -7,8 +7,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig, changed
+from conftest import Rig, changed
 from control.test_control import GOAL, PERIOD, ROBOT, assert_within_limits
+from control_rig import CONFIG, ControlRig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ START = 1e-4
 """How far from where the robot stands a trajectory may begin [m, rad]."""
 
 
-class Watched(Rig):
+class Watched(ControlRig):
     """Keeps the platform's commanded motion of every cycle."""
 
     def __init__(self) -> None:
@@ -73,6 +74,11 @@ KINDS: dict[str, Goal] = {
 }
 
 
+@pytest.fixture
+def rig() -> ControlRig:
+    return ControlRig()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("override", [0.3, 1.0, 2.0])
 @pytest.mark.parametrize("kind", KINDS)
@@ -86,10 +92,9 @@ def test_the_platforms_limits_bind_every_kind_at_every_override(kind: str, overr
     rate = (rig.used() ** (1.0, 1.0 / 2.0, 1.0 / 3.0)).max()
     assert rate >= 0.9 * min(1.0, override * (0.5 if "half" in kind else 1.0))  # nor slower than they must
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
-def test_an_override_takes_back_a_goals_own_slowness(rig: Rig) -> None:
+def test_an_override_takes_back_a_goals_own_slowness(rig: ControlRig) -> None:
     rig.enable()
     rig.command("override", 2.0)
     rig.goal("g1", 0.1, 0.0, 0.0, speed=0.5)
@@ -137,7 +142,6 @@ def test_no_sequence_takes_the_platform_beyond_its_limits(steps: list[tuple[obje
     assert rig.control.fault is None
     assert (rig.used() <= 1.0 + BETWEEN).all()
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
 # ---------------------------------------------------------------------- what is slowed
@@ -160,10 +164,9 @@ def test_a_stretched_trajectory_fits_at_its_final_speed(steps: list[tuple[float,
     assert rig.control.fault is None
     assert (rig.used() <= 1.0 + BETWEEN).all()
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
-def test_a_jerk_too_short_to_be_seen_before_it_is_slowed(rig: Rig) -> None:
+def test_a_jerk_too_short_to_be_seen_before_it_is_slowed(rig: ControlRig) -> None:
     rig.enable()
     made = points((0.0, 0.0), (0.05, 0.002), (0.052, 0.0022), (0.1, 0.004))
     assert isinstance(rig.send("g1", TrajectoryGoal(made, stretch=True)), Accepted)
@@ -174,7 +177,7 @@ def test_a_jerk_too_short_to_be_seen_before_it_is_slowed(rig: Rig) -> None:
 
 @pytest.mark.parametrize("coordinate", range(3))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_too_fast_says_for_what_and_what_would_be_right(rig: Rig, coordinate: int, sign: float) -> None:
+def test_too_fast_says_for_what_and_what_would_be_right(rig: ControlRig, coordinate: int, sign: float) -> None:
     rig.enable()
     x, y, phi = sign * np.eye(3)[coordinate] * (0.1, 0.1, 0.4)
     made = TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(0.4, x, y, phi)
@@ -249,7 +252,7 @@ def test_a_limit_itself_is_within(n: int, end: int) -> None:
 
 @pytest.mark.parametrize("coordinate", range(3))
 @pytest.mark.parametrize("end", range(2))
-def test_the_controls_own_gate_has_the_slack_of_rounding(rig: Rig, coordinate: int, end: int) -> None:
+def test_the_controls_own_gate_has_the_slack_of_rounding(rig: ControlRig, coordinate: int, end: int) -> None:
     """Of position: a setpoint that is a micrometre beyond a limit was checked, one that is further was not."""
     limits, gate_of_control = (LIMITS.platform.x, LIMITS.platform.y, LIMITS.platform.phi), rig.control.setpoints._bounds
     for share, refused in ((0.99, False), (1.01, True)):
@@ -316,9 +319,8 @@ def test_the_gate_knows_the_platforms_velocity_acceleration_and_jerk(n: int, sig
         (lambda m: m._replace(pose=(m.pose[0] + 5e-5, *m.pose[1:])), "jerk"),
     ],
 )
-def test_a_step_in_any_row_is_a_fault_before_it_is_sent(
-    rig: Rig, later: Callable[[MotionState], MotionState], said: str
-) -> None:
+def test_a_step_in_any_row_is_a_fault_before_it_is_sent(later: Callable[[MotionState], MotionState], said: str) -> None:
+    rig = Rig()
     rig.enable()
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(20)
@@ -328,9 +330,10 @@ def test_a_step_in_any_row_is_a_fault_before_it_is_sent(
     assert "setpoint refused: " in (rig.control.fault or "")
     assert said in (rig.control.fault or "")
     assert not any(message.arbitration_id - 0x300 in (1, 2, 3) for message in rig.sent)
+    rig.bus.shutdown()
 
 
-def test_a_motion_that_ends_at_once_is_a_fault(rig: Rig) -> None:
+def test_a_motion_that_ends_at_once_is_a_fault(rig: ControlRig) -> None:
     rig.enable()
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(100)
@@ -339,7 +342,7 @@ def test_a_motion_that_ends_at_once_is_a_fault(rig: Rig) -> None:
     assert "jerk" in (rig.control.fault or "")
 
 
-def test_a_position_just_beyond_its_limit_is_told_from_it(rig: Rig) -> None:
+def test_a_position_just_beyond_its_limit_is_told_from_it(rig: ControlRig) -> None:
     rig.enable()
     answer = refusal(rig.send("g1", SlidersGoal((-0.1700001, 0.0, 0.0))))
     assert "slider A: position is 100 nm beyond its limit -170 mm" in answer.message
@@ -356,7 +359,9 @@ def test_a_position_just_beyond_its_limit_is_told_from_it(rig: Rig) -> None:
         ((0.0, 0.0, -1.0), "slider A (position -170 mm)"),
     ],
 )
-def test_a_jog_into_a_limit_ends_there_and_says_so(rig: Rig, velocity: tuple[float, float, float], bound: str) -> None:
+def test_a_jog_into_a_limit_ends_there_and_says_so(
+    rig: ControlRig, velocity: tuple[float, float, float], bound: str
+) -> None:
     rig.enable()
     jog = VelocityGoal(*velocity, timeout=0.2)
     for _ in range(60):
@@ -381,7 +386,7 @@ TAKEN = (0.3, 1.0, 1.0 + 1e-9, -1.0)
 @pytest.mark.parametrize("beyond", [1.001, -1.001, 2.0, 40.0, -1000.0])
 @pytest.mark.parametrize("axis", range(3))
 def test_a_jog_above_the_platforms_velocity_is_refused_and_one_that_is_not_taken(axis: int, beyond: float) -> None:
-    rig = Rig()
+    rig = ControlRig()
     rig.enable()
     top = CONFIG.limits.platform.velocity[axis]
 
@@ -396,7 +401,6 @@ def test_a_jog_above_the_platforms_velocity_is_refused_and_one_that_is_not_taken
     for number, share in enumerate(TAKEN):
         assert isinstance(rig.send(f"j{number}", jog(share)), Accepted)
         rig.until(rig.holds)
-    rig.bus.shutdown()
 
 
 @pytest.mark.parametrize(
@@ -410,7 +414,7 @@ def test_a_jog_above_the_platforms_velocity_is_refused_and_one_that_is_not_taken
     ],
 )
 def test_a_jog_meant_in_millimetres_or_degrees_is_told_so(
-    rig: Rig, velocity: tuple[float, float, float], said: str
+    rig: ControlRig, velocity: tuple[float, float, float], said: str
 ) -> None:
     rig.enable()
     assert refusal(rig.send("j1", VelocityGoal(*velocity))).message.endswith(f"the jog's {said}")
@@ -426,13 +430,13 @@ def test_a_jog_meant_in_millimetres_or_degrees_is_told_so(
     ],
 )
 def test_a_pose_meant_in_millimetres_or_degrees_is_told_so(
-    rig: Rig, pose: tuple[float, float, float], said: str
+    rig: ControlRig, pose: tuple[float, float, float], said: str
 ) -> None:
     rig.enable()
     assert refusal(rig.send("g1", PoseGoal(*pose))).message == f"the goal is out of the workspace: {said}"
 
 
-def test_a_renewal_that_is_refused_ends_the_jog_at_once(rig: Rig) -> None:
+def test_a_renewal_that_is_refused_ends_the_jog_at_once(rig: ControlRig) -> None:
     rig.enable()
     rig.send("j1", VelocityGoal(0.05, 0.0, 0.0, timeout=10.0))
     rig.cycles(100)
@@ -443,14 +447,14 @@ def test_a_renewal_that_is_refused_ends_the_jog_at_once(rig: Rig) -> None:
     assert rig.outcomes() == [("j1", "done")]
 
 
-def test_a_jog_that_is_let_go_before_a_limit_is_not_at_it(rig: Rig) -> None:
+def test_a_jog_that_is_let_go_before_a_limit_is_not_at_it(rig: ControlRig) -> None:
     rig.enable()
     rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.4))
     rig.until(rig.holds)
     assert [said.message for said in rig.notices if said.outcome] == ["goal j1 done: released"]
 
 
-def test_a_jog_of_no_velocity_brakes_one_and_begins_none(rig: Rig) -> None:
+def test_a_jog_of_no_velocity_brakes_one_and_begins_none(rig: ControlRig) -> None:
     rig.enable()
     assert refusal(rig.send("j1", VelocityGoal(0.0, 0.0, 0.0))).code == "no_velocity"
     rig.send("j2", VelocityGoal(0.1, 0.0, 0.0, timeout=0.5))
@@ -460,7 +464,7 @@ def test_a_jog_of_no_velocity_brakes_one_and_begins_none(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("goal", [PoseGoal(0.05, 0.0, 0.0), SlidersGoal((0.01, 0.0, 0.0))])
-def test_at_override_zero_a_goal_has_no_expected_end(rig: Rig, goal: Goal) -> None:
+def test_at_override_zero_a_goal_has_no_expected_end(rig: ControlRig, goal: Goal) -> None:
     rig.enable()
     rig.command("override", 0.0)
     for number in range(2):
@@ -490,11 +494,10 @@ def test_a_goal_that_preempts_at_an_override_goes_on_as_the_robot_moves(
     assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
     assert (rig.used() <= 1.0 + BETWEEN).all()
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
 @pytest.mark.parametrize("coordinate", range(3))
-def test_how_far_a_trajectory_may_begin_from_where_the_robot_stands(rig: Rig, coordinate: int) -> None:
+def test_how_far_a_trajectory_may_begin_from_where_the_robot_stands(rig: ControlRig, coordinate: int) -> None:
     rig.enable()
     for off, taken in ((0.99 * START, True), (-1.01 * START, False)):
         x, y, phi = np.eye(3)[coordinate] * off
@@ -518,12 +521,11 @@ def test_a_slider_beyond_its_travel_is_not_enabled() -> None:
         inside = min(sliders_at(0.0, 0.0, middle)) >= LIMITS.slider.positions[0][0] - 1e-4
         low, high = (middle, high) if inside else (low, middle)
     assert abs(high) < abs(LIMITS.platform.phi[0])
-    rig = Rig(changed(CONFIG, start=sliders_at(0.0, 0.0, high)))
+    rig = ControlRig(changed(CONFIG, start=sliders_at(0.0, 0.0, high)))
     answer = refusal(rig.command("enable"))
     assert answer.code == "out_of_workspace"
     assert "the robot stands outside its limits: slider A: position" in answer.message
     assert rig.mode is Mode.DISABLED
-    rig.bus.shutdown()
 
 
 @pytest.mark.parametrize("drive", range(3))

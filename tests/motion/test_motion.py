@@ -10,8 +10,9 @@ from collections import Counter
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
 from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits, slower
+from control_rig import CONFIG, ControlRig
 from numpy.typing import NDArray
 from refusals import refusal
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
@@ -72,7 +73,7 @@ def accepted(answer: Answer) -> Accepted:
     return answer
 
 
-def stands(rig: Rig) -> bool:
+def stands(rig: ControlRig) -> bool:
     return rig.mode is Mode.HOLDING and rig.control.goal_queue.idle
 
 
@@ -92,8 +93,13 @@ def bare(start: tuple[float, float, float], end: tuple[float, float, float]) -> 
 # ---------------------------------------------------------------------- arrival
 
 
+@pytest.fixture
+def rig() -> ControlRig:
+    return ControlRig()
+
+
 @pytest.mark.parametrize("end", [(0.05, 0.0, 0.0), (0.02, -0.06, 0.1), (-0.1, 0.03, -0.4), (0.0, 0.0, 0.02)])
-def test_no_later_than_ruckig_itself(rig: Rig, end: tuple[float, float, float]) -> None:
+def test_no_later_than_ruckig_itself(rig: ControlRig, end: tuple[float, float, float]) -> None:
     rig.enable()
     answer = accepted(rig.goal("g1", *end))
     assert answer.slowed == 1.0
@@ -105,7 +111,7 @@ def test_no_later_than_ruckig_itself(rig: Rig, end: tuple[float, float, float]) 
 @pytest.mark.long
 @pytest.mark.parametrize("config", [CONFIG, SLOW], ids=["as shipped", "slow sliders"])
 def test_the_corners_of_the_workspace(config: Config) -> None:
-    rig = Rig(config)
+    rig = ControlRig(config)
     rig.enable()
     for number, direction in enumerate(DIRECTIONS):
         corner = outermost(direction)
@@ -119,12 +125,11 @@ def test_the_corners_of_the_workspace(config: Config) -> None:
         rig.until(rig.holds)
     assert rig.control.fault is None
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
 @pytest.mark.parametrize("leg", range(3))
 @pytest.mark.parametrize("beyond", [-1e-5, 0.0, 2e-6])
-def test_the_very_end_of_a_sliders_travel(rig: Rig, leg: int, beyond: float) -> None:
+def test_the_very_end_of_a_sliders_travel(rig: ControlRig, leg: int, beyond: float) -> None:
     limits = CONFIG.limits.slider.positions[leg]
     target = inverse(ROBOT, np.array([0.02, -0.01, 0.2])).position
     target[leg] = limits[0] - beyond
@@ -142,7 +147,9 @@ def test_the_very_end_of_a_sliders_travel(rig: Rig, leg: int, beyond: float) -> 
 @pytest.mark.long
 @pytest.mark.parametrize(("coordinate", "end"), [(0, 0), (0, 1), (1, 1)])
 @pytest.mark.parametrize("at", [1.38, 1.40, 1.42, 1.44])  # of these at most one peak can be where it is looked anyway
-def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(rig: Rig, at: float, coordinate: int, end: int) -> None:
+def test_a_path_may_not_peak_beyond_a_limit_between_its_ends(
+    rig: ControlRig, at: float, coordinate: int, end: int
+) -> None:
     """Both ends inside, and by how much the middle is outside is less than what lies between two looks."""
     rig.enable()
     limit = (CONFIG.limits.platform.x, CONFIG.limits.platform.y)[coordinate][end]
@@ -171,18 +178,17 @@ def test_a_path_that_is_hardly_too_fast_is_slowed(quantity: str, by: float) -> N
     row = ("velocity", "acceleration").index(quantity)
 
     def used(config: Config) -> float:
-        rig = Rig(config)
+        rig = ControlRig(config)
         rig.enable()
         rig.goal("g1", 0.1, 0.02, 0.2)
         rig.until(rig.holds)
-        rig.bus.shutdown()
         return float(np.abs(rig.setpoints()[:, 1 + row]).max())
 
     planned = used(CONFIG) / by ** (1 + row)
     assert used(slower(CONFIG, **{quantity: planned / 0.98})) <= planned * (1.0 + 2e-3)  # between two looks
 
 
-def test_slowed_is_said(rig: Rig) -> None:
+def test_slowed_is_said(rig: ControlRig) -> None:
     rig.enable()
     rig.goal("g1", 0.0, 0.0, 0.84)
     rig.until(rig.holds)
@@ -205,7 +211,7 @@ def test_slowed_is_said(rig: Rig) -> None:
         (OwnLimits((0.02, 0.02, 0.1), (0.1, 0.1, 1.0), (2.0, 2.0, 20.0)), (0.02, 0.1, 2.0)),
     ],
 )
-def test_own_limits_are_kept_and_made_use_of(rig: Rig, own: OwnLimits, most: tuple[float, float, float]) -> None:
+def test_own_limits_are_kept_and_made_use_of(rig: ControlRig, own: OwnLimits, most: tuple[float, float, float]) -> None:
     rig.enable()
     accepted(rig.send("g1", PoseGoal(0.05, 0.0, 0.0, limits=own)))
     motion = []
@@ -217,7 +223,7 @@ def test_own_limits_are_kept_and_made_use_of(rig: Rig, own: OwnLimits, most: tup
     assert used.max() == pytest.approx(1.0, rel=1e-3)
 
 
-def test_own_limits_above_the_robots_are_refused(rig: Rig) -> None:
+def test_own_limits_above_the_robots_are_refused(rig: ControlRig) -> None:
     rig.enable()
     answer = refusal(rig.send("g1", PoseGoal(0.05, 0.0, 0.0, limits=OwnLimits(velocity=(0.1, 0.3, 1.0)))))
     assert (answer.code, answer.value, answer.limit) == ("above_limit", 0.3, 0.25)
@@ -231,7 +237,7 @@ def test_own_limits_above_the_robots_are_refused(rig: Rig) -> None:
 SQUARE = [(0.05, 0.0, 0.0), (0.05, 0.05, 0.1), (0.0, 0.05, 0.0), (0.0, 0.0, 0.0)]
 
 
-def square(rig: Rig, blend: float | None, speed: float = 1.0) -> int:
+def square(rig: ControlRig, blend: float | None, speed: float = 1.0) -> int:
     """Send a square at once; return how many cycles it takes."""
     for number, pose in enumerate(SQUARE):
         accepted(rig.send(f"q{number}", PoseGoal(*pose, blend=blend, speed=speed)))
@@ -241,7 +247,7 @@ def square(rig: Rig, blend: float | None, speed: float = 1.0) -> int:
 
 
 @pytest.mark.parametrize("blend", [0.0, 0.005, 0.02])
-def test_goals_wait_and_blend_within_their_radius(rig: Rig, blend: float) -> None:
+def test_goals_wait_and_blend_within_their_radius(rig: ControlRig, blend: float) -> None:
     rig.enable()
     square(rig, blend)
     assert rig.outcomes() == [(f"q{number}", "done") for number in range(4)]
@@ -255,15 +261,14 @@ def test_goals_wait_and_blend_within_their_radius(rig: Rig, blend: float) -> Non
 def test_a_wider_blend_is_quicker() -> None:
     taken = []
     for blend in (0.0, 0.005, 0.02):
-        rig = Rig()
+        rig = ControlRig()
         rig.enable()
         taken.append(square(rig, blend))
-        rig.bus.shutdown()
     assert taken[0] > taken[1] > taken[2]
 
 
 @pytest.mark.parametrize("valid_for", [0.1, 0.25])
-def test_a_waiting_goal_is_valid_for_its_time_and_not_a_cycle_longer(rig: Rig, valid_for: float) -> None:
+def test_a_waiting_goal_is_valid_for_its_time_and_not_a_cycle_longer(rig: ControlRig, valid_for: float) -> None:
     rig.enable()
     rig.send("g1", PoseGoal(0.05, 0.0, 0.0, speed=0.2, blend=0.01))
     goal = PoseGoal(0.05, 0.05, 0.0, valid_for=valid_for)
@@ -273,7 +278,7 @@ def test_a_waiting_goal_is_valid_for_its_time_and_not_a_cycle_longer(rig: Rig, v
     assert rig.control.cycles - sent == round(valid_for / PERIOD) + 1
 
 
-def test_what_waits_no_more_slows_nothing(rig: Rig) -> None:
+def test_what_waits_no_more_slows_nothing(rig: ControlRig) -> None:
     """An override may take back a goal's own slowness, as far as what waits behind it can be taken so."""
     rig.enable()
     rig.send("slow", PoseGoal(0.1, 0.0, 0.0, speed=0.5, blend=0.0))
@@ -289,7 +294,7 @@ def test_what_waits_no_more_slows_nothing(rig: Rig) -> None:
     assert_within_limits(rig)
 
 
-def test_what_is_over_slows_nothing(rig: Rig) -> None:
+def test_what_is_over_slows_nothing(rig: ControlRig) -> None:
     """How fast the rest of a path can be taken is what the rest of it says, not what lies behind."""
     rig.enable()
     rig.send("fast", PoseGoal(0.05, 0.0, 0.0, blend=0.0))
@@ -302,7 +307,7 @@ def test_what_is_over_slows_nothing(rig: Rig) -> None:
     assert_within_limits(rig)
 
 
-def test_without_blend_the_next_goal_preempts(rig: Rig) -> None:
+def test_without_blend_the_next_goal_preempts(rig: ControlRig) -> None:
     rig.enable()
     rig.send("g1", PoseGoal(0.05, 0.0, 0.0))
     rig.cycles(50)
@@ -310,7 +315,7 @@ def test_without_blend_the_next_goal_preempts(rig: Rig) -> None:
     assert rig.outcomes() == [("g1", "preempted")]
 
 
-def test_the_queue_has_an_end(rig: Rig) -> None:
+def test_the_queue_has_an_end(rig: ControlRig) -> None:
     rig.enable()
     depth = CONFIG.motion.queue
     for number in range(depth + 1):
@@ -325,7 +330,7 @@ def test_the_queue_has_an_end(rig: Rig) -> None:
 
 @pytest.mark.parametrize("name", ["stop", "pause", "quick_stop"])
 @pytest.mark.parametrize("wait", [20, 150, 260])
-def test_a_queue_is_stopped_or_paused_as_a_whole(rig: Rig, name: str, wait: int) -> None:
+def test_a_queue_is_stopped_or_paused_as_a_whole(rig: ControlRig, name: str, wait: int) -> None:
     rig.enable()
     for number, pose in enumerate(SQUARE):
         rig.send(f"q{number}", PoseGoal(*pose, blend=0.01))
@@ -346,7 +351,7 @@ def test_a_queue_is_stopped_or_paused_as_a_whole(rig: Rig, name: str, wait: int)
         assert_within_limits(rig)
 
 
-def test_a_waiting_goal_can_be_stopped_alone(rig: Rig) -> None:
+def test_a_waiting_goal_can_be_stopped_alone(rig: ControlRig) -> None:
     rig.enable()
     for number, pose in enumerate(SQUARE):
         rig.send(f"q{number}", PoseGoal(*pose, blend=0.01))
@@ -359,7 +364,7 @@ def test_a_waiting_goal_can_be_stopped_alone(rig: Rig) -> None:
     assert_within_limits(rig)
 
 
-def test_a_waiting_goal_expires(rig: Rig) -> None:
+def test_a_waiting_goal_expires(rig: ControlRig) -> None:
     rig.enable()
     rig.send("g1", PoseGoal(0.05, 0.0, 0.0, speed=0.2, blend=0.01))
     accepted(rig.send("g2", PoseGoal(0.05, 0.05, 0.0, valid_for=0.3)))
@@ -375,7 +380,7 @@ KINDS = ("pose", "pose", "pose", "sliders", "velocity", "track", "trajectory")
 ORDERS = ("stop", "pause", "resume", "override", "disable", "quick_stop", "enable", "reset", "break")
 
 
-def random_goal(rnd: random.Random, rig: Rig) -> Goal:
+def random_goal(rnd: random.Random, rig: ControlRig) -> Goal:
     """A goal of any kind, reachable or not."""
     pose = rnd.uniform(-0.16, 0.16), rnd.uniform(-0.16, 0.16), rnd.uniform(-1.0, 0.8)
     if rnd.random() < 0.6:
@@ -419,10 +424,10 @@ def meddle(rnd: random.Random, rig: Rig) -> None:
 
 @pytest.mark.slow
 @pytest.mark.generated(20_090_901, 20_090_902, 20_090_903, 20_090_904)
-def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig, seed: int) -> None:
-    rnd = random.Random(seed)
+def test_thousands_of_goals_have_as_many_endings(seed: int) -> None:
+    rig, rnd = Rig(), random.Random(seed)
     rig.enable()
-    number = 2_500  # four times, so that all processors have their part
+    number = 1_000
     for k in range(number):
         rig.post(f"g{k}", random_goal(rnd, rig))
         rig.cycles(600 if k % 100 == 50 else rnd.choice((0, 0, 1, 3, 10, 30)))
@@ -450,6 +455,7 @@ def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig, seed: int) -> No
     assert set(answered.values()) == {1}
     said = [notice.message for notice in rig.notices if notice.kind == "fault"]
     assert all("emergency 0x4310" in message or message == "quick_stop by ann" for message in said), set(said)
+    rig.bus.shutdown()
 
 
 # ---------------------------------------------------------------------- while a goal is being planned
@@ -457,7 +463,7 @@ def test_ten_thousand_goals_have_ten_thousand_endings(rig: Rig, seed: int) -> No
 
 @pytest.mark.parametrize("name", ["stop", "disable", "quick_stop"])
 def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
-    rig = Rig(SLOW)
+    rig = ControlRig(SLOW)
     rig.enable()
     rig.goal("g1", 0.08, 0.0, 0.0)
     rig.cycles(300)
@@ -471,7 +477,6 @@ def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
     rig.cycles(300)
     if name == "stop":
         assert rig.control.commanded.pose == moved
-    rig.bus.shutdown()
 
 
 PLAIN_SET_OUT = GoalPlanner._set_out
@@ -502,10 +507,10 @@ def test_of_two_ways_the_sooner_is_taken(
     def no_stop(goals: GoalPlanner, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
         raise TOO_FAST_IN_MOTION
 
-    def asked(wait: int, way: str) -> tuple[Rig, Answer]:
+    def asked(wait: int, way: str) -> tuple[ControlRig, Answer]:
         monkeypatch.setattr(GoalPlanner, "_set_out", only_from_rest if way == "stop" else PLAIN_SET_OUT)
         monkeypatch.setattr(GoalPlanner, "_stop_first", no_stop if way == "lower" else plain_stop_first)
-        rig = Rig(config)
+        rig = ControlRig(config)
         rig.enable()
         rig.goal("g1", *first)
         rig.cycles(wait)
@@ -519,7 +524,6 @@ def test_of_two_ways_the_sooner_is_taken(
             rig, answer = asked(wait, way)
             if isinstance(answer, Accepted):
                 durations[way == "stop"] = answer.duration
-            rig.bus.shutdown()
         rig, free = asked(wait, "either")
         began = len(rig.rows)
         answer = accepted(free)
@@ -530,7 +534,6 @@ def test_of_two_ways_the_sooner_is_taken(
         assert (len(rig.rows) - began) * PERIOD == pytest.approx(answer.duration, abs=0.03)
         assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
         assert_within_limits(rig)
-        rig.bus.shutdown()
     assert differing >= 3
 
 
@@ -540,7 +543,7 @@ def test_a_stop_is_kept_though_the_rate_of_the_goal_to_come_is_thought_about(
 ) -> None:
     """The robot stops for a goal that is then to run at an override; it is told to stop as that is being looked at."""
     monkeypatch.setattr(GoalPlanner, "_set_out", only_from_rest)
-    rig = Rig(SLOW)
+    rig = ControlRig(SLOW)
     rig.enable()
     rig.goal("g1", 0.08, 0.02, 0.3)
     rig.cycles(400)
@@ -559,11 +562,10 @@ def test_a_stop_is_kept_though_the_rate_of_the_goal_to_come_is_thought_about(
     rig.cycles(200)
     assert rig.control.commanded.at_rest
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
 def test_a_renewed_goal_request_is_held_until_the_one_before_is_planned() -> None:
-    rig = Rig(SLOW)
+    rig = ControlRig(SLOW)
     rig.enable()
     rig.goal("g1", 0.08, 0.0, 0.0)
     rig.cycles(300)
@@ -574,10 +576,9 @@ def test_a_renewed_goal_request_is_held_until_the_one_before_is_planned() -> Non
     assert ends[-1] == ("p4", "done")
     assert [goal_id for goal_id, _ in ends] == ["g1", "p0", "p1", "p2", "p3", "p4"]
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
-def test_a_goal_that_came_before_a_stop_but_waits_is_stopped(rig: Rig) -> None:
+def test_a_goal_that_came_before_a_stop_but_waits_is_stopped(rig: ControlRig) -> None:
     rig.enable()
     request = GoalRequest(7, "ann", "late", PoseGoal(0.05, 0.0, 0.0), round(rig.now * 1e9))
     rig.cycle(msgspec.structs.replace(request, withdrawn="stop by ann"))
@@ -590,7 +591,7 @@ def test_a_goal_that_came_before_a_stop_but_waits_is_stopped(rig: Rig) -> None:
 def test_a_goal_that_waits_for_its_turn_is_not_done_where_another_would_have_begun() -> None:
     """A waiting goal's seam is passed between the acceptance of a goal that preempts it and that goal's turn."""
     for before in range(1, 40, 3):
-        rig = Rig(SLOW)
+        rig = ControlRig(SLOW)
         rig.enable()
         rig.send("q0", PoseGoal(0.05, 0.02, 0.3, blend=0.01))
         rig.send("q1", PoseGoal(-0.05, 0.05, -0.3))
@@ -604,4 +605,3 @@ def test_a_goal_that_waits_for_its_turn_is_not_done_where_another_would_have_beg
         assert {goal_id for goal_id, _ in rig.outcomes()} == {"q0", "q1", "g2"}
         assert rig.control.commanded.pose == pytest.approx((0.0, -0.05, 0.4), abs=1e-9)
         assert answer.duration > 0.0
-        rig.bus.shutdown()

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from motion.test_runs import HERE, run_of, way
 from motion.test_time_scaling import SCALING
 from trirail.motion.feasibility import PLATFORM_PLANNED

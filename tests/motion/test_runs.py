@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray

@@ -11,7 +11,7 @@ from unittest.mock import patch
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import chebyshev

@@ -8,7 +8,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from motion.test_runs import FAR, HERE, ROBOT, at, run_of, way

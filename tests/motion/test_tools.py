@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
 from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits
+from control_rig import CONFIG, ControlRig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -30,6 +30,11 @@ Pose = tuple[float, float, float]
 TOOLS = st.tuples(*[st.floats(-0.12, 0.12)] * 2)
 POSES = st.tuples(st.floats(-0.04, 0.04), st.floats(-0.04, 0.04), st.floats(-0.4, 0.4))
 NANOMETRE = 1e-9
+
+
+@pytest.fixture
+def rig() -> ControlRig:
+    return ControlRig()
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +62,7 @@ def planned(goals: GoalPlanner, begin: Pose, goal: PoseGoal) -> NDArray[np.float
     return np.array([run.state(cycle * PERIOD, begin).pose for cycle in cycles])
 
 
-def setpoints(rig: Rig, begun: int) -> NDArray[np.float64]:
+def setpoints(rig: ControlRig, begun: int) -> NDArray[np.float64]:
     """Run to standstill; return the poses of all setpoints since a cycle, by forward kinematics."""
     rig.until(rig.holds, 20_000)
     return forward(ROBOT, rig.setpoints()[begun:, 0])
@@ -165,7 +170,7 @@ def test_a_pure_rotation_leaves_the_tool_where_it_is(
 @pytest.mark.parametrize("tool", [(0.1, 0.0), (-0.03, 0.11)])
 def test_every_setpoint_keeps_the_tool_on_its_line(config: Config, tool: Tool) -> None:
     """To a pose, then a pure rotation there: on every setpoint that is sent, also by a robot with slow sliders."""
-    rig = Rig(config)
+    rig = ControlRig(config)
     rig.enable()
     x, y, phi = at((0.03, -0.02, 0.3), tool)
     for number, turned in enumerate((phi, -0.2)):
@@ -177,7 +182,6 @@ def test_every_setpoint_keeps_the_tool_on_its_line(config: Config, tool: Tool) -
     assert np.hypot(*(point(solved, tool) - (x, y)).T).max() < NANOMETRE
     assert rig.outcomes() == [("g0", "done"), ("g1", "done")]
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
 @pytest.mark.parametrize("config", [CONFIG, SLOW], ids=["as shipped", "slow sliders"])
@@ -228,7 +232,7 @@ def test_own_limits_are_those_of_the_tool(goals: dict[bool, GoalPlanner]) -> Non
     assert 0.99 < max(speed / own) <= 1.001
 
 
-def test_out_of_the_workspace_is_where_the_centre_would_be(rig: Rig) -> None:
+def test_out_of_the_workspace_is_where_the_centre_would_be(rig: ControlRig) -> None:
     rig.enable()
     assert isinstance(rig.send("g1", PoseGoal(0.2, 0.0, 0.0, tool=(0.1, 0.0))), Accepted)
     rig.until(rig.holds)
@@ -240,7 +244,7 @@ def test_out_of_the_workspace_is_where_the_centre_would_be(rig: Rig) -> None:
 # ---------------------------------------------------------------------- from motion
 
 
-def states(rig: Rig, cycles: int) -> list[MotionState]:
+def states(rig: ControlRig, cycles: int) -> list[MotionState]:
     found = []
     for _ in range(cycles):
         rig.cycle()
@@ -274,7 +278,7 @@ def test_from_tool_to_tool_in_motion_nothing_jumps(
     goals: list[tuple[Pose, Tool | None, float | None, int]], config: Config, order: tuple[str, float | None] | None
 ) -> None:
     """Goals that preempt and goals that blend, each with a tool of its own, and a change of rate on the way."""
-    rig = Rig(config)
+    rig = ControlRig(config)
     rig.enable()
     found = [rig.control.commanded]
     for number, (pose, tool, blend, wait) in enumerate(goals):
@@ -296,7 +300,6 @@ def test_from_tool_to_tool_in_motion_nothing_jumps(
     if not order and rig.outcomes()[-1] == (f"g{len(goals) - 1}", "done"):
         # From motion Ruckig's own ends are off by up to ten nanometres.
         assert rig.control.commanded.pose == pytest.approx(goals[-1][0], abs=2e-8)
-    rig.bus.shutdown()
 
 
 def test_a_coordinate_that_hardly_moves_bounds_nothing(goals: dict[bool, GoalPlanner]) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from conftest import CONFIG, Rig
 from control.test_control import PERIOD, assert_within_limits
+from control_rig import CONFIG, ControlRig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refusal
@@ -22,6 +22,11 @@ def line(first: tuple[float, float, float] | None, last: tuple[float, float, flo
     )
 
 
+@pytest.fixture
+def rig() -> ControlRig:
+    return ControlRig()
+
+
 @pytest.mark.parametrize("stretch", [False, True])
 @pytest.mark.parametrize(
     ("goal", "code", "said"),
@@ -31,7 +36,9 @@ def line(first: tuple[float, float, float] | None, last: tuple[float, float, flo
         (line(None, (0.0, 0.0, -0.2)), "wrong_end", "the trajectory ends with -11.4592°/s in phi: let it end at rest"),
     ],
 )
-def test_an_end_that_moves_is_refused(rig: Rig, goal: TrajectoryGoal, code: str, said: str, stretch: bool) -> None:
+def test_an_end_that_moves_is_refused(
+    rig: ControlRig, goal: TrajectoryGoal, code: str, said: str, stretch: bool
+) -> None:
     rig.enable()
     answer = refusal(rig.send("g1", TrajectoryGoal(goal.points, stretch=stretch)))
     assert answer.code == code
@@ -41,7 +48,7 @@ def test_an_end_that_moves_is_refused(rig: Rig, goal: TrajectoryGoal, code: str,
     assert rig.control.commanded.at_rest
 
 
-def test_one_that_is_sent_in_motion_is_told_to_wait(rig: Rig) -> None:
+def test_one_that_is_sent_in_motion_is_told_to_wait(rig: ControlRig) -> None:
     rig.enable()
     rig.send("g1", PoseGoal(0.05, 0.0, 0.0))
     rig.cycles(100)
@@ -62,7 +69,7 @@ def test_whatever_its_ends_the_setpoints_stay_within_the_limits(
     first: tuple[float, float, float], last: tuple[float, float, float], stretch: bool, scale: float
 ) -> None:
     """The smallest velocities, that may be rounding, among them."""
-    rig = Rig()
+    rig = ControlRig()
     rig.enable()
     points = line(*(tuple(scale * v for v in ends) for ends in (first, last))).points  # type: ignore[arg-type]
     rig.send("g", TrajectoryGoal(points, stretch=stretch))
@@ -71,10 +78,9 @@ def test_whatever_its_ends_the_setpoints_stay_within_the_limits(
     rig.until(rig.holds)
     assert rig.control.fault is None
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
-def test_rounding_of_a_velocity_is_not_a_motion(rig: Rig) -> None:
+def test_rounding_of_a_velocity_is_not_a_motion(rig: ControlRig) -> None:
     rig.enable()
     assert isinstance(rig.send("g1", line((1e-9, 0.0, 0.0), (0.0, -1e-9, 0.0))), Accepted)
     rig.until(rig.holds)
@@ -82,7 +88,7 @@ def test_rounding_of_a_velocity_is_not_a_motion(rig: Rig) -> None:
     assert_within_limits(rig)
 
 
-def test_an_acceleration_at_an_end_is_bound_by_the_jerk_limit_over_one_cycle(rig: Rig) -> None:
+def test_an_acceleration_at_an_end_is_bound_by_the_jerk_limit_over_one_cycle(rig: ControlRig) -> None:
     rig.enable()
     most = CONFIG.limits.platform.jerk[0] * PERIOD
     for at in (0, 1):

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import CONFIG, carried
+from control_rig import CONFIG, carried
 from trirail.processes.backlog import MOST_OF_ONE, PATIENCE
 from trirail.processes.gateway import Gateway
 from trirail.processes.incoming import Incoming, Kind

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -49,9 +50,10 @@ def held_by(service: Service, user: str) -> subprocess.Popen[str]:
     return process
 
 
-def told(robot: Robot) -> list[tuple[str, str | None]]:
-    events = robot.events(history=True, timeout=1.0)
-    return [(event.message, event.user) for event in events if event.kind == "lease"]
+def told(robot: Robot, number: int) -> list[tuple[str, str | None]]:
+    """What was told of the lease, message and user, as soon as it is so much."""
+    events = robot.events(history=True, timeout=20.0)
+    return list(itertools.islice(((event.message, event.user) for event in events if event.kind == "lease"), number))
 
 
 @pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGSTOP])
@@ -60,7 +62,7 @@ def test_a_holder_that_dies_or_hangs_is_a_controlled_stop_and_the_lease_is_free(
 ) -> None:
     with held_by(service, "bob") as holder, service.robot() as ann:
         try:
-            assert ann.state().lease == "bob"
+            until(ann, lambda state: (state.lease, state.mode) == ("bob", "moving"))
             with refused_as(RefusalCode.LEASED):
                 ann.move_to(x=0.0, y=0.0, phi=0.0)
             assert ann.state().mode == "moving"
@@ -68,7 +70,7 @@ def test_a_holder_that_dies_or_hangs_is_a_controlled_stop_and_the_lease_is_free(
             state = until(ann, lambda state: state.lease is None)
             state = until(ann, lambda state: state.mode == "holding")
             assert 0.0 < state.pose[0] < 0.09
-            assert told(ann)[-1] == ("lease of bob is over: no sign of life for 1 s", None)
+            assert told(ann, 2)[-1] == ("lease of bob is over: no sign of life for 1 s", None)
             with refused_as(RefusalCode.NO_LEASE):
                 ann.move_to(x=0.0, y=0.0, phi=0.0)
             with ann.lease():
@@ -90,7 +92,7 @@ def test_a_gateway_that_is_lost_for_longer_than_a_lease_neither_keeps_it_nor_fre
             assert lease.lost is not None
         with again(service) as ann:
             until(ann, lambda state: state.mode == "holding" and state.lease is None)
-            assert told(ann) == [
+            assert told(ann, 2) == [
                 ("lease acquired by ann", "ann"),
                 ("lease of ann is over: no sign of life for 0.5 s", None),
             ]
@@ -125,7 +127,7 @@ def test_it_is_taken_over_by_those_who_may_and_both_are_told(service: Service) -
                 assert lease.lost.code is RefusalCode.LEASE_OVER
                 assert bob.move_to(x=0.0, y=0.0, phi=0.0).wait(20.0).outcome == "done"
                 ann.stop()  # is everybody's
-        assert told(bob) == [
+        assert told(bob, 3) == [
             ("lease acquired by ann", "ann"),
             ("lease taken over by bob from ann", "bob"),
             ("lease released by bob", None),

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import pytest
 from certificates import tls_config, user
-from conftest import CONFIG
+from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from prometheus_client import CollectorRegistry, generate_latest

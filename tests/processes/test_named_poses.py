@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple
 import message_schemas
 import pytest
 from jsonschema import Draft202012Validator
+from processes.test_service import until
 from refusals import refused_as
 from trirail.client import own_service
 from trirail.client.client import Robot
@@ -67,13 +69,14 @@ def trirail(place: Place, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
 
 
-def at(robot: Robot) -> tuple[float, float, float]:
-    return robot.state().pose
+def at(robot: Robot, *pose: float) -> None:
+    """See it come to be at a pose."""
+    until(robot, lambda state: state.pose == pytest.approx(pose, abs=1e-5))
 
 
 def test_a_pose_is_taught_without_power_and_gone_to(robot: Robot) -> None:
     rest = robot.teach("rest")
-    assert (rest.x, rest.y, rest.phi) == pytest.approx(at(robot), abs=1e-9)
+    at(robot, rest.x, rest.y, rest.phi)
     robot.enable()
     for number in range(5):  # what is done stands: it can be taught at once
         pose = (0.01 * number, -0.02, 0.1)
@@ -81,9 +84,9 @@ def test_a_pose_is_taught_without_power_and_gone_to(robot: Robot) -> None:
         taught = robot.teach("pick")
         assert (taught.x, taught.y, taught.phi) == pytest.approx(pose, abs=1e-5)
     assert robot.move_to_named("rest", id="home-again").wait(WITHIN).outcome == "done"
-    assert at(robot) == pytest.approx((rest.x, rest.y, rest.phi), abs=1e-5)
+    at(robot, rest.x, rest.y, rest.phi)
     assert robot.move_to_named("park", speed=0.5).wait(WITHIN).outcome == "done"
-    assert at(robot) == pytest.approx((0.0, 0.05, 0.0), abs=1e-5)
+    at(robot, 0.0, 0.05, 0.0)
     assert {name: pose.taught for name, pose in robot.poses().items()} == {"park": False, "pick": True, "rest": True}
     goal = robot.move_to_named("rest", speed=0.1)
     with refused_as(RefusalCode.MOVING):
@@ -92,8 +95,8 @@ def test_a_pose_is_taught_without_power_and_gone_to(robot: Robot) -> None:
     with pytest.raises(RefusedError) as refused:
         robot.move_to_named("nowhere")
     assert refused.value.code is RefusalCode.UNKNOWN_POSE
-    told = [event for event in robot.events(history=True, timeout=1.0) if event.kind == "pose"]
-    assert [event.user for event in told] == ["ann"] * 6
+    told = (event.user for event in robot.events(history=True, timeout=WITHIN) if event.kind == "pose")
+    assert list(itertools.islice(told, 6)) == ["ann"] * 6
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
@@ -144,7 +147,7 @@ def test_from_the_command_line(place: Place, robot: Robot) -> None:
     assert (taught.returncode, taught.stdout) == (0, "pick: x 0.000 mm   y 0.000 mm   φ 0.0000 °\n".replace(" °", "°"))
     done = trirail(place, "goto", "park", "--wait")
     assert (done.returncode, done.stderr) == (0, "")
-    assert at(robot) == pytest.approx((0.0, 0.05, 0.0), abs=1e-5)
+    at(robot, 0.0, 0.05, 0.0)
     listed = trirail(place, "poses").stdout.splitlines()
     assert [line.split()[0] for line in listed] == ["park", "pick"]
     assert [line.rpartition("   ")[2] for line in listed] == ["of [poses]", "taught"]

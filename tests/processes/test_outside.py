@@ -316,31 +316,37 @@ while True:  # asks, and is stopped in the middle of it
 JUNK = (b"", b"junk", b'{"a":' * 5000, b"\xff" * 1000, b"null", b"[]", b"{}", b"0" * 300_000)
 
 
-def test_clients_skip_what_is_no_message(shared: tuple[Service, Robot, zenoh.Session]) -> None:
-    service, robot, session = shared
+@contextlib.contextmanager
+def published(session: zenoh.Session, *messages: tuple[str, bytes]) -> Iterator[None]:
+    """Publish messages by key again and again: who listens since when is nobody's to know."""
     over = threading.Event()
-    forged = msgspec.json.encode(Event(10**6, 1.0, 1, 2e9, "service", "info", "[/]\x1b[2J\u202e\nforged: a line"))
 
     def publish() -> None:
-        for junk in itertools.cycle(JUNK):
-            for key in ("state", "event", "records"):
-                session.put(f"trirail/demo/{key}", junk)
-            session.put("trirail/demo/event", forged)
-            if over.wait(0.002):
+        for key, payload in itertools.cycle(messages):
+            session.put(key, payload)
+            if over.wait(0.0005):
                 return
 
     publishing = threading.Thread(target=publish)
     publishing.start()
     try:
+        yield
+    finally:
+        over.set()
+        publishing.join()
+
+
+def test_clients_skip_what_is_no_message(shared: tuple[Service, Robot, zenoh.Session]) -> None:
+    service, robot, session = shared
+    forged = msgspec.json.encode(Event(10**6, 1.0, 1, 2e9, "service", "info", "[/]\x1b[2J\u202e\nforged: a line"))
+    junk = [(f"trirail/demo/{key}", each) for each in JUNK for key in ("state", "event", "records")]
+    with published(session, *junk, ("trirail/demo/event", forged)):
         status = trirail("status", locator=service.locator)
         moved = trirail("goto", 0.0, 0.01, 0.0, "--wait", locator=service.locator)
         heard: list[bytes] = []
         with robot.records(heard.append):
             assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(10.0).outcome == "done"
         seen = next(event for event in robot.events(timeout=5.0) if event.message.startswith("[/]"))
-    finally:
-        over.set()
-        publishing.join()
     for ran in (status, moved):
         assert ran.returncode == 0, ran.stderr
         assert "Traceback" not in ran.stderr
@@ -356,14 +362,13 @@ def test_what_was_forged_is_shown_as_what_it_is(shared: tuple[Service, Robot, ze
     forged = msgspec.json.encode(
         Event(10**7, 1.0, 1, 3e9, "service", "info", "[/] [bold]\x1b[2J\x9b\u202e\nmode: fault")
     )
-    with events(service, "events") as lines, events(service, "events", "--json") as json_lines:
-        for read in (lines, json_lines):
-            read()  # it listens
-        while True:
-            session.put("trirail/demo/event", forged)
-            line = lines()
-            if "[bold]" in line:
-                break
+    with (
+        events(service, "events") as lines,
+        events(service, "events", "--json") as json_lines,
+        published(session, ("trirail/demo/event", forged)),
+    ):
+        while "[bold]" not in (line := lines()):
+            pass
         while "[bold]" not in (packed := json_lines()):
             pass
     assert r"[/] [bold]\x1b[2J\x9b\u202e\nmode: fault" in line

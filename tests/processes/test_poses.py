@@ -13,7 +13,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from conftest import CONFIG, Rig
+from conftest import Rig
+from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import Config, geometry, parse

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import can
 import numpy as np
 import pytest
-from conftest import CONFIG, carried
+from control_rig import CONFIG, carried
 from lockstep import CARRIERS, STEP_NS, Lockstep
 from msgspec import structs
 from trirail.config import Config

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from conftest import CONFIG
+from control_rig import CONFIG
 from trirail.processes import recording
 from trirail.processes.heartbeats import Heartbeats
 from trirail.wire.links import PacketLink

@@ -15,7 +15,7 @@ import msgspec
 import pytest
 import zenoh
 from certificates import ROLES, user
-from conftest import CONFIG
+from control_rig import CONFIG
 from trirail.cli import router_command
 from trirail.cli.key_folder import KeyFolder
 from trirail.config import Config, Tls, Zenoh

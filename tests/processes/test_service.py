@@ -156,6 +156,16 @@ def until(robot: Robot, condition: Callable[[State], bool]) -> State:
     raise AssertionError("the service has gone silent")
 
 
+def told(robot: Robot, enough: Callable[[list[Event]], bool]) -> list[Event]:
+    """Return the events so far, as soon as they are enough."""
+    heard: list[Event] = []
+    for event in robot.events(history=True, timeout=20.0):
+        heard.append(event)
+        if enough(heard):
+            return heard
+    raise AssertionError(heard)
+
+
 def in_motion(robot: Robot) -> None:
     robot.enable()
     robot.move_to(x=0.1, y=0.02, phi=0.3, speed=0.2, id="long")
@@ -222,8 +232,8 @@ def test_a_session(cold_service: Service) -> None:
         assert first.wait(timeout=10.0).outcome == "preempted"
         assert second.wait(timeout=10.0).outcome == "done"
         robot.disable()
-        assert robot.state().sliders.status == ("switch on disabled",) * 3
-        events = list(robot.events(history=True, timeout=1.0))
+        until(robot, lambda state: state.sliders.status == ("switch on disabled",) * 3)
+        events = told(robot, lambda heard: sum(event.kind == "goal" for event in heard) == 4)
         assert [event.seq for event in events] == list(range(1, len(events) + 1))
         outcomes = [event.outcome for event in events if event.kind == "goal"]
         assert outcomes == ["rejected", "done", "preempted", "done"]
@@ -254,7 +264,7 @@ def test_a_session_with_odrives(tmp_path: Path) -> None:
             state = until(robot, lambda state: state.mode == "holding")
             assert state.pose == pytest.approx((0.02, -0.01, 0.1), abs=1e-4)
             robot.disable()
-            assert robot.state().sliders.status == ("switch on disabled",) * 3
+            until(robot, lambda state: state.sliders.status == ("switch on disabled",) * 3)
         assert service.end() == 0
         sent = service.frames()
         commands = {0x00, 0x01, 0x03, 0x04, 0x05, 0x07, 0x09, 0x0B, 0x0C}
@@ -280,9 +290,8 @@ def test_what_a_drive_does_without_stands_in_every_place_where_one_looks(tmp_pat
         missing = json.loads(trirail("status", "--json", locator=service.locator).stdout)["missing_protections"]
         assert missing == [{"drive": name, "object": "1006", "means": words} for name in "BC"]
         with service.robot() as robot:
-            told = [event.message for event in robot.events(history=True, timeout=2.0)]
+            told(robot, lambda heard: "drives B, C: lacks 1006" in heard[-1].message)
             assert robot.info().missing_protections == tuple(MissingProtection(**each) for each in missing)
-        assert any("drives B, C: lacks 1006" in message for message in told), told
         assert service.end() == 0
 
 
@@ -421,7 +430,7 @@ def test_the_client_tells_of_a_target_and_its_end_brakes(shared: tuple[Service, 
     assert track.result.outcome == "stopped"
     with refused_as(RefusalCode.JOG_OVER):
         track.update((0.0, 0.0, 0.0))
-    assert robot.state().mode == "holding"
+    until(robot, lambda state: state.mode == "holding")
     with robot.track(timeout=0.05) as silent:
         silent.update((0.0, 0.0, 0.0))
         until(robot, lambda _: silent.result is not None)
@@ -444,9 +453,7 @@ def test_every_kind_of_goal(shared: tuple[Service, Robot, zenoh.Session], tmp_pa
     slow = robot.move_to(x=-0.03, y=0.0, phi=0.0, speed=0.2)
     until(robot, lambda state: state.goal is not None and state.goal.progress > 0.2)
     robot.pause()
-    state = robot.state()
-    assert (state.mode, state.override) == ("holding", 0.5)
-    assert state.goal is not None
+    assert until(robot, lambda state: (state.mode, state.override) == ("holding", 0.5)).goal is not None
     robot.resume()
     robot.override(100.0)
     assert slow.wait(timeout=20.0).outcome == "done"
@@ -550,8 +557,7 @@ def test_done_is_said_when_the_robot_is_measured_to_be_there(tmp_path: Path) -> 
             said = json.loads(trirail("goto", 0.05, 0.0, 0.0, "--wait", "--json", locator=lagging.locator).stdout)
             assert (said["outcome"], said["settle"]) == ("unsettled", None)
             assert max(np.abs(said["residual"]["pose"]) / windows.pose) > 1.0
-            state = robot.state()
-            assert (state.mode, state.faults) == ("holding", ())
+            assert until(robot, lambda state: state.mode == "holding").faults == ()
             until(robot, lambda state: state.settled)
             there = trirail("goto", 0.05, 0.0, 0.0, "--wait", locator=lagging.locator)
             assert (there.returncode, "done: arrived, settled in 1 ms" in there.stdout) == (0, True)
@@ -577,7 +583,7 @@ def test_goals_wait_blend_and_are_cancelled(service: Service) -> None:
         assert (corner.wait(10.0).outcome, end.wait(10.0).outcome) == ("done", "done")
         slow = robot.move_to(x=-0.05, y=0.0, phi=0.0, speed=0.1)
         slow.cancel()
-        assert slow.wait(1.0).outcome == "stopped"
+        assert slow.wait(10.0).outcome == "stopped"
         with pytest.raises(RefusedError) as refused:
             slow.cancel()
         assert refused.value.code is RefusalCode.NO_GOAL
@@ -664,8 +670,7 @@ def test_a_killed_gateway_is_a_controlled_stop(service: Service) -> None:
         assert robot.state().mode in ("stopping", "holding")
         state = until(robot, lambda state: state.mode == "holding")
         assert 0.01 < state.pose[0] < 0.09
-        outcomes = [(event.id, event.outcome) for event in robot.events(history=True, timeout=1.0) if event.outcome]
-        assert ("long", "stopped") in outcomes
+        told(robot, lambda heard: (heard[-1].id, heard[-1].outcome) == ("long", "stopped"))
         assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
     assert service.end() == 0
     assert_stopped_smoothly(service.frames())
@@ -708,9 +713,7 @@ def test_a_robot_is_stopped_without_a_planner(service: Service, harm: signal.Sig
         in_motion(robot)
         os.kill(service.child("planner"), harm)
         robot.stop()
-        state = robot.state()
-        assert state.mode == "holding"
-        assert state.pose[0] < 0.09
+        assert until(robot, lambda state: state.mode == "holding").pose[0] < 0.09
     assert service.end() == 0
     assert_stopped_smoothly(service.frames())
 
@@ -745,8 +748,7 @@ def test_a_recording_that_suffers_is_told_to_everyone(service: Service) -> None:
         in_motion(robot)
         recorder = service.child("recorder")
         resource.prlimit(recorder, resource.RLIMIT_FSIZE, (50_000, 50_000))  # more than the log has, less than a second
-        told = (event for event in robot.events(history=True, timeout=10.0) if event.level == "warning")
-        assert "takes no more" in next(told).message
+        told(robot, lambda heard: heard[-1].level == "warning" and "takes no more" in heard[-1].message)
         until(robot, lambda state: any("nothing is recorded" in warning for warning in state.warnings))
         assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)
     service.end()
@@ -766,8 +768,8 @@ def test_a_recorder_that_cannot_begin_again_never_ends_the_service(service: Serv
         service.wait_said("the recorder has died (exit code 78): the robot is not affected; starting it again in 10 s")
         folder.unlink()
         assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
-        told = (event.message for event in robot.events(history=True, timeout=20.0) if "record" in event.message)
-        begun, gone, back = itertools.islice(told, 3)
+        said = (event.message for event in robot.events(history=True, timeout=20.0) if "record" in event.message)
+        begun, gone, back = itertools.islice(said, 3)
     assert gone == "the recorder has gone: nothing is recorded until it is back"
     assert begun.startswith(f"recording to {folder}/")
     assert back.startswith(f"recording to {folder}/")
@@ -899,7 +901,7 @@ def test_a_session_is_sent_again(tmp_path: Path) -> None:
                 again = trirail("replay", files[0], "--to", service.locator, "--json")
                 assert again.returncode == 0, again.stderr
                 once_more = trirail("replay", files[0], "--to", service.locator)
-                state = robot.state()
+                until(robot, lambda state: state.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-5))
         assert service.end() == 0
         files += list((folder / "recordings").glob("*.rrd"))
     motions = json.loads(again.stdout)
@@ -909,7 +911,6 @@ def test_a_session_is_sent_again(tmp_path: Path) -> None:
         assert motion["lacking"] == 0
         assert max(motion["position"]) < 1e-9
     assert once_more.returncode == 0, once_more.stderr  # for it stands where the session began
-    assert state.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-5)
 
 
 # ---------------------------------------------------------------------- what cannot start

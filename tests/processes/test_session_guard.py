@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import pytest
 from certificates import tls_config, user
-from conftest import CONFIG
+from control_rig import CONFIG
 from refusals import refused_as
 from trirail.cli import doctor_network, terminal
 from trirail.cli.key_folder import KeyFolder

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from certificates import service_port, tls_config, user
-from conftest import CONFIG
+from control_rig import CONFIG
 from trirail.client.stop_call import NoDoorError, Outcome, StopCall, StopOrder
 from trirail.config import Config, Zenoh
 from trirail.errors import RefusalCode, RefusedError, ServiceError

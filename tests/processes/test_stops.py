@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import zenoh
-from conftest import CONFIG
+from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.errors import RefusalCode

@@ -80,8 +80,7 @@ def test_an_operator_moves_it_from_the_command_line(served: Served) -> None:
 @pytest.mark.usefixtures("ann")
 def test_a_viewer_sees_it_and_is_refused_at_once_naming_the_role(served: Served) -> None:
     with served.robot("eva") as eva:
-        before = eva.state()
-        assert before.mode == "holding"
+        before = until(eva, lambda state: state.mode == "holding")
         assert eva.info().robot == "demo"
         assert eva.role() is Role.VIEWER
         assert {"ann", "eva"} <= set(eva.users())
@@ -138,8 +137,8 @@ def test_only_a_maintainer_takes_the_lease_over(served: Served, ann: Robot) -> N
         ):
             pass
         assert refused.value.code is RefusalCode.NOT_ALLOWED
-        assert ann.state().lease == "max"
+        until(ann, lambda state: state.lease == "max")
         assert lease.lost is None
     with ann.lease() as lease, served.robot("max") as boss, boss.lease(force=True):
         assert lease.wait(10.0)
-        assert ann.state().lease == "max"
+        until(ann, lambda state: state.lease == "max")

@@ -58,6 +58,8 @@ class Device:
         self.silent = False
         """True cuts the wire: nothing is heard or sent any more, while the device itself goes on."""
         self._now = 0.0
+        self._up_to_date = False
+        """Whether all that is due at this moment has been done, and nothing has happened since."""
         self._transmit: Callable[[int, bytes], None] = _discard
         self._handlers: dict[int, Callable[[bytes], None]] = {}
         self._emergency_id = self.objects.internal(0x1014, 0, 0x80 + node)
@@ -105,6 +107,7 @@ class Device:
         handler = self._handlers.get(can_id)
         if handler is not None:
             handler(data)
+            self._up_to_date = False
         if self._event_tpdos:
             self._send_events()
 
@@ -113,6 +116,7 @@ class Device:
         if self.silent:
             return
         self.poll(now)
+        self._up_to_date = False
         if can_id == 0x700 + self.node:
             answer = self._error_control.guarded(self.nmt, now)
             if answer is not None:
@@ -124,7 +128,9 @@ class Device:
 
     def poll(self, now: float) -> None:
         """Do what is due at time `now` [s]."""
-        self._now = now
+        if now == self._now and self._up_to_date:
+            return
+        self._now, self._up_to_date = now, True
         if now >= self._sync_due:
             due, self._sync_due = self._sync_due, math.inf
             self.sync_lost(due)
@@ -161,7 +167,7 @@ class Device:
         """Reset node (all objects) or communication (1000h to 1FFFh), boot up, enter PRE-OPERATIONAL."""
         if self.nmt is Nmt.OPERATIONAL:
             self.connection_lost(CONNECTION_LOST)
-        self.nmt = Nmt.INITIALISING
+        self.nmt, self._up_to_date = Nmt.INITIALISING, False
         self.objects.restore(indices)
         if indices is _ALL:
             self._sync_due = math.inf

@@ -83,11 +83,13 @@ class SimulatedDrive(Device):
     def press(self, switches: int) -> None:
         """Have these switches of its slider pressed: bits of the digital inputs 60FDh, where it has that."""
         self._profile.inputs.value = switches
+        self._up_to_date = False
 
     def fail(self, code: int) -> None:
         """Break down with EMCY and 603Fh error `code`: transitions 13 and, at standstill, 14."""
         if self.state in _FAULTY:
             return
+        self._up_to_date = False
         self.fault = self._profile.error_code.value = code
         self.errors.report(code)
         self._change(PowerState.FAULT_REACTION_ACTIVE)

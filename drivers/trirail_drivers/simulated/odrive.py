@@ -27,6 +27,11 @@ _CYCLIC: Final = {
     "encoder": cansimple.GET_ENCODER_ESTIMATES,
     "error": cansimple.GET_ERROR,
 }
+_SENT: Final = tuple(
+    (name, f"{CAN}.{name}_msg_rate_ms", command)
+    for name, command in (("heartbeat", cansimple.HEARTBEAT), *_CYCLIC.items())
+)
+"""What it sends by itself: the name, the setting with the period [ms], and the message."""
 _OTHERS: Final = ("iq", "temperature", "bus_voltage", "torques", "powers")
 """What it can send by itself beside heartbeats, and what nobody reads: settings that are told, and not sent."""
 _REQUESTS: Final = (cansimple.GET_VERSION, cansimple.GET_ERROR, cansimple.GET_ENCODER_ESTIMATES)
@@ -136,9 +141,8 @@ class SimulatedOdrive:
         watchdog = self.settings["axis0.config.watchdog_timeout"]
         if self._armed and self.settings["axis0.config.enable_watchdog"] and now >= self._fed + watchdog:
             self.fail(Error.WATCHDOG_TIMER_EXPIRED)
-        for name, command in (("heartbeat", cansimple.HEARTBEAT), *_CYCLIC.items()):
-            period = self.settings[f"{CAN}.{name}_msg_rate_ms"] / 1000.0
-            if period and now >= self._due[name]:
+        for name, setting, command in _SENT:
+            if now >= self._due[name] and (period := self.settings[setting] / 1000.0):
                 self._answer(command)
                 self._due[name] += period
                 if self._due[name] <= now:  # too late for that one as well: leave it out
