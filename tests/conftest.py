@@ -113,9 +113,8 @@ class Rig(ControlRig):
         """Run one cycle, with a request or without; `sent` holds its frames afterwards."""
         self.sent.clear()
         super().cycle(request)
-        self.seen.append(
-            [canopen_frames.SETPOINT.unpack(sent.data) for sent in self.sent if sent.arbitration_id >> 7 == 6]
-        )
+        setpoints = [sent for sent in self.sent if sent.arbitration_id >> 7 == 6]
+        self.seen.append([canopen_frames.SETPOINT.unpack(sent.data) for sent in setpoints])
 
     def captured(self) -> NDArray[np.float64]:
         """Return what the frames of all cycles so far have, not a number where no setpoints were sent."""

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import pytest
-from control_rig import CONFIG
+from control_rig import CONFIG, PerfectDrives
 from trirail.config import geometry
 from trirail.control.control import Control, Given
 from trirail.control.local_planner import LocalPlanner

@@ -188,7 +188,7 @@ def test_every_setpoint_keeps_the_tool_on_its_line(config: Config, tool: Tool) -
 @pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.4), (0.02, -0.01, 0.4), (0.02, -0.01, 0.0)])
 def test_a_jog_of_a_tool_turns_about_it_and_takes_it_straight(config: Config, velocity: Pose) -> None:
     """On every setpoint: while it begins, is renewed, and is let go."""
-    rig, tool = Rig(config), (-0.03, 0.11)
+    rig, tool = ControlRig(config), (-0.03, 0.11)
     rig.enable()
     begun = len(rig.rows) - 1
     for now in (velocity, velocity, (0.0, 0.0, 0.0)):
@@ -202,10 +202,9 @@ def test_a_jog_of_a_tool_turns_about_it_and_takes_it_straight(config: Config, ve
     assert (solved[-1, 2] > 0.05) == (velocity[2] > 0.0)
     assert_platform_within_limits(solved, tool)
     assert_within_limits(rig)
-    rig.bus.shutdown()
 
 
-def test_a_jog_of_a_far_tool_is_as_slow_as_the_centre_has_to_be(rig: Rig) -> None:
+def test_a_jog_of_a_far_tool_is_as_slow_as_the_centre_has_to_be(rig: ControlRig) -> None:
     rig.enable()
     rate = 0.9 * CONFIG.limits.platform.velocity[2]
     answer = rig.send("j1", VelocityGoal(0.0, 0.0, rate, timeout=0.1, tool=(0.5, 0.0)))
