@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -43,8 +44,11 @@ def main() -> None:
         raise SystemExit("no Chromium here: install it (Debian: apt-get install chromium)")
     with tempfile.TemporaryDirectory(prefix="trirail-", ignore_cleanup_errors=True) as folder:
         config, locator = own_service.private(Path(folder))
+        os.environ["STATE_DIRECTORY"] = folder  # its poses are no one else's
         with own_service.service(config, Path(folder, "shown.rrd")), Robot("demo", locator, user="ann") as robot:
             robot.enable()
+            for name in ("pick", "place"):
+                robot.teach(name)
             over = threading.Event()
             tour = threading.Thread(target=_tour, args=[robot, over])
             tour.start()

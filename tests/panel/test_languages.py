@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,12 @@ import pytest
 import trirail
 from chromium import Page, needs_chromium
 from panel.fake_robot import FakeRobot
+from panel.test_page import SHOWN, SIZES
 from trirail.panel.server import LANGUAGES, Panel
 from trirail.wire.vocabulary import Command, Mode, Role
 
 PAGE = Path(str(trirail.__file__)).parent / "panel/page"
 FILES = {file.stem: msgspec.json.decode(file.read_bytes(), type=dict[str, str]) for file in PAGE.glob("*.json")}
-SHOWN = "document.body.dataset.contact === 'yes'"
 WORDS = re.compile(r"[^\W\d_]{3,}")
 """Three letters or more: what is shorter is a coordinate or a unit."""
 
@@ -118,6 +119,40 @@ def test_no_word_of_the_page_is_outside_of_the_languages(browser: Page, robot: F
         robot.silent.set()
         page.until("document.body.dataset.contact === 'none'")
         assert outside(page) == []
+        page.close()
+
+
+BROKEN = """[...document.querySelectorAll('button, th, h1, h2, label > span, #mode-name')].flatMap((element) => {
+  const walker = document.createTreeWalker(element, NodeFilter.SHOW_TEXT);
+  const broken = [];
+  for (let node = walker.nextNode(); node; node = walker.nextNode())
+    for (const word of node.data.matchAll(/[^\\s-]+/g)) {
+      const range = document.createRange();
+      range.setStart(node, word.index);
+      range.setEnd(node, word.index + word[0].length);
+      const lines = new Set([...range.getClientRects()].map((each) => Math.round(each.top)));
+      if (lines.size > word[0].split('\\u00ad').length) broken.push(word[0]);
+    }
+  return broken;
+})"""
+
+
+@pytest.mark.viewer
+@needs_chromium
+def test_no_word_is_broken_and_none_sticks_out(browser: Page, robot: FakeRobot) -> None:
+    with Panel(robot.robot(), 0) as panel:
+        page = browser.another()
+        page.open(panel.url)
+        page.until(SHOWN)
+        for (width, height, phone), code in itertools.product(SIZES.values(), FILES):
+            page.resize(width, height, phone=phone)
+            page.choose("#language", code)
+            page.until(f"document.documentElement.lang === {code!r}")
+            for view in ("following", "to-pose"):
+                page.click(f"[data-view={view}]")
+                assert page.evaluate(BROKEN) == [], (code, width, view)
+                wide = "[...document.querySelectorAll('button')].filter((each) => each.scrollWidth > each.clientWidth)"
+                assert page.evaluate(f"{wide}.map((each) => each.innerText)") == [], (code, width, view)
         page.close()
 
 

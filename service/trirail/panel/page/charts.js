@@ -6,8 +6,11 @@ import { say } from "./words.js";
 const KEPT = 180; // seconds
 const EVERY = 100; // between two points [ms]
 const DRAWN = 250; // between two drawings [ms]
-const HEIGHT = 124; // of one chart [px]
+const LOW = 124; // as high is a chart where the page scrolls, and at least [px]
+const TITLE = 21; // of that its title [px]
 const PHI = 180 / Math.PI;
+
+const DESK = matchMedia("(min-width: 1000px)"); // as the style sheet: there they share the height that there is
 
 const byId = (id) => document.getElementById(id);
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -29,7 +32,7 @@ export class Charts {
       plot("x, y [mm]", [["x", x], ["y", y]], [0, 1]),
       plot("φ [°]", [["φ", phi]], [2]),
       plot(say("chart.error"), sliders.map((name, k) => [name, colours.sliders[k]]), [3, 4, 5]),
-      plot(say("chart.lateness"), [[say("chart.late"), x]], [6]),
+      plot(say("chart.lateness"), [[say("chart.late"), x]], [6], true),
     ];
   }
 
@@ -55,20 +58,23 @@ export class Charts {
   }
 
   draw() {
-    const width = byId("charts").clientWidth;
+    const { clientWidth: width, clientHeight } = byId("charts");
+    const share = DESK.matches ? Math.floor(clientHeight / this.plots.length) : LOW;
     for (const each of this.plots) {
-      if (each.width !== width) each.setSize({ width, height: HEIGHT });
+      const height = Math.max(LOW, share) - TITLE;
+      if (each.width !== width || each.height !== height) each.setSize({ width, height });
       each.setData([this.times, ...each.columns.map((column) => this.rows.map((row) => row[column]))]);
     }
   }
 }
 
-function plot(title, lines, columns) {
+// The last one has the times below it, for all of them.
+function plot(title, lines, columns, last = false) {
   const axis = { stroke: style("--quiet"), grid: { stroke: style("--raised") }, ticks: { stroke: style("--raised") } };
   const series = lines.map(([label, stroke]) => ({ label, stroke, width: 1.5, spanGaps: false, points: { show: false } }));
-  const clock = (_, times) => times.map((time) => new Date(time * 1e3).toLocaleTimeString("en-GB"));
+  const clock = (_, times) => times.map((time) => (last ? new Date(time * 1e3).toLocaleTimeString("en-GB") : ""));
   const made = new uPlot(
-    { title, width: 300, height: HEIGHT, legend: { show: lines.length > 1, live: false }, cursor: { show: false }, axes: [{ ...axis, values: clock, space: 90 }, { ...axis, size: 60 }], series: [{}, ...series] },
+    { title, width: 300, height: LOW, legend: { show: lines.length > 1, live: false }, cursor: { show: false }, axes: [{ ...axis, values: clock, space: 90, size: last ? 30 : 8 }, { ...axis, size: 60, space: 22 }], series: [{}, ...series] },
     [[], ...lines.map(() => [])],
     byId("charts"),
   );

@@ -40,6 +40,9 @@ export class Drawing {
     lines(parts.edge_stops, "stop", this.platform);
     const centre = add("circle", "centre", this.platform);
     centre.setAttribute("r", 0.012 * (high[0] - low[0]));
+    this.point = add("circle", "tool", this.platform);
+    this.point.setAttribute("r", 0.012 * (high[0] - low[0]));
+    this.tool(null);
     this.sleeves = legs.map((leg, k) => add("line", leg.turns ? "sleeve" : "cross", svg, colours.sliders[k]));
     const dots = (kind, size) => legs.map((_, k) => {
       const dot = add("circle", kind, svg, colours.sliders[k]);
@@ -62,6 +65,12 @@ export class Drawing {
     this.chosen.style.display = pose ? "" : "none";
     this.chosen.setAttribute("class", may === null ? "" : may ? "free" : "barred");
     if (pose) place(this.chosen, pose);
+  }
+
+  // Show a tool, a point (u, v) of the platform; null for none.
+  tool(point) {
+    this.point.style.display = point ? "" : "none";
+    if (point) this.point.setAttribute("transform", `translate(${point[0]} ${-point[1]})`);
   }
 
   // Show a path of poses, and whether it can be followed.

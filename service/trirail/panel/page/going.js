@@ -84,6 +84,7 @@ export class Going {
     const wrong = this.fields.find((field, k) => field.value !== "" && values[k] === null);
     byId("going-says").replaceChildren(...(wrong ? [quoted(wrong.value), `: ${say("going.wrong")}`] : []));
     this.now().drawing?.wanted(this.centre, null);
+    this.now().drawing?.tool(byId("tool").value ? this.#tool : null);
     if (this.pose) this.send({ do: "check", pose: this.pose, number: ++this.number, ...this.#names });
   }
 

@@ -51,7 +51,7 @@ export class Jogging {
     const words = (number) => (STEPS[number] === null ? say("jog.held") : say("jog.step", { length: STEPS[number], angle: TURNS[number] }));
     byId("step-says").textContent = words(this.step);
     [...byId("steps").children].forEach((button, number) => {
-      button.setAttribute("aria-checked", String(number === this.step));
+      button.setAttribute("aria-pressed", String(number === this.step));
       button.setAttribute("aria-label", words(number));
       button.textContent = STEPS[number] ?? say("jog.hold");
     });
@@ -64,7 +64,6 @@ export class Jogging {
 
   #button(number) {
     const button = document.createElement("button");
-    button.setAttribute("role", "radio");
     button.dataset.step = number;
     button.addEventListener("click", () => this.choose(number));
     return button;

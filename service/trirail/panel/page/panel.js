@@ -173,7 +173,7 @@ function views(group, shown = () => {}) {
   for (const view of byId(group).children)
     view.addEventListener("click", () => {
       for (const each of byId(group).children) {
-        each.setAttribute("aria-checked", String(each === view));
+        each.setAttribute("aria-pressed", String(each === view));
         byId(each.dataset.view).toggleAttribute("hidden", each !== view);
       }
       shown(view.dataset.view);
