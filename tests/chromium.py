@@ -106,8 +106,9 @@ class Page:
         self._call("Emulation.setTouchEmulationEnabled", enabled=phone)
 
     def colours(self, scheme: str) -> None:
-        """Show the page as to somebody who likes it light, or dark."""
+        """Show the page as to somebody who likes it light, or dark; return when it is drawn so."""
         self._call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        self.evaluate("new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
 
     def languages(self, wished: str) -> None:
         """Be the browser of somebody who wishes pages in this language."""
