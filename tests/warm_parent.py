@@ -1,7 +1,7 @@
 """The warm process: forks `trirail` with arguments, for tests: python warm_parent.py CONTROL, as warm.py starts it.
 
 On CONTROL, a SEQPACKET socket, it takes requests, each with the descriptor of a socket where it says the process id and
-how that ended, and the one of what the program prints to.
+how that ended, and those of what the program prints to.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class Warm:
             os.kill(pid, signal.SIGTERM)
 
     def _receive(self) -> bool:
-        packet, descriptors, _, _ = socket.recv_fds(self._control, LARGEST, 2)
+        packet, descriptors, _, _ = socket.recv_fds(self._control, LARGEST, 3)
         if not packet:
             return False
-        voice, output = descriptors
+        voice, *outputs = descriptors
         pid = os.fork()
         if pid == 0:
             self._control.close()
@@ -63,8 +63,9 @@ class Warm:
                 os.close(pidfd)
                 other.close()
             os.close(voice)
-            _program(json.loads(packet), output)
-        os.close(output)
+            _program(json.loads(packet), outputs)
+        for output in outputs:
+            os.close(output)
         told = socket.socket(fileno=voice)
         told.send(str(pid).encode())
         pidfd = os.pidfd_open(pid)
@@ -90,7 +91,7 @@ class Warm:
         os.waitpid(pid, 0)
 
 
-def _program(request: dict[str, object], output: int) -> NoReturn:
+def _program(request: dict[str, object], outputs: list[int]) -> NoReturn:
     """Be `trirail` with these arguments."""
     code: object = 1
     try:
@@ -101,9 +102,10 @@ def _program(request: dict[str, object], output: int) -> NoReturn:
         os.chdir(folder)
         os.environ.clear()
         os.environ.update(environment)
-        os.dup2(output, sys.stdout.fileno())
-        os.dup2(output, sys.stderr.fileno())
-        os.close(output)
+        os.setsid()
+        for output, stream in zip(outputs, (sys.stdout, sys.stderr), strict=True):
+            os.dup2(output, stream.fileno())
+            os.close(output)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
         sys.argv = ["trirail", *arguments]

@@ -84,7 +84,7 @@ def test_marks_that_stand_still_are_refused() -> None:
     stage = two_cameras(3)
     frozen = stage.look()
     stage.look = lambda: frozen  # type: ignore[method-assign]
-    with pytest.raises(AlignmentError, match=r"moved by 0\.00 pixels") as refused:
+    with pytest.raises(AlignmentError) as refused:
         stage.drive(calibration_by_moves())
     assert refused.value.fault is AlignmentFault.STILL
 

@@ -148,7 +148,7 @@ def test_swapped_marks_of_one_camera_are_refused_and_nothing_moves() -> None:
     targets = stage.look()
     moved = stage.motions
     stage.part = {"left": part["right"], "right": part["left"]}
-    with pytest.raises(AlignmentError, match="left, right are swapped") as refused:
+    with pytest.raises(AlignmentError) as refused:
         stage.drive(align(Task(calibration, targets)))
     assert refused.value.fault is AlignmentFault.SWAPPED
     assert stage.motions == moved

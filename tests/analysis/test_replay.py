@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import random
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -27,6 +25,7 @@ from trirail.telemetry.reading import Recording, join, read
 from trirail.wire.goals import VelocityGoal
 from trirail.wire.packets import CommandRequest, Disturbance, DrivesFault, GoalRequest
 from trirail.wire.plan_packets import Extended, NotPlanned, Planned
+from warm import trirail
 
 pytestmark = pytest.mark.slow
 
@@ -260,11 +259,6 @@ def test_errors_are_those_of_enabled_drives(recording: Recording) -> None:
     summed = summary(recording)
     assert all(0.0 < each.rms <= each.max < 0.004 for each in summed.tracking)
     assert sum(summed.modes.values()) == pytest.approx(summed.cycles / summed.rate_hz)
-
-
-def trirail(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "trirail", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def test_the_commands(path: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warm
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -44,8 +45,7 @@ with Robot("demo", sys.argv[1]) as robot:
 
 
 def trirail(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "trirail", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=WITHIN, check=False)
+    done = warm.trirail(*arguments)
     assert done.returncode == code, done.stdout + done.stderr
     return done
 

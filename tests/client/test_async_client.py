@@ -183,7 +183,7 @@ def test_a_goal_that_is_refused_is_forgotten_and_one_that_is_none_is_not_sent(si
     async def work(robot: AsyncRobot) -> None:
         sending = asyncio.ensure_future(robot.move_to(x=9.0, y=0.0, phi=0.0))
         await asyncio.to_thread(silent.answer, ErrorReply(RefusalCode.OUT_OF_WORKSPACE, "too far"))
-        with pytest.raises(RefusedError, match="too far"):
+        with pytest.raises(RefusedError):
             await sending
         wrong: list[Callable[[], Awaitable[object]]] = [
             lambda: robot.move_to(x=0.0, y=0.0, phi=0.0, id="\n"),

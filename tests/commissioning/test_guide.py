@@ -28,6 +28,8 @@ from trirail_drivers.simulated import SimulatedBus, SimulatedDrive
 
 pytestmark = pytest.mark.long
 
+ROBOT = msgspec.structs.replace(CONFIG, loop=msgspec.structs.replace(CONFIG.loop, rate_hz=500))
+"""At half the rate of what is shipped the same minute of somebody's work is half the cycles."""
 HOMING = config.Homing(method=19, speed_switch=0.02, speed_zero=0.005, acceleration=0.5, timeout=10.0)
 ODRIVE_COUNTS = 200.0
 
@@ -71,7 +73,7 @@ class Run:
     def __init__(
         self,
         folder: Path,
-        robot: Config = CONFIG,
+        robot: Config = ROBOT,
         faults: Sequence[str] = (),
         person: Beside | None = None,
         source: Path = SIM,
@@ -116,13 +118,13 @@ def with_drives(robot: Config, **keys: object) -> Config:
 
 
 def odrives() -> Config:
-    robot = with_drives(CONFIG, counts_per_metre=ODRIVE_COUNTS)
+    robot = with_drives(ROBOT, counts_per_metre=ODRIVE_COUNTS)
     return msgspec.structs.replace(robot, drives=msgspec.structs.replace(robot.drives, protocol="odrive"))
 
 
 @pytest.mark.core
 @pytest.mark.parametrize(
-    "robot", [CONFIG, with_drives(CONFIG, direction=-1), odrives()], ids=["sim", "reversed", "odrive"]
+    "robot", [ROBOT, with_drives(ROBOT, direction=-1), odrives()], ids=["sim", "reversed", "odrive"]
 )
 def test_a_sound_robot_passes_every_step(robot: Config, tmp_path: Path) -> None:
     run = Run(tmp_path, robot)
@@ -139,7 +141,7 @@ def test_a_sound_robot_passes_every_step(robot: Config, tmp_path: Path) -> None:
 
 
 def test_drives_that_are_to_be_homed_are_homed_one_by_one(tmp_path: Path) -> None:
-    robot = with_drives(CONFIG, homing=HOMING)
+    robot = with_drives(ROBOT, homing=HOMING)
     start = msgspec.structs.replace(robot.can.simulated, start=(0.01, 0.02, 0.03))
     robot = msgspec.structs.replace(robot, can=msgspec.structs.replace(robot.can, simulated=start))
     run = Run(tmp_path, robot)
@@ -242,7 +244,7 @@ def test_the_cures_of_what_was_found_end_it(seed: int, tmp_path: Path) -> None:
     orders, ratios = chance.sample(range(3), 3), [chance.choice(RATIOS) for _ in NAMES]
     slip = f"{chance.choice(NAMES)} slips {chance.choice((0.3, 0.04))}" if seed % 4 > 1 else ""
     faults = (absolute if seed % 2 else relative)(orders, ratios)
-    robot, source = CONFIG, SIM
+    robot, source = ROBOT, SIM
     for number in range(3):
         folder = tmp_path / str(number)
         folder.mkdir()
@@ -295,7 +297,7 @@ def test_a_switch_that_is_pressed_at_rest_is_named(tmp_path: Path, monkeypatch: 
         self.press(0)
 
     monkeypatch.setattr(SimulatedDrive, "restarted", restarted)
-    run = Run(tmp_path, robot=with_drives(CONFIG, homing=HOMING), person=person)
+    run = Run(tmp_path, robot=with_drives(ROBOT, homing=HOMING), person=person)
     found(run, "switches", "A", "takes its positive limit switch for pressed", "normally closed")
     assert run.of("home", "A").verdict == "skipped"
 
@@ -416,7 +418,7 @@ def noted(name: str, do: Callable[[], None], told: list[str]) -> Callable[[], No
 def test_ctrl_c_stops_in_that_cycle_and_ends_without_power(monkeypatch: pytest.MonkeyPatch) -> None:
     pressed = [False]
     told: list[str] = []
-    with open_steps(CONFIG, [], Beside(), lambda: pressed[0], sleep=lambda _: None) as steps:
+    with open_steps(ROBOT, [], Beside(), lambda: pressed[0], sleep=lambda _: None) as steps:
         steps.session.set_up()
         bench = steps.session.bench()
         for name in ("sync", "quick_stop"):

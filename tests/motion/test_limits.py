@@ -309,6 +309,20 @@ def test_the_gate_knows_the_platforms_velocity_acceleration_and_jerk(n: int, sig
             assert (violation is not None) is refused, (quantity, violation)
             if violation is not None:
                 assert (violation.what, violation.quantity) == (("x", "y", "phi")[n], quantity)
+                assert abs(violation.limit) == PLATFORM[row, n]
+
+
+@pytest.mark.parametrize("n", range(3))
+@pytest.mark.parametrize("end", range(2))
+def test_the_gate_knows_where_the_platform_may_be(n: int, end: int) -> None:
+    limit, outward = (LIMITS.platform.x, LIMITS.platform.y, LIMITS.platform.phi)[n][end], (-1.0, 1.0)[end]
+    for share, refused in ((0.99, False), (1.01, True)):
+        motion = [[0.0] * 3 for _ in range(3)]
+        motion[0][n] = limit + outward * share * EDGE
+        violation = at_the_gate(STANDS, STANDS, motion, motion)
+        assert (violation is not None) is refused
+        if violation is not None:
+            assert (violation.what, violation.quantity, violation.limit) == (("x", "y", "phi")[n], "position", limit)
 
 
 @pytest.mark.parametrize(

@@ -13,13 +13,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from processes.test_service import Service, again, trirail, until
+from processes.test_service import Service, again, until
 from refusals import refused_as
 from trirail.analysis.replay import again as replayed
 from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import read
+from warm import trirail
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,6 @@ import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +21,7 @@ from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.processes.interpreter import child
 from trirail.wire.zenoh_session import open_client
+from warm import trirail
 
 pytestmark = pytest.mark.slow
 
@@ -61,12 +60,6 @@ def place(tmp_path: Path) -> Place:
 def robot(place: Place) -> Iterator[Robot]:
     with place.service(), Robot("demo", place.locator, user="ann") as robot:
         yield robot
-
-
-def trirail(place: Place, *words: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"TRIRAIL_CONNECT": place.locator}
-    command = [sys.executable, "-m", "trirail", *words]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
 
 
 def at(robot: Robot, *pose: float) -> None:
@@ -143,23 +136,23 @@ def test_a_service_does_not_start_with_poses_that_cannot_be_used(place: Place, w
 
 def test_from_the_command_line(place: Place, robot: Robot) -> None:
     robot.enable()
-    taught = trirail(place, "teach", "pick")
+    taught = trirail("teach", "pick", locator=place.locator)
     assert (taught.returncode, taught.stdout) == (0, "pick: x 0.000 mm   y 0.000 mm   φ 0.0000 °\n".replace(" °", "°"))
-    done = trirail(place, "goto", "park", "--wait")
+    done = trirail("goto", "park", "--wait", locator=place.locator)
     assert (done.returncode, done.stderr) == (0, "")
     at(robot, 0.0, 0.05, 0.0)
-    listed = trirail(place, "poses").stdout.splitlines()
+    listed = trirail("poses", locator=place.locator).stdout.splitlines()
     assert [line.split()[0] for line in listed] == ["park", "pick"]
     assert [line.rpartition("   ")[2] for line in listed] == ["of [poses]", "taught"]
-    told = json.loads(trirail(place, "poses", "--json").stdout)
+    told = json.loads(trirail("poses", "--json", locator=place.locator).stdout)
     assert told["park"] == {"name": "park", "x": 0.0, "y": 0.05, "phi": 0.0, "taught": False}
-    unknown = trirail(place, "goto", "nowhere")
+    unknown = trirail("goto", "nowhere", locator=place.locator)
     assert (unknown.returncode, unknown.stdout) == (1, "")
     assert unknown.stderr == "trirail: no pose 'nowhere': `trirail poses` lists those that there are\n"
     for words, names in ((("goto", ""), ["park", "pick"]), (("forget", ""), ["pick"])):
-        assert trirail(place, "__complete", *words).stdout.splitlines()[-len(names) :] == names
-    assert trirail(place, "forget", "pick").returncode == 0
-    assert trirail(place, "forget", "park").returncode == 1
+        assert trirail("__complete", *words, locator=place.locator).stdout.splitlines()[-len(names) :] == names
+    assert trirail("forget", "pick", locator=place.locator).returncode == 0
+    assert trirail("forget", "park", locator=place.locator).returncode == 1
 
 
 def test_from_anything_that_speaks_zenoh(place: Place, robot: Robot) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
-from processes.test_service import Service, trirail, until
+from processes.test_service import Service, until
 from refusals import refused_as
 from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError
@@ -27,6 +27,7 @@ from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
 from trirail.wire.messages import Event
 from trirail.wire.sizes import MAX_MESSAGE, MAX_POINTS, MAX_TRANSPORT
 from trirail.wire.zenoh_session import open_client
+from warm import trirail
 
 pytestmark = pytest.mark.slow
 

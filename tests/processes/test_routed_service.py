@@ -12,11 +12,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from processes.test_service import Service, trirail, until, wait_readable
+from processes.test_service import Service, until, wait_readable
 from trirail.client.client import Robot
 from trirail.client.fleet import Attention, Fleet, Member
 from trirail.errors import ServiceError
 from trirail.processes.interpreter import python
+from warm import trirail
 
 pytestmark = pytest.mark.slow
 

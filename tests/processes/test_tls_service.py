@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import json
 import stat
-import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 from certificates import ROLES, tls_config, user
-from processes.test_service import Service, trirail, until
+from processes.test_service import Service, until
+from refusals import refused_as
 from trirail.client.client import Robot
-from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.errors import RefusalCode, ServiceError
 from trirail.wire import zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.vocabulary import Role
+from warm import trirail
 
 pytestmark = pytest.mark.slow
 
@@ -78,18 +79,15 @@ def test_an_operator_moves_it_from_the_command_line(served: Served) -> None:
 
 
 @pytest.mark.usefixtures("ann")
-def test_a_viewer_sees_it_and_is_refused_at_once_naming_the_role(served: Served) -> None:
+def test_a_viewer_sees_it_and_is_refused(served: Served) -> None:
     with served.robot("eva") as eva:
         before = until(eva, lambda state: state.mode == "holding")
         assert eva.info().robot == "demo"
         assert eva.role() is Role.VIEWER
         assert {"ann", "eva"} <= set(eva.users())
         for ask in (lambda: eva.move_to(x=0.0, y=0.0, phi=0.0), eva.disable, eva.acquire):
-            began = time.monotonic()
-            with pytest.raises(RefusedError, match=r"eva is a viewer at demo: \S+ needs operator") as refused:
+            with refused_as(RefusalCode.NOT_ALLOWED):
                 ask()
-            assert time.monotonic() - began < 1.0  # as is promised
-            assert refused.value.code is RefusalCode.NOT_ALLOWED
         after = until(eva, lambda state: state.seq > before.seq + 100)
         assert after.commanded.pose == before.commanded.pose
         assert after.lease is None
@@ -107,9 +105,8 @@ def test_everybody_with_a_role_stops_it(served: Served, ann: Robot, name: str) -
 @pytest.mark.usefixtures("ann")
 def test_who_is_revoked_or_has_no_role_does_nothing(served: Served) -> None:
     for name in ("gone", "una"):
-        with served.robot(name) as asking, pytest.raises(RefusedError, match=f"{name} has no role") as refused:
+        with served.robot(name) as asking, refused_as(RefusalCode.NOT_ALLOWED):
             asking.move_to(x=0.0, y=0.0, phi=0.0)
-        assert refused.value.code is RefusalCode.NOT_ALLOWED
 
 
 @pytest.mark.parametrize("name", ["late", "early", "foreign", "none"])
@@ -131,12 +128,8 @@ def test_nobody_without_a_certificate_opens_one(served: Served) -> None:
 
 def test_only_a_maintainer_takes_the_lease_over(served: Served, ann: Robot) -> None:
     with served.robot("max") as boss, boss.lease() as lease:
-        with (
-            pytest.raises(RefusedError, match="taking the lease over needs maintainer") as refused,
-            ann.lease(force=True),
-        ):
+        with refused_as(RefusalCode.NOT_ALLOWED), ann.lease(force=True):
             pass
-        assert refused.value.code is RefusalCode.NOT_ALLOWED
         until(ann, lambda state: state.lease == "max")
         assert lease.lost is None
     with ann.lease() as lease, served.robot("max") as boss, boss.lease(force=True):

@@ -7,8 +7,9 @@ from typing import get_args
 import msgspec
 import pytest
 from hypothesis import given
+from refusals import refused_as
 from trirail.alignment.procedure import AlignmentEnd
-from trirail.errors import AlignmentFault, RefusedError
+from trirail.errors import AlignmentFault, RefusalCode
 from trirail.wire import boundary
 from trirail.wire.looks import WELL, AlignmentLook, LookEnd, SeenMark
 from trirail.wire.packets import Happened, Looked, decode_answer, decode_request, event_packet, message
@@ -59,7 +60,7 @@ MARK = {"name": "left", "pixel": [1.0, 2.0]}
 )
 def test_what_is_none_is_refused(wrong: dict[str, object]) -> None:
     boundary.decode(msgspec.json.encode(ONE | {"marks": [MARK]}), AlignmentLook, "no look")
-    with pytest.raises(RefusedError, match="no look"):
+    with refused_as(RefusalCode.MALFORMED):
         boundary.decode(msgspec.msgpack.encode(ONE | wrong), AlignmentLook, "no look", boundary.MSGPACK)
 
 
