@@ -30,7 +30,7 @@ def test_it_is_the_motion_that_was_made_whatever_the_weights(seed: int, n: int, 
         found = rigid_error(at, to, w)
         assert found.turn == pytest.approx(turn, abs=1e-12)
         assert found.shift == pytest.approx(shift, abs=1e-13)
-        assert found.ways(at) == pytest.approx(to - at, abs=1e-13)
+        assert found.displacements(at) == pytest.approx(to - at, abs=1e-13)
         assert np.abs(found.misfit).max() < 1e-13
 
 

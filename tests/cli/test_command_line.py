@@ -148,6 +148,13 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
         ("sliders 0 0 0 --speed x", 2, "--speed: 'x' is no share of the limits"),
         ("goto 0 0 0 4 5", 2, "trirail: 4 5 are more than it takes (trirail goto --help tells the usage)"),
         ("enable now", 2, "trirail: now is more than it takes (trirail enable --help tells the usage)"),
+        (
+            "workspace my.toml",
+            2,
+            "trirail: my.toml is more than it takes: a configuration is --config my.toml "
+            "(trirail workspace --help tells the usage)",
+        ),
+        ("enable my.toml", 2, "trirail: my.toml is more than it takes (trirail enable --help tells the usage)"),
         ("goto 0,5 0 0", 2, ": write 0.5, with a point"),
         ("goto -12,5mm 0 0", 2, ": write -12.5, with a point"),
         ("override 12,5", 2, ": write 12.5, with a point"),

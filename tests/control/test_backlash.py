@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from trirail.config import Config
 from trirail.control.backlash import TURNS, add_offset, backlash, taking_up
-from trirail.motion.backlash_reserve import NO_BACKLASH, SHARE, planned_limits, take_up
+from trirail.motion.backlash_reserve import NO_BACKLASH, SHARE, planned_limits, reserve_for_backlash
 from trirail.wire.goals import SlidersGoal
 from trirail.wire.vocabulary import Mode
 
@@ -51,7 +51,7 @@ class Play:
 
 @given(widths=WIDTHS, seed=st.integers(0, 10_000))
 def test_a_slider_with_play_is_where_it_was_told_to_be(widths: tuple[float, float, float], seed: int) -> None:
-    taken = take_up(widths, SLIDER)
+    taken = reserve_for_backlash(widths, SLIDER)
     kept, play = backlash(taken, PERIOD), Play(np.array(widths))
     rows, settled = np.zeros((6, 3)), 0
     places = ways(seed, 1500)
@@ -82,7 +82,7 @@ def test_a_slider_with_play_is_where_it_was_told_to_be(widths: tuple[float, floa
 
 def test_what_is_tried_twice_begins_from_the_same() -> None:
     """A setpoint that the gate refuses has not been."""
-    kept = backlash(take_up((5e-5,) * 3, SLIDER), PERIOD)
+    kept = backlash(reserve_for_backlash((5e-5,) * 3, SLIDER), PERIOD)
     first, second = np.zeros((6, 3)), np.zeros((6, 3))
     for place in (0.0, 1e-3):
         first[:], second[:] = 0.0, 0.0
@@ -94,13 +94,13 @@ def test_what_is_tried_twice_begins_from_the_same() -> None:
 
 
 def test_without_backlash_nothing_is_taken_from_the_limits() -> None:
-    assert take_up((0.0, 0.0, 0.0), SLIDER) is NO_BACKLASH
+    assert reserve_for_backlash((0.0, 0.0, 0.0), SLIDER) is NO_BACKLASH
     assert planned_limits(CONFIG.limits, (0.0, 0.0, 0.0)) is CONFIG.limits
 
 
 @given(widths=st.tuples(*[st.floats(0.0, 1e-3)] * 3))
 def test_motion_and_take_up_together_stay_within_the_limits(widths: tuple[float, float, float]) -> None:
-    taken, less = take_up(widths, SLIDER), planned_limits(CONFIG.limits, widths).slider
+    taken, less = reserve_for_backlash(widths, SLIDER), planned_limits(CONFIG.limits, widths).slider
     assert less.velocities[0] + taken.velocity <= SLIDER.velocities[0] * (1.0 + 1e-12)
     assert less.accelerations[0] + taken.acceleration <= SLIDER.accelerations[0] * (1.0 + 1e-12)
     assert less.jerks[0] + taken.jerk <= SLIDER.jerks[0] * (1.0 + 1e-12)

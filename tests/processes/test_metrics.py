@@ -100,7 +100,7 @@ def test_what_passes_the_gateway_is_counted() -> None:
     assert 'trirail_loop_lateness_seconds_bucket{le="2e-05"} 1.0' in text
     assert 'trirail_loop_lateness_seconds_bucket{le="+Inf"} 2.0' in text
     assert "trirail_loop_lateness_seconds_count 2.0" in text
-    assert "trirail_loop_cycle_seconds_sum 0.0014" in text
+    assert "trirail_loop_cycle_seconds_sum 0.0016" in text
     assert 'trirail_goals_total{outcome="done"} 2.0' in text
     assert 'trirail_goals_total{outcome="rejected"} 1.0' in text
     assert "trirail_goal_settle_seconds_count 1.0" in text

@@ -259,7 +259,7 @@ class Device:
             if sample is not None:
                 self._send(tpdo.can_id, sample)
         for rpdo in self._sync_rpdos:
-            rpdo.take_up()
+            rpdo.write_latched()
         self._sync_due = self._now + self.sync_timeout()
 
     def _receive_pdo(self, pdo: ReceivePdo, data: bytes) -> None:

@@ -165,9 +165,9 @@ class ReceivePdo(Pdo):
         """Take in a frame that is long enough."""
         self._latched = self.layout.unpack_from(data)
         if not self.synchronous:
-            self.take_up()
+            self.write_latched()
 
-    def take_up(self) -> None:
+    def write_latched(self) -> None:
         """Write what was latched; a value that an object refuses is left out, as an SDO's would be."""
         values, self._latched = self._latched, None
         if values is None:

@@ -31,14 +31,14 @@ class Misplacement(NamedTuple):
     """By how much the worst distance of two marks is too long, as a share of it."""
 
     @property
-    def ways(self) -> Floats:
+    def distances(self) -> Floats:
         """How far each mark has to go by the motion that aligns the part, (n,) [m]."""
-        return np.asarray(np.linalg.norm(self.error.ways(self.at), axis=1))
+        return np.asarray(np.linalg.norm(self.error.displacements(self.at), axis=1))
 
     @property
     def worst(self) -> float:
         """The greatest of these [m]."""
-        return float(self.ways.max())
+        return float(self.distances.max())
 
 
 def misplacement(

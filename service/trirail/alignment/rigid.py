@@ -38,7 +38,7 @@ class RigidError(NamedTuple):
     covariance: Floats
     """Of shift and turn, (3, 3) [m, rad]."""
 
-    def ways(self, at: Floats) -> Floats:
+    def displacements(self, at: Floats) -> Floats:
         """Return how far the motion takes points, (n, 2) both [m]."""
         arms = at - self.middle
         return np.asarray(self.shift + arms @ turned(self.turn).T - arms)

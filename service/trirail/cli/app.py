@@ -314,6 +314,9 @@ def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
     elif isinstance(error, UnusedCliTokensError):
         more = " ".join(quoted(word.strip()) for word in error.unused_tokens or ())
         said = f"{more} {'is' if ' ' not in more else 'are'} more than it takes"
+        options = error.app.assemble_argument_collection() if error.app else ()
+        if more.endswith(".toml") and any("--config" in option.names for option in options):
+            said += f": a configuration is --config {more.split()[-1]}"
     by_command = type(error) is CycloptsError  # raised by the command itself, which is not told how it was called
     command = " ".join(("trirail", *(words[:1] if by_command else error.command_chain or ())))
     return f"{said} ({command} --help tells the usage)"

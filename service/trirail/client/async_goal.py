@@ -12,7 +12,7 @@ import msgspec
 from trirail.client.goal import LETTING_GO, STANDS_WITHIN, AcceptedGoal, HeldVelocity, Result, Velocity
 from trirail.client.outgoing import seconds
 from trirail.errors import TrirailError
-from trirail.wire.goals import Goal, Tool, VelocityGoal
+from trirail.wire.goals import Goal, Tool
 from trirail.wire.vocabulary import Command, Stop
 
 
@@ -60,9 +60,8 @@ class AsyncJog(HeldVelocity[AsyncGoalHandle]):
         timeout: float,
         tool: Tool | None = None,
     ) -> None:
-        super().__init__(velocity, timeout)
+        super().__init__(velocity, timeout, tool)
         self._send_goal = send
-        self._tool = tool
         self._over = asyncio.Event()
         self._renewing: asyncio.Task[None] | None = None
 
@@ -88,10 +87,7 @@ class AsyncJog(HeldVelocity[AsyncGoalHandle]):
             return False
 
     async def _send(self, velocity: Velocity, timeout: float) -> AsyncGoalHandle:
-        def made(name: str) -> VelocityGoal:
-            return VelocityGoal(*velocity, timeout=timeout, id=name, tool=self._tool)
-
-        return await self._send_goal(made, self._id)
+        return await self._send_goal(self._message(velocity, timeout), self._id)
 
     async def _renew(self) -> None:
         while not await self._is_over(self._timeout / 3.0):

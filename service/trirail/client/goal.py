@@ -110,9 +110,10 @@ Handle = TypeVar("Handle", bound=AcceptedGoal)
 class HeldVelocity(Generic[Handle]):
     """A jog, whether a thread or a task renews it: what is sent of it, and what the service says."""
 
-    def __init__(self, velocity: Velocity, timeout: float) -> None:
+    def __init__(self, velocity: Velocity, timeout: float, tool: Tool | None) -> None:
         self._velocity = velocity
         self._timeout = number(timeout, "timeout")
+        self._tool = tool
         self._id = uuid.uuid4().hex[:12]
         self._goal: Handle | None = None
         self.error: Exception | None = None
@@ -131,6 +132,9 @@ class HeldVelocity(Generic[Handle]):
     @property
     def _moves(self) -> bool:
         return self._goal is not None and self.result is None and self.error is None
+
+    def _message(self, velocity: Velocity, timeout: float) -> Callable[[str], Goal]:
+        return lambda name: VelocityGoal(*velocity, timeout=timeout, id=name, tool=self._tool)
 
     def _renewal_failed(self, error: TrirailError) -> None:
         at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
@@ -157,9 +161,8 @@ class Jog(HeldVelocity[GoalHandle]):
         timeout: float,
         tool: Tool | None = None,
     ) -> None:
-        super().__init__(velocity, timeout)
+        super().__init__(velocity, timeout, tool)
         self._send_goal = send
-        self._tool = tool
         self._over = threading.Event()
         self._renewing = threading.Thread(target=self._renew, name="jog", daemon=True)
 
@@ -177,10 +180,7 @@ class Jog(HeldVelocity[GoalHandle]):
             self._goal.wait(self._timeout + STANDS_WITHIN)
 
     def _send(self, velocity: Velocity, timeout: float) -> GoalHandle:
-        def made(name: str) -> VelocityGoal:
-            return VelocityGoal(*velocity, timeout=timeout, id=name, tool=self._tool)
-
-        return self._send_goal(made, self._id)
+        return self._send_goal(self._message(velocity, timeout), self._id)
 
     def _renew(self) -> None:
         while not self._over.wait(self._timeout / 3.0):

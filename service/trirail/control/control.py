@@ -25,7 +25,7 @@ from trirail.control.plan_requests import PlannerPort, PlanRequests
 from trirail.control.setpoints import Setpoints
 from trirail.control.transitions import Transitions
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.backlash_reserve import take_up
+from trirail.motion.backlash_reserve import reserve_for_backlash
 from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
@@ -85,7 +85,7 @@ class Control:
         self.goal_queue = GoalQueue(self.ledger, self.lease, self._planner, self.schedule, frames, queue, config.period)
         legs, step_length = robot.packed(), config.limits.slider.fastest * config.period
         self._following_error_limit = config.limits.slider.following_error
-        taken = take_up(config.correction.backlash, config.limits.slider)
+        taken = reserve_for_backlash(config.correction.backlash, config.limits.slider)
         self.measured = Measured(
             legs, config.period, step_length, self._following_error_limit, config.limits.in_position, taken
         )

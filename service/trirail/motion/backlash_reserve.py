@@ -38,7 +38,7 @@ class TakeUp(NamedTuple):
 NO_BACKLASH = TakeUp((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0)
 
 
-def take_up(widths: Sequence[float], slider: SliderLimits) -> TakeUp:
+def reserve_for_backlash(widths: Sequence[float], slider: SliderLimits) -> TakeUp:
     """Return how backlash of such widths [m] is taken up as fast as its share of the limits allows."""
     most = max(widths)
     limits = min(slider.velocities), min(slider.accelerations), min(slider.jerks)
@@ -57,7 +57,7 @@ def planned_limits(limits: Limits, widths: Sequence[float]) -> Limits:
     """Return the limits with what taking up backlash may add left out: those for which motions are planned."""
     if not any(widths):
         return limits
-    slider, taken, half = limits.slider, take_up(widths, limits.slider), max(widths) / 2.0
+    slider, taken, half = limits.slider, reserve_for_backlash(widths, limits.slider), max(widths) / 2.0
     less = msgspec.structs.replace(
         slider,
         position=tuple((low + half, high - half) for low, high in slider.positions),

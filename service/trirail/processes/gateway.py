@@ -69,7 +69,7 @@ class Gateway:
         config: Config,
         link: PacketLink,
         beat: Callable[[], None],
-        opened: zenoh.Session,
+        session: zenoh.Session,
         guard: Guard,
         log: Callable[[Event], None] = lambda _: None,
         measured: Callable[[msgspec.Struct], None] = lambda _: None,
@@ -88,7 +88,7 @@ class Gateway:
         self._state_due = self._summary_due = self._heard = 0.0
         self._replies = Replies(self._robot)
         self._refusals = Refusals(link, self._replies)
-        self._inbox = Inbox(opened, self._robot, self._refusals.too_much)
+        self._inbox = Inbox(session, self._robot, self._refusals.too_much)
         self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._send_to_loop, self._inbox.wake)
         self._looks = Looks(self._robot, lambda looked: link.send(message(looked)))
         self._requests = Requests(config, link, guard, self._replies, self._loop_death, hurrying)
@@ -96,13 +96,13 @@ class Gateway:
             self._robot, self._requests, self._replies, self._states, self._inbox, self._refusals.refuse
         )
         connect = config.zenoh.connect
-        self._routers = RouterLinks(connect, partial(guard.linked, opened), guard.why_not_linked, self._send_to_loop)
+        self._routers = RouterLinks(connect, partial(guard.linked, session), guard.why_not_linked, self._send_to_loop)
         known = {*guard.users, config.zenoh.router or ""}
         self._crowding = Crowding(
-            partial(guard.links, opened), guard.disconnect, known, zenoh_session.SESSIONS, self._send_to_loop
+            partial(guard.links, session), guard.disconnect, known, zenoh_session.SESSIONS, self._send_to_loop
         )
         self._ending = False
-        self._publications = Publications(opened, self._robot)
+        self._publications = Publications(session, self._robot)
 
     def serve(self, ready: Callable[[], None]) -> None:
         """Serve until told to end or the loop has gone; `ready` is called once the loop has said welcome."""
@@ -293,8 +293,8 @@ def main(
     """
     sys.setswitchinterval(SWITCH_EVERY)
     guard = Guard(config)
-    with guard.open() as opened:
-        gateway = Gateway(config, link, beat, opened, guard, log, measured, hurrying)
+    with guard.open() as session:
+        gateway = Gateway(config, link, beat, session, guard, log, measured, hurrying)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
 
         def is_ready() -> None:

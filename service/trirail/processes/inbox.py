@@ -39,13 +39,13 @@ class Inbox:
 
     def __init__(
         self,
-        opened: zenoh.Session,
+        session: zenoh.Session,
         robot: str,
         too_much: Callable[[Incoming], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._clock = clock
-        self._session = opened
+        self._session = session
         self._robot = robot
         self._too_much = too_much
         self._lock = threading.Lock()

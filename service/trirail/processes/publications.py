@@ -40,9 +40,9 @@ _PAST = RepliesConfig(
 class Publications:
     """Publishers on a robot's keys. State and records are dropped where somebody is slow, events wait for them."""
 
-    def __init__(self, opened: zenoh.Session, robot: str) -> None:
+    def __init__(self, session: zenoh.Session, robot: str) -> None:
         def dropping(name: str, encoding: str, priority: zenoh.Priority) -> zenoh.Publisher:
-            return opened.declare_publisher(
+            return session.declare_publisher(
                 zenoh_session.key(robot, name),
                 encoding=encoding,
                 congestion_control=zenoh.CongestionControl.DROP,
@@ -53,7 +53,7 @@ class Publications:
         self._summary = dropping("summary", boundary.JSON, zenoh.Priority.DATA)
         self._records = dropping("records", boundary.BINARY, zenoh.Priority.DATA_LOW)
         self._event = declare_advanced_publisher(
-            opened,
+            session,
             zenoh_session.key(robot, "event"),
             encoding=boundary.JSON,
             # The past goes out in one burst, whole, in a queue of its own: who is slow to take it delays nothing else.

@@ -109,13 +109,13 @@ def settings(config: RouterConfig) -> dict[str, Any]:
 @contextmanager
 def routing(config: RouterConfig) -> Iterator[zenoh.Session]:
     """Route while the context lasts. Raises ServiceError where an address cannot be listened on."""
-    opened = zenoh_session.open_router(settings(config))
+    session = zenoh_session.open_router(settings(config))
     try:
         if config.zenoh.tls is not None:
-            _tell_roles(opened, config, Path(config.zenoh.tls.directory))
-        yield opened
+            _tell_roles(session, config, Path(config.zenoh.tls.directory))
+        yield session
     finally:
-        zenoh_session.close(opened)
+        zenoh_session.close(session)
 
 
 def run(config: RouterConfig, up: Callable[[], None]) -> None:
@@ -130,7 +130,7 @@ def run(config: RouterConfig, up: Callable[[], None]) -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
-def _tell_roles(opened: zenoh.Session, config: RouterConfig, folder: Path) -> None:
+def _tell_roles(session: zenoh.Session, config: RouterConfig, folder: Path) -> None:
     """Answer every certificate that asks for its role: the robots know only their router."""
     users = with_role(config.zenoh.users, folder)
     asked = zenoh_session.key("*", "role", "*")
@@ -145,4 +145,4 @@ def _tell_roles(opened: zenoh.Session, config: RouterConfig, folder: Path) -> No
             reply = RoleReply(user, users.get(user))
             query.reply(query.key_expr, msgspec.json.encode(reply), encoding=boundary.JSON)
 
-    opened.declare_queryable(asked, zenoh.handlers.Callback(answer, indirect=False))
+    session.declare_queryable(asked, zenoh.handlers.Callback(answer, indirect=False))
