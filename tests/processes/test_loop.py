@@ -11,8 +11,8 @@ from conftest import Followers, Rig, alone, what_memory_takes
 from trirail.motion.motion_planner import MotionPlanner
 from trirail.processes.clock import Tick
 from trirail.processes.heartbeats import Heartbeats, Watch
-from trirail.processes.loop import REQUESTS_A_CYCLE, Loop
-from trirail.processes.ports import Ports
+from trirail.processes.loop import Loop
+from trirail.processes.ports import REQUESTS_A_CYCLE, Ports
 from trirail.processes.reports import BATCHES_PER_SECOND
 from trirail.wire import links
 from trirail.wire.goals import PoseGoal

@@ -3,50 +3,36 @@
 from __future__ import annotations
 
 import itertools
-import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, MutableSequence
-from types import FrameType
 
-import msgspec
 from trirail_drivers.bus.capture import Capture
-from trirail_drivers.config import Can
-from trirail_drivers.connection.opening import connect
 from trirail_drivers.driver.cyclic import Lender
 from trirail_drivers.interface import DriveFault, DriveGroup
 
 from trirail.config import Config
 from trirail.control.control import Control, Given
 from trirail.control.modes import ModeEvent
-from trirail.kinematics.robot import warm_up
-from trirail.processes import realtime
 from trirail.processes.clock import SPARE_NS, Doors, Overruns, Tick, Ticker
 from trirail.processes.heartbeats import Haste, Heartbeats, Watch
-from trirail.processes.ports import PlannerLink, Ports
+from trirail.processes.ports import GatewayLink, PlannerLink, Ports
 from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
 from trirail.processes.reports import Reports
 from trirail.wire.packets import (
     Disturbance,
     DrivesFault,
-    Farewell,
     Request,
-    decode_request,
-    message,
 )
 from trirail.wire.records import LONGEST, Part
 from trirail.wire.vocabulary import Mode
 
-REQUESTS_A_CYCLE = 4
-"""Requests that are taken in one cycle: at 1 kHz more than the gateway can send, so that a stop waits for nothing."""
 DECIDING_NS = 300_000
 """Where less is left before the next tick, requests that have been read wait for the time behind its setpoints [ns]."""
 SAYING_NS = 150_000
 """Likewise what is to be said of what has been decided."""
 LEAST_PATIENCE = 3
 """Cycles for which the gateway may be silent, however few there are a second."""
-PLANNER_WITHIN = 120.0
-"""How long the planner may take to come up: the very first start compiles the kinematics [s]."""
 SHUTDOWN = 3.0
 """How long a controlled stop may take before the drives are left to their own quick stop [s]."""
 
@@ -72,7 +58,9 @@ class Loop:
         """
         self._now = now
         self._drives = drives
-        self._gateway = ports.gateway
+        patience = max(LEAST_PATIENCE, round(config.watchdogs.gateway_timeout * config.loop.rate_hz))
+        watch = Watch(heartbeats.of("gateway"), patience)
+        self._gateway = GatewayLink(ports.gateway, watch, config.watchdogs.gateway_timeout)
         self._planner = PlannerLink(ports.planner)
         self._period = config.period
         self._period_ns = round(config.period * 1e9)
@@ -85,21 +73,15 @@ class Loop:
         self._overruns = Overruns(config.watchdogs.max_overruns)
         self._heart = heartbeats.of("loop")
         self._haste = Haste(heartbeats)
-        self._gateway_timeout = config.watchdogs.gateway_timeout
-        patience = max(LEAST_PATIENCE, round(self._gateway_timeout * config.loop.rate_hz))
-        self._gateway_watch = Watch(heartbeats.of("gateway"), patience)
-        self._gateway_frozen = False
         self._doors = Doors(ports)
         self._never_listens = self._period_ns <= SPARE_NS
         self._listened = self._never_listens
         """Whether nobody else is to be heard before the next tick."""
-        self._in_hand: list[Request] = []
-        """What has been read, and there was no time left to decide by it."""
         self._unsaid = False
         """Whether there was no time left to say what has been decided."""
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
-            beside = self._reports, heartbeats, ports.gateway, self._doors, self._gateway_watch, self._haste
+            beside = self._reports, heartbeats, ports.gateway, self._doors, watch, self._haste
             self._quiet = QuietCycles(self.control, drives, *beside)
         self._fault: DriveFault | None = None
         self._marked_ns = 0
@@ -131,7 +113,7 @@ class Loop:
         Or only the last, where somebody calls while the next tick is waited for: once before each tick.
         """
         quiet, newest = self._quiet, None
-        disturbed = self.ending or self._gateway_frozen or not self._planner.idle
+        disturbed = self.ending or self._gateway.frozen or not self._planner.idle
         if quiet is not None and not disturbed:
             newest = quiet.run(ticker, self._overruns, listens=not self._listened, once=self._postponed)
         elif quiet is not None:
@@ -165,7 +147,8 @@ class Loop:
         self._listened = self._never_listens
         now_ns = tick.deadline_ns + tick.lateness_ns
         if self._haste.hurried() or self._gateway.ended:
-            self._handle_urgent(self._requests(), now_ns)
+            self._gateway.read()
+            self._handle_urgent(self._gateway.requests(), now_ns)
         feedback = self._drives.read()
         self._mark(Part.READ)
         self._handle_urgent(self._watch(tick, feedback.fault), now_ns)
@@ -187,7 +170,7 @@ class Loop:
     @property
     def _postponed(self) -> bool:
         """Whether there was no time left for all that came behind the newest setpoints."""
-        return self._unsaid or bool(self._in_hand)
+        return self._unsaid or self._gateway.postponed
 
     def _decide(self, next_ns: int, called: bool = True) -> None:
         """Decide what comes at the next tick, which is due at that time, where somebody has `called`.
@@ -195,11 +178,11 @@ class Loop:
         What there is no time for before it waits for the time behind its setpoints, once: requests, and what is to be
         said.
         """
-        waited = bool(self._in_hand)
+        waited = self._gateway.postponed
         if called or waited:
-            self._read()
+            self._gateway.read()
             in_time = waited or next_ns - self._now() >= DECIDING_NS
-            self.control.decide(self._noted(next_ns, requests=in_time))
+            self.control.decide(self._noted(next_ns, self._gateway.requests() if in_time else ()))
         if self._unsaid or ((called or waited) and next_ns - self._now() >= SAYING_NS):
             self._say()
         else:
@@ -216,13 +199,14 @@ class Loop:
     def _hear(self, ticker: Ticker) -> None:
         """Decide by what is said while the next tick is waited for: it has its effect then, and not a cycle later."""
         self._listened = True
-        if given := list(self._noted(ticker.deadline_ns + self._period_ns, waiting=True)):
+        self._gateway.read()
+        if given := list(self._noted(ticker.deadline_ns + self._period_ns, self._gateway.requests(), waiting=True)):
             self.control.decide(given)
         self._say()
 
-    def _noted(self, now_ns: int, *, requests: bool = True, waiting: bool = False) -> Iterator[Given]:
-        """Yield what the planner has sent, and before it the gateway's `requests`; keep it for the recorder."""
-        for what in itertools.chain(self._requests() if requests else (), self._planner.answers()):
+    def _noted(self, now_ns: int, requests: Iterable[Request], *, waiting: bool = False) -> Iterator[Given]:
+        """Yield requests and what the planner has sent, and keep it for the recorder."""
+        for what in itertools.chain(requests, self._planner.answers()):
             self._reports.note(now_ns, what, waiting=waiting)
             yield what, now_ns
 
@@ -232,26 +216,6 @@ class Loop:
         self._parts_ns[part] = min(max(0, now - self._marked_ns), LONGEST)
         self._marked_ns = now
 
-    def _requests(self) -> Iterator[Request]:
-        """Yield what the gateway has sent: as much as comes in a cycle, and no more than a cycle has time for."""
-        self._read()
-        while self._in_hand and not self._gateway_frozen:
-            yield self._in_hand.pop(0)
-
-    def _read(self) -> None:
-        """Read what the gateway has sent. Nothing is read of what a frozen one has left, until it serves again.
-
-        One that says what cannot be read has lost its mind: it is let go, and started again.
-        """
-        while len(self._in_hand) < REQUESTS_A_CYCLE and not self._gateway_frozen:
-            packet = self._gateway.receive()
-            if packet is None:
-                return
-            try:
-                self._in_hand.append(decode_request(memoryview(packet)[1:]))
-            except msgspec.DecodeError:
-                self._gateway.hang_up()
-
     def _watch(self, tick: Tick, fault: DriveFault | None) -> Iterator[Disturbance]:
         """Count what the ticker missed; yield what has happened: late ticks, a lost gateway, a wish to end."""
         if fault is not self._fault:
@@ -259,24 +223,11 @@ class Loop:
             self._reports.note(tick.deadline_ns + tick.lateness_ns, DrivesFault(fault.message if fault else None))
         if in_a_row := self._overruns.too_many(tick.missed):
             yield Disturbance(ModeEvent.LATE.name, f"{in_a_row} ticks missed in a row: the machine is too busy")
-        if (lost := self._gateway_lost()) is not None:
+        if (lost := self._gateway.lost()) is not None:
             yield Disturbance(ModeEvent.GATEWAY_LOST.name, lost)
         if self.ending and self._ending_since is None:
             self._ending_since = self.control.cycles
             yield Disturbance(ModeEvent.SHUTDOWN.name, "the service is ending: controlled stop, drives disabled")
-
-    def _gateway_lost(self) -> str | None:
-        """Return how the gateway has been lost in this cycle; None where it has not."""
-        if self._gateway.take_lost():
-            self._gateway_frozen = False
-            return "the gateway is gone: controlled stop"
-        if self._gateway_watch.silent():
-            if not self._gateway_frozen:
-                self._gateway_frozen = True
-                return f"the gateway is frozen, no sign of life for {self._gateway_timeout:g} s: controlled stop"
-        elif self._gateway_watch.heard:
-            self._gateway_frozen = False
-        return None
 
     def _over(self) -> bool:
         if self._ending_since is None:
@@ -290,47 +241,3 @@ class Loop:
         self._heart.beat()
         self._planner.accept()
         self._reports.flush()
-
-
-def main(
-    config: Config,
-    bus: Callable[[], Can],
-    ports: Ports,
-    heartbeats: Heartbeats,
-    ready: Callable[[object], None],
-    rehearse: Callable[[Config], tuple[str, ...]],
-) -> int:
-    """Run the loop's process; `ready` is called with what the loop runs without once it turns.
-
-    `bus` waits for the drives' bus and returns it. `rehearse` runs what must come without delay, before the drives are
-    touched, and returns what kept it from that.
-    """
-    drives: DriveGroup | None = None
-    ended_as_told = False
-    try:
-        warm_up()
-        unrehearsed = rehearse(config)
-        ports.planner.await_peer(PLANNER_WITHIN)
-        capture = Capture() if config.telemetry.capture_can else None
-        drives = connect(bus(), config.drives, capture=capture)
-        drives.configure(config.period, config.limits.slider.fastest)
-        lacking = (*realtime.acquire(config.loop), *unrehearsed)
-        loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)
-
-        def end(_signal: int, _frame: FrameType | None) -> None:
-            loop.ending = True
-
-        signal.signal(signal.SIGTERM, end)
-        ready({"lacking": lacking, "bus_load": drives.bus_load})
-        loop.run(Ticker(round(config.period * 1e9)))
-        ended_as_told = True
-    finally:
-        heartbeats.of("loop").rest()  # the drives may take their time to stop
-        if drives is not None:
-            drives.close()
-        for port in (ports.gateway, ports.recorder):
-            if ended_as_told:
-                port.send(message(Farewell()))
-        for port in ports:
-            port.close()
-    return 0

@@ -1,4 +1,4 @@
-"""Where the processes beside the loop connect, and the loop's side of the planner."""
+"""Where the processes beside the loop connect, and the loop's sides of gateway and planner."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import msgspec
 
+from trirail.processes.heartbeats import Watch
 from trirail.wire.links import Port
-from trirail.wire.packets import PlannerLost
+from trirail.wire.packets import PlannerLost, Request, decode_request
 from trirail.wire.plan_packets import PlanAnswer, PlanRequest, decode_plan_answer, encode
 
 
@@ -20,8 +21,65 @@ class Ports(NamedTuple):
     planner: Port
 
 
+REQUESTS_A_CYCLE = 4
+"""Requests that are taken in one cycle: at 1 kHz more than the gateway can send, so that a stop waits for nothing."""
 ANSWERS_A_CYCLE = 2
 """Packets of the planner's that are taken in one cycle: it has been asked once."""
+
+
+class GatewayLink:
+    """What the gateway asks for, and whether it lives."""
+
+    def __init__(self, port: Port, watch: Watch, timeout: float) -> None:
+        self._port = port
+        self._watch = watch
+        self._timeout = timeout
+        self._in_hand: list[Request] = []
+        self.frozen = False
+        """Whether it gives no sign of life."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has gone, and that has not been found by receiving or sending yet."""
+        return self._port.ended
+
+    @property
+    def postponed(self) -> bool:
+        """Whether something has been read, and nobody has taken it up."""
+        return bool(self._in_hand)
+
+    def read(self) -> None:
+        """Read what it has sent: as much as comes in a cycle, and no more than a cycle has time for.
+
+        Nothing is read of what a frozen one has left, until it serves again. One that says what cannot be read has lost
+        its mind: it is let go, and started again.
+        """
+        for _ in range(0 if self.frozen else REQUESTS_A_CYCLE):
+            packet = self._port.receive()
+            if packet is None:
+                return
+            try:
+                self._in_hand.append(decode_request(memoryview(packet)[1:]))
+            except msgspec.DecodeError:
+                self._port.hang_up()
+
+    def requests(self) -> Iterator[Request]:
+        """Yield what has been read."""
+        while self._in_hand and not self.frozen:
+            yield self._in_hand.pop(0)
+
+    def lost(self) -> str | None:
+        """Return how it has been lost in this cycle, to be asked once in each; None where it has not."""
+        if self._port.take_lost():
+            self.frozen = False
+            return "the gateway is gone: controlled stop"
+        if self._watch.silent():
+            if not self.frozen:
+                self.frozen = True
+                return f"the gateway is frozen, no sign of life for {self._timeout:g} s: controlled stop"
+        elif self._watch.heard:
+            self.frozen = False
+        return None
 
 
 class PlannerLink:

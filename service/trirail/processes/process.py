@@ -100,13 +100,13 @@ def _run(child: Child) -> int:
 
         return drives_process.main(config, child.runtime, child.ready)
     if name == "loop":
-        from trirail.processes import drives_process, loop
+        from trirail.processes import drives_process, loop_process
         from trirail.processes.rehearsal import rehearse
 
         gateway, recorder, planner = (socket.socket(fileno=number) for number in child.sockets)
         ports = Ports(links.Port(gateway), links.Port(recorder), links.Port(planner, MAX_PLANNING))
         bus = partial(drives_process.bus, config, child.runtime)
-        return loop.main(config, bus, ports, child.heartbeats, child.ready, rehearse)
+        return loop_process.main(config, bus, ports, child.heartbeats, child.ready, rehearse)
     if name == "planner":
         from trirail.processes import planner_process
 
