@@ -44,7 +44,7 @@ def top_level(*packages: ModuleType) -> Iterator[ast.stmt]:
         ("from trirail.processes import supervisor", {"numpy"}),
         ("from trirail.processes import gateway", {"numpy", "zenoh"}),
         ("from trirail.processes import planner_process", {"numpy", "numba", "ruckig"}),
-        ("from trirail.processes import loop", {"numpy", "numba", "ruckig", "can", "canopen"}),
+        ("from trirail.processes import loop_process", {"numpy", "numba", "ruckig", "can", "canopen"}),
         ("from trirail.processes import recording", {"numpy", "rerun"}),
     ],
 )

@@ -292,7 +292,9 @@ def test_the_commands(service: Service) -> None:
     def call(*arguments: object) -> subprocess.CompletedProcess[str]:
         return trirail(*arguments, locator=service.locator)
 
-    assert json.loads(call("enable", "--json").stdout) == {"command": "enable", "mode": "holding", "ok": True}
+    confirmed = json.loads(call("enable", "--json").stdout)
+    assert confirmed.pop("seq") <= json.loads(call("status", "--json").stdout)["seq"]
+    assert confirmed == {"command": "enable", "mode": "holding", "ok": True}
     done = call("goto", 0.01, -0.02, 5, "--deg", "--wait")
     assert (done.returncode, done.stderr) == (0, "")
     assert "done" in done.stdout
