@@ -82,6 +82,14 @@ def test_after_an_answer(service: Service, locator: str, command: Callable[..., 
         assert robot.state().seq >= service.known > BEHIND
 
 
+def test_after_the_second_answer_too(service: Service, locator: str) -> None:
+    with Robot("demo", locator) as robot:
+        robot.pause()
+        service.seq += BEHIND
+        robot.pause()
+        assert robot.state().seq >= service.known > BEHIND
+
+
 def test_after_an_answer_in_an_event_loop(service: Service, locator: str) -> None:
     async def main() -> int:
         async with AsyncRobot("demo", locator) as robot:

@@ -53,10 +53,14 @@ class Shell:
         self.recorder: PacketLink = links.connect(folder / "recorder")
         self.planner: PacketLink = links.connect(folder / "planner", MAX_PLANNING)
         self.motion_planner = MotionPlanner(rig.config)
+        self.took_ns = 0
+        """How long after its tick a cycle comes to deciding."""
         self.serves = True
         """Whether the planner answers what it is asked before the next cycle."""
         self.heartbeats = Heartbeats.create()
-        self.loop = Loop(rig.config, rig.driver, self.ports, self.heartbeats, now=lambda: round(rig.now * 1e9))
+        self.loop = Loop(
+            rig.config, rig.driver, self.ports, self.heartbeats, now=lambda: round(rig.now * 1e9) + self.took_ns
+        )
         self.loop.control.start(rig.control.measured.feedback)
 
     def cycles(self, number: int, missed: int = 0) -> None:
@@ -244,6 +248,39 @@ def test_what_a_frozen_gateway_has_left_dies_with_it(shell: Shell, tmp_path: Pat
     shell.cycles(300)  # the next one takes its time to serve
     beating(shell, 500)
     assert shell.mode() is Mode.HOLDING
+
+
+@pytest.mark.parametrize("goes", ["closes", "says what cannot be read", "freezes"])
+def test_what_was_read_of_a_gateway_and_had_to_wait_moves_nothing_once_it_is_lost(shell: Shell, goes: str) -> None:
+    shell.enabled()
+    beating(shell, 50)
+    shell.took_ns = 800_000
+    if goes == "freezes":
+        shell.cycles(299)
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.01, 0.0, 0.0), now)))
+    if goes == "says what cannot be read":
+        shell.gateway.send(bytes((Kind.MESSAGE,)) + b"nonsense")
+    shell.cycles(1)
+    if goes != "says what cannot be read":
+        shell.cycles(1 if goes == "freezes" else 0)
+        shell.gateway.close()
+    before = shell.loop.control.commanded
+    shell.cycles(300)
+    assert shell.mode() is Mode.HOLDING
+    assert shell.loop.control.commanded == before
+
+
+def test_what_had_to_wait_is_decided_by_a_cycle_later(shell: Shell) -> None:
+    shell.enabled()
+    shell.took_ns = 800_000
+    now = round(shell.rig.now * 1e9)
+    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.01, 0.0, 0.0), now)))
+    shell.cycles(1)
+    assert shell.planner.receive() is None
+    shell.serves = False
+    shell.cycles(1)
+    assert shell.planner.receive() is not None
 
 
 def test_a_machine_that_stands_still_is_no_frozen_gateway(shell: Shell) -> None:

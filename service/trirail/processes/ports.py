@@ -69,9 +69,13 @@ class GatewayLink:
             yield self._in_hand.pop(0)
 
     def lost(self) -> str | None:
-        """Return how it has been lost in this cycle, to be asked once in each; None where it has not."""
+        """Return how it has been lost in this cycle, to be asked once in each; None where it has not.
+
+        What has been read of it and not taken up goes with it: nobody is there who could stop what would come of that.
+        """
         if self._port.take_lost():
             self.frozen = False
+            self._in_hand.clear()
             return "the gateway is gone: controlled stop"
         if self._watch.silent():
             if not self.frozen:
