@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from contextlib import aclosing
+from contextlib import aclosing, suppress
 
 import pytest
 from refusals import refused_as
 from trirail.client.async_client import AsyncRobot
-from trirail.errors import RefusalCode
+from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.goals import TrajectoryPoint
 from trirail.wire.records import unpack
 from trirail.wire.state import State
@@ -133,18 +133,21 @@ def test_a_task_that_is_cancelled_while_it_jogs_moves_nothing_any_more(locator: 
 def test_a_goal_whose_sender_is_cancelled_does_not_go_on(locator: str) -> None:
     async def work(robot: AsyncRobot) -> None:
         for number in range(20):  # cancelled as early, or as late, as it comes
-            sending = asyncio.create_task(robot.move_to(x=0.1, y=0.0, phi=0.0, speed=0.1, id=f"g{number}"))
+            sending = asyncio.create_task(robot.move_to(x=0.1, y=0.0, phi=0.0, speed=0.001, id=f"g{number}"))
             for _ in range(number):
                 await asyncio.sleep(0)
-            sending.cancel()
-            try:
-                await sending
-            except asyncio.CancelledError:
-                pass
-            else:
-                raise AssertionError("it was not cancelled")
-        state = await until(robot, lambda state: state.mode == "holding" and state.goal is None)
-        later = await until(robot, lambda newer: newer.seq > state.seq + 500)
-        assert later.commanded.pose == pytest.approx(state.commanded.pose, abs=1e-12)
+            if sending.cancel():
+                with pytest.raises(asyncio.CancelledError):
+                    await sending
+            else:  # answered before, while the one before it was still being stopped
+                with suppress(RefusedError):
+                    await (await sending).cancel()
+        moved = (await robot.state()).seq
+        async with aclosing(robot.states(WITHIN)) as states:  # a goal that went on would take more than a minute
+            async for state in states:
+                if state.mode != "holding" or state.goal is not None:
+                    moved = state.seq
+                elif state.seq > moved + 500:
+                    break
 
     run(locator, work)
