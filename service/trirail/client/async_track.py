@@ -41,9 +41,9 @@ class AsyncTrack(FollowedTarget[AsyncGoalHandle]):
         goal = self._goal_of(pose, velocity, clocks.time() if time is None else time)
         if self._goal is None:
             self._goal = await self._begin(lambda _: goal, self.id)
-            self._on_answer(self._goal.reply)
+            self._lag = self._goal.reply.lag
         else:
-            self._post(goal, self._on_answer)
+            self._send(goal)
 
     async def close(self) -> None:
         """Brake on the path, if the robot still follows; return when it stands."""

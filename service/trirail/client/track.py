@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import itertools
 import threading
 import time as clocks
 from collections.abc import Callable, Sequence
 from typing import Generic, Self, TypeVar
 
 from trirail.client.goal import STANDS_WITHIN, AcceptedGoal, GoalHandle, Result
-from trirail.errors import RefusalCode, RefusedError, TrirailError
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.goals import Goal, TrackGoal
 from trirail.wire.messages import GoalReply
 
@@ -27,6 +29,9 @@ class FollowedTarget(Generic[Handle]):
         self._timeout = timeout
         self._goal: Handle | None = None
         self._lock = threading.Lock()
+        self._numbers = itertools.count(1)
+        self._answered = 0
+        """The newest update that has been answered."""
         self._error: TrirailError | None = None
         self._lag: float | None = None
 
@@ -56,8 +61,16 @@ class FollowedTarget(Generic[Handle]):
         if error is not None:
             raise error
 
-    def _on_answer(self, answer: GoalReply | TrirailError) -> None:
+    def _send(self, goal: Goal) -> None:
+        """Send what is not the first, and have its answer taken later."""
+        self._post(goal, functools.partial(self._on_answer, next(self._numbers)))
+
+    def _on_answer(self, number: int, answer: GoalReply | TrirailError) -> None:
+        """Take what has come of an update; that one was lost on the way is no matter where a later one was answered."""
         with self._lock:
+            if isinstance(answer, ServiceError) and number < self._answered:
+                return
+            self._answered = max(self._answered, number)
             if isinstance(answer, TrirailError):
                 self._error = answer
             elif answer.lag is not None:
@@ -102,9 +115,9 @@ class Track(FollowedTarget[GoalHandle]):
         goal = self._goal_of(pose, velocity, clocks.time() if time is None else time)
         if self._goal is None:
             self._goal = self._begin(lambda _: goal, self.id)
-            self._on_answer(self._goal.reply)
+            self._lag = self._goal.reply.lag
         else:
-            self._post(goal, self._on_answer)
+            self._send(goal)
 
     def close(self) -> None:
         """Brake on the path, if the robot still follows; return when it stands."""

@@ -1,0 +1,71 @@
+"""A track's updates are posted, and what comes of them is heard whenever it comes, in whatever order."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.client.goal import GoalHandle
+from trirail.client.track import Taker, Track
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
+from trirail.wire.goals import Goal
+from trirail.wire.messages import GoalReply
+
+POSE = 0.0, 0.0, 0.0
+UPDATES = 12
+
+
+def no_command(*_: object) -> None:
+    raise AssertionError("nothing was to be commanded")
+
+
+class Sent:
+    """A track of which all updates have been sent, and what takes the answer to each after the first."""
+
+    def __init__(self) -> None:
+        self.takers: list[Taker] = []
+        self.track = Track(self._begin, self._post, "target", 0.25)
+        for _ in range(UPDATES + 1):
+            self.track.update(POSE)
+
+    def _begin(self, _: object, goal_id: str) -> GoalHandle:
+        handle = GoalHandle(goal_id, no_command)
+        handle.reply = GoalReply(goal_id, None, lag=0.0)
+        return handle
+
+    def _post(self, _: Goal, take: Taker) -> None:
+        self.takers.append(take)
+
+    def told(self) -> TrirailError | None:
+        """What the next update raises."""
+        try:
+            self.track.update(POSE)
+        except TrirailError as error:
+            return error
+        return None
+
+
+@given(st.permutations(range(UPDATES)), st.sets(st.integers(0, UPDATES - 1)))
+def test_an_update_that_was_lost_is_told_only_where_no_later_one_was_answered(order: list[int], lost: set[int]) -> None:
+    sent, newest = Sent(), -1
+    for number in order:
+        sent.takers[number](ServiceError("silent") if number in lost else GoalReply("target", None, lag=number * 1e-3))
+        told = sent.told()
+        assert (told is not None) == (number in lost and number > newest)
+        newest = max(newest, number)
+
+
+@given(st.permutations(range(UPDATES)))
+def test_a_refusal_is_told_whenever_it_comes(order: list[int]) -> None:
+    sent = Sent()
+    for number in order:
+        sent.takers[number](RefusedError(RefusalCode.JOG_OVER, "it has ended"))
+        assert isinstance(sent.told(), RefusedError)
+
+
+def test_the_lag_is_what_the_service_last_said() -> None:
+    sent = Sent()
+    assert sent.track.lag == pytest.approx(0.0)
+    sent.takers[3](GoalReply("target", None, lag=2e-3))
+    sent.takers[4](GoalReply("target", None))
+    assert sent.track.lag == pytest.approx(2e-3)
