@@ -80,11 +80,12 @@ def test_a_frozen_recorder_is_replaced_and_the_robot_does_not_mind(service: Serv
 
 
 def test_a_frozen_loop_ends_the_service_and_everyone_is_told(service: Service) -> None:
-    heard: list[Event] = []
     with service.robot() as robot:
         in_motion(robot)
+        told = robot.events(history=True, timeout=20.0)
+        heard = [next(told)]
         os.kill(service.child("loop"), signal.SIGSTOP)
-        for event in robot.events(history=True, timeout=20.0):
+        for event in told:
             heard.append(event)
             if event.mode == "fault":
                 break
