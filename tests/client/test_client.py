@@ -93,6 +93,19 @@ def test_events_are_told_once_and_in_order_whatever_comes_again(noisy: Robot) ->
     assert told[-1] == NEWEST.seq
 
 
+def test_a_service_that_does_not_answer_in_time_is_told_as_that(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client, "REPLY_WITHIN", TIMEOUT)
+    locator, mute = f"unixsock-stream/{tmp_path}/zenoh", list[zenoh.Query]()
+    with open_service([locator]) as session, session.declare_queryable("trirail/demo/**", mute.append):
+        with Robot("demo", locator) as robot:
+            for order in (robot.stop, robot.enable):
+                with pytest.raises(ServiceError, match=rf"robot 'demo' at {locator} has not answered in time"):
+                    order()
+        mute.clear()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("kind", [Robot, AsyncRobot])
 def test_the_environment_says_which_robot_and_where_as_in_a_shell(

@@ -33,6 +33,8 @@ HERE_WITHIN = 1.0
 """How long the answer may take who is connected [s]."""
 POST_WITHIN = 2.0
 """How long the answer may take to what is posted [s]."""
+ZENOHS_TIMEOUT = b"Timeout"
+"""What Zenoh itself answers to a query whose time is over."""
 OVERTAKEN_WITHIN = 1.0
 """How long a state may be on its way that an answer or an event has overtaken [s]; a service that was started again
 within it, and counts from one, is heard after it."""
@@ -118,7 +120,13 @@ class Connection:
             except RefusedError as error:
                 return ServiceError(f"somebody answered at {self._connect}, but {error}")
             return self._noted(answer)
-        refused = refusal(reply.err.payload.to_bytes() if reply.err is not None else b"")
+        content = reply.err.payload.to_bytes() if reply.err is not None else b""
+        if content == ZENOHS_TIMEOUT:
+            return ServiceError(
+                f"robot {self.robot!r} at {self._connect} has not answered in time: its service, or the network to it, "
+                "is overloaded or hangs; its log tells more"
+            )
+        refused = refusal(content)
         if isinstance(refused, RefusedError):
             raise refused
         return refused
