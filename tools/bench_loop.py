@@ -25,8 +25,8 @@ from bench_rig import QUANTILES, Rig, quantiles, rig, without_pause
 from numpy.typing import NDArray
 from trirail.client.client import Robot
 from trirail.config import SIM, load
+from trirail.diagnosis import bare_loop
 from trirail.errors import TrirailError
-from trirail.processes import bare_loop
 from trirail.wire.records import PARTS, Part, unpack
 from trirail.wire.vocabulary import Mode
 

@@ -18,10 +18,9 @@ from hypothesis import strategies as st
 from trirail.cli import doctor, doctor_cycle, doctor_network, probes
 from trirail.cli.machine import Gathered, Machine, Passed
 from trirail.config import SIM, Config, Tls, everything, load
-from trirail.diagnosis import Check, drive_checks
+from trirail.diagnosis import Check, bare_loop, drive_checks
+from trirail.diagnosis.bare_loop import Cycles
 from trirail.errors import ServiceError
-from trirail.processes import bare_loop
-from trirail.processes.bare_loop import Cycles
 from trirail_drivers.bus.frames import bits_of, frame_bits
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.errors import BusError

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from bench_latency import Setpoint
 from bench_rig import QUANTILES, Rig
-from trirail.processes.bare_loop import Cycles
+from trirail.diagnosis.bare_loop import Cycles
 from trirail.wire.records import PARTS
 
 

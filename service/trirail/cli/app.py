@@ -70,8 +70,8 @@ def run(
 
     os.environ.update(ONE_THREAD)  # before anything imports numpy
 
+    from trirail.cli.service_log import Log
     from trirail.config import SIM, load
-    from trirail.processes.log import Log
     from trirail.processes.supervisor import Supervisor
     from trirail.wire.starting import Starting
 

@@ -6,7 +6,7 @@ from msgspec import Struct
 
 from trirail.config import Config
 from trirail.diagnosis import Check
-from trirail.processes.bare_loop import Cycles, Spread, spread
+from trirail.diagnosis.bare_loop import Cycles, Spread, spread
 
 SHARE = 0.5
 """Of a period, after which 999 of 1000 bare cycles are to be over: the rest is for the service's own arithmetic."""

@@ -7,7 +7,7 @@ from typing import Any
 from msgspec import Struct
 
 from trirail.cli.key_folder import Issued
-from trirail.processes.bare_loop import Cycles
+from trirail.diagnosis.bare_loop import Cycles
 from trirail.processes.session_guard import Guard
 
 

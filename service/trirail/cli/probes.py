@@ -23,9 +23,10 @@ from trirail_drivers.bus import adapters
 from trirail.cli.key_folder import AUTHORITY_KEY, Issued, KeyFolder
 from trirail.cli.machine import Gathered, Machine, Passed
 from trirail.config import Config, LoopTable
+from trirail.diagnosis import bare_loop
+from trirail.diagnosis.bare_loop import Cycles
 from trirail.errors import ServiceError
-from trirail.processes import bare_loop, realtime
-from trirail.processes.bare_loop import Cycles
+from trirail.processes import realtime
 from trirail.processes.interpreter import title
 from trirail.processes.session_guard import Guard
 

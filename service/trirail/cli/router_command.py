@@ -19,7 +19,7 @@ def router(config: Path, /, *, print_config: Annotated[bool, Flag] = False) -> i
     print_config
         Print the same as a configuration of zenohd, Zenoh's own program, and end. It tells nobody his role.
     """
-    from trirail.processes import router as routers
+    from trirail.cli import router as routers
 
     settings = routers.load(config)
     if print_config:

@@ -10,7 +10,7 @@ import re
 import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.processes.log import Log
+from trirail.cli.service_log import Log
 from trirail.wire.messages import Event
 
 FAULT = Event(7, 1.0, 1000, 1_700_000_000.25, "fault", "error", "drive B: following error", mode="fault")

@@ -28,7 +28,7 @@ from trirail.processes.interpreter import python
 
 TURN: Final = 0.25
 """For so long the compiled call goes on, and then Python looks at signals and progress [s]."""
-_MODULE: Final = "trirail.processes.bare_loop"
+_MODULE: Final = "trirail.diagnosis.bare_loop"
 _SYNC, _SETPOINT, _POSITION = 0x080, 0x201, 0x181
 """Identifiers of CiA 301's predefined connections, of the first node."""
 _DATA: Final = bytes(8)

@@ -16,12 +16,11 @@ import pytest
 import zenoh
 from certificates import ROLES, user
 from control_rig import CONFIG
-from trirail.cli import router_command
+from trirail.cli import router, router_command
 from trirail.cli.key_folder import KeyFolder
+from trirail.cli.router import RouterConfig
 from trirail.config import Config, Tls, Zenoh
 from trirail.errors import ConfigError, ServiceError
-from trirail.processes import router
-from trirail.processes.router import RouterConfig
 from trirail.processes.session_guard import Guard
 from trirail.telemetry.sinks import free_port
 from trirail.wire import zenoh_session
