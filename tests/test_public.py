@@ -43,7 +43,7 @@ def top_level(*packages: ModuleType) -> Iterator[ast.stmt]:
         ("from trirail.config import SIM, load; load(SIM)", {"numpy", "can", "canopen"}),
         ("from trirail.processes import supervisor", {"numpy"}),
         ("from trirail.processes import gateway", {"numpy", "zenoh"}),
-        ("from trirail.processes import planner_process", {"numpy", "numba", "ruckig"}),
+        ("from trirail.motion import motion_planner", {"numpy", "numba", "ruckig"}),
         ("from trirail.processes import loop_process", {"numpy", "numba", "ruckig", "can", "canopen"}),
         ("from trirail.processes import recording", {"numpy", "rerun"}),
     ],

@@ -34,7 +34,7 @@ import sys
 from pathlib import Path
 outcome = "failed"
 try:
-    from trirail.processes import gateway, loop, planner_process, recording
+    from trirail.processes import gateway, loop_process, recording
     from trirail.client import client
     outcome = "well"
 finally:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from trirail.processes.realtime import give_back
 from trirail.processes.systemd import notify
 
-LOADED = "trirail.processes.rehearsal"
+LOADED = "trirail.processes.loop_process"
 """The module that is imported last, once all compiled rooms are."""
 QUARTERS = 4
 """So many parts of the work are told of."""
@@ -82,7 +82,7 @@ def compile_all(begin: Callable[[str], None]) -> None:
 
 
 def _import_rooms() -> None:
-    from trirail.processes import planner_process, rehearsal  # noqa: F401 - importing compiles
+    from trirail.processes import loop_process  # noqa: F401 - importing compiles
 
 
 def main() -> int:

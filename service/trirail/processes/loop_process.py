@@ -1,27 +1,186 @@
-"""The loop's process: it rehearses, connects the drives, takes its rights, and turns until it is told to end."""
+"""The loop's process: it rehearses, connects the drives, takes its rights, and turns until it is told to end.
+
+What must come without delay, stop, quick stop, a fault, a lost gateway, the end, it runs once, on simulated drives of
+the configured kind, before the first cycle on the real ones: what that needs is then in memory, and locked there.
+"""
 
 from __future__ import annotations
 
+import os
 import signal
-from collections.abc import Callable
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
 from types import FrameType
 
+from msgspec import structs
 from trirail_drivers.bus.capture import Capture
 from trirail_drivers.config import Can
-from trirail_drivers.connection.opening import connect
-from trirail_drivers.interface import DriveGroup
+from trirail_drivers.connection.opening import connect, simulated_bus
+from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import NAMES, DriveGroup
+from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.config import Config
 from trirail.kinematics.robot import warm_up
+from trirail.motion.motion_planner import MotionPlanner
 from trirail.processes import realtime
 from trirail.processes.clock import Ticker
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.loop import Loop
 from trirail.processes.ports import Ports
-from trirail.wire.packets import Farewell, message
+from trirail.wire import links
+from trirail.wire.goals import VelocityGoal
+from trirail.wire.links import PacketLink, Port
+from trirail.wire.packets import CommandRequest, Farewell, GoalRequest, Request, message
+from trirail.wire.plan_packets import MAX_PLANNING, decode_plan_request, encode
+from trirail.wire.vocabulary import Command, Mode
 
 PLANNER_WITHIN = 120.0
 """How long the planner may take to come up: the very first start compiles the kinematics [s]."""
+STEP_WITHIN = 500
+"""Cycles after which the next step comes, whatever has become of the one before."""
+IN_MOTION = 20
+"""Cycles of a jog before what ends it."""
+SLOW = 0.1
+"""Share of the platform's velocity along x at which it jogs."""
+
+
+class _RehearsedTime:
+    """The monotonic clock until the cycles begin, and then their time: a busy machine makes nobody late."""
+
+    def __init__(self) -> None:
+        self._now: float | None = None
+
+    def __call__(self) -> float:
+        return time.monotonic() if self._now is None else self._now
+
+    def advance(self, seconds: float) -> None:
+        self._now = self() + seconds
+
+
+class _Rehearsal:
+    """Ticks as fast as it can, and does what gateway, planner and drives would."""
+
+    def __init__(self, config: Config, folder: Path) -> None:
+        self._config = config
+        self._folder = folder
+        self._clock = _RehearsedTime()
+        self._bus = simulated_bus(config.can, config.drives, self._clock)
+        driver = PROTOCOLS[config.drives.protocol].driver
+        self._drives = driver(self._bus, config.can.bitrate, config.drives, self._clock)
+        listening = [links.listen(folder / name) for name in Ports._fields]
+        gateway, recorder, planner = listening
+        self._ports = Ports(Port(gateway), Port(recorder), Port(planner, MAX_PLANNING))
+        self._heartbeats = Heartbeats.create()
+        # What Python does is rehearsed, in each cycle: compiled code has its pages from the first one on.
+        self._loop = Loop(config, self._drives, self._ports, self._heartbeats, quiet=False, now=lambda: self._now_ns)
+        self._asked = links.connect(folder / "planner", MAX_PLANNING)
+        self._planner = MotionPlanner(config)
+        self._gateway: PacketLink | None = None
+        self._now_ns = round(self._clock() * 1e9)
+        self._tickets = 0
+        self._steps = self._script()
+
+    def run(self) -> None:
+        """Run all of it."""
+        try:
+            self._drives.configure(self._config.period, self._config.limits.slider.fastest)
+            self._loop.run(Ticker(round(self._config.period * 1e9), lambda: self._now_ns, self._pass))
+        finally:
+            self._drives.close()
+            self._hang_up()
+            self._asked.close()
+            os.close(self._heartbeats.descriptor)
+            for port in self._ports:
+                port.close()
+
+    def _pass(self, deadline_ns: int) -> None:
+        """Let a period pass, and the others do what they have to."""
+        self._clock.advance(self._config.period)
+        self._now_ns = deadline_ns
+        while (packet := self._asked.receive()) is not None:
+            self._asked.send(encode(self._planner.plan(decode_plan_request(packet))))
+        next(self._steps, None)
+
+    def _script(self) -> Iterator[None]:
+        yield from self._jog()
+        self._order(Command.STOP)
+        yield from self._until(lambda: self._mode is Mode.HOLDING)
+        yield from self._jog()
+        self._order(Command.QUICK_STOP)
+        yield from self._until(lambda: self._mode is Mode.FAULT)
+        yield from self._reset()
+        yield from self._jog()
+        self._bus.faults.add("A fault 2310")
+        yield from self._until(lambda: self._mode is Mode.FAULT)
+        yield from self._reset()
+        yield from self._jog()
+        self._hang_up()
+        yield from self._until(lambda: self._mode is Mode.HOLDING)
+        self._loop.ending = True
+
+    def _reset(self) -> Iterator[None]:
+        """Leave the fault once the robot stands."""
+        yield from self._until(lambda: not self._loop.control.measured.powered)
+        self._order(Command.RESET)
+        yield from self._until(lambda: self._mode is Mode.DISABLED)
+
+    def _jog(self) -> Iterator[None]:
+        """Have the robot in motion, with power and a gateway."""
+        if self._gateway is None:
+            self._gateway = links.connect(self._folder / "gateway")
+            yield from self._until(lambda: self._ports.gateway.connected)
+        if self._mode is not Mode.HOLDING:
+            self._order(Command.ENABLE)
+            yield from self._until(lambda: self._mode is Mode.HOLDING)
+        velocity = VelocityGoal(SLOW * self._config.limits.platform.velocity[0], 0.0, 0.0, timeout=10.0)
+        self._tickets += 1
+        self._send(GoalRequest(self._tickets, "", f"{self._tickets}", velocity, self._now_ns))
+        yield from self._until(lambda: self._mode is Mode.MOVING)
+        yield from self._until(lambda: False, IN_MOTION)
+
+    @property
+    def _mode(self) -> Mode:
+        return self._loop.control.state.mode
+
+    def _until(self, condition: Callable[[], bool], within: int = STEP_WITHIN) -> Iterator[None]:
+        """Let cycles pass until something holds, so many at most."""
+        for _ in range(within):
+            yield
+            if self._gateway is not None:
+                while self._gateway.receive() is not None:
+                    pass
+            if condition():
+                return
+
+    def _order(self, name: Command) -> None:
+        self._tickets += 1
+        with self._heartbeats.hurrying() if name.stops else nullcontext():
+            self._send(CommandRequest(self._tickets, "", name))
+
+    def _send(self, request: Request) -> None:
+        if self._gateway is not None:
+            self._gateway.send(message(request))
+
+    def _hang_up(self) -> None:
+        if self._gateway is not None:
+            self._gateway.close()
+            self._gateway = None
+
+
+def rehearse(config: Config) -> tuple[str, ...]:
+    """Run what must come without delay, once; return why that was not possible, if it was not."""
+    each = {name: structs.replace(drive, homing=None) for name, drive in zip(NAMES, config.drives.each, strict=True)}
+    config = structs.replace(config, drives=structs.replace(config.drives, **each))
+    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+        try:
+            _Rehearsal(config, Path(folder)).run()
+        except DriveError as error:
+            return (f"rehearsed stops: {error}",)
+    return ()
 
 
 def main(
@@ -30,12 +189,10 @@ def main(
     ports: Ports,
     heartbeats: Heartbeats,
     ready: Callable[[object], None],
-    rehearse: Callable[[Config], tuple[str, ...]],
 ) -> int:
     """Run the loop's process; `ready` is called with what the loop runs without once it turns.
 
-    `bus` waits for the drives' bus and returns it. `rehearse` runs what must come without delay, before the drives are
-    touched, and returns what kept it from that.
+    `bus` waits for the drives' bus and returns it.
     """
     drives: DriveGroup | None = None
     ended_as_told = False

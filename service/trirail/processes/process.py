@@ -7,21 +7,27 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import socket
 import sys
+import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import msgspec
+from trirail_drivers.config import Can
 
 from trirail.config import Config
-from trirail.errors import TrirailError
-from trirail.processes.heartbeats import Heartbeats
+from trirail.errors import ServiceError, TrirailError
+from trirail.processes import realtime
+from trirail.processes.heartbeats import BEAT_EVERY, Heartbeats
 from trirail.processes.ports import Ports
 from trirail.wire import links
+from trirail.wire.links import Closed
 from trirail.wire.messages import Event
-from trirail.wire.plan_packets import MAX_PLANNING
+from trirail.wire.plan_packets import MAX_PLANNING, decode_plan_request, encode
 
 
 class Order(msgspec.Struct, frozen=True):
@@ -40,6 +46,12 @@ MEASURED = "measured"
 """The key of what a process has measured, for the metrics."""
 LOG_WITHIN = 0.05
 """How long a line for the log waits for a supervisor whose own output is held up, before it is left out [s]."""
+DRIVES: Final = "drives"
+"""The process of the simulated drives, and its socket in the service's folder of sockets."""
+DRIVES_WITHIN: Final = 60.0
+"""How long the drives may take to be there [s]."""
+LOOK_EVERY: Final = 0.005
+"""How often it is seen whether they are [s]."""
 
 
 class Child:
@@ -95,22 +107,17 @@ def _run(child: Child) -> int:
         from trirail.kinematics.compiled import tell_of_compiling
 
         tell_of_compiling(child.compiling)
-    if name == "drives":
-        from trirail.processes import drives_process
-
-        return drives_process.main(config, child.runtime, child.ready)
+    if name == DRIVES:
+        return _serve_drives(child)
     if name == "loop":
-        from trirail.processes import drives_process, loop_process
-        from trirail.processes.rehearsal import rehearse
+        from trirail.processes import loop_process
 
         gateway, recorder, planner = (socket.socket(fileno=number) for number in child.sockets)
         ports = Ports(links.Port(gateway), links.Port(recorder), links.Port(planner, MAX_PLANNING))
-        bus = partial(drives_process.bus, config, child.runtime)
-        return loop_process.main(config, bus, ports, child.heartbeats, child.ready, rehearse)
+        bus = partial(_bus, config.can, child.runtime / DRIVES)
+        return loop_process.main(config, bus, ports, child.heartbeats, child.ready)
     if name == "planner":
-        from trirail.processes import planner_process
-
-        return planner_process.main(config, child.runtime / name, child.heartbeats.of(name), child.ready)
+        return _plan(child)
     heart = child.heartbeats.of(name)
     link = links.connect(child.runtime / name)
     if name == "gateway":
@@ -120,3 +127,71 @@ def _run(child: Child) -> int:
     from trirail.processes import recording
 
     return recording.main(config, child.order.record, link, heart, child.ready, child.measured)
+
+
+def _plan(child: Child) -> int:
+    """Be the planner: answer what the loop asks, one request at a time, until the loop has gone.
+
+    It runs beside the loop and never on its processor; it keeps nothing, so it may be killed at any time.
+    """
+    from trirail.motion.motion_planner import MotionPlanner
+
+    def beat() -> None:
+        if serving:  # the first start compiles in its warm-up
+            heart.beat()
+
+    serving = False
+    config, heart = child.order.config, child.heartbeats.of(child.name)
+    planner = MotionPlanner(config, beat)
+    planner.warm_up()
+    lacking = realtime.stay_beside(config.loop, realtime.PLANNER_BELOW)
+    link = links.connect(child.runtime / child.name, MAX_PLANNING)
+    child.ready({"lacking": lacking})
+    poll = select.poll()
+    poll.register(link.fileno(), select.POLLIN)
+    serving = True
+    try:
+        while True:
+            heart.beat()
+            poll.poll(BEAT_EVERY * 1e3)
+            newest = None  # nobody waits any more for what was asked before
+            while (packet := link.receive()) is not None:
+                newest = packet
+            if newest is not None:
+                link.send(encode(planner.plan(decode_plan_request(newest))))
+    except Closed:
+        heart.rest()
+    return 0
+
+
+def _serve_drives(child: Child) -> int:
+    """Be the simulated drives until the loop has gone: it has them on a bus between processes, as real ones on theirs.
+
+    They keep nothing, so they may be killed when it has.
+    """
+    from trirail_drivers.connection.serving import serve
+
+    config = child.order.config
+
+    def begin() -> None:
+        lacking = realtime.stay_beside(config.loop, realtime.DRIVES_BELOW)
+        child.ready({"lacking": lacking})
+
+    def connected() -> None:
+        # The loop stops the robot first, whoever is told to end; its end is the end of this process.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+    serve(child.runtime / DRIVES, config.can, config.drives, begin, connected)
+    return 0
+
+
+def _bus(can: Can, drives: Path) -> Can:
+    """Section [can] of the bus that the loop is on; where the drives are simulated, once their process serves them."""
+    if can.interface != "simulated":
+        return can
+    deadline = time.monotonic() + DRIVES_WITHIN
+    while not drives.exists():
+        if time.monotonic() > deadline:
+            raise ServiceError(f"the simulated drives are not there within {DRIVES_WITHIN:g} s")
+        time.sleep(LOOK_EVERY)
+    return msgspec.structs.replace(can, interface="unix", channel=str(drives))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from trirail.config import SIM, load
 from trirail.control.control import Control
-from trirail.processes.rehearsal import rehearse
+from trirail.processes.loop_process import rehearse
 from trirail.wire.vocabulary import Mode
 
 CONFIGS = sorted(file for file in (SIM, *(SIM.parent / "drives").glob("*.toml")))
