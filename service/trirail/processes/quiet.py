@@ -11,36 +11,33 @@ the end of a batch of records at the latest.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numba import f8, from_dtype, i8, types, u1, u8
 from numpy.typing import NDArray
-from trirail_drivers.bus.frames import BITS
 from trirail_drivers.driver.cyclic import MOST_FRAMES
 
 from trirail.control import cycle
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
-from trirail.processes.bus_calls import memcpy, receive_frames, send_frames
 from trirail.processes.clock import DOORS, SPARE_NS, called, now_ns, sleep, wait
 from trirail.processes.cycle_frames import (
     AXES,
     EXPECTATIONS,
     FRAMES,
-    LENGTH_AT,
     TIMINGS,
     begin_cycle,
     end_read,
+    memcpy,
+    receive_frames,
+    send_frames,
     set_frames,
     take_frames,
 )
 from trirail.processes.heartbeats import HASTE
 from trirail.wire.records import LONGEST, Part
-
-__all__ = ["COMMAND", "FOLLOW", "HOLD", "STATE", "Reached", "run"]
 
 _GONE: Final = (0x008 | 0x010) << 16
 """POLLERR and POLLHUP of poll.h, where poll leaves them."""
@@ -148,17 +145,6 @@ def _copy(kept: NDArray[np.int64], to: int, source: int) -> None:
         memcpy(kept[i, to], kept[i, source], np.uint64(kept[i, 2]))
 
 
-@compiled()
-def _send(
-    bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], times: NDArray[np.void]
-) -> int:
-    """Send frames, count what they take of the bus, and return how many it has taken."""
-    number = send_frames(bus, headers, frames)
-    for i in range(number):
-        times[0].traffic += BITS[frames[i, LENGTH_AT]]
-    return number
-
-
 @compiled(
     i8(
         *(_STATE, i8[:, ::1], i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
@@ -245,10 +231,10 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             return Reached.WAITED
         s.deadline_ns, s.lateness_ns = s.deadline_ns + s.missed * s.period_ns, s.lateness_ns - s.missed * s.period_ns
         s.synced, s.arrived = t, 0
-        begun, due = _send(bus, begin, starts, times), t >= times[0].beat_due
+        begun, due = send_frames(bus, begin, starts, times), t >= times[0].beat_due
         first, number = times[0].next_beat, times[0].beats
         if begun == len(begin) and due:
-            begun += _send(bus, beats[first : first + number], signs[first : first + number], times)
+            begun += send_frames(bus, beats[first : first + number], signs[first : first + number], times)
         if begun < len(begin) + number * due:
             times[0].begun = begun
             return Reached.SYNCED
@@ -308,7 +294,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
 
         s.called, s.found = in_position or somebody or code != s.found or s.cycle + 1 >= s.due, code
         s.arrived, s.time, s.gateway_seen, s.gateway_turns = 0, time, count, turns
-        s.sent = _send(bus, departures, setpoints, times)
+        s.sent = send_frames(bus, departures, setpoints, times)
         _mark(state, moment, Part.WRITE)
 
         s.cycle += 1
@@ -326,10 +312,3 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         if s.called:
             return Reached.DONE
     return Reached.DONE
-
-
-def copies(arrays: Sequence[NDArray[Any]]) -> tuple[NDArray[np.int64], list[NDArray[Any]]]:
-    """Return what `run` keeps of arrays, (n, 3), and the room where it keeps it, which is to live as long."""
-    rooms = [np.empty_like(array) for array in arrays]
-    rows = [(array.ctypes.data, room.ctypes.data, array.nbytes) for array, room in zip(arrays, rooms, strict=True)]
-    return np.array(rows, np.int64), rooms

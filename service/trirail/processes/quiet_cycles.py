@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import MutableSequence
+from collections.abc import MutableSequence, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -185,7 +185,7 @@ class QuietCycles:
                 *(measured.settling.monitored, measured.record, schedule.motion, setpoints.sliders),
                 *(setpoints.found, lent.axes, lent.times, lent.history, self._nothing),
             )
-            self._kept, self._rooms = quiet.copies(kept)
+            self._kept, self._rooms = _copies(kept)
         return (
             *(self._state, self._kept, self._moment, lent.bus),
             *(lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
@@ -203,3 +203,10 @@ class QuietCycles:
         furthest = run.furthest if run is not None else self._nothing
         self._kept[-1, 0] = furthest.ctypes.data
         return path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest
+
+
+def _copies(arrays: Sequence[NDArray[Any]]) -> tuple[NDArray[np.int64], list[NDArray[Any]]]:
+    """Return what the compiled call keeps of arrays, (n, 3), and the rooms where it does, which are to live as long."""
+    rooms = [np.empty_like(array) for array in arrays]
+    rows = [(array.ctypes.data, room.ctypes.data, array.nbytes) for array, room in zip(arrays, rooms, strict=True)]
+    return np.array(rows, np.int64), rooms
