@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from trirail.processes.fork_server import Inheritance
-from trirail.processes.interpreter import python
+from trirail.processes.operating_system import python
 
 ENDING = """
 import socket

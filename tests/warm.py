@@ -108,7 +108,7 @@ def pytest_configure(config: pytest.Config) -> None:
 @functools.cache
 def _parent() -> socket.socket:
     """Start the warm process; it ends with this one, and ends what it has forked."""
-    from trirail.processes.interpreter import ONE_THREAD, python
+    from trirail.processes.operating_system import ONE_THREAD, python
 
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:

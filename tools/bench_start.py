@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from trirail.client import own_service
-from trirail.processes.interpreter import processes
+from trirail.processes.operating_system import processes
 from trirail.telemetry.sinks import free_port
 
 TICK = os.sysconf("SC_CLK_TCK")

@@ -20,7 +20,7 @@ from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.config import SIM, load
 from trirail.errors import EmptyRecordingError, ServiceError, TrirailError
-from trirail.processes.interpreter import child
+from trirail.processes.operating_system import child
 from trirail.telemetry.reading import Recording, read
 from trirail.telemetry.sinks import HOST, free_port
 from trirail.wire.state import State
@@ -285,7 +285,7 @@ class Rig:
 
 
 def _python(*arguments: str) -> list[str]:
-    from trirail.processes.interpreter import python
+    from trirail.processes.operating_system import python
 
     # A tool finds its neighbours by its own folder, which -P would leave out; the current one is not on its path.
     return [python()[0], *arguments]

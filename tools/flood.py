@@ -35,7 +35,7 @@ import zenoh
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import RefusedError, ServiceError, TrirailError
-from trirail.processes.interpreter import processes, python
+from trirail.processes.operating_system import processes, python
 from trirail.telemetry.sinks import free_port
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from PIL import Image
 from rerun.experimental import ViewerClient
-from trirail.processes.interpreter import python
+from trirail.processes.operating_system import python
 from trirail.telemetry.sinks import free_port
 
 TIMEOUT = 60.0

@@ -19,7 +19,7 @@ from refusals import refused_as
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError, ServiceError
-from trirail.processes.interpreter import child
+from trirail.processes.operating_system import child
 from trirail.wire.zenoh_session import open_client
 from warm import trirail
 

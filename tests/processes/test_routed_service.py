@@ -16,7 +16,7 @@ from processes.test_service import Service, until, wait_readable
 from trirail.client.client import Robot
 from trirail.client.fleet import Attention, Fleet, Member
 from trirail.errors import ServiceError
-from trirail.processes.interpreter import python
+from trirail.processes.operating_system import python
 from warm import trirail
 
 pytestmark = pytest.mark.slow

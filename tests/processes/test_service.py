@@ -32,7 +32,7 @@ from trirail.cli.remote_view import RemoteView
 from trirail.client.client import Robot
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError, ServiceError
-from trirail.processes.interpreter import child, processes, python
+from trirail.processes.operating_system import child, processes, python
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import read
 from trirail.wire.goals import OwnLimits

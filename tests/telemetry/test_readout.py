@@ -17,7 +17,7 @@ from markdown_it import MarkdownIt
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 from trirail.config import SIM, load
-from trirail.processes.interpreter import python
+from trirail.processes.operating_system import python
 from trirail.telemetry import readout
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.shown_robot import ShownRobot

@@ -66,7 +66,7 @@ def run(
     log
         Write what happens as lines for people, or as JSON, instead of as [telemetry] log has it.
     """
-    from trirail.processes.interpreter import ONE_THREAD
+    from trirail.processes.operating_system import ONE_THREAD
 
     os.environ.update(ONE_THREAD)  # before anything imports numpy
 

@@ -17,7 +17,7 @@ from trirail.client import own_service
 from trirail.client.client import Result, Robot
 from trirail.config import Config, load
 from trirail.errors import ConfigError, RefusedError
-from trirail.processes.signals import Signals
+from trirail.processes.operating_system import Signals
 from trirail.wire.state import State
 
 GOAL_WITHIN = 15.0

@@ -32,7 +32,7 @@ def panel(
     """
     from trirail.client.client import Robot
     from trirail.panel.server import Panel
-    from trirail.processes.signals import Signals
+    from trirail.processes.operating_system import Signals
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with Robot(service.robot, service.connect, tls=service.tls) as robot, Panel(robot, port) as served:

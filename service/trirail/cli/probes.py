@@ -27,7 +27,7 @@ from trirail.diagnosis import bare_loop
 from trirail.diagnosis.bare_loop import Cycles
 from trirail.errors import ServiceError
 from trirail.processes import realtime
-from trirail.processes.interpreter import title
+from trirail.processes.operating_system import title
 from trirail.processes.session_guard import Guard
 
 SYSTEM = Path("/sys")

@@ -18,7 +18,7 @@ from urllib.parse import quote, urlsplit
 
 from trirail.client.client import Robot
 from trirail.errors import ServiceError
-from trirail.processes.interpreter import python
+from trirail.processes.operating_system import python
 from trirail.telemetry.sinks import HOST, free_port
 from trirail.wire.credentials import credentials_for
 from trirail.wire.endpoints import is_local

@@ -17,7 +17,7 @@ from typing import IO
 
 from trirail.config import SIM
 from trirail.errors import RefusedError, ServiceError, TrirailError
-from trirail.processes.interpreter import python
+from trirail.processes.operating_system import python
 
 PATIENT = {"max_overruns": "1000", "missed_syncs": "2000", "missed_positions": "1000", "heartbeat": "1.0"}
 """Keys of a configuration with which neither the loop nor the drives give up on a machine that stalls for a second."""

@@ -24,7 +24,7 @@ from trirail_drivers.interface import NAMES
 
 from trirail.config import LoopTable
 from trirail.processes import realtime
-from trirail.processes.interpreter import python
+from trirail.processes.operating_system import python
 
 TURN: Final = 0.25
 """For so long the compiled call goes on, and then Python looks at signals and progress [s]."""

@@ -8,8 +8,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from trirail.processes.operating_system import notify
 from trirail.processes.realtime import give_back
-from trirail.processes.systemd import notify
 
 LOADED = "trirail.processes.loop_process"
 """The module that is imported last, once all compiled rooms are."""

@@ -16,7 +16,7 @@ from setproctitle import setproctitle
 
 from trirail.config import LoopTable
 from trirail.errors import ServiceError
-from trirail.processes.interpreter import title
+from trirail.processes.operating_system import title
 
 _MADV_DONTNEED = 4
 

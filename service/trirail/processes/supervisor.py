@@ -17,10 +17,9 @@ from trirail.processes.compiling import Progress
 from trirail.processes.descriptors import raise_limit
 from trirail.processes.health import Monitor, Running
 from trirail.processes.heartbeats import PROCESSES, HangWatch, Heartbeats
+from trirail.processes.operating_system import Signals, Watchdog, notify
 from trirail.processes.process import Order
 from trirail.processes.realtime import give_back
-from trirail.processes.signals import Signals
-from trirail.processes.systemd import Watchdog, notify
 from trirail.processes.warm_parent import ChildProcess, WarmParent
 from trirail.wire import links
 from trirail.wire.messages import Event, Level

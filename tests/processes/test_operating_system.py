@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from rigs import Clock
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
+from trirail.processes.operating_system import FEEDS, Watchdog, notify
 from trirail.processes.supervisor import WATCHED_BY_SYSTEMD
-from trirail.processes.systemd import FEEDS, Watchdog, notify
 
 UNIT = Path(__file__).parents[2] / "configs" / "trirail.service"
 
