@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.processes import descriptors
+from trirail.processes import sockets
 from trirail.processes.zenoh_links import EACH, LOOK_EVERY, Crowding, surplus
 from trirail.wire.packets import Remark
 
@@ -43,8 +43,8 @@ class Crowd:
         self.ended: list[str] = []
         self.told: list[Remark] = []
         self.descriptors = 10
-        monkeypatch.setattr(descriptors, "used", lambda: self.descriptors)
-        monkeypatch.setattr(descriptors, "limit", lambda: 1000)
+        monkeypatch.setattr(sockets, "descriptors_used", lambda: self.descriptors)
+        monkeypatch.setattr(sockets, "descriptor_limit", lambda: 1000)
         self.crowding = Crowding(lambda: self.links, self.ended.extend, USERS, MOST, self.told.append, lambda: self.now)
 
     def look(self, links: int, descriptors: int = 10, name: str | None = "eva") -> tuple[str, ...]:

@@ -18,8 +18,8 @@ from trirail.client.stop_call import NoDoorError, Outcome, StopCall, StopOrder
 from trirail.config import Config, Zenoh
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.processes import stop_door
-from trirail.processes.descriptors import Reserve
 from trirail.processes.session_guard import Guard
+from trirail.processes.sockets import Reserve
 from trirail.processes.stop_door import Answer
 from trirail.wire import tls
 from trirail.wire.credentials import Credentials

@@ -9,8 +9,7 @@ import zenoh
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError, ServiceError
-from trirail.processes.descriptors import disconnect
-from trirail.processes.stop_addresses import SOCKET_MODE
+from trirail.processes.sockets import SOCKET_MODE, disconnect
 from trirail.processes.stop_door import Answer, StopDoor
 from trirail.wire import tls, zenoh_session
 from trirail.wire.access import access_control

@@ -22,8 +22,7 @@ from typing import Final
 import msgspec
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.descriptors import Reserve, limit
-from trirail.processes.stop_addresses import listen, source
+from trirail.processes.sockets import Reserve, descriptor_limit, listen, source
 from trirail.wire import tls
 from trirail.wire.decoding import decoded
 from trirail.wire.messages import CommandReply, ErrorReply
@@ -90,7 +89,7 @@ class StopDoor:
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._selector.register(self._wake, selectors.EVENT_READ, self._woken)
         self._listening: list[socket.socket] = []
-        self._places = min(PLACES, limit() // 4)
+        self._places = min(PLACES, descriptor_limit() // 4)
         self._reserve = Reserve(self._places)
         self._thread = threading.Thread(target=self._run, name="stop door", daemon=True)
 

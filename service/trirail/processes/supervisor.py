@@ -14,12 +14,12 @@ from typing import Any
 from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.processes.compiling import Progress
-from trirail.processes.descriptors import raise_limit
 from trirail.processes.health import Monitor, Running
 from trirail.processes.heartbeats import PROCESSES, HangWatch, Heartbeats
 from trirail.processes.operating_system import Signals, Watchdog, notify
 from trirail.processes.process import Order
 from trirail.processes.realtime import give_back
+from trirail.processes.sockets import raise_descriptor_limit
 from trirail.processes.warm_parent import ChildProcess, WarmParent
 from trirail.wire import links
 from trirail.wire.messages import Event, Level
@@ -104,7 +104,7 @@ class Supervisor:
 
         `up` is called once with what each process said when it was ready.
         """
-        raise_limit()
+        raise_descriptor_limit()
         runtime = _runtime_folder()
         with runtime as folder, Signals() as signals:
             self._listening = [links.listen(Path(folder, name)) for name in PORTS]

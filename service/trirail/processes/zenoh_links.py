@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from trirail.processes import descriptors
+from trirail.processes import sockets
 from trirail.wire.packets import Remark
 from trirail.wire.text import quoted
 
@@ -72,7 +72,7 @@ class Crowding:
         self._seen: dict[str, None] = {}
         self._warnings: dict[str, str] = {}
         self._due = 0.0
-        self.use = InUse(0, most, 0, descriptors.limit())
+        self.use = InUse(0, most, 0, sockets.descriptor_limit())
         """As it was looked last."""
 
     def warnings(self) -> tuple[str, ...]:
@@ -87,7 +87,7 @@ class Crowding:
         self._due = now + LOOK_EVERY
         links = self._links()
         self._seen = {at: None for at in (*self._seen, *links) if at in links}
-        self.use = InUse(len(links), self._most, descriptors.used(), descriptors.limit())
+        self.use = InUse(len(links), self._most, sockets.descriptors_used(), sockets.descriptor_limit())
         named = {at: name for at in self._seen if (name := links[at]) is not None}
         if ending := surplus(named, self._users, self._most):
             self._end(ending)
