@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 from control_rig import CONFIG, carried
-from trirail.processes.backlog import MOST_OF_ONE, PATIENCE
 from trirail.processes.gateway import Gateway
-from trirail.processes.incoming import Incoming, Kind
+from trirail.processes.incoming import GOAL_PATIENCE, GOALS_OF_ONE, Incoming, Kind
 from trirail.processes.replies import REFUSALS_PER_SECOND
 from trirail.processes.requests import AHEAD, AHEAD_OF_ALL, UNDER_WAY
 from trirail.processes.session_guard import Guard
@@ -122,9 +121,9 @@ def test_a_goal_that_has_waited_too_long_does_not_begin(rig: Rig, monkeypatch: p
     monkeypatch.setattr(time, "monotonic_ns", lambda: now)
     for name in ("a", "b", "c", "d", "e"):
         goal(gateway, name)
-    now += round(0.9 * PATIENCE * 1e9)
+    now += round(0.9 * GOAL_PATIENCE * 1e9)
     gateway._hear(packets.message(Accepted(1, "a", 1.0, 1.0, False, False)), lambda: None)
-    now += round(0.2 * PATIENCE * 1e9)
+    now += round(0.2 * GOAL_PATIENCE * 1e9)
     gateway._hear(packets.message(Accepted(2, "b", 1.0, 1.0, False, False)), lambda: None)
     passed = [(request.id, request.withdrawn) for request in link.sent if isinstance(request, GoalRequest)]
     assert [name for name, _ in passed] == ["a", "b", "c", "d", "e"]
@@ -171,11 +170,11 @@ def test_what_the_loop_has_at_once_is_bounded_for_all_users_together(rig: Rig) -
 
 def test_goals_of_one_who_floods_are_refused_and_nobody_elses(rig: Rig) -> None:
     gateway, link = rig
-    for number in range(AHEAD + MOST_OF_ONE + 3):
+    for number in range(AHEAD + GOALS_OF_ONE + 3):
         goal(gateway, f"e{number}", "eve")
     goal(gateway, "a", "ann")
     refused = [said for said in link.sent if isinstance(said, RefusedRequest)]
-    assert refused == [RefusedRequest("eve", f"{MOST_OF_ONE} goals of eve are waiting already: send fewer")] * 3
+    assert refused == [RefusedRequest("eve", f"{GOALS_OF_ONE} goals of eve are waiting already: send fewer")] * 3
     assert passed(link)[-1] == ("a", None)
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from trirail.processes.fairness import BURST, RATE, Pace
 from trirail.processes.inbox import UNREAD, UNREAD_OF_ONE, Inbox, _incoming
-from trirail.processes.incoming import Incoming
+from trirail.processes.incoming import BURST, RATE, Incoming, Pace
 from trirail.wire import zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE, MAX_UNREAD
 from trirail.wire.vocabulary import Command

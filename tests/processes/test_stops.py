@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
 from trirail.processes.inbox import ALIKE
-from trirail.processes.incoming import REMEMBERED, Copies, Incoming
+from trirail.processes.incoming import Incoming
+from trirail.processes.replies import REMEMBERED, Copies
 from trirail.processes.session_guard import Guard
 from trirail.wire import packets, zenoh_session
 from trirail.wire.messages import CommandReply, ErrorReply

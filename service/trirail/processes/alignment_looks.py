@@ -8,8 +8,7 @@ from collections.abc import Callable
 from msgspec import structs
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.fairness import Pace
-from trirail.processes.incoming import Incoming
+from trirail.processes.incoming import Incoming, Pace
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.looks import WELL, AlignmentLook
 from trirail.wire.packets import Looked

@@ -12,8 +12,7 @@ from functools import partial
 
 import zenoh
 
-from trirail.processes.fairness import FairQueue, Pace
-from trirail.processes.incoming import Incoming, Kind
+from trirail.processes.incoming import FairQueue, Incoming, Kind, Pace
 from trirail.processes.stop_door import Answer
 from trirail.wire import zenoh_session
 from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_UNREAD

@@ -1,21 +1,23 @@
-"""A message as it has come to the gateway, before anything of it is decoded; and stops that come twice.
+"""What has come to the gateway and waits there: messages before they are decoded, and goals. Users take turns.
 
-A stop goes over Zenoh and to the door: it is carried out once, and each copy is answered alike. The slower copy may
-come when the robot moves again: it must not stop goals that were sent after the first was confirmed.
+The loop has only a few goals at once: what it has not been given can be withdrawn.
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from collections import deque
+from collections.abc import Callable, Iterator, KeysView
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
-import msgspec
 import zenoh
+from msgspec import structs
 
-from trirail.errors import RefusalCode
+from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
-from trirail.wire.messages import ErrorReply
+from trirail.wire.packets import GoalRequest
+from trirail.wire.sizes import MAX_UNREAD
 
 Kind = Literal["goal", "cmd", "info", "role", "poses", "teach", "forget", "alignment"]
 
@@ -59,66 +61,174 @@ class Incoming(NamedTuple):
         return self._replace(query=None, at_door=None, alike=())
 
 
-REMEMBERED = 60.0
-"""How long an answer is kept for a copy that is to come; nobody waits longer for one [s]."""
-MOST = 4096
-"""So many are remembered at once; beyond that the oldest are forgotten."""
-
-_Id = tuple[str, str, bytes]
-
-
-class _Stop:
-    """What is known of one."""
-
-    def __init__(self, came: float) -> None:
-        self.came = came
-        self.answer: msgspec.Struct | None = None
-        self.waiting: list[Incoming] = []
+BURST = 400
+"""Messages of one user that are read as soon as it is his turn."""
+RATE = 200.0
+"""Messages of one user that are read a second beyond that: ten times what a stream of goals or a held jog sends."""
+_FORGOTTEN = 1000
+"""With so many users those are forgotten who have their whole burst again."""
 
 
-class Copies:
-    """Keeps which stops have come, by key, id and content. One without an id has no copies. `clock` gives seconds."""
+class Pace:
+    """A token bucket for each user, as the generic cell rate algorithm keeps it: one moment instead of a count."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._stops: dict[_Id, _Stop] = {}  # in the order in which they came
+    def __init__(self, burst: int = BURST, rate: float = RATE) -> None:
+        self._burst, self._rate = burst, rate
+        self._full_at: dict[str, float] = {}
+        """When each user's bucket is full again, in seconds of the caller's clock."""
 
-    def first(self, incoming: Incoming) -> bool:
-        """Whether none of it has come before; a later one waits for the answer of the first, or has it `known`."""
-        if not incoming.id:
-            return True
-        if (stop := self._stops.get(_id(incoming))) is not None:
-            if stop.answer is None:
-                stop.waiting.append(incoming)
-            return False
-        self._forget()
-        self._stops[_id(incoming)] = _Stop(self._clock())
-        return True
+    def wait(self, user: str, now: float) -> float:
+        """Return how long it is until a user's next message may be read; 0 where it may be now [s]."""
+        # Half a message less than the burst: a sum of so many fractions does not end at a whole one.
+        return max(0.0, self._full_at.get(user, -math.inf) - now - (self._burst - 0.5) / self._rate)
 
-    def known(self, incoming: Incoming) -> msgspec.Struct | None:
-        """Return what the first was answered; None where it was not yet."""
-        stop = self._stops.get(_id(incoming))
-        return stop.answer if stop is not None else None
-
-    def answered(self, incoming: Incoming, content: msgspec.Struct) -> list[Incoming]:
-        """Note an answer, and return who else has waited for it. What was not carried out is not remembered."""
-        stop = self._stops.get(_id(incoming))
-        if stop is None or stop.answer is not None:
-            return []
-        stop.answer = content
-        if isinstance(content, ErrorReply) and content.code == RefusalCode.BUSY:
-            del self._stops[_id(incoming)]
-        waiting, stop.waiting = stop.waiting, []
-        return waiting
-
-    def _forget(self) -> None:
-        """Forget what nobody asks for any more."""
-        while self._stops:
-            name, oldest = next(iter(self._stops.items()))
-            if len(self._stops) < MOST and self._clock() - oldest.came < REMEMBERED:
-                return
-            del self._stops[name]
+    def count(self, user: str, now: float) -> None:
+        """Note that a message of a user has been read."""
+        self._full_at[user] = max(self._full_at.get(user, now), now) + 1.0 / self._rate
+        if len(self._full_at) > _FORGOTTEN:
+            self._full_at = {user: full for user, full in self._full_at.items() if full > now}
 
 
-def _id(stop: Incoming) -> _Id:
-    return stop.key, stop.id, stop.payload
+T = TypeVar("T")
+
+
+class FairQueue(Generic[T]):
+    """Round robin: who has been served goes behind the others; who comes anew begins behind them."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, deque[T]] = {}  # the users in the order of their turns, none without anything
+        self._length = 0
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __iter__(self) -> Iterator[T]:
+        for waiting in self._of.values():
+            yield from waiting
+
+    @property
+    def users(self) -> KeysView[str]:
+        """Who has something in it, in the order of their turns; not to be looked through while it changes."""
+        return self._of.keys()
+
+    def of(self, user: str) -> int:
+        """Return how much of it is a user's."""
+        return len(self._of.get(user, ()))
+
+    def put(self, user: str, item: T) -> None:
+        """Put something behind the user's own."""
+        self._of.setdefault(user, deque()).append(item)
+        self._length += 1
+
+    def first(self, user: str) -> T:
+        """Return the user's first; KeyError where there is none."""
+        return self._of[user][0]
+
+    def pop(self, user: str) -> T:
+        """Take the first of a user, who goes behind the others; KeyError where there is none."""
+        waiting = self._of.pop(user)
+        item = waiting.popleft()
+        self._length -= 1
+        if waiting:
+            self._of[user] = waiting
+        return item
+
+    def change(self, make: Callable[[T], T]) -> None:
+        """Put something else in the place of each."""
+        self._of = {user: deque(map(make, waiting)) for user, waiting in self._of.items()}
+
+
+GOALS = 5_000
+"""Goals that may wait for those before them; beyond that they are refused."""
+GOALS_OF_ONE = 1_250
+"""Of them those of one user: the others have room whatever he sends."""
+GOAL_PATIENCE = 8.0
+"""A goal that has waited longer for those before it does not begin any more: its sender gives up soon [s]."""
+
+
+class WaitingGoal(NamedTuple):
+    """A goal, and the message that it came in, without its payload."""
+
+    incoming: Incoming
+    request: GoalRequest
+
+
+class Backlog:
+    """Goals by user, each user's in the order in which they came, bounded in number and in bytes; users take turns.
+
+    Each goal leaves it exactly once, by `drop_first`: one that is withdrawn keeps its place, and the loop tells of
+    its end in its turn.
+    """
+
+    def __init__(self) -> None:
+        self._goals: FairQueue[WaitingGoal] = FairQueue()
+        self._bytes = 0
+        self._stop = 0, ""
+        self._stopped: dict[str, tuple[int, str]] = {}
+        """By id, before which message a goal was told to stop that may not be read yet, and why; the newest last."""
+
+    def __iter__(self) -> Iterator[WaitingGoal]:
+        return iter(self._goals)
+
+    @property
+    def users(self) -> list[str]:
+        """Who has goals in it, in the order of their turns."""
+        return list(self._goals.users)
+
+    def check_room(self, user: str, size: int) -> None:
+        """Raise RefusedError if there is no room for one more goal of so many bytes."""
+        own = self._goals.of(user)
+        if own >= GOALS_OF_ONE:
+            raise RefusedError(RefusalCode.BUSY, f"{own} goals of {user} are waiting already: send fewer")
+        if len(self._goals) >= GOALS or self._bytes + size > MAX_UNREAD:
+            raise RefusedError(RefusalCode.BUSY, f"{len(self._goals)} goals are waiting already: send fewer")
+
+    def add(self, incoming: Incoming, request: GoalRequest) -> None:
+        """Put a goal behind the user's others; withdrawn where it had come before the robot was told to stop."""
+        for before, reason in (self._stop, self._stopped.get(request.id, (0, ""))):
+            if incoming.number < before:
+                request = structs.replace(request, withdrawn=reason)
+        self._goals.put(request.user, WaitingGoal(incoming._replace(payload=b""), request))
+        self._bytes += incoming.size
+
+    def first(self, user: str) -> WaitingGoal:
+        """Return the goal of a user whose turn it is; one that has waited too long is withdrawn. KeyError for none."""
+        incoming, request = self._goals.first(user)
+        if request.withdrawn is None and time.monotonic_ns() - request.received_ns > GOAL_PATIENCE * 1e9:
+            reason = f"too many goals before it: it has waited longer than {GOAL_PATIENCE:g} s"
+            request = structs.replace(request, withdrawn=reason)
+        return WaitingGoal(incoming, request)
+
+    def drop_first(self, user: str) -> None:
+        """Let go of the user's first: the loop has it."""
+        self._bytes -= self._goals.pop(user).incoming.size
+
+    def withdraw(self, goal_id: str, reason: str) -> bool:
+        """Withdraw the goal of an id; whether there is one."""
+        found = any(goal.request.id == goal_id for goal in self._goals)
+        if found:
+            self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.request.id == goal_id else goal)
+        return found
+
+    def withdraw_coming(self, goal_id: str, reason: str, before: int) -> None:
+        """Withdraw the goal of an id where it is read after this, and had come before a message."""
+        self._stopped.pop(goal_id, None)
+        self._stopped[goal_id] = before, reason
+        if len(self._stopped) > GOALS:
+            del self._stopped[next(iter(self._stopped))]
+
+    def withdraw_all(self, reason: str, before: int) -> None:
+        """Withdraw every goal that came before a message, those as well that are read after it."""
+        if before >= self._stop[0]:  # one that came earlier may be read later
+            self._stop = before, reason
+        self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.incoming.number < before else goal)
+
+    def withdraw_others(self, user: str | None, reason: str) -> None:
+        """Withdraw every goal but a user's."""
+        self._goals.change(lambda goal: goal if goal.request.user == user else _withdrawn(goal, reason))
+
+
+def _withdrawn(goal: WaitingGoal, reason: str) -> WaitingGoal:
+    """Return a goal as one that does not begin any more; for the first reason that there was."""
+    request = goal.request
+    return goal if request.withdrawn else goal._replace(request=structs.replace(request, withdrawn=reason))

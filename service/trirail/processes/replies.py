@@ -1,6 +1,9 @@
 """Answers to queries, sent by threads of their own, and what is refused, which everyone is told, but not too often.
 
-Whoever does not take an answer holds up nobody else."""
+Whoever does not take an answer holds up nobody else. A stop goes over Zenoh and to the door: it is carried out once,
+and each copy is answered alike. The slower copy may come when the robot moves again: it must not stop goals that were
+sent after the first was confirmed.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,83 @@ import contextlib
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 
 import msgspec
 import zenoh
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.incoming import Copies, Incoming
+from trirail.processes.incoming import Incoming
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.links import PacketLink
 from trirail.wire.messages import ErrorReply
 from trirail.wire.packets import RefusedRequest, message
 from trirail.wire.text import is_name, quoted
+
+REMEMBERED = 60.0
+"""How long an answer is kept for a copy that is to come; nobody waits longer for one [s]."""
+COPIES_KEPT = 4096
+"""So many are remembered at once; beyond that the oldest are forgotten."""
+
+_Id = tuple[str, str, bytes]
+
+
+class _Stop:
+    """What is known of one."""
+
+    def __init__(self, came: float) -> None:
+        self.came = came
+        self.answer: msgspec.Struct | None = None
+        self.waiting: list[Incoming] = []
+
+
+class Copies:
+    """Keeps which stops have come, by key, id and content. One without an id has no copies. `clock` gives seconds."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._stops: dict[_Id, _Stop] = {}  # in the order in which they came
+
+    def first(self, incoming: Incoming) -> bool:
+        """Whether none of it has come before; a later one waits for the answer of the first, or has it `known`."""
+        if not incoming.id:
+            return True
+        if (stop := self._stops.get(_id(incoming))) is not None:
+            if stop.answer is None:
+                stop.waiting.append(incoming)
+            return False
+        self._forget()
+        self._stops[_id(incoming)] = _Stop(self._clock())
+        return True
+
+    def known(self, incoming: Incoming) -> msgspec.Struct | None:
+        """Return what the first was answered; None where it was not yet."""
+        stop = self._stops.get(_id(incoming))
+        return stop.answer if stop is not None else None
+
+    def answered(self, incoming: Incoming, content: msgspec.Struct) -> list[Incoming]:
+        """Note an answer, and return who else has waited for it. What was not carried out is not remembered."""
+        stop = self._stops.get(_id(incoming))
+        if stop is None or stop.answer is not None:
+            return []
+        stop.answer = content
+        if isinstance(content, ErrorReply) and content.code == RefusalCode.BUSY:
+            del self._stops[_id(incoming)]
+        waiting, stop.waiting = stop.waiting, []
+        return waiting
+
+    def _forget(self) -> None:
+        """Forget what nobody asks for any more."""
+        while self._stops:
+            name, oldest = next(iter(self._stops.items()))
+            if len(self._stops) < COPIES_KEPT and self._clock() - oldest.came < REMEMBERED:
+                return
+            del self._stops[name]
+
+
+def _id(stop: Incoming) -> _Id:
+    return stop.key, stop.id, stop.payload
+
 
 THREADS = 32
 """So many askers that take no answer hold up nobody else."""

@@ -16,9 +16,8 @@ import msgspec
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.backlog import Backlog
 from trirail.processes.inbox import Inbox
-from trirail.processes.incoming import Incoming
+from trirail.processes.incoming import Backlog, Incoming
 from trirail.processes.loop_death import LoopDeath
 from trirail.processes.publications import StateMaker
 from trirail.processes.replies import Replies

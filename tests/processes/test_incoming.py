@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.processes.fairness import FairQueue
+from trirail.processes.incoming import FairQueue
 
 USERS = "abcd"
 
